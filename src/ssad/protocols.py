@@ -1,0 +1,56 @@
+"""The seams of SSAD: what a part must offer so that others can use it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from ssad.types import F32, Bool, Controller, Episode
+
+
+@dataclass(frozen=True)
+class View:
+    """What a driving system sees at one step: B egos, each in its own scene. Arrays are read-only copies.
+
+    time [B] s; speed [B] m/s; accel [B] m/s^2; pose [B, 3] x, y, yaw in the world frame; target_speed [B] m/s;
+    route [B, 40, 2]: the next 40 m of the route in the ego's frame (x forward, y left), one point a metre, the last
+    one repeated past the end; lane_offset [B] m (left of the route is positive) and heading_error [B] rad;
+    others [B, K, 7]: nearest other agents first, in the ego's frame: x, y, yaw, speed (along their own heading),
+    length, width, kind (0 = empty row), within 60 m; signal [B, 2]: state (`SignalState`) of the next signal on the
+    route and distance to its stop line in m; done [B]: episodes that have ended (their control is ignored).
+    """
+
+    time: F32
+    speed: F32
+    accel: F32
+    pose: F32
+    target_speed: F32
+    route: F32
+    lane_offset: F32
+    heading_error: F32
+    others: F32
+    signal: F32
+    done: Bool
+
+
+@runtime_checkable
+class DrivingSystem(Protocol):
+    """What drives the ego.
+
+    controller: EXTERNAL calls `act` each step (10 Hz); AUTOPILOT and FOLLOW run inside the world and `act` is never
+    called. `reset` is called once before a batch of episodes with one seed an episode. A result must not depend on
+    which episodes share the batch.
+    """
+
+    name: str
+    controller: Controller
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Forget the past; B = len(episodes)."""
+
+    def act(self, view: View) -> F32:
+        """Controls [B, 3]: throttle in [0, 1], brake in [0, 1], steer in [-1, 1] (left positive).
+
+        A fourth column above 0.5 drives the throttle in reverse.
+        """

@@ -1,0 +1,298 @@
+"""The frozen data that passes between the parts of SSAD.
+
+Shape letters used in every docstring: B scenes of a batch, A agents of a scene, T steps, N points of a route,
+L lanes, P points of lane centre lines, S signals, K a small fixed count.
+Frames: world is right-handed, x east, y north, z up, yaw counter-clockwise from east; metres, seconds, radians.
+CARLA's left-handed frame is converted where CARLA's files are read, and nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+U8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
+
+
+class LaneType(IntEnum):
+    """What a lane is for (OpenDRIVE lane types, folded to those that matter here)."""
+
+    NONE = 0
+    DRIVING = 1
+    SHOULDER = 2
+    SIDEWALK = 3
+    PARKING = 4
+    BIKING = 5
+    MEDIAN = 6
+
+
+class AgentKind(IntEnum):
+    """What an agent is; NONE marks an empty slot of a batch."""
+
+    NONE = 0
+    CAR = 1
+    TRUCK = 2
+    BUS = 3
+    MOTORCYCLE = 4
+    BICYCLE = 5
+    WALKER = 6
+    PROP = 7
+
+
+class Contact(IntFlag):
+    """What the ego touches; bits, since it can touch several at once."""
+
+    NONE = 0
+    VEHICLE = 1
+    WALKER = 2
+    CYCLIST = 4
+    STATIC = 8
+
+
+class SignalState(IntEnum):
+    """State of a traffic signal; OFF does not control anything (priority rules hold)."""
+
+    OFF = 0
+    RED = 1
+    YELLOW = 2
+    GREEN = 3
+
+
+class Controller(IntEnum):
+    """Who steers an agent.
+
+    NONE stands still; EXTERNAL takes the action given to `World.step`; AUTOPILOT follows its route, sees everything
+    and yields; FOLLOW keeps its route and target speed and sees nothing; SCRIPT runs its phases.
+    """
+
+    NONE = 0
+    EXTERNAL = 1
+    AUTOPILOT = 2
+    FOLLOW = 3
+    SCRIPT = 4
+
+
+@dataclass(frozen=True)
+class Model:
+    """Body and limits of an agent type. Metres, m/s, m/s^2, radians."""
+
+    name: str
+    kind: AgentKind
+    length: float
+    width: float
+    height: float
+    wheelbase: float = 0.0
+    max_steer: float = 0.0
+    max_accel: float = 0.0
+    max_brake: float = 0.0
+    max_speed: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A place in the world frame: x, y in metres, yaw in radians."""
+
+    x: float
+    y: float
+    yaw: float = 0.0
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What starts a phase.
+
+    kind `ego_distance`: centre distance between the ego and actor number `actor` falls below `value` metres;
+    `ego_speed`: the ego drives faster than `value` m/s; `travelled`: the actor itself has moved more than `value`
+    metres; `time`: `value` seconds since the episode began; `always`: at once.
+    """
+
+    kind: Literal["always", "ego_distance", "ego_speed", "travelled", "time"] = "always"
+    value: float = 0.0
+    actor: int = 0
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One piece of a scripted behaviour: once `when` holds (latched, in order), drive at `speed` m/s."""
+
+    speed: float
+    when: Condition = field(default_factory=Condition)
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A scripted participant of a scenario: pose in the world frame, phases, and an optional path to follow.
+
+    Without `path` it goes straight along its heading; with it, it follows the polyline (x, y) in metres. Without
+    phases it stands still. Vehicles reach their speed by full throttle or full brake, walkers at once.
+    """
+
+    name: str
+    model: str
+    pose: Pose
+    phases: tuple[Phase, ...] = ()
+    path: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class SignalPlan:
+    """How the signals of an episode behave: those that face the ego's route, and all the others."""
+
+    ego: Literal["program", "off", "red", "green"] = "program"
+    others: Literal["program", "off", "red", "green"] = "program"
+    until: float = 60.0
+
+
+@dataclass(frozen=True)
+class TrafficPlan:
+    """Random background vehicles: share of the spawn points near the route, and least and most vehicles (FREA)."""
+
+    intensity: float = 0.3
+    minimum: int = 5
+    maximum: int = 18
+    wake_distance: float = 50.0
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What ends an episode besides a collision and the end of the route."""
+
+    max_steps: int = 300
+    max_time: float = 60.0
+    max_distance: float = 1.0e9
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What happens, as its author wrote it; round-trips through YAML.
+
+    `type` names a scenario class (`StraightObstacle`, ..., `NaturalJunction`) which turns `route`, `trigger`,
+    `placements` and `parameters` into actors, or is `Custom`, which takes `actors` as they are.
+    route: key points (x, y) in metres, at least two; trigger: the place the scenario is built around;
+    placements: poses of actors whose place the scenario's author fixed; seed varies what is random in it.
+    """
+
+    name: str
+    type: str
+    town: str
+    route: tuple[Pose, ...]
+    trigger: Pose | None = None
+    placements: tuple[Pose, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    actors: tuple[Actor, ...] = ()
+    signals: SignalPlan = field(default_factory=SignalPlan)
+    traffic: TrafficPlan | None = None
+    limits: Limits = field(default_factory=Limits)
+    target_speed: float = 8.0
+    seed: int = 0
+    group: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A path along lanes, sampled every `spacing` metres.
+
+    xy [N, 2] m, yaw [N] rad, lane [N] index into the town's lane graph (-1: off the graph), speed_limit [N] m/s,
+    width [N] m of the lane under the path.
+    """
+
+    xy: F32
+    yaw: F32
+    lane: I32
+    speed_limit: F32
+    width: F32
+    spacing: float = 1.0
+
+    @property
+    def length(self) -> float:
+        """Length of the path, m."""
+        return self.spacing * (len(self.xy) - 1)
+
+
+@dataclass(frozen=True)
+class EpisodeAgent:
+    """One agent of a concrete episode: where it starts and how it is driven."""
+
+    name: str
+    model: str
+    controller: Controller
+    pose: Pose
+    speed: float = 0.0
+    target_speed: float = 8.0
+    phases: tuple[Phase, ...] = ()
+    route: Route | None = None
+    wake_distance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A scenario made concrete on a lane graph: everything a world needs to run it. Agent 0 is the ego.
+
+    signal_override: signal index of the town -> forced state, until `override_until` seconds.
+    `Condition.actor` counts the agents after the ego, in order: actor 0 is agent 1.
+    """
+
+    key: str
+    scenario: Scenario
+    town: str
+    agents: tuple[EpisodeAgent, ...]
+    signal_override: Mapping[int, SignalState] = field(default_factory=dict)
+    override_until: float = 60.0
+    limits: Limits = field(default_factory=Limits)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class EpisodeTrace:
+    """What happened in one episode: one row a recorded step, row 0 is the start. T rows, A agents, agent 0 the ego.
+
+    dt s. names, models, kind [A]; length, width [A] m. x, y [T, A] m, yaw [T, A] rad, speed [T, A] m/s (signed,
+    forward), active [T, A] (False: not present). Ego only, all [T]: accel m/s^2 (along its heading),
+    contact (`Contact` bits of contacts that began in this step), contact_agent (agent first touched in this step, -1
+    none, -2 not an agent), off_road, route_distance m (least distance to the rest of the route), route_complete in
+    percent, driven m so far, lane_invasion (lane markings crossed in this step), red_light and stop_sign (lines run
+    in this step), throttle, brake, steer (the control applied), signal [T, S'] states of the `signal_ids`.
+    route [N, 2] m: the ego's route. end: why it ended (`collision`, `complete`, `max_steps`, `max_distance`,
+    `max_time`).
+    """
+
+    key: str
+    town: str
+    dt: float
+    names: tuple[str, ...]
+    models: tuple[str, ...]
+    kind: U8
+    length: F32
+    width: F32
+    x: F32
+    y: F32
+    yaw: F32
+    speed: F32
+    active: Bool
+    accel: F32
+    contact: U8
+    contact_agent: I32
+    off_road: Bool
+    route_distance: F32
+    route_complete: F32
+    driven: F32
+    lane_invasion: U8
+    red_light: U8
+    stop_sign: U8
+    throttle: F32
+    brake: F32
+    steer: F32
+    signal_ids: I32
+    signal: U8
+    route: F32
+    end: str
