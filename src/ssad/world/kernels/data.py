@@ -1,0 +1,91 @@
+"""Arrays that the kernels share, as Warp structs. Legend: B scenes, A agents, E episodes of the bank, K phases,
+N route points of the pool, M lane segments, S signals."""
+
+import warp as wp
+
+HORIZON = 8  # forecast points
+STRIDE = wp.constant(0.5)  # seconds between forecast points
+FORECAST = wp.constant(HORIZON)
+FAR = wp.constant(1.0e6)
+
+
+@wp.struct
+class Bank:
+    """What does not change while an episode runs; scenes refer to it by episode number."""
+
+    model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot
+    controller: wp.array2d(dtype=wp.int32)  # [E, A]
+    start: wp.array2d(dtype=wp.vec4)  # [E, A] x, y, yaw, speed
+    cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s, wake distance m (0: awake at once)
+    route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
+    phase_count: wp.array2d(dtype=wp.int32)  # [E, A]
+    phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] condition kind, value, agent
+    phase_speed: wp.array3d(dtype=wp.float32)  # [E, A, K]
+    town: wp.array(dtype=wp.int32)  # [E]
+    signal: wp.array2d(dtype=wp.int32)  # [E, S] forced state, -1 none
+    limits: wp.array(dtype=wp.vec4)  # [E] max steps, max time s, max distance m, override until s
+    kind: wp.array(dtype=wp.int32)  # [models]
+    body: wp.array(dtype=wp.vec4)  # [models] half length, half width, wheelbase, max steer
+    power: wp.array(dtype=wp.vec4)  # [models] max accel, max brake, max speed, unused
+
+
+@wp.struct
+class Roads:
+    """Routes of all agents, lane segments of all towns with their grids, and signals."""
+
+    path: wp.array(dtype=wp.vec4)  # [N] x, y, yaw, curvature
+    rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, turn rank there
+    path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
+    segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
+    segment_half: wp.array(dtype=wp.vec2)  # [M] half widths at both ends
+    segment_lane: wp.array(dtype=wp.int32)  # [M] lane, counted over all towns
+    lane_junction: wp.array(dtype=wp.int32)  # [L] 1 inside a junction
+    cell_first: wp.array(dtype=wp.int32)
+    cell_segment: wp.array(dtype=wp.int32)
+    grid: wp.array(dtype=wp.vec4)  # [towns] origin x, origin y, cells a metre, unused
+    grid_size: wp.array(dtype=wp.vec3i)  # [towns] nx, ny, first entry in cell_first
+    signal_first: wp.array(dtype=wp.int32)  # [towns]
+    signal_program: wp.array(dtype=wp.vec4)  # [S] cycle s, green from, green for, yellow for; cycle 0: off
+
+
+@wp.struct
+class State:
+    """What changes: one row a scene. `pose` is x, y, yaw; `previous` is the pose one step before."""
+
+    episode: wp.array(dtype=wp.int32)  # [B]
+    step: wp.array(dtype=wp.int32)  # [B]
+    end: wp.array(dtype=wp.int32)  # [B] 0 running, else why it ended
+    pose: wp.array2d(dtype=wp.vec3)  # [B, A]
+    previous: wp.array2d(dtype=wp.vec3)  # [B, A]
+    speed: wp.array2d(dtype=wp.float32)  # [B, A]
+    wheel: wp.array2d(dtype=wp.float32)  # [B, A] front-wheel angle, rad
+    active: wp.array2d(dtype=wp.int32)  # [B, A] 0 absent, 1 asleep, 2 awake
+    progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
+    phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
+    travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
+    waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
+    control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
+    forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
+    lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
+    lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
+    touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent
+
+
+@wp.struct
+class Ego:
+    """The record of each scene's ego in this step; all [B]."""
+
+    contact: wp.array(dtype=wp.int32)  # kinds of contacts that began
+    contact_agent: wp.array(dtype=wp.int32)
+    touching: wp.array(dtype=wp.int64)  # agents touched in the step before
+    off_road: wp.array(dtype=wp.int32)
+    over_line: wp.array(dtype=wp.int32)
+    invasion: wp.array(dtype=wp.int32)
+    red_light: wp.array(dtype=wp.int32)
+    complete: wp.array(dtype=wp.float32)  # percent
+    mark: wp.array(dtype=wp.int32)  # last route point passed
+    route_distance: wp.array(dtype=wp.float32)
+    driven: wp.array(dtype=wp.float32)
+    accel: wp.array(dtype=wp.float32)
+    speed: wp.array(dtype=wp.float32)  # in the step before
+    reward: wp.array(dtype=wp.float32)

@@ -1,0 +1,321 @@
+"""Who drives how: Autopilot (sees everything, yields), route follower (sees nothing), scripted phases.
+
+The Autopilot is the background traffic and the ego baseline alike. Its acceleration is the least of: IDM free road
+(Treiber et al. 2000) under the route's speed profile, IDM behind whoever is in its corridor, IDM to the stop line of
+a red signal, and IDM to the near edge of a predicted conflict it must yield to.
+"""
+
+import warp as wp
+
+from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State
+from ssad.world.kernels.shared import GREEN, OFF, RED, YELLOW, reach_along, route_at, signal_state, wrap
+
+IDM_ACCEL = wp.constant(2.5)
+IDM_BRAKE = wp.constant(3.0)
+IDM_HEADWAY = wp.constant(1.2)
+IDM_GAP = wp.constant(2.0)
+SIGHT = wp.constant(60.0)
+HALF_WALKER = wp.constant(6)
+C_NONE = wp.constant(0)
+C_AUTOPILOT = wp.constant(2)
+C_FOLLOW = wp.constant(3)
+C_SCRIPT = wp.constant(4)
+RIGHT_TURN = wp.constant(1.0)
+
+
+@wp.func
+def idm_gap(v: float, lead: float, gap: float) -> float:
+    """IDM's interaction term, m/s^2 (negative): how hard to brake behind something `gap` metres ahead."""
+    close = v * (v - lead) / (2.0 * wp.sqrt(IDM_ACCEL * IDM_BRAKE))
+    wish = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + close)
+    ratio = wish / wp.max(gap, 0.1)
+    return -IDM_ACCEL * ratio * ratio
+
+
+@wp.func
+def idm_free(v: float, target: float) -> float:
+    """IDM's free-road term, m/s^2; above the target speed a firm, bounded return to it."""
+    if v > target:
+        return wp.max(-2.0 * (v - target), -4.0)
+    r = v / wp.max(target, 0.1)
+    return IDM_ACCEL * (1.0 - r * r * r * r)
+
+
+@wp.func
+def condition_holds(state: State, b: int, i: int, when: wp.vec3, time: float) -> bool:
+    """Whether a phase may begin; kinds: 0 always, 1 ego distance, 2 ego speed, 3 travelled, 4 time."""
+    kind = int(when[0])
+    ok = kind == 0
+    if kind == 1:
+        p = state.pose[b, 0]
+        q = state.pose[b, int(when[2])]
+        ok = wp.length(wp.vec2(p[0] - q[0], p[1] - q[1])) < when[1]
+    elif kind == 2:
+        ok = state.speed[b, 0] > when[1]
+    elif kind == 3:
+        ok = state.travelled[b, i] > when[1]
+    elif kind == 4:
+        ok = time >= when[1] - 1.0e-4
+    return ok
+
+
+@wp.func
+def steer_on_route(bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, v: float) -> float:
+    """Steering in [-1, 1]: curvature of the route a moment ahead, corrected critically damped in distance."""
+    route = bank.route[e, i]
+    at = state.progress[b, i]
+    p = roads.path[route[0] + at]
+    pose = state.pose[b, i]
+    c = wp.cos(p[2])
+    s = wp.sin(p[2])
+    dx = pose[0] - p[0]
+    dy = pose[1] - p[1]
+    left = -s * dx + c * dy
+    here = wp.min(at + int(wp.max(v, 0.0) * 0.15 + 0.5), route[1] - 1)
+    k_ref = roads.path[route[0] + here][3]
+    body = bank.body[bank.model[e, i]]
+    slip = wp.atan(0.5 * wp.tan(state.wheel[b, i]))
+    aim = wp.min(at + 1, route[1] - 1)
+    off = wp.clamp(wrap(pose[2] + slip - roads.path[route[0] + aim][2]), -1.2, 1.2)
+    soft = 1.0 / (1.0 + 0.05 * v * v / 10.0)
+    k = k_ref - 0.25 * soft * wp.clamp(left, -3.0, 3.0) - 0.9 * soft * off
+    # curvature k of the box centre: sin(slip) = k L / 2, tan(wheel) = 2 tan(slip)
+    sine = wp.clamp(0.5 * k * body[2], -0.95, 0.95)
+    wheel = wp.atan(2.0 * sine / wp.sqrt(1.0 - sine * sine))
+    return wp.clamp(wheel / wp.max(body[3], 1.0e-3), -1.0, 1.0)
+
+
+@wp.func
+def lead_gap(
+    bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int, u0: float, body: wp.vec4
+) -> wp.vec3:
+    """Where agent j stands relative to i's route: (gap bumper to bumper m or FAR, its speed along the route, |lateral|)."""
+    route = bank.route[e, i]
+    p = state.pose[b, i]
+    q = state.pose[b, j]
+    dx = q[0] - p[0]
+    dy = q[1] - p[1]
+    u = wp.clamp(dx * wp.cos(p[2]) + dy * wp.sin(p[2]), 0.0, SIGHT)
+    lateral = float(0.0)
+    at = wp.vec3(0.0, 0.0, 0.0)
+    for _ in range(4):
+        at = route_at(roads, route[0], route[1], u0 + u)
+        c = wp.cos(at[2])
+        s = wp.sin(at[2])
+        rx = q[0] - at[0]
+        ry = q[1] - at[1]
+        along = rx * c + ry * s
+        lateral = -rx * s + ry * c
+        u = wp.clamp(u + along, 0.0, SIGHT)
+    other = bank.body[bank.model[e, j]]
+    reach = reach_along(state, b, j, at[2], wp.vec2(other[0], other[1]))
+    turn = wrap(q[2] - at[2])
+    margin = 0.3
+    if bank.kind[bank.model[e, j]] == HALF_WALKER:
+        margin = 0.6
+    result = wp.vec3(FAR, 0.0, wp.abs(lateral))
+    if u > 0.0 and u < SIGHT and wp.abs(lateral) < body[1] + reach[1] + margin:
+        rest = wp.abs((q[0] - at[0]) * wp.cos(at[2]) + (q[1] - at[1]) * wp.sin(at[2]))
+        if rest < 1.0:  # beyond the route's end a projection says nothing
+            result = wp.vec3(u - body[0] - reach[0], state.speed[b, j] * wp.cos(turn), wp.abs(lateral))
+    return result
+
+
+@wp.func
+def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
+    """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
+
+    Only another Autopilot can be relied on to give way: inside a junction before outside, then straight before
+    right before left, then whoever is nearer to the junction, then the lower number.
+    """
+    if bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2:
+        return False
+    ri = bank.route[e, i]
+    rj = bank.route[e, j]
+    a = roads.rule[ri[0] + state.progress[b, i]]
+    c = roads.rule[rj[0] + state.progress[b, j]]
+    inside_i = a[2] <= 0.0
+    inside_j = c[2] <= 0.0
+    if inside_i != inside_j:
+        return inside_i
+    if a[3] != c[3]:
+        return a[3] < c[3]
+    if wp.abs(a[2] - c[2]) > 1.0:
+        return a[2] < c[2]
+    return i < j
+
+
+@wp.func
+def conflict_gap(
+    bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int, u0: float, target: float, body: wp.vec4
+) -> float:
+    """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
+
+    i is taken to speed up towards its target, j to keep its speed along its own route (its heading if it has none);
+    positions are compared at the same time and half a second to either side.
+    """
+    route = bank.route[e, i]
+    v = wp.max(state.speed[b, i], 0.0)
+    other = bank.body[bank.model[e, j]]
+    lat_margin = 0.4
+    lon_margin = 1.0
+    if bank.kind[bank.model[e, j]] == HALF_WALKER:
+        lat_margin = 1.0
+    gap = FAR
+    u = float(0.0)
+    w = v
+    for k in range(FORECAST):
+        after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
+        u = u + 0.5 * (w + after) * STRIDE
+        w = after
+        at = route_at(roads, route[0], route[1], u0 + u)
+        c = wp.cos(at[2])
+        s = wp.sin(at[2])
+        for d in range(3):
+            n = k + d - 1
+            q = state.pose[b, j]
+            if n >= 0:
+                q = state.forecast[b, j, wp.min(n, FORECAST - 1)]
+            rx = q[0] - at[0]
+            ry = q[1] - at[1]
+            if rx * rx + ry * ry < 225.0:
+                along = rx * c + ry * s
+                across = -rx * s + ry * c
+                turn = q[2] - at[2]
+                ct = wp.abs(wp.cos(turn))
+                st = wp.abs(wp.sin(turn))
+                he = other[0] * ct + other[1] * st
+                we = other[0] * st + other[1] * ct
+                if wp.abs(across) < body[1] + we + lat_margin and wp.abs(along) < body[0] + he + lon_margin:
+                    edge = u + along - he - body[0]
+                    # already past the near edge with j behind the middle: braking would only stay in its way
+                    if edge > 0.0 or along > 0.0:
+                        gap = wp.min(gap, wp.max(edge, 0.0))
+    return gap
+
+
+@wp.func
+def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, agents: int, time: float) -> float:
+    """Wanted acceleration of an Autopilot, m/s^2."""
+    route = bank.route[e, i]
+    at = state.progress[b, i]
+    first = route[0] + at
+    rule = roads.rule[first]
+    pose = state.pose[b, i]
+    v = state.speed[b, i]
+    body = bank.body[bank.model[e, i]]
+    p = roads.path[first]
+    part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
+    u0 = float(at) + part
+    cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
+    target = wp.min(bank.cruise[e, i][0], cap)
+    accel = idm_free(v, target)
+
+    # signals
+    index = roads.path_signal[first]
+    if index >= 0:
+        ahead = rule[1] - part - body[0]
+        light = signal_state(bank, roads, e, index, time)
+        if ahead > -0.5:
+            stop = light == RED
+            if light == YELLOW:
+                stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
+            if light == RED and rule[3] == RIGHT_TURN and state.waited[b, i] >= 1.0:
+                stop = False  # right turn on red, after a stop; it yields below
+            if stop:
+                accel = wp.min(accel, idm_gap(v, 0.0, ahead + 1.0))
+
+    # everybody else
+    sees = SIGHT + v * 2.0
+    for j in range(agents):
+        if j != i and state.active[b, j] != 0:
+            q = state.pose[b, j]
+            dx = q[0] - pose[0]
+            dy = q[1] - pose[1]
+            d2 = dx * dx + dy * dy
+            if d2 < sees * sees:
+                lon = dx * wp.cos(pose[2]) + dy * wp.sin(pose[2])
+                facing = wp.cos(q[2] - pose[2])
+                lead = lead_gap(bank, roads, state, b, i, j, e, u0, body)
+                if lead[0] < FAR:
+                    accel = wp.min(accel, idm_gap(v, wp.max(lead[1], 0.0), lead[0]))
+                follows = lon < 0.0 and facing > 0.5  # behind me, going my way: its task
+                leads = lead[0] < FAR and facing > 0.7
+                vj = wp.abs(state.speed[b, j])
+                span = 4.5 * (vj + wp.max(target, v)) + 12.0
+                if vj > 0.2 and not follows and not leads and d2 < span * span:
+                    gap = conflict_gap(bank, roads, state, b, i, j, e, u0, target, body)
+                    if gap < FAR:
+                        yields = not has_priority(bank, roads, state, b, i, j, e)
+                        if yields or gap < 0.5 * v:
+                            accel = wp.min(accel, idm_gap(v, 0.0, gap))
+    return accel
+
+
+@wp.kernel(enable_backward=False)
+def drive(bank: Bank, roads: Roads, state: State, agents: int, dt: float):
+    """Controls of every agent that is not external, from the state of all at the start of the step."""
+    b, i = wp.tid()
+    if state.end[b] != 0 or state.active[b, i] == 0:
+        return
+    e = state.episode[b]
+    m = bank.model[e, i]
+    who = bank.controller[e, i]
+    time = float(state.step[b]) * dt
+    v = state.speed[b, i]
+    if state.active[b, i] == 1:
+        state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
+        return
+    power = bank.power[m]
+    target = bank.cruise[e, i][0]
+    count = bank.phase_count[e, i]
+    if count > 0:
+        n = state.phase[b, i]
+        go = int(1)
+        while n < count and go == 1:
+            if condition_holds(state, b, i, bank.phase_when[e, i, n], time):
+                n = n + 1
+            else:
+                go = 0
+        state.phase[b, i] = n
+        if n > 0:
+            target = bank.phase_speed[e, i, n - 1]
+        elif who == C_SCRIPT:
+            target = 0.0
+    if who == C_NONE:
+        state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
+    elif who == C_SCRIPT:
+        if count == 0:
+            target = 0.0
+        steer = float(0.0)
+        if bank.route[e, i][1] > 1:
+            steer = steer_on_route(bank, roads, state, b, i, e, v)
+        throttle = float(0.0)
+        brake = float(1.0)
+        if bank.kind[m] == HALF_WALKER:
+            throttle = target / power[2]
+            brake = 0.0
+        elif target > 0.0 and v <= target:
+            throttle = 1.0
+            brake = 0.0
+        state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
+    elif who == C_AUTOPILOT or who == C_FOLLOW:
+        steer = float(0.0)
+        accel = float(0.0)
+        if bank.route[e, i][1] > 1:
+            steer = steer_on_route(bank, roads, state, b, i, e, v)
+        if who == C_AUTOPILOT:
+            accel = autopilot_accel(bank, roads, state, b, i, e, agents, time)
+        else:
+            cap = roads.rule[bank.route[e, i][0] + state.progress[b, i]][0]
+            aim = wp.min(target, cap)
+            accel = wp.clamp(2.0 * (aim - v), -power[1], power[0])
+        throttle = wp.clamp(accel / wp.max(power[0], 0.1), 0.0, 1.0)
+        brake = wp.clamp(-accel / wp.max(power[1], 0.1), 0.0, 1.0)
+        if v < 0.2 and accel <= 0.0:
+            brake = 1.0
+        state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
+    if v < 0.3:
+        state.waited[b, i] = state.waited[b, i] + dt
+    elif v > 3.0:
+        state.waited[b, i] = 0.0

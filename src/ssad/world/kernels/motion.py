@@ -1,0 +1,146 @@
+"""One step of motion: kinematic bicycle with actuator limits, walkers, progress along routes, forecasts."""
+
+import warp as wp
+
+from ssad.world.kernels.data import FORECAST, STRIDE, Bank, Roads, State
+from ssad.world.kernels.shared import lane_under, route_at, wrap
+
+WALKER = wp.constant(6)
+GRIP_LIMIT = wp.constant(7.0)
+STEER_SECONDS = wp.constant(0.5)
+REVERSE_LIMIT = wp.constant(5.0)
+AUTOPILOT = wp.constant(2)
+
+
+@wp.func
+def bicycle(
+    pose: wp.vec3, speed: float, wheel: float, control: wp.vec4, body: wp.vec4, power: wp.vec4, dt: float, n: int
+) -> wp.vec(length=5, dtype=float):
+    """`n` sub-steps of the kinematic bicycle about the box centre (rear share 1/2): x, y, yaw, speed, wheel.
+
+    Throttle gives up to power[0], brake up to power[1] against the motion; the wheel turns at its limited rate to
+    steer * body[3]; yaw rate is cut at lateral acceleration GRIP_LIMIT.
+    """
+    h = dt / float(n)
+    x = pose[0]
+    y = pose[1]
+    yaw = pose[2]
+    v = speed
+    w = wheel
+    throttle = wp.clamp(control[0], 0.0, 1.0)
+    brake = wp.clamp(control[1], 0.0, 1.0)
+    aim = wp.clamp(control[2], -1.0, 1.0) * body[3]
+    turn = body[3] * h / STEER_SECONDS
+    for _ in range(n):
+        w = w + wp.clamp(aim - w, -turn, turn)
+        push = throttle * power[0]
+        if control[3] > 0.5:
+            push = -push
+        before = v
+        v = v + push * h
+        drag = brake * power[1] * h
+        if v > 0.0:
+            v = wp.max(v - drag, 0.0)
+        else:
+            v = wp.min(v + drag, 0.0)
+        v = wp.clamp(v, -REVERSE_LIMIT, power[2])
+        mean = 0.5 * (before + v)
+        slip = wp.atan(0.5 * wp.tan(w))
+        rate = mean * wp.sin(slip) * 2.0 / body[2]
+        cut = GRIP_LIMIT / wp.max(wp.abs(mean), 1.0e-3)
+        rate = wp.clamp(rate, -cut, cut)
+        heading = yaw + slip + 0.5 * rate * h
+        x = x + mean * wp.cos(heading) * h
+        y = y + mean * wp.sin(heading) * h
+        yaw = yaw + rate * h
+    out = wp.vec(length=5, dtype=float)
+    out[0] = x
+    out[1] = y
+    out[2] = wrap(yaw)
+    out[3] = v
+    out[4] = w
+    return out
+
+
+@wp.kernel(enable_backward=False)
+def move(
+    bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int
+):
+    """Advance every agent by dt with its control (external ones with the action) and look where it is now."""
+    b, i = wp.tid()
+    if state.end[b] != 0 or state.active[b, i] == 0:
+        return
+    e = state.episode[b]
+    m = bank.model[e, i]
+    pose = state.pose[b, i]
+    state.previous[b, i] = pose
+    control = state.control[b, i]
+    if bank.controller[e, i] == 1:
+        control = action[b, i]
+        state.control[b, i] = control
+    speed = state.speed[b, i]
+    kind = bank.kind[m]
+    power = bank.power[m]
+    if kind == WALKER:
+        # steer is the wanted speed over the model's top speed; a walker turns and stops at once
+        aim = wp.clamp(control[0], 0.0, 1.0) * power[2]
+        change = power[0] * dt
+        after = speed + wp.clamp(aim - speed, -change, change)
+        go = 0.5 * (speed + after) * dt
+        pose = wp.vec3(pose[0] + go * wp.cos(pose[2]), pose[1] + go * wp.sin(pose[2]), pose[2])
+        state.travelled[b, i] = state.travelled[b, i] + wp.abs(go)
+        speed = after
+    elif power[2] > 0.0:
+        if speed != 0.0 or control[0] > 0.0:
+            out = bicycle(pose, speed, state.wheel[b, i], control, bank.body[m], power, dt, substeps)
+            moved = wp.vec3(out[0], out[1], out[2])
+            d = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
+            state.travelled[b, i] = state.travelled[b, i] + d
+            pose = moved
+            speed = out[3]
+            state.wheel[b, i] = out[4]
+    state.pose[b, i] = pose
+    state.speed[b, i] = speed
+
+    # nearest route point within 12 m ahead of the last one
+    route = bank.route[e, i]
+    at = state.progress[b, i]
+    if route[1] > 1:
+        best = float(1.0e12)
+        found = at
+        last = wp.min(at + 12, route[1] - 1)
+        k = at
+        while k <= last:
+            p = roads.path[route[0] + k]
+            dx = pose[0] - p[0]
+            dy = pose[1] - p[1]
+            d2 = dx * dx + dy * dy
+            if d2 < best:
+                best = d2
+                found = k
+            elif k > found + 3:
+                k = last
+            k = k + 1
+        at = found
+        state.progress[b, i] = at
+        if i > 0 and bank.controller[e, i] == AUTOPILOT and at >= route[1] - 3:
+            state.active[b, i] = 0  # background traffic leaves at the end of its route
+
+    under = lane_under(roads, bank.town[e], pose[0], pose[1])
+    state.lane[b, i] = int(under[0])
+    state.lateral[b, i] = wp.vec2(under[1], under[2])
+
+    follows = route[1] > 1
+    if follows:
+        p = roads.path[route[0] + at]
+        off = wp.vec2(pose[0] - p[0], pose[1] - p[1])
+        if wp.length(off) > 4.0:
+            follows = False  # far from its route: nothing says where it goes
+    for k in range(FORECAST):
+        ahead = speed * STRIDE * float(k + 1)
+        if follows:
+            state.forecast[b, i, k] = route_at(roads, route[0], route[1], float(at) + ahead)
+        else:
+            state.forecast[b, i, k] = wp.vec3(
+                pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2]
+            )

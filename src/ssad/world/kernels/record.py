@@ -1,0 +1,271 @@
+"""Contacts of all agents, and the record of each scene's ego: what the metrics are made of, and why it ended."""
+
+import warp as wp
+
+from ssad.world.kernels.data import FAR, Bank, Ego, Roads, State
+from ssad.world.kernels.shared import RED, boxes_touch, signal_state, wrap
+
+END_RUNNING = wp.constant(0)
+END_COLLISION = wp.constant(1)
+END_COMPLETE = wp.constant(2)
+END_STEPS = wp.constant(3)
+END_DISTANCE = wp.constant(4)
+END_TIME = wp.constant(5)
+CONTACT_VEHICLE = wp.constant(1)
+CONTACT_WALKER = wp.constant(2)
+CONTACT_CYCLIST = wp.constant(4)
+CONTACT_STATIC = wp.constant(8)
+
+
+@wp.func
+def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """Pose half-way between two."""
+    return wp.vec3(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), a[2] + 0.5 * wrap(b[2] - a[2]))
+
+
+@wp.kernel(enable_backward=False)
+def contact(bank: Bank, state: State, agents: int):
+    """Which agents each agent touches, at the end of the step and half-way through it; wakes sleeping traffic."""
+    b, i = wp.tid()
+    if state.end[b] != 0:
+        return
+    mask = wp.int64(0)
+    if state.active[b, i] != 0:
+        e = state.episode[b]
+        p = state.pose[b, i]
+        p0 = state.previous[b, i]
+        pb = bank.body[bank.model[e, i]]
+        reach = pb[0] + pb[1]
+        for j in range(agents):
+            if j != i and state.active[b, j] != 0:
+                q = state.pose[b, j]
+                dx = q[0] - p[0]
+                dy = q[1] - p[1]
+                qb = bank.body[bank.model[e, j]]
+                r = reach + qb[0] + qb[1] + 4.0
+                if dx * dx + dy * dy < r * r:
+                    hit = boxes_touch(p, pb[0], pb[1], q, qb[0], qb[1])
+                    if not hit:
+                        q0 = state.previous[b, j]
+                        hit = boxes_touch(halfway(p0, p), pb[0], pb[1], halfway(q0, q), qb[0], qb[1])
+                    if hit:
+                        mask = mask | (wp.int64(1) << wp.int64(j))
+        if state.active[b, i] == 1:
+            ego = state.pose[b, 0]
+            if wp.length(wp.vec2(ego[0] - p[0], ego[1] - p[1])) < bank.cruise[e, i][1]:
+                state.active[b, i] = 2
+    state.touch[b, i] = mask
+
+
+@wp.func
+def contact_kind(kind: int) -> int:
+    """Contact bit for an agent kind."""
+    bit = CONTACT_VEHICLE
+    if kind == 6:
+        bit = CONTACT_WALKER
+    elif kind == 5:
+        bit = CONTACT_CYCLIST
+    elif kind == 7:
+        bit = CONTACT_STATIC
+    return bit
+
+
+@wp.kernel(enable_backward=False)
+def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: float):
+    """One row of the ego's record, the SafeBench reward, and the end of the episode; one thread a scene."""
+    b = wp.tid()
+    if state.end[b] != 0:
+        return
+    e = state.episode[b]
+    step = state.step[b] + 1
+    state.step[b] = step
+    time = float(step) * dt
+    pose = state.pose[b, 0]
+    before = state.previous[b, 0]
+    v = state.speed[b, 0]
+    body = bank.body[bank.model[e, 0]]
+    control = state.control[b, 0]
+
+    # contacts that began in this step
+    now = state.touch[b, 0]
+    fresh = now & (~ego.touching[b])
+    ego.touching[b] = now
+    kinds = int(0)
+    other = int(-1)
+    if fresh != wp.int64(0):
+        for j in range(1, agents):
+            if ((fresh >> wp.int64(j)) & wp.int64(1)) == wp.int64(1):
+                kinds = kinds | contact_kind(bank.kind[bank.model[e, j]])
+                if other < 0:
+                    other = j
+    ego.contact[b] = kinds
+    ego.contact_agent[b] = other
+
+    # road
+    lane = state.lane[b, 0]
+    off = int(0)
+    if lane < 0:
+        off = 1
+    ego.off_road[b] = off
+    over = int(0)
+    inside = int(0)
+    if lane >= 0:
+        inside = roads.lane_junction[lane]
+        side = state.lateral[b, 0]
+        if inside == 0 and wp.abs(side[0]) + body[1] > side[1]:
+            over = 1
+    elif ego.over_line[b] == 1 or off == 1:
+        over = 1
+    ego.invasion[b] = int(0)
+    if over == 1 and ego.over_line[b] == 0:
+        ego.invasion[b] = 1
+    ego.over_line[b] = over
+
+    # motion
+    gone = wp.length(wp.vec2(pose[0] - before[0], pose[1] - before[1]))
+    ego.driven[b] = ego.driven[b] + gone
+    ego.accel[b] = (v - ego.speed[b]) / dt
+    ego.speed[b] = v
+
+    # route: a point is passed once the ego is beyond it, looking two points ahead (as SafeBench's route criterion)
+    route = bank.route[e, 0]
+    mark = ego.mark[b]
+    passed = mark
+    for k in range(3):
+        n = mark + k
+        if n < route[1]:
+            p = roads.path[route[0] + n]
+            if (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2]) > 0.0:
+                passed = n
+    mark = passed
+    ego.mark[b] = mark
+    last = route[1] - 1
+    share = 100.0 * float(mark) / float(last)
+    tail = roads.path[route[0] + last]
+    to_end = wp.length(wp.vec2(pose[0] - tail[0], pose[1] - tail[1]))
+    if share > 99.0 and to_end < 10.0:
+        share = 100.0
+    ego.complete[b] = wp.max(share, ego.complete[b])
+    least = FAR
+    near = mark
+    for k in range(wp.max(mark - 1, 0), wp.min(mark + 64, last) + 1):
+        p = roads.path[route[0] + k]
+        dx = pose[0] - p[0]
+        dy = pose[1] - p[1]
+        d2 = dx * dx + dy * dy
+        if d2 < least:
+            least = d2
+            near = k
+    ego.route_distance[b] = wp.sqrt(least)
+
+    # red light: the tail crosses the stop line on red; a right turn after a stop is allowed
+    p = roads.path[route[0] + near]
+    c = wp.cos(p[2])
+    s = wp.sin(p[2])
+    left = -s * (pose[0] - p[0]) + c * (pose[1] - p[1])
+    ran = int(0)
+    back = near - int(body[0] + 1.0)
+    if back >= 0 and wp.abs(left) < 4.0:
+        rule = roads.rule[route[0] + back]
+        index = roads.path_signal[route[0] + back]
+        if index >= 0 and rule[1] <= wp.max(gone, 0.0) + 0.5 and rule[1] > -0.5:
+            stopped_right = rule[3] == 1.0 and state.waited[b, 0] >= 1.0
+            if signal_state(bank, roads, e, index, time) == RED and not stopped_right:
+                ran = 1
+    # rule[1] is whole metres: count a line once
+    if ran == 1 and ego.red_light[b] == 0:
+        ego.red_light[b] = 1
+    elif ran == 1:
+        ego.red_light[b] = 2
+    else:
+        ego.red_light[b] = 0
+
+    # SafeBench's reward
+    along = v * wp.cos(wrap(pose[2] - p[2]))
+    reward = along
+    if kinds != 0:
+        reward = reward - 1.0
+    if along > 8.0:
+        reward = reward - 10.0
+    if wp.abs(left) > 4.0:
+        reward = reward - 1.0
+    ego.reward[b] = reward - 5.0 * control[2] * control[2] - 0.2 * wp.abs(control[2]) * along * along
+
+    limits = bank.limits[e]
+    end = END_RUNNING
+    if kinds != 0:
+        end = END_COLLISION
+    elif ego.complete[b] >= 100.0:
+        end = END_COMPLETE
+    elif float(step) >= limits[0]:
+        end = END_STEPS
+    elif ego.driven[b] >= limits[2]:
+        end = END_DISTANCE
+    elif time >= limits[1]:
+        end = END_TIME
+    state.end[b] = end
+
+
+@wp.kernel(enable_backward=False)
+def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), auto: int):
+    """Put scenes back to the start of their episode: where mask is 1, or (auto) where the episode has ended."""
+    b, i = wp.tid()
+    go = mask[b] == 1
+    if auto == 1 and state.end[b] != 0:
+        go = True
+    if not go:
+        return
+    e = state.episode[b]
+    start = bank.start[e, i]
+    pose = wp.vec3(start[0], start[1], start[2])
+    state.pose[b, i] = pose
+    state.previous[b, i] = pose
+    state.speed[b, i] = start[3]
+    state.wheel[b, i] = 0.0
+    state.control[b, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    state.progress[b, i] = 0
+    state.phase[b, i] = 0
+    state.travelled[b, i] = 0.0
+    state.waited[b, i] = 0.0
+    state.touch[b, i] = wp.int64(0)
+    state.lateral[b, i] = wp.vec2(0.0, 0.0)
+    state.lane[b, i] = -1
+    awake = int(2)
+    if bank.model[e, i] < 0:
+        awake = 0
+    elif bank.cruise[e, i][1] > 0.0:
+        awake = 1
+    state.active[b, i] = awake
+    for k in range(8):
+        ahead = start[3] * 0.5 * float(k + 1)
+        state.forecast[b, i, k] = wp.vec3(
+            pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2]
+        )
+
+
+@wp.kernel(enable_backward=False)
+def restart_record(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), auto: int):
+    """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
+    b = wp.tid()
+    go = mask[b] == 1
+    if auto == 1 and state.end[b] != 0:
+        go = True
+    if not go:
+        return
+    mask[b] = 0
+    state.step[b] = 0
+    state.end[b] = 0
+    ego.contact[b] = 0
+    ego.contact_agent[b] = -1
+    ego.touching[b] = wp.int64(0)
+    ego.off_road[b] = 0
+    ego.over_line[b] = 0
+    ego.invasion[b] = 0
+    ego.red_light[b] = 0
+    ego.complete[b] = 0.0
+    ego.mark[b] = 0
+    ego.route_distance[b] = 0.0
+    ego.driven[b] = 0.0
+    ego.accel[b] = 0.0
+    ego.reward[b] = 0.0
+    ego.speed[b] = bank.start[state.episode[b], 0][3]

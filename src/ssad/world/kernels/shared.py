@@ -1,0 +1,126 @@
+"""Functions that several kernels use: angles, routes, signals, boxes, the lane under a point."""
+
+import warp as wp
+
+from ssad.world.kernels.data import FAR, Bank, Roads, State
+
+OFF = wp.constant(0)
+RED = wp.constant(1)
+YELLOW = wp.constant(2)
+GREEN = wp.constant(3)
+
+
+@wp.func
+def wrap(angle: float) -> float:
+    """Angle in (-pi, pi]."""
+    return angle - 6.283185307179586 * wp.floor((angle + 3.141592653589793) / 6.283185307179586)
+
+
+@wp.func
+def route_at(roads: Roads, first: int, count: int, u: float) -> wp.vec3:
+    """Pose (x, y, yaw) at `u` metres along a route; held at both ends."""
+    t = wp.clamp(u, 0.0, float(count - 1))
+    i = wp.min(int(t), count - 2)
+    f = t - float(i)
+    a = roads.path[first + i]
+    b = roads.path[first + i + 1]
+    return wp.vec3(a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * wrap(b[2] - a[2]))
+
+
+@wp.func
+def signal_state(bank: Bank, roads: Roads, e: int, index: int, time: float) -> int:
+    """State of signal `index` of the episode's town at `time`: forced by the episode, else its fixed programme."""
+    forced = bank.signal[e, index]
+    if forced >= 0 and time < bank.limits[e][3]:
+        return forced
+    program = roads.signal_program[roads.signal_first[bank.town[e]] + index]
+    if program[0] <= 0.0:
+        return OFF
+    t = time - program[1]
+    t = t - program[0] * wp.floor(t / program[0])
+    state = RED
+    if t < program[2]:
+        state = GREEN
+    elif t < program[2] + program[3]:
+        state = YELLOW
+    return state
+
+
+@wp.func
+def axis_gap(dx: float, dy: float, ax: float, ay: float, reach: float) -> float:
+    """Distance between two boxes along the axis (ax, ay); negative where they overlap on it."""
+    return wp.abs(dx * ax + dy * ay) - reach
+
+
+@wp.func
+def boxes_touch(p: wp.vec3, pl: float, pw: float, q: wp.vec3, ql: float, qw: float) -> bool:
+    """Whether two oriented boxes (pose, half length, half width) overlap: separating-axis test."""
+    dx = q[0] - p[0]
+    dy = q[1] - p[1]
+    r = pl + pw + ql + qw
+    if dx * dx + dy * dy > r * r:
+        return False
+    pc = wp.cos(p[2])
+    ps = wp.sin(p[2])
+    qc = wp.cos(q[2])
+    qs = wp.sin(q[2])
+    c = wp.abs(pc * qc + ps * qs)
+    s = wp.abs(pc * qs - ps * qc)
+    if axis_gap(dx, dy, pc, ps, pl + ql * c + qw * s) > 0.0:
+        return False
+    if axis_gap(dx, dy, -ps, pc, pw + ql * s + qw * c) > 0.0:
+        return False
+    if axis_gap(dx, dy, qc, qs, ql + pl * c + pw * s) > 0.0:
+        return False
+    return axis_gap(dx, dy, -qs, qc, qw + pl * s + pw * c) <= 0.0
+
+
+@wp.func
+def lane_under(roads: Roads, town: int, x: float, y: float) -> wp.vec3:
+    """Lane whose strip is under the point: (lane or -1, m left of its centre line, half width).
+
+    Looks only at the grid cell of the point, which lists every strip that touches it.
+    """
+    grid = roads.grid[town]
+    size = roads.grid_size[town]
+    cx = int(wp.floor((x - grid[0]) * grid[2]))
+    cy = int(wp.floor((y - grid[1]) * grid[2]))
+    best = wp.vec3(-1.0, 0.0, 0.0)
+    if cx < 0 or cy < 0 or cx >= size[0] or cy >= size[1]:
+        return best
+    cell = size[2] + cy * size[0] + cx
+    least = FAR
+    for k in range(roads.cell_first[cell], roads.cell_first[cell + 1]):
+        m = roads.cell_segment[k]
+        g = roads.segment[m]
+        dx = g[2] - g[0]
+        dy = g[3] - g[1]
+        px = x - g[0]
+        py = y - g[1]
+        length2 = wp.max(dx * dx + dy * dy, 1.0e-9)
+        raw = (px * dx + py * dy) / length2
+        t = wp.clamp(raw, 0.0, 1.0)
+        ex = px - t * dx
+        ey = py - t * dy
+        d2 = ex * ex + ey * ey
+        half = roads.segment_half[m]
+        h = half[0] + t * (half[1] - half[0])
+        if d2 < least and d2 <= h * h:
+            # past an end of the segment the strip goes on only as far as a bend needs
+            over = (raw - t) * (raw - t) * length2
+            if over < 0.25:
+                least = d2
+                side = 1.0
+                if dx * py - dy * px < 0.0:
+                    side = -1.0
+                best = wp.vec3(float(roads.segment_lane[m]), side * wp.sqrt(d2), h)
+    return best
+
+
+@wp.func
+def reach_along(state: State, b: int, j: int, yaw: float, half: wp.vec2) -> wp.vec2:
+    """Half extent of agent j's box along and across a direction, m."""
+    d = state.pose[b, j][2] - yaw
+    c = wp.abs(wp.cos(d))
+    s = wp.abs(wp.sin(d))
+    return wp.vec2(half[0] * c + half[1] * s, half[0] * s + half[1] * c)

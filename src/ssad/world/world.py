@@ -1,0 +1,269 @@
+"""The embedded world: B scenes of A agents advance together at 10 Hz, on CPU or CUDA, the same every time."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ssad.errors import ConfigError
+from ssad.roads.graph import LaneGraph
+from ssad.types import I32, Controller, Episode, SignalState
+from ssad.world.bank import agent_kinds, build, signal_programs
+from ssad.world.kernels.data import HORIZON, Ego, State
+from ssad.world.kernels.drive import drive
+from ssad.world.kernels.look import look
+from ssad.world.kernels.motion import move
+from ssad.world.kernels.record import contact, record, restart, restart_record
+
+ENDS = ("", "collision", "complete", "max_steps", "max_distance", "max_time")
+OBSERVATION = 28  # see kernels.look
+VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+
+_STATE: dict[str, tuple[str, Any]] = {
+    "episode": ("B", wp.int32),
+    "step": ("B", wp.int32),
+    "end": ("B", wp.int32),
+    "pose": ("BA", wp.vec3),
+    "previous": ("BA", wp.vec3),
+    "speed": ("BA", wp.float32),
+    "wheel": ("BA", wp.float32),
+    "active": ("BA", wp.int32),
+    "progress": ("BA", wp.int32),
+    "phase": ("BA", wp.int32),
+    "travelled": ("BA", wp.float32),
+    "waited": ("BA", wp.float32),
+    "control": ("BA", wp.vec4),
+    "forecast": ("BAH", wp.vec3),
+    "lane": ("BA", wp.int32),
+    "lateral": ("BA", wp.vec2),
+    "touch": ("BA", wp.int64),
+}
+_EGO: dict[str, Any] = {
+    "contact": wp.int32,
+    "contact_agent": wp.int32,
+    "touching": wp.int64,
+    "off_road": wp.int32,
+    "over_line": wp.int32,
+    "invasion": wp.int32,
+    "red_light": wp.int32,
+    "complete": wp.float32,
+    "mark": wp.int32,
+    "route_distance": wp.float32,
+    "driven": wp.float32,
+    "accel": wp.float32,
+    "speed": wp.float32,
+    "reward": wp.float32,
+}
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that changes in a world, copied to the host; equal snapshots continue equally."""
+
+    arrays: Mapping[str, npt.NDArray[np.generic]]
+
+
+class World:
+    """Episodes run side by side.
+
+    `episodes` are the bank; scene b runs episode `assign[b]` (default: one scene an episode). `graphs` maps each
+    town named by them to its lane graph. `ego` replaces the controller of every ego. With `autoreset` a scene whose
+    episode has ended starts it again at the next step. A scene's bits depend on its episode and actions alone: not on
+    the batch, its order, or what the other scenes do. Raises ConfigError for an episode that cannot be built.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        graphs: Mapping[str, LaneGraph],
+        *,
+        assign: Sequence[int] | I32 | None = None,
+        device: str = "cpu",
+        dt: float = 0.1,
+        substeps: int = 2,
+        ego: Controller | None = None,
+        autoreset: bool = False,
+    ) -> None:
+        if dt <= 0.0 or substeps < 1:
+            raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
+        wp.config.quiet = True
+        wp.init()
+        self.episodes = tuple(episodes)
+        self.graphs = dict(graphs)
+        self.dt = dt
+        self.device = device
+        self.bank, self.roads, self.agents = build(self.episodes, graphs, device, ego)
+        order = np.arange(len(self.episodes)) if assign is None else np.asarray(assign)
+        if len(order) == 0 or order.min() < 0 or order.max() >= len(self.episodes):
+            raise ConfigError(f"scenes must be assigned episodes 0 to {len(self.episodes) - 1}")
+        self.batch = len(order)
+        self.state = State()
+        shapes = {
+            "B": (self.batch,),
+            "BA": (self.batch, self.agents),
+            "BAH": (self.batch, self.agents, HORIZON),
+        }
+        for name, (shape, kind) in _STATE.items():
+            setattr(self.state, name, wp.zeros(shapes[shape], dtype=kind, device=device))
+        self.ego = Ego()
+        for name, kind in _EGO.items():
+            setattr(self.ego, name, wp.zeros(self.batch, dtype=kind, device=device))
+        self.actions = wp.zeros((self.batch, self.agents), dtype=wp.vec4, device=device)
+        self.observation = wp.zeros((self.batch, OBSERVATION), dtype=wp.float32, device=device)
+        self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
+        self._kinds = agent_kinds(self.bank)
+        self._assign(order.astype(np.int32))
+        flat = (self.batch, self.agents)
+        again = [self.bank, self.roads, self.state, self.ego, self._mask]
+        self._restart = [self._launch(restart, flat, [*again, 0]), self._launch(restart_record, self.batch, [*again, 0])]
+        self._step = []
+        if autoreset:
+            self._step += [
+                self._launch(restart, flat, [*again, 1]),
+                self._launch(restart_record, self.batch, [*again, 1]),
+            ]
+        self._step += [
+            self._launch(drive, flat, [self.bank, self.roads, self.state, self.agents, dt]),
+            self._launch(move, flat, [self.bank, self.roads, self.state, self.actions, dt, substeps]),
+            self._launch(contact, flat, [self.bank, self.state, self.agents]),
+            self._launch(record, self.batch, [self.bank, self.roads, self.state, self.ego, self.agents, dt]),
+        ]
+        self._look = self._launch(
+            look, self.batch, [self.bank, self.roads, self.state, self.ego, self.agents, self.observation]
+        )
+        self._graph: Any = None
+        self.reset()
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
+        """A recorded launch: its arguments are packed once."""
+        return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+
+    def _assign(self, order: I32) -> None:
+        self.state.episode.assign(order)
+        self.kind = self._kinds[order]
+
+    def array(self, name: str) -> npt.NDArray[Any]:
+        """A state or ego array by name as numpy: a view on CPU, a copy on CUDA. Ego's come as `ego.<name>`."""
+        source = getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
+        out: npt.NDArray[Any] = source.numpy()
+        return out
+
+    def reset(self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None) -> None:
+        """Start the given scenes (default: all) again, with other episodes of the bank if given."""
+        which = np.arange(self.batch) if scenes is None else np.asarray(scenes, np.int64)
+        if episodes is not None:
+            order = self.state.episode.numpy().copy()
+            order[which] = episodes
+            if len(order) and (order.min() < 0 or order.max() >= len(self.episodes)):
+                raise ConfigError(f"no such episode; the bank holds {len(self.episodes)}")
+            self._assign(order)
+        mask = np.zeros(self.batch, np.int32)
+        mask[which] = 1
+        self._mask.assign(mask)
+        for command in self._restart:
+            command.launch()
+
+    def set_actions(self, actions: npt.ArrayLike) -> None:
+        """Controls of external agents: [B, 3|4] for the egos or [B, A, 3|4] for all; throttle, brake, steer, reverse.
+
+        Raises ConfigError for a wrong shape or a number that is not finite.
+        """
+        given = np.asarray(actions, np.float32)
+        full = np.zeros((self.batch, self.agents, 4), np.float32)
+        if given.ndim == 2 and given.shape[0] == self.batch and given.shape[1] in (3, 4):
+            full[:, 0, : given.shape[1]] = given
+        elif given.ndim == 3 and given.shape[:2] == full.shape[:2] and given.shape[2] in (3, 4):
+            full[..., : given.shape[2]] = given
+        else:
+            raise ConfigError(
+                f"actions have shape {given.shape}; expected ({self.batch}, 3) or "
+                f"({self.batch}, {self.agents}, 3): throttle, brake, steer"
+            )
+        if not np.isfinite(full).all():
+            raise ConfigError("actions hold a number that is not finite")
+        self.actions.assign(full)
+
+    def step(self, actions: npt.ArrayLike | None = None) -> None:
+        """Advance every running scene by dt; ended scenes stand still (or start again, with `autoreset`)."""
+        if actions is not None:
+            self.set_actions(actions)
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        for command in self._step:
+            command.launch()
+
+    def capture(self, *, observe: bool = False, steps: int = 1) -> None:
+        """Record `steps` steps (and the observation) as one CUDA graph that `step` replays; CUDA only."""
+        with wp.ScopedCapture(device=self.device) as recorded:
+            for _ in range(steps):
+                for command in self._step:
+                    command.launch()
+                if observe:
+                    self._look.launch()
+        self._graph = recorded.graph
+
+    def observe(self) -> npt.NDArray[np.float32]:
+        """Observation rows [B, 28] of the egos: see kernels.look."""
+        self._look.launch()
+        out: npt.NDArray[np.float32] = self.observation.numpy()
+        return out
+
+    def ended(self) -> npt.NDArray[np.int32]:
+        """[B] index into ENDS; 0 while the episode runs."""
+        return self.array("end")
+
+    def signals(self, scene: int) -> npt.NDArray[np.uint8]:
+        """`SignalState` of every signal of the scene's town at its present time, [S]."""
+        episode = self.episodes[int(self.array("episode")[scene])]
+        time = float(self.array("step")[scene]) * self.dt
+        return signal_states(episode, self.graphs[episode.town], np.array([time]))[0]
+
+    def snapshot(self) -> Snapshot:
+        """Copy of all that changes."""
+        arrays = {name: self.array(name).copy() for name in _STATE}
+        arrays |= {f"ego.{name}": self.array(f"ego.{name}").copy() for name in _EGO}
+        return Snapshot(arrays)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from a snapshot of this world; raises ConfigError if it is of another shape."""
+        for name, value in snapshot.arrays.items():
+            target = getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
+            if tuple(target.numpy().shape) != value.shape:
+                raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
+            target.assign(value)
+        self.kind = self._kinds[self.array("episode")]
+
+    def hashes(self) -> list[str]:
+        """One hash a scene over all that changes (but its place in the batch and bank)."""
+        arrays = [self.array(name) for name in _STATE if name != "episode"]
+        arrays += [self.array(f"ego.{name}") for name in _EGO]
+        out = []
+        for b in range(self.batch):
+            live = self.kind[b] > 0
+            h = hashlib.sha256()
+            for a in arrays:
+                row = a[b]
+                # empty slots that only the batch's widest scene needs do not count
+                h.update(np.ascontiguousarray(row[live] if np.ndim(row) and len(row) == len(live) else row).tobytes())
+            out.append(h.hexdigest())
+        return out
+
+
+def signal_states(episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+    """`SignalState` [T, S] of a town's signals at `times` [T] s: the host's twin of kernels.shared.signal_state."""
+    programs = signal_programs(graph)
+    out = np.zeros((len(times), len(programs)), np.uint8)
+    for s, (cycle, begin, green, yellow) in enumerate(programs):
+        if cycle > 0:
+            t = (times - begin) % cycle
+            out[:, s] = np.where(t < green, SignalState.GREEN, np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED))
+    for s, state in episode.signal_override.items():
+        out[times < episode.override_until, s] = int(state)
+    return out
