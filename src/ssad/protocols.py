@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-from ssad.types import F32, Bool, Controller, Episode
+import numpy.typing as npt
+
+from ssad.types import F32, I32, Bool, Controller, Episode
 
 
 @dataclass(frozen=True)
@@ -54,3 +56,38 @@ class DrivingSystem(Protocol):
 
         A fourth column above 0.5 drives the throttle in reverse.
         """
+
+
+@runtime_checkable
+class World(Protocol):
+    """A place where episodes run, B scenes at once; `ssad.world.check.check_world` holds an implementation to it.
+
+    A scene's bits depend on its episode and its actions alone. `dt` s a step. `array(name)` gives at least `pose`
+    [B, A, 3] (x, y, yaw), `speed` [B, A], `active` [B, A], `step` [B] and `end` [B].
+    """
+
+    dt: float
+    batch: int
+    agents: int
+    episodes: tuple[Episode, ...]
+
+    def reset(self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None) -> None:
+        """Start scenes again (default: all), with other episodes if given."""
+
+    def step(self, actions: npt.ArrayLike | None = None) -> None:
+        """Advance every running scene by dt; actions [B, 3|4] for the egos or [B, A, 3|4] for all."""
+
+    def ended(self) -> I32:
+        """[B] 0 while an episode runs, else why it ended."""
+
+    def array(self, name: str) -> npt.NDArray[Any]:
+        """A state array by name."""
+
+    def snapshot(self) -> Any:
+        """All that changes, to be given back to `restore`."""
+
+    def restore(self, snapshot: Any) -> None:
+        """Continue from a snapshot."""
+
+    def hashes(self) -> list[str]:
+        """One hash a scene over all that changes."""

@@ -1,8 +1,8 @@
 """Who drives how: Autopilot (sees everything, yields), route follower (sees nothing), scripted phases.
 
-The Autopilot is the background traffic and the ego baseline alike. Its acceleration is the least of: IDM free road
-(Treiber et al. 2000) under the route's speed profile, IDM behind whoever is in its corridor, IDM to the stop line of
-a red signal, and IDM to the near edge of a predicted conflict it must yield to.
+The Autopilot is the background traffic and the ego baseline alike. Its acceleration is IDM's (Treiber et al. 2000):
+the free-road term under the route's speed profile, and the hardest interaction term of: whoever is in its corridor,
+the stop line of a red signal, and the near edge of a predicted conflict it must yield to.
 """
 
 import warp as wp
@@ -209,7 +209,8 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
     u0 = float(at) + part
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
     target = wp.min(bank.cruise[e, i][0], cap)
-    accel = idm_free(v, target)
+    free = idm_free(v, target)
+    react = float(0.0)
 
     # signals
     index = roads.path_signal[first]
@@ -223,7 +224,7 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
             if light == RED and rule[3] == RIGHT_TURN and state.waited[b, i] >= 1.0:
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
-                accel = wp.min(accel, idm_gap(v, 0.0, ahead + 1.0))
+                react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
 
     # everybody else
     sees = SIGHT + v * 2.0
@@ -238,7 +239,7 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
                 facing = wp.cos(q[2] - pose[2])
                 lead = lead_gap(bank, roads, state, b, i, j, e, u0, body)
                 if lead[0] < FAR:
-                    accel = wp.min(accel, idm_gap(v, wp.max(lead[1], 0.0), lead[0]))
+                    react = wp.min(react, idm_gap(v, wp.max(lead[1], 0.0), lead[0]))
                 follows = lon < 0.0 and facing > 0.5  # behind me, going my way: its task
                 leads = lead[0] < FAR and facing > 0.7
                 vj = wp.abs(state.speed[b, j])
@@ -248,8 +249,10 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
                     if gap < FAR:
                         yields = not has_priority(bank, roads, state, b, i, j, e)
                         if yields or gap < 0.5 * v:
-                            accel = wp.min(accel, idm_gap(v, 0.0, gap))
-    return accel
+                            react = wp.min(react, idm_gap(v, 0.0, gap))
+    if free > 0.0:
+        return free + react  # IDM: both terms add
+    return wp.min(free, react)
 
 
 @wp.kernel(enable_backward=False)

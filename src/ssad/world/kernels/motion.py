@@ -5,6 +5,7 @@ import warp as wp
 from ssad.world.kernels.data import FORECAST, STRIDE, Bank, Roads, State
 from ssad.world.kernels.shared import lane_under, route_at, wrap
 
+vec5 = wp.types.vector(length=5, dtype=wp.float32)
 WALKER = wp.constant(6)
 GRIP_LIMIT = wp.constant(7.0)
 STEER_SECONDS = wp.constant(0.5)
@@ -15,7 +16,7 @@ AUTOPILOT = wp.constant(2)
 @wp.func
 def bicycle(
     pose: wp.vec3, speed: float, wheel: float, control: wp.vec4, body: wp.vec4, power: wp.vec4, dt: float, n: int
-) -> wp.vec(length=5, dtype=float):
+) -> vec5:
     """`n` sub-steps of the kinematic bicycle about the box centre (rear share 1/2): x, y, yaw, speed, wheel.
 
     Throttle gives up to power[0], brake up to power[1] against the motion; the wheel turns at its limited rate to
@@ -53,7 +54,7 @@ def bicycle(
         x = x + mean * wp.cos(heading) * h
         y = y + mean * wp.sin(heading) * h
         yaw = yaw + rate * h
-    out = wp.vec(length=5, dtype=float)
+    out = vec5()
     out[0] = x
     out[1] = y
     out[2] = wrap(yaw)

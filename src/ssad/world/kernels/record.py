@@ -207,11 +207,11 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
 
 
 @wp.kernel(enable_backward=False)
-def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), auto: int):
-    """Put scenes back to the start of their episode: where mask is 1, or (auto) where the episode has ended."""
+def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
+    """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
     b, i = wp.tid()
     go = mask[b] == 1
-    if auto == 1 and state.end[b] != 0:
+    if ended_too == 1 and state.end[b] != 0:
         go = True
     if not go:
         return
@@ -244,11 +244,11 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
 
 
 @wp.kernel(enable_backward=False)
-def restart_record(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), auto: int):
+def restart_record(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
     go = mask[b] == 1
-    if auto == 1 and state.end[b] != 0:
+    if ended_too == 1 and state.end[b] != 0:
         go = True
     if not go:
         return
