@@ -131,7 +131,9 @@ def highway(repeats: int, steps: int) -> dict[str, float]:
 
 def main() -> None:
     """Print a table and, with --json, write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, nargs="*", default=None)
     parser.add_argument("--no-highway", action="store_true")
@@ -140,9 +142,7 @@ def main() -> None:
     parser.add_argument("--json", default=None)
     args = parser.parse_args()
     sizes = args.batch or ([1, 64, 1024] if args.device == "cpu" else [1, 64, 1024, 16384, 65536])
-    rows = [
-        measure(b, args.device, observe=True, repeats=args.repeats, budget=args.budget) for b in sizes
-    ]
+    rows = [measure(b, args.device, observe=True, repeats=args.repeats, budget=args.budget) for b in sizes]
     for row in rows:
         print(
             f"B={row['batch']:>6}  {row['agents']:5.1f} agents a scene  {row['us_per_step']:>12.1f} us/step  "

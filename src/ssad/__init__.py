@@ -1,5 +1,65 @@
-"""SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?"""
+"""SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?
+
+The public names. They are loaded on first use, so that `import ssad` costs nothing.
+"""
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from ssad.agents import make_system as make_system
+    from ssad.errors import SSADError as SSADError
+    from ssad.metrics import aggregate as aggregate
+    from ssad.metrics import episode_metrics as episode_metrics
+    from ssad.protocols import DrivingSystem as DrivingSystem
+    from ssad.protocols import View as View
+    from ssad.roads import load_town as load_town
+    from ssad.scenarios.dynamic import build_episode as build_episode
+    from ssad.scenarios.dynamic import load_scenarios as load_scenarios
+    from ssad.scenarios.dynamic import save_scenarios as save_scenarios
+    from ssad.types import Controller as Controller
+    from ssad.types import Episode as Episode
+    from ssad.types import EpisodeTrace as EpisodeTrace
+    from ssad.types import Scenario as Scenario
+    from ssad.world.check import check_world as check_world
+    from ssad.world.env import VectorEnv as VectorEnv
+    from ssad.world.rollout import rollout as rollout
+    from ssad.world.witness import find_witness as find_witness
+    from ssad.world.world import World as World
+
+_WHERE = {
+    "make_system": "agents",
+    "SSADError": "errors",
+    "aggregate": "metrics",
+    "episode_metrics": "metrics",
+    "DrivingSystem": "protocols",
+    "View": "protocols",
+    "load_town": "roads",
+    "build_episode": "scenarios.dynamic",
+    "load_scenarios": "scenarios.dynamic",
+    "save_scenarios": "scenarios.dynamic",
+    "Controller": "types",
+    "Episode": "types",
+    "EpisodeTrace": "types",
+    "Scenario": "types",
+    "check_world": "world.check",
+    "VectorEnv": "world.env",
+    "rollout": "world.rollout",
+    "find_witness": "world.witness",
+    "World": "world.world",
+}
+__all__ = ["__version__", *_WHERE]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name in _WHERE:
+        return getattr(import_module(f"ssad.{_WHERE[name]}"), name)
+    raise AttributeError(f"module 'ssad' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

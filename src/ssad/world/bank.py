@@ -28,11 +28,23 @@ WHEN = {"always": 0, "ego_distance": 1, "ego_speed": 2, "travelled": 3, "time": 
 @dataclass(frozen=True)
 class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
-    line, m to the next junction (0 inside), turn rank there (0 straight, 1 right, 2 left); signal [N] or -1."""
+    line, m to the next junction (0 inside), turn rank there (0 straight, 1 right, 2 left); signal [N] or -1; bend [N] m
+    that the next 64 m leave the straight line along the point's heading."""
 
     path: F32
     rule: F32
     signal: npt.NDArray[np.int32]
+    bend: F32
+
+
+def _bend(route: Route) -> F32:
+    """[N] greatest lateral distance of the next 64 m of path from the line through each point along its heading."""
+    n = len(route.xy)
+    ahead = np.minimum(np.arange(n)[:, None] + np.arange(1, 65), n - 1)
+    d = route.xy[ahead] - route.xy[:, None]
+    c, s = np.cos(route.yaw)[:, None], np.sin(route.yaw)[:, None]
+    out: F32 = np.abs(d[..., 1] * c - d[..., 0] * s).max(1).astype(np.float32)
+    return out
 
 
 def path_table(route: Route, graph: LaneGraph) -> PathTable:
@@ -51,11 +63,16 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     entry, rank = _junctions(route, graph, yaw)
     path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
     return PathTable(
-        path.astype(np.float32), np.stack([cap, stop, entry, rank], 1).astype(np.float32), signal
+        path.astype(np.float32),
+        np.stack([cap, stop, entry, rank], 1).astype(np.float32),
+        signal,
+        _bend(route),
     )
 
 
-def _stop_lines(route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]) -> None:
+def _stop_lines(
+    route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]
+) -> None:
     """Fill `stop` (m ahead) and `signal` for every route point from the graph's stop lines on the route's lanes."""
     marks: list[tuple[float, int]] = []
     for k, lane in enumerate(graph.stop_lane):
@@ -271,13 +288,15 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
         "signal_program": wp.vec4,
         "path": wp.vec4,
         "rule": wp.vec4,
+        "bend": wp.float32,
     }
     parts["path"] = [t.path for t in pool.tables]
     parts["rule"] = [t.rule for t in pool.tables]
     parts["path_signal"] = [t.signal for t in pool.tables]
+    parts["bend"] = [t.bend for t in pool.tables]
     for name, values in parts.items():
         kind = types.get(name, wp.int32)
-        dtype = np.float32 if kind in (wp.vec4, wp.vec2) else np.int32
+        dtype = np.int32 if kind in (wp.int32, wp.vec3i) else np.float32
         joined = np.concatenate(values).astype(dtype)
         if len(joined) == 0:  # a town without signals
             joined = np.zeros((1, *joined.shape[1:]), dtype)

@@ -63,7 +63,10 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
     _need([row[::-1] for row in turned] == told, "the order of scenes does not matter")
     for k in order[:2]:
         alone = _run(make([k]), [k], steps)
-        _need([row[0] for row in alone] == [row[k] for row in told], "a scene alone gives the bits it gives in a batch")
+        _need(
+            [row[0] for row in alone] == [row[k] for row in told],
+            "a scene alone gives the bits it gives in a batch",
+        )
 
     world = make(order)
     half = steps // 2
@@ -71,7 +74,9 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
     kept = world.snapshot()
     _run(world, order, 5, first=1000)
     world.restore(kept)
-    _need(_run(world, order, steps - half, first=half) == told[half:], "a restored snapshot continues as before")
+    _need(
+        _run(world, order, steps - half, first=half) == told[half:], "a restored snapshot continues as before"
+    )
 
     world = make(order)
     _run(world, order, half)

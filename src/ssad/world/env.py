@@ -89,7 +89,11 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._slice = _SLICE[observation]
         self._action: Action = action
         self.world = World(
-            episodes, graphs, assign=np.arange(num_envs) % len(episodes), device=device, ego=Controller.EXTERNAL
+            episodes,
+            graphs,
+            assign=np.arange(num_envs) % len(episodes),
+            device=device,
+            ego=Controller.EXTERNAL,
         )
 
     def _observe(self) -> npt.NDArray[np.float32]:
@@ -113,7 +117,11 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def step(
         self, actions: npt.NDArray[np.floating[Any]]
     ) -> tuple[
-        npt.NDArray[np.float32], npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_], dict[str, Any]
+        npt.NDArray[np.float32],
+        npt.NDArray[np.float64],
+        npt.NDArray[np.bool_],
+        npt.NDArray[np.bool_],
+        dict[str, Any],
     ]:
         """One step of 0.1 s in every scene."""
         self.world.step(to_controls(self._action, actions))

@@ -69,9 +69,7 @@ def shifted(route: Route, start: float, offset: float) -> Route:
     normal = np.stack([-np.sin(route.yaw), np.cos(route.yaw)], 1)
     xy = route.xy + (offset * share)[:, None] * normal
     step = np.gradient(xy, axis=0)
-    return replace(
-        route, xy=xy.astype(np.float32), yaw=np.arctan2(step[:, 1], step[:, 0]).astype(np.float32)
-    )
+    return replace(route, xy=xy.astype(np.float32), yaw=np.arctan2(step[:, 1], step[:, 0]).astype(np.float32))
 
 
 def _drive(ego: EpisodeAgent, m: Manoeuvre, place: float) -> EpisodeAgent:
@@ -83,7 +81,9 @@ def _drive(ego: EpisodeAgent, m: Manoeuvre, place: float) -> EpisodeAgent:
         Phase(m.speed, Condition("time", m.start)),
         Phase(cruise, Condition("time", m.start + m.hold)),
     )
-    return replace(ego, controller=Controller.FOLLOW, phases=phases, route=shifted(ego.route, place, m.offset))
+    return replace(
+        ego, controller=Controller.FOLLOW, phases=phases, route=shifted(ego.route, place, m.offset)
+    )
 
 
 def _manoeuvres(start: float, target: float) -> Iterator[Manoeuvre]:

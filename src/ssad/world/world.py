@@ -40,6 +40,7 @@ _STATE: dict[str, tuple[str, Any]] = {
     "waited": ("BA", wp.float32),
     "control": ("BA", wp.vec4),
     "forecast": ("BAH", wp.vec3),
+    "intent": ("BAH", wp.vec4),
     "lane": ("BA", wp.int32),
     "lateral": ("BA", wp.vec2),
     "touch": ("BA", wp.int64),
@@ -121,7 +122,10 @@ class World:
         self._assign(order.astype(np.int32))
         flat = (self.batch, self.agents)
         again = [self.bank, self.roads, self.state, self.ego, self._mask]
-        self._restart = [self._launch(restart, flat, [*again, 0]), self._launch(restart_record, self.batch, [*again, 0])]
+        self._restart = [
+            self._launch(restart, flat, [*again, 0]),
+            self._launch(restart_record, self.batch, [*again, 0]),
+        ]
         self._step = []
         if autoreset:
             self._step += [
@@ -154,7 +158,9 @@ class World:
         out: npt.NDArray[Any] = source.numpy()
         return out
 
-    def reset(self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None) -> None:
+    def reset(
+        self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None
+    ) -> None:
         """Start the given scenes (default: all) again, with other episodes of the bank if given."""
         which = np.arange(self.batch) if scenes is None else np.asarray(scenes, np.int64)
         if episodes is not None:
@@ -251,19 +257,29 @@ class World:
             for a in arrays:
                 row = a[b]
                 # empty slots that only the batch's widest scene needs do not count
-                h.update(np.ascontiguousarray(row[live] if np.ndim(row) and len(row) == len(live) else row).tobytes())
+                h.update(
+                    np.ascontiguousarray(
+                        row[live] if np.ndim(row) and len(row) == len(live) else row
+                    ).tobytes()
+                )
             out.append(h.hexdigest())
         return out
 
 
-def signal_states(episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+def signal_states(
+    episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]
+) -> npt.NDArray[np.uint8]:
     """`SignalState` [T, S] of a town's signals at `times` [T] s: the host's twin of kernels.shared.signal_state."""
     programs = signal_programs(graph)
     out = np.zeros((len(times), len(programs)), np.uint8)
     for s, (cycle, begin, green, yellow) in enumerate(programs):
         if cycle > 0:
             t = (times - begin) % cycle
-            out[:, s] = np.where(t < green, SignalState.GREEN, np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED))
+            out[:, s] = np.where(
+                t < green,
+                SignalState.GREEN,
+                np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED),
+            )
     for s, state in episode.signal_override.items():
         out[times < episode.override_until, s] = int(state)
     return out

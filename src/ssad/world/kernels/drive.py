@@ -8,7 +8,7 @@ the stop line of a red signal, and the near edge of a predicted conflict it must
 import warp as wp
 
 from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State
-from ssad.world.kernels.shared import GREEN, OFF, RED, YELLOW, reach_along, route_at, signal_state, wrap
+from ssad.world.kernels.shared import RED, YELLOW, route_frame, signal_state, wrap
 
 IDM_ACCEL = wp.constant(2.5)
 IDM_BRAKE = wp.constant(3.0)
@@ -87,37 +87,44 @@ def steer_on_route(bank: Bank, roads: Roads, state: State, b: int, i: int, e: in
 
 @wp.func
 def lead_gap(
-    bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int, u0: float, body: wp.vec4
-) -> wp.vec3:
-    """Where agent j stands relative to i's route: (gap bumper to bumper m or FAR, its speed along the route, |lateral|)."""
-    route = bank.route[e, i]
-    p = state.pose[b, i]
+    roads: Roads,
+    state: State,
+    b: int,
+    j: int,
+    route: wp.vec2i,
+    u0: float,
+    lon: float,
+    own: wp.vec4,
+    other: wp.vec4,
+    heading: wp.vec2,
+    margin: float,
+) -> wp.vec2:
+    """Where agent j stands on a route that begins `u0` metres along: (gap bumper to bumper m or FAR, speed along it).
+
+    lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading.
+    """
     q = state.pose[b, j]
-    dx = q[0] - p[0]
-    dy = q[1] - p[1]
-    u = wp.clamp(dx * wp.cos(p[2]) + dy * wp.sin(p[2]), 0.0, SIGHT)
+    u = wp.clamp(lon, 0.0, SIGHT)
     lateral = float(0.0)
-    at = wp.vec3(0.0, 0.0, 0.0)
+    rest = float(0.0)
+    at = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(4):
-        at = route_at(roads, route[0], route[1], u0 + u)
-        c = wp.cos(at[2])
-        s = wp.sin(at[2])
+        at = route_frame(roads, route[0], route[1], u0 + u)
         rx = q[0] - at[0]
         ry = q[1] - at[1]
-        along = rx * c + ry * s
-        lateral = -rx * s + ry * c
-        u = wp.clamp(u + along, 0.0, SIGHT)
-    other = bank.body[bank.model[e, j]]
-    reach = reach_along(state, b, j, at[2], wp.vec2(other[0], other[1]))
-    turn = wrap(q[2] - at[2])
-    margin = 0.3
-    if bank.kind[bank.model[e, j]] == HALF_WALKER:
-        margin = 0.6
-    result = wp.vec3(FAR, 0.0, wp.abs(lateral))
-    if u > 0.0 and u < SIGHT and wp.abs(lateral) < body[1] + reach[1] + margin:
-        rest = wp.abs((q[0] - at[0]) * wp.cos(at[2]) + (q[1] - at[1]) * wp.sin(at[2]))
-        if rest < 1.0:  # beyond the route's end a projection says nothing
-            result = wp.vec3(u - body[0] - reach[0], state.speed[b, j] * wp.cos(turn), wp.abs(lateral))
+        rest = rx * at[2] + ry * at[3]
+        lateral = ry * at[2] - rx * at[3]
+        if wp.abs(rest) < 0.05:
+            break
+        u = wp.clamp(u + rest, 0.0, SIGHT)
+    c = heading[0] * at[2] + heading[1] * at[3]
+    s = wp.abs(heading[0] * at[3] - heading[1] * at[2])
+    along = other[0] * wp.abs(c) + other[1] * s
+    across = other[0] * s + other[1] * wp.abs(c)
+    result = wp.vec2(FAR, 0.0)
+    # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
+    if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin:
+        result = wp.vec2(u - own[0] - along, state.speed[b, j] * c)
     return result
 
 
@@ -146,48 +153,61 @@ def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int,
 
 
 @wp.func
-def conflict_gap(
-    bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int, u0: float, target: float, body: wp.vec4
-) -> float:
-    """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
-
-    i is taken to speed up towards its target, j to keep its speed along its own route (its heading if it has none);
-    positions are compared at the same time and half a second to either side.
-    """
-    route = bank.route[e, i]
-    v = wp.max(state.speed[b, i], 0.0)
-    other = bank.body[bank.model[e, j]]
-    lat_margin = 0.4
-    lon_margin = 1.0
-    if bank.kind[bank.model[e, j]] == HALF_WALKER:
-        lat_margin = 1.0
-    gap = FAR
+def intend(roads: Roads, state: State, b: int, i: int, route: wp.vec2i, u0: float, v: float, target: float):
+    """Write where i will be every half second if it speeds up towards its target along its route."""
     u = float(0.0)
     w = v
     for k in range(FORECAST):
         after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
         u = u + 0.5 * (w + after) * STRIDE
         w = after
-        at = route_at(roads, route[0], route[1], u0 + u)
-        c = wp.cos(at[2])
-        s = wp.sin(at[2])
-        for d in range(3):
-            n = k + d - 1
+        state.intent[b, i, k] = route_frame(roads, route[0], route[1], u0 + u)
+
+
+@wp.func
+def conflict_gap(
+    state: State,
+    b: int,
+    i: int,
+    j: int,
+    v: float,
+    target: float,
+    own: wp.vec4,
+    other: wp.vec4,
+    lat_margin: float,
+) -> float:
+    """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
+
+    i is where it intends to be, j where it will be if it keeps its speed along its own route (its heading if it has
+    none); they are compared at the same time and half a second to either side.
+    """
+    gap = FAR
+    u = float(0.0)
+    w = v
+    reach = own[0] + other[0] + 2.0
+    reach2 = reach * reach
+    for k in range(FORECAST):
+        after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
+        u = u + 0.5 * (w + after) * STRIDE
+        w = after
+        at = state.intent[b, i, k]
+        for n in range(k - 1, wp.min(k + 2, FORECAST)):
             q = state.pose[b, j]
             if n >= 0:
-                q = state.forecast[b, j, wp.min(n, FORECAST - 1)]
+                q = state.forecast[b, j, n]
             rx = q[0] - at[0]
             ry = q[1] - at[1]
-            if rx * rx + ry * ry < 225.0:
-                along = rx * c + ry * s
-                across = -rx * s + ry * c
-                turn = q[2] - at[2]
-                ct = wp.abs(wp.cos(turn))
-                st = wp.abs(wp.sin(turn))
+            if rx * rx + ry * ry < reach2:
+                along = rx * at[2] + ry * at[3]
+                across = ry * at[2] - rx * at[3]
+                qc = wp.cos(q[2])
+                qs = wp.sin(q[2])
+                ct = wp.abs(qc * at[2] + qs * at[3])
+                st = wp.abs(qs * at[2] - qc * at[3])
                 he = other[0] * ct + other[1] * st
                 we = other[0] * st + other[1] * ct
-                if wp.abs(across) < body[1] + we + lat_margin and wp.abs(along) < body[0] + he + lon_margin:
-                    edge = u + along - he - body[0]
+                if wp.abs(across) < own[1] + we + lat_margin and wp.abs(along) < own[0] + he + 1.0:
+                    edge = u + along - he - own[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or along > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
@@ -195,7 +215,42 @@ def conflict_gap(
 
 
 @wp.func
-def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, agents: int, time: float) -> float:
+def apart(
+    state: State,
+    b: int,
+    i: int,
+    j: int,
+    pose: wp.vec3,
+    c: float,
+    s: float,
+    lon: float,
+    lat: float,
+    ahead: float,
+    bend: float,
+    other_bend: float,
+    pad: float,
+) -> bool:
+    """Whether j's next 4 s cannot meet i's, by the boxes that hold both in i's frame: cheap and never wrong.
+
+    ahead: metres i can go; bend, other_bend: metres that each path may leave its straight line; pad: reach of bodies.
+    """
+    q = state.forecast[b, j, FORECAST - 1]
+    dx = q[0] - pose[0]
+    dy = q[1] - pose[1]
+    lon1 = dx * c + dy * s
+    lat1 = dy * c - dx * s
+    off = bend + other_bend + pad
+    low = wp.min(lat, lat1)
+    high = wp.max(lat, lat1)
+    near = wp.min(lon, lon1) - off
+    far = wp.max(lon, lon1) + off
+    return low > off or high < -off or near > ahead or far < 0.0
+
+
+@wp.func
+def autopilot_accel(
+    bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, agents: int, time: float
+) -> float:
     """Wanted acceleration of an Autopilot, m/s^2."""
     route = bank.route[e, i]
     at = state.progress[b, i]
@@ -203,7 +258,7 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
     rule = roads.rule[first]
     pose = state.pose[b, i]
     v = state.speed[b, i]
-    body = bank.body[bank.model[e, i]]
+    own = bank.body[bank.model[e, i]]
     p = roads.path[first]
     part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
     u0 = float(at) + part
@@ -215,9 +270,9 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
     # signals
     index = roads.path_signal[first]
     if index >= 0:
-        ahead = rule[1] - part - body[0]
-        light = signal_state(bank, roads, e, index, time)
-        if ahead > -0.5:
+        ahead = rule[1] - part - own[0]
+        if ahead > -0.5 and ahead < SIGHT + 20.0:
+            light = signal_state(bank, roads, e, index, time)
             stop = light == RED
             if light == YELLOW:
                 stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
@@ -228,6 +283,12 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
 
     # everybody else
     sees = SIGHT + v * 2.0
+    c = wp.cos(pose[2])
+    s = wp.sin(pose[2])
+    # a path that is not followed exactly leaves the ego's straight line a little more
+    bend = roads.bend[first] + 1.0
+    goes = wp.max(target, v) * STRIDE * float(FORECAST)
+    ready = int(0)
     for j in range(agents):
         if j != i and state.active[b, j] != 0:
             q = state.pose[b, j]
@@ -235,21 +296,53 @@ def autopilot_accel(bank: Bank, roads: Roads, state: State, b: int, i: int, e: i
             dy = q[1] - pose[1]
             d2 = dx * dx + dy * dy
             if d2 < sees * sees:
-                lon = dx * wp.cos(pose[2]) + dy * wp.sin(pose[2])
-                facing = wp.cos(q[2] - pose[2])
-                lead = lead_gap(bank, roads, state, b, i, j, e, u0, body)
-                if lead[0] < FAR:
-                    react = wp.min(react, idm_gap(v, wp.max(lead[1], 0.0), lead[0]))
-                follows = lon < 0.0 and facing > 0.5  # behind me, going my way: its task
-                leads = lead[0] < FAR and facing > 0.7
-                vj = wp.abs(state.speed[b, j])
-                span = 4.5 * (vj + wp.max(target, v)) + 12.0
-                if vj > 0.2 and not follows and not leads and d2 < span * span:
-                    gap = conflict_gap(bank, roads, state, b, i, j, e, u0, target, body)
+                lon = dx * c + dy * s
+                lat = dy * c - dx * s
+                model = bank.model[e, j]
+                other = bank.body[model]
+                pad = own[0] + other[0] + 2.0
+                heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
+                facing = heading[0] * c + heading[1] * s
+                walks = bank.kind[model] == HALF_WALKER
+                # across straight lanes only the width of an aligned body counts
+                wide = (
+                    own[1]
+                    + other[0] * wp.abs(heading[1] * c - heading[0] * s)
+                    + other[1] * wp.abs(facing)
+                    + 1.0
+                )
+                gap = FAR
+                if lon > -bend - own[0] and wp.abs(lat) < bend + wide:
+                    margin = 0.3
+                    if walks:
+                        margin = 0.6
+                    lead = lead_gap(roads, state, b, j, route, u0, lon, own, other, heading, margin)
+                    gap = lead[0]
                     if gap < FAR:
-                        yields = not has_priority(bank, roads, state, b, i, j, e)
-                        if yields or gap < 0.5 * v:
-                            react = wp.min(react, idm_gap(v, 0.0, gap))
+                        react = wp.min(react, idm_gap(v, wp.max(lead[1], 0.0), gap))
+                vj = wp.abs(state.speed[b, j])
+                follows = lon < 0.0 and facing > 0.5  # behind me, going my way: its task
+                leads = gap < FAR and facing > 0.7
+                if vj > 0.2 and not follows and not leads:
+                    bend_j = float(0.0)
+                    reach_j = wide
+                    if bank.route[e, j][1] > 1:
+                        bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
+                    if bend_j > 1.0 or bend > 2.0:
+                        reach_j = pad
+                    ahead = goes + own[0]
+                    if not apart(state, b, i, j, pose, c, s, lon, lat, ahead, bend, bend_j, reach_j):
+                        if ready == 0:
+                            intend(roads, state, b, i, route, u0, wp.max(v, 0.0), target)
+                            ready = 1
+                        margin = 0.4
+                        if walks:
+                            margin = 1.0
+                        gap = conflict_gap(state, b, i, j, wp.max(v, 0.0), target, own, other, margin)
+                        if gap < FAR:
+                            yields = not has_priority(bank, roads, state, b, i, j, e)
+                            if yields or gap < 0.5 * v:
+                                react = wp.min(react, idm_gap(v, 0.0, gap))
     if free > 0.0:
         return free + react  # IDM: both terms add
     return wp.min(free, react)

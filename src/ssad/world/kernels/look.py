@@ -8,7 +8,15 @@ from ssad.world.kernels.shared import wrap
 
 @wp.func
 def put(
-    out: wp.array2d(dtype=wp.float32), b: int, at: int, x: float, y: float, l: float, w: float, r: float, v: float
+    out: wp.array2d(dtype=wp.float32),
+    b: int,
+    at: int,
+    x: float,
+    y: float,
+    l: float,
+    w: float,
+    r: float,
+    v: float,
 ):
     """One row of six numbers."""
     out[b, at + 0] = x
@@ -21,7 +29,14 @@ def put(
 
 @wp.func
 def put_agent(
-    bank: Bank, state: State, out: wp.array2d(dtype=wp.float32), b: int, e: int, j: int, at: int, pose: wp.vec3
+    bank: Bank,
+    state: State,
+    out: wp.array2d(dtype=wp.float32),
+    b: int,
+    e: int,
+    j: int,
+    at: int,
+    pose: wp.vec3,
 ):
     """Row of agent j in the ego's frame: x, y, length, width, relative yaw, speed; zeros for j < 0."""
     if j < 0:
@@ -34,9 +49,7 @@ def put_agent(
     dy = q[1] - pose[1]
     body = bank.body[bank.model[e, j]]
     turn = wrap(q[2] - pose[2])
-    put(
-        out, b, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j]
-    )
+    put(out, b, at, c * dx + s * dy, -s * dx + c * dy, 2.0 * body[0], 2.0 * body[1], turn, state.speed[b, j])
 
 
 @wp.kernel(enable_backward=False)

@@ -15,7 +15,14 @@ AUTOPILOT = wp.constant(2)
 
 @wp.func
 def bicycle(
-    pose: wp.vec3, speed: float, wheel: float, control: wp.vec4, body: wp.vec4, power: wp.vec4, dt: float, n: int
+    pose: wp.vec3,
+    speed: float,
+    wheel: float,
+    control: wp.vec4,
+    body: wp.vec4,
+    power: wp.vec4,
+    dt: float,
+    n: int,
 ) -> vec5:
     """`n` sub-steps of the kinematic bicycle about the box centre (rear share 1/2): x, y, yaw, speed, wheel.
 
@@ -64,9 +71,7 @@ def bicycle(
 
 
 @wp.kernel(enable_backward=False)
-def move(
-    bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int
-):
+def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int):
     """Advance every agent by dt with its control (external ones with the action) and look where it is now."""
     b, i = wp.tid()
     if state.end[b] != 0 or state.active[b, i] == 0:

@@ -241,10 +241,13 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
         state.forecast[b, i, k] = wp.vec3(
             pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2]
         )
+        state.intent[b, i, k] = wp.vec4(0.0, 0.0, 0.0, 0.0)
 
 
 @wp.kernel(enable_backward=False)
-def restart_record(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
+def restart_record(
+    bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int
+):
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
     go = mask[b] == 1

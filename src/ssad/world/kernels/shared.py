@@ -28,6 +28,20 @@ def route_at(roads: Roads, first: int, count: int, u: float) -> wp.vec3:
 
 
 @wp.func
+def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
+    """Point and unit heading (x, y, tx, ty) at `u` metres along a route; held at both ends."""
+    t = wp.clamp(u, 0.0, float(count - 1))
+    i = wp.min(int(t), count - 2)
+    f = t - float(i)
+    a = roads.path[first + i]
+    b = roads.path[first + i + 1]
+    dx = b[0] - a[0]
+    dy = b[1] - a[1]
+    r = 1.0 / wp.sqrt(wp.max(dx * dx + dy * dy, 1.0e-12))
+    return wp.vec4(a[0] + f * dx, a[1] + f * dy, dx * r, dy * r)
+
+
+@wp.func
 def signal_state(bank: Bank, roads: Roads, e: int, index: int, time: float) -> int:
     """State of signal `index` of the episode's town at `time`: forced by the episode, else its fixed programme."""
     forced = bank.signal[e, index]
@@ -115,12 +129,3 @@ def lane_under(roads: Roads, town: int, x: float, y: float) -> wp.vec3:
                     side = -1.0
                 best = wp.vec3(float(roads.segment_lane[m]), side * wp.sqrt(d2), h)
     return best
-
-
-@wp.func
-def reach_along(state: State, b: int, j: int, yaw: float, half: wp.vec2) -> wp.vec2:
-    """Half extent of agent j's box along and across a direction, m."""
-    d = state.pose[b, j][2] - yaw
-    c = wp.abs(wp.cos(d))
-    s = wp.abs(wp.sin(d))
-    return wp.vec2(half[0] * c + half[1] * s, half[0] * s + half[1] * c)
