@@ -122,9 +122,27 @@ def lead_gap(
     along = other[0] * wp.abs(c) + other[1] * s
     across = other[0] * s + other[1] * wp.abs(c)
     result = wp.vec2(FAR, 0.0)
+    # in a bend the corners sweep wider than the body
+    spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+    sweep = wp.min(0.5 * wp.abs(roads.path[spot][3]) * own[0] * own[0], 1.0)
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
-    if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin:
+    if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin + sweep:
         result = wp.vec2(u - own[0] - along, state.speed[b, j] * c)
+    if wp.abs(rest) >= 0.3 and lon < 25.0:
+        # inside a tight bend a projection need not converge: try the body against the path piece by piece
+        for k in range(16):
+            u = 1.5 * float(k + 1)
+            at = route_frame(roads, route[0], route[1], u0 + u)
+            rx = q[0] - at[0]
+            ry = q[1] - at[1]
+            c = heading[0] * at[2] + heading[1] * at[3]
+            s = wp.abs(heading[0] * at[3] - heading[1] * at[2])
+            along = other[0] * wp.abs(c) + other[1] * s
+            across = other[0] * s + other[1] * wp.abs(c)
+            rest = rx * at[2] + ry * at[3]
+            lateral = ry * at[2] - rx * at[3]
+            if wp.abs(lateral) < own[1] + across + margin and wp.abs(rest) < along + 0.75 and result[0] >= FAR:
+                result = wp.vec2(u + rest - along - own[0], state.speed[b, j] * c)
     return result
 
 
