@@ -89,7 +89,7 @@ def parts(batch: int, device: str, repeats: int = 5) -> dict[str, float]:
     world = make_world(batch, device, min(batch, 150))
     for _ in range(50):
         world.step()
-    names = ["restart", "restart_record", "drive", "move", "contact", "record", "look"]
+    names = ["restart", "restart_record", "sight", "meet", "drive", "move", "contact", "record", "look"]
     spent: dict[str, list[float]] = {n: [] for n in names}
     for _ in range(repeats * 10):
         for name, command in zip(names, [*world._step, world._look], strict=True):

@@ -15,8 +15,8 @@ from ssad.errors import ConfigError
 from ssad.roads.graph import LaneGraph
 from ssad.types import I32, Controller, Episode, SignalState
 from ssad.world.bank import agent_kinds, build, signal_programs
-from ssad.world.kernels.data import HORIZON, Ego, State
-from ssad.world.kernels.drive import drive
+from ssad.world.kernels.data import HORIZON, Ego, State, Work
+from ssad.world.kernels.drive import drive, meet, sight
 from ssad.world.kernels.look import look
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
@@ -40,7 +40,8 @@ _STATE: dict[str, tuple[str, Any]] = {
     "waited": ("BA", wp.float32),
     "control": ("BA", wp.vec4),
     "forecast": ("BAH", wp.vec3),
-    "intent": ("BAH", wp.vec4),
+    "aim": ("BA", wp.vec2),
+    "react": ("BA", wp.float32),
     "lane": ("BA", wp.int32),
     "lateral": ("BA", wp.vec2),
     "touch": ("BA", wp.int64),
@@ -104,6 +105,8 @@ class World:
         if len(order) == 0 or order.min() < 0 or order.max() >= len(self.episodes):
             raise ConfigError(f"scenes must be assigned episodes 0 to {len(self.episodes) - 1}")
         self.batch = len(order)
+        if self.batch * self.agents**2 >= 1 << 29:
+            raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
         self.state = State()
         shapes = {
             "B": (self.batch,),
@@ -118,6 +121,12 @@ class World:
         self.actions = wp.zeros((self.batch, self.agents), dtype=wp.vec4, device=device)
         self.observation = wp.zeros((self.batch, OBSERVATION), dtype=wp.float32, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
+        self.work = Work()
+        self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
+        pairs = self.batch * self.agents * max(self.agents - 1, 1)
+        self.work.pair = wp.zeros(pairs, dtype=wp.int32, device=device)
+        # one thread walks the list on CPU; on CUDA enough to fill the device
+        workers = 1 if device == "cpu" else min(pairs, 1 << 18)
         self._kinds = agent_kinds(self.bank)
         self._assign(order.astype(np.int32))
         flat = (self.batch, self.agents)
@@ -133,9 +142,13 @@ class World:
                 self._launch(restart_record, self.batch, [*again, 1]),
             ]
         self._step += [
-            self._launch(drive, flat, [self.bank, self.roads, self.state, self.agents, dt]),
+            self._launch(sight, flat, [self.bank, self.roads, self.state, self.work, self.agents, dt]),
+            self._launch(
+                meet, workers, [self.bank, self.roads, self.state, self.work, self.agents, workers]
+            ),
+            self._launch(drive, flat, [self.bank, self.roads, self.state, dt]),
             self._launch(move, flat, [self.bank, self.roads, self.state, self.actions, dt, substeps]),
-            self._launch(contact, flat, [self.bank, self.state, self.agents]),
+            self._launch(contact, flat, [self.bank, self.state, self.work, self.agents]),
             self._launch(record, self.batch, [self.bank, self.roads, self.state, self.ego, self.agents, dt]),
         ]
         self._look = self._launch(

@@ -69,9 +69,8 @@ class State:
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
-    intent: wp.array3d(
-        dtype=wp.vec4
-    )  # [B, A, HORIZON] x, y, heading vector where an Autopilot wants to be (scratch)
+    aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
+    react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
     lateral: wp.array2d(
         dtype=wp.vec2
@@ -97,3 +96,11 @@ class Ego:
     accel: wp.array(dtype=wp.float32)
     speed: wp.array(dtype=wp.float32)  # in the step before
     reward: wp.array(dtype=wp.float32)
+
+
+@wp.struct
+class Work:
+    """Pairs of agents that a step must look at more closely; rebuilt in every step."""
+
+    count: wp.array(dtype=wp.int32)  # [1]
+    pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)

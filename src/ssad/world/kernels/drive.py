@@ -7,7 +7,7 @@ the stop line of a red signal, and the near edge of a predicted conflict it must
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State
+from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State, Work
 from ssad.world.kernels.shared import RED, YELLOW, route_frame, signal_state, wrap
 
 IDM_ACCEL = wp.constant(2.5)
@@ -171,23 +171,13 @@ def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int,
 
 
 @wp.func
-def intend(roads: Roads, state: State, b: int, i: int, route: wp.vec2i, u0: float, v: float, target: float):
-    """Write where i will be every half second if it speeds up towards its target along its route."""
-    u = float(0.0)
-    w = v
-    for k in range(FORECAST):
-        after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
-        u = u + 0.5 * (w + after) * STRIDE
-        w = after
-        state.intent[b, i, k] = route_frame(roads, route[0], route[1], u0 + u)
-
-
-@wp.func
 def conflict_gap(
+    roads: Roads,
     state: State,
     b: int,
-    i: int,
     j: int,
+    route: wp.vec2i,
+    u0: float,
     v: float,
     target: float,
     own: wp.vec4,
@@ -208,7 +198,7 @@ def conflict_gap(
         after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
         u = u + 0.5 * (w + after) * STRIDE
         w = after
-        at = state.intent[b, i, k]
+        at = route_frame(roads, route[0], route[1], u0 + u)
         for n in range(k - 1, wp.min(k + 2, FORECAST)):
             q = state.pose[b, j]
             if n >= 0:
@@ -234,43 +224,35 @@ def conflict_gap(
 
 @wp.func
 def apart(
-    state: State,
-    b: int,
-    i: int,
-    j: int,
-    pose: wp.vec3,
-    c: float,
-    s: float,
-    lon: float,
-    lat: float,
-    ahead: float,
-    bend: float,
-    other_bend: float,
-    pad: float,
+    state: State, b: int, j: int, pose: wp.vec3, c: float, s: float, lon: float, lat: float, ahead: float, off: float
 ) -> bool:
-    """Whether j's next 4 s cannot meet i's, by the boxes that hold both in i's frame: cheap and never wrong.
+    """Whether j's next 4 s cannot meet mine, by the boxes that hold both in my frame: cheap and never wrong.
 
-    ahead: metres i can go; bend, other_bend: metres that each path may leave its straight line; pad: reach of bodies.
+    lon, lat: where j is now; ahead: metres I can go; off: what bent paths and the bodies' reach add.
     """
     q = state.forecast[b, j, FORECAST - 1]
     dx = q[0] - pose[0]
     dy = q[1] - pose[1]
     lon1 = dx * c + dy * s
     lat1 = dy * c - dx * s
-    off = bend + other_bend + pad
-    low = wp.min(lat, lat1)
-    high = wp.max(lat, lat1)
-    near = wp.min(lon, lon1) - off
-    far = wp.max(lon, lon1) + off
-    return low > off or high < -off or near > ahead or far < 0.0
+    aside = wp.min(lat, lat1) > off or wp.max(lat, lat1) < -off
+    return aside or wp.min(lon, lon1) - off > ahead or wp.max(lon, lon1) + off < 0.0
 
 
-@wp.func
-def autopilot_accel(
-    bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, agents: int, time: float
-) -> float:
-    """Wanted acceleration of an Autopilot, m/s^2."""
+@wp.kernel(enable_backward=False)
+def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: float):
+    """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
+
+    The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
+    their order does not matter, since only the hardest reaction counts.
+    """
+    b, i = wp.tid()
+    if state.end[b] != 0 or state.active[b, i] != 2:
+        return
+    e = state.episode[b]
     route = bank.route[e, i]
+    if bank.controller[e, i] != C_AUTOPILOT or route[1] < 2:
+        return
     at = state.progress[b, i]
     first = route[0] + at
     rule = roads.rule[first]
@@ -279,95 +261,115 @@ def autopilot_accel(
     own = bank.body[bank.model[e, i]]
     p = roads.path[first]
     part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
-    u0 = float(at) + part
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
     target = wp.min(bank.cruise[e, i][0], cap)
-    free = idm_free(v, target)
+    state.aim[b, i] = wp.vec2(float(at) + part, target)
     react = float(0.0)
 
-    # signals
     index = roads.path_signal[first]
     if index >= 0:
         ahead = rule[1] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
-            light = signal_state(bank, roads, e, index, time)
+            light = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
             stop = light == RED
             if light == YELLOW:
                 stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
             if light == RED and rule[3] == RIGHT_TURN and state.waited[b, i] >= 1.0:
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
-                react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
+                react = idm_gap(v, 0.0, ahead + 1.0)
+    state.react[b, i] = react
 
-    # everybody else
     sees = SIGHT + v * 2.0
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
-    # a path that is not followed exactly leaves the ego's straight line a little more
+    # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
-    goes = wp.max(target, v) * STRIDE * float(FORECAST)
-    ready = int(0)
+    goes = wp.max(target, v) * STRIDE * float(FORECAST) + own[0]
     for j in range(agents):
         if j != i and state.active[b, j] != 0:
             q = state.pose[b, j]
             dx = q[0] - pose[0]
             dy = q[1] - pose[1]
-            d2 = dx * dx + dy * dy
-            if d2 < sees * sees:
+            if dx * dx + dy * dy < sees * sees:
                 lon = dx * c + dy * s
                 lat = dy * c - dx * s
-                model = bank.model[e, j]
-                other = bank.body[model]
-                pad = own[0] + other[0] + 2.0
-                heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
-                facing = heading[0] * c + heading[1] * s
-                walks = bank.kind[model] == HALF_WALKER
+                other = bank.body[bank.model[e, j]]
+                turn = q[2] - pose[2]
+                facing = wp.cos(turn)
                 # across straight lanes only the width of an aligned body counts
-                wide = (
-                    own[1]
-                    + other[0] * wp.abs(heading[1] * c - heading[0] * s)
-                    + other[1] * wp.abs(facing)
-                    + 1.0
-                )
-                gap = FAR
+                wide = own[1] + other[0] * wp.abs(wp.sin(turn)) + other[1] * wp.abs(facing) + 1.0
+                flags = int(0)
                 if lon > -bend - own[0] and wp.abs(lat) < bend + wide:
-                    margin = 0.3
-                    if walks:
-                        margin = 0.6
-                    lead = lead_gap(roads, state, b, j, route, u0, lon, own, other, heading, margin)
-                    gap = lead[0]
-                    if gap < FAR:
-                        react = wp.min(react, idm_gap(v, wp.max(lead[1], 0.0), gap))
-                vj = wp.abs(state.speed[b, j])
-                follows = lon < 0.0 and facing > 0.5  # behind me, going my way: its task
-                leads = gap < FAR and facing > 0.7
-                if vj > 0.2 and not follows and not leads:
+                    flags = 1
+                if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5):
+                    # who is behind and goes my way keeps its distance itself
                     bend_j = float(0.0)
-                    reach_j = wide
+                    reach = wide
                     if bank.route[e, j][1] > 1:
                         bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
                     if bend_j > 1.0 or bend > 2.0:
-                        reach_j = pad
-                    ahead = goes + own[0]
-                    if not apart(state, b, i, j, pose, c, s, lon, lat, ahead, bend, bend_j, reach_j):
-                        if ready == 0:
-                            intend(roads, state, b, i, route, u0, wp.max(v, 0.0), target)
-                            ready = 1
-                        margin = 0.4
-                        if walks:
-                            margin = 1.0
-                        gap = conflict_gap(state, b, i, j, wp.max(v, 0.0), target, own, other, margin)
-                        if gap < FAR:
-                            yields = not has_priority(bank, roads, state, b, i, j, e)
-                            if yields or gap < 0.5 * v:
-                                react = wp.min(react, idm_gap(v, 0.0, gap))
-    if free > 0.0:
-        return free + react  # IDM: both terms add
-    return wp.min(free, react)
+                        reach = own[0] + other[0] + 2.0
+                    if not apart(state, b, j, pose, c, s, lon, lat, goes, bend + bend_j + reach):
+                        flags = flags + 2
+                if flags > 0:
+                    slot = wp.atomic_add(work.count, 0, 1)
+                    work.pair[slot] = ((b * agents + i) * agents + j) * 4 + flags
 
 
 @wp.kernel(enable_backward=False)
-def drive(bank: Bank, roads: Roads, state: State, agents: int, dt: float):
+def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, workers: int):
+    """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
+    tid = wp.tid()
+    total = work.count[0]
+    slot = int(tid)
+    while slot < total:
+        code = work.pair[slot]
+        flags = code % 4
+        code = code / 4
+        j = code % agents
+        code = code / agents
+        i = code % agents
+        b = code / agents
+        e = state.episode[b]
+        route = bank.route[e, i]
+        pose = state.pose[b, i]
+        q = state.pose[b, j]
+        v = wp.max(state.speed[b, i], 0.0)
+        own = bank.body[bank.model[e, i]]
+        other = bank.body[bank.model[e, j]]
+        walks = bank.kind[bank.model[e, j]] == HALF_WALKER
+        aim = state.aim[b, i]
+        react = float(0.0)
+        leads = int(0)
+        if flags != 2:
+            c = wp.cos(pose[2])
+            s = wp.sin(pose[2])
+            heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
+            lon = (q[0] - pose[0]) * c + (q[1] - pose[1]) * s
+            margin = 0.3
+            if walks:
+                margin = 0.6
+            lead = lead_gap(roads, state, b, j, route, aim[0], lon, own, other, heading, margin)
+            if lead[0] < FAR:
+                react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
+                if heading[0] * c + heading[1] * s > 0.7:
+                    leads = 1
+        if flags >= 2 and leads == 0:
+            margin = 0.4
+            if walks:
+                margin = 1.0
+            gap = conflict_gap(roads, state, b, j, route, aim[0], v, aim[1], own, other, margin)
+            if gap < FAR:
+                if gap < 0.5 * v or not has_priority(bank, roads, state, b, i, j, e):
+                    react = wp.min(react, idm_gap(v, 0.0, gap))
+        if react < 0.0:
+            wp.atomic_min(state.react, b, i, react)
+        slot = slot + workers
+
+
+@wp.kernel(enable_backward=False)
+def drive(bank: Bank, roads: Roads, state: State, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, i = wp.tid()
     if state.end[b] != 0 or state.active[b, i] == 0:
@@ -419,7 +421,10 @@ def drive(bank: Bank, roads: Roads, state: State, agents: int, dt: float):
         if bank.route[e, i][1] > 1:
             steer = steer_on_route(bank, roads, state, b, i, e, v)
         if who == C_AUTOPILOT:
-            accel = autopilot_accel(bank, roads, state, b, i, e, agents, time)
+            free = idm_free(v, state.aim[b, i][1])
+            accel = wp.min(free, state.react[b, i])
+            if free > 0.0:
+                accel = free + state.react[b, i]  # IDM: both terms add
         else:
             cap = roads.rule[bank.route[e, i][0] + state.progress[b, i]][0]
             aim = wp.min(target, cap)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Bank, Ego, Roads, State
+from ssad.world.kernels.data import FAR, Bank, Ego, Roads, State, Work
 from ssad.world.kernels.shared import RED, boxes_touch, signal_state, wrap
 
 END_RUNNING = wp.constant(0)
@@ -24,9 +24,11 @@ def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.kernel(enable_backward=False)
-def contact(bank: Bank, state: State, agents: int):
+def contact(bank: Bank, state: State, work: Work, agents: int):
     """Which agents each agent touches, at the end of the step and half-way through it; wakes sleeping traffic."""
     b, i = wp.tid()
+    if b == 0 and i == 0:
+        work.count[0] = 0  # for the next step's `sight`
     if state.end[b] != 0:
         return
     mask = wp.int64(0)
@@ -230,6 +232,8 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
     state.touch[b, i] = wp.int64(0)
     state.lateral[b, i] = wp.vec2(0.0, 0.0)
     state.lane[b, i] = -1
+    state.aim[b, i] = wp.vec2(0.0, 0.0)
+    state.react[b, i] = 0.0
     awake = int(2)
     if bank.model[e, i] < 0:
         awake = 0
@@ -241,7 +245,6 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
         state.forecast[b, i, k] = wp.vec3(
             pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2]
         )
-        state.intent[b, i, k] = wp.vec4(0.0, 0.0, 0.0, 0.0)
 
 
 @wp.kernel(enable_backward=False)
