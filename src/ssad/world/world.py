@@ -40,6 +40,7 @@ _STATE: dict[str, tuple[str, Any]] = {
     "waited": ("BA", wp.float32),
     "control": ("BA", wp.vec4),
     "forecast": ("BAH", wp.vec3),
+    "span": ("BA", wp.vec4),
     "aim": ("BA", wp.vec2),
     "react": ("BA", wp.float32),
     "lane": ("BA", wp.int32),
@@ -143,9 +144,7 @@ class World:
             ]
         self._step += [
             self._launch(sight, flat, [self.bank, self.roads, self.state, self.work, self.agents, dt]),
-            self._launch(
-                meet, workers, [self.bank, self.roads, self.state, self.work, self.agents, workers]
-            ),
+            self._launch(meet, workers, [self.bank, self.roads, self.state, self.work, self.agents, workers]),
             self._launch(drive, flat, [self.bank, self.roads, self.state, dt]),
             self._launch(move, flat, [self.bank, self.roads, self.state, self.actions, dt, substeps]),
             self._launch(contact, flat, [self.bank, self.state, self.work, self.agents]),

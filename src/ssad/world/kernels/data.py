@@ -69,6 +69,7 @@ class State:
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
+    span: wp.array2d(dtype=wp.vec4)  # [B, A] least x, y and greatest x, y of the pose and its forecast
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road

@@ -15,6 +15,7 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+LONGEST = wp.constant(5.2)  # half length of the longest model, m
 HALF_WALKER = wp.constant(6)
 C_NONE = wp.constant(0)
 C_AUTOPILOT = wp.constant(2)
@@ -141,7 +142,11 @@ def lead_gap(
             across = other[0] * s + other[1] * wp.abs(c)
             rest = rx * at[2] + ry * at[3]
             lateral = ry * at[2] - rx * at[3]
-            if wp.abs(lateral) < own[1] + across + margin and wp.abs(rest) < along + 0.75 and result[0] >= FAR:
+            if (
+                wp.abs(lateral) < own[1] + across + margin
+                and wp.abs(rest) < along + 0.75
+                and result[0] >= FAR
+            ):
                 result = wp.vec2(u + rest - along - own[0], state.speed[b, j] * c)
     return result
 
@@ -224,7 +229,16 @@ def conflict_gap(
 
 @wp.func
 def apart(
-    state: State, b: int, j: int, pose: wp.vec3, c: float, s: float, lon: float, lat: float, ahead: float, off: float
+    state: State,
+    b: int,
+    j: int,
+    pose: wp.vec3,
+    c: float,
+    s: float,
+    lon: float,
+    lat: float,
+    ahead: float,
+    off: float,
 ) -> bool:
     """Whether j's next 4 s cannot meet mine, by the boxes that hold both in my frame: cheap and never wrong.
 
@@ -280,27 +294,40 @@ def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: f
                 react = idm_gap(v, 0.0, ahead + 1.0)
     state.react[b, i] = react
 
-    sees = SIGHT + v * 2.0
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
+    # how far ahead anybody matters: 4 s of driving, and the distance to brake in comfort
+    goes = wp.max(target, v) * STRIDE * float(FORECAST)
+    sees = wp.min(wp.max(goes, 15.0 + 3.0 * v), SIGHT)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
-    goes = wp.max(target, v) * STRIDE * float(FORECAST) + own[0]
+    low = wp.vec2(pose[0], pose[1])
+    high = low
+    for k in range(5):
+        at_k = route_frame(roads, route[0], route[1], float(at) + part + 0.2 * float(k + 1) * sees)
+        low = wp.vec2(wp.min(low[0], at_k[0]), wp.min(low[1], at_k[1]))
+        high = wp.vec2(wp.max(high[0], at_k[0]), wp.max(high[1], at_k[1]))
+    # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
+    pad = own[0] + LONGEST + 4.0
+    low = wp.vec2(low[0] - pad, low[1] - pad)
+    high = wp.vec2(high[0] + pad, high[1] + pad)
     for j in range(agents):
         if j != i and state.active[b, j] != 0:
-            q = state.pose[b, j]
-            dx = q[0] - pose[0]
-            dy = q[1] - pose[1]
-            if dx * dx + dy * dy < sees * sees:
+            box = state.span[b, j]
+            if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
+                other = bank.body[bank.model[e, j]]
+                q = state.pose[b, j]
+                dx = q[0] - pose[0]
+                dy = q[1] - pose[1]
                 lon = dx * c + dy * s
                 lat = dy * c - dx * s
-                other = bank.body[bank.model[e, j]]
                 turn = q[2] - pose[2]
                 facing = wp.cos(turn)
                 # across straight lanes only the width of an aligned body counts
                 wide = own[1] + other[0] * wp.abs(wp.sin(turn)) + other[1] * wp.abs(facing) + 1.0
                 flags = int(0)
-                if lon > -bend - own[0] and wp.abs(lat) < bend + wide:
+                near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
+                if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
                     flags = 1
                 if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5):
                     # who is behind and goes my way keeps its distance itself
@@ -310,7 +337,7 @@ def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: f
                         bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own[0] + other[0] + 2.0
-                    if not apart(state, b, j, pose, c, s, lon, lat, goes, bend + bend_j + reach):
+                    if not apart(state, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
                         flags = flags + 2
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)

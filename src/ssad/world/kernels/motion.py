@@ -142,11 +142,18 @@ def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec
         off = wp.vec2(pose[0] - p[0], pose[1] - p[1])
         if wp.length(off) > 4.0:
             follows = False  # far from its route: nothing says where it goes
-    for k in range(FORECAST):
-        ahead = speed * STRIDE * float(k + 1)
-        if follows:
-            state.forecast[b, i, k] = route_at(roads, route[0], route[1], float(at) + ahead)
-        else:
-            state.forecast[b, i, k] = wp.vec3(
-                pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2]
-            )
+    low = wp.vec2(pose[0], pose[1])
+    high = low
+    if wp.abs(speed) > 0.1:
+        for k in range(FORECAST):
+            ahead = speed * STRIDE * float(k + 1)
+            q = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
+            if follows:
+                q = route_at(roads, route[0], route[1], float(at) + ahead)
+            state.forecast[b, i, k] = q
+            low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
+            high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
+    else:
+        for k in range(FORECAST):
+            state.forecast[b, i, k] = pose
+    state.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])

@@ -240,6 +240,11 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
     elif bank.cruise[e, i][1] > 0.0:
         awake = 1
     state.active[b, i] = awake
+    far = start[3] * 4.0
+    tip = wp.vec2(pose[0] + far * wp.cos(pose[2]), pose[1] + far * wp.sin(pose[2]))
+    state.span[b, i] = wp.vec4(
+        wp.min(pose[0], tip[0]), wp.min(pose[1], tip[1]), wp.max(pose[0], tip[0]), wp.max(pose[1], tip[1])
+    )
     for k in range(8):
         ahead = start[3] * 0.5 * float(k + 1)
         state.forecast[b, i, k] = wp.vec3(
