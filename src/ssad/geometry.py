@@ -1,0 +1,86 @@
+"""Plane geometry on arrays: angles, frames and oriented boxes. Metres, radians, right-handed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.floating[Any]]
+ArrayLike = npt.ArrayLike
+
+
+def wrap_angle(angle: ArrayLike) -> Floats:
+    """Angles brought into [-pi, pi)."""
+    value = _floats(angle)
+    wrapped = (value + np.pi) % (2.0 * np.pi) - np.pi
+    # rounding of the remainder may give exactly +pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped).astype(value.dtype)
+
+
+def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:
+    """Vectors xy [..., 2] turned counter-clockwise by angle [...]."""
+    vector = _floats(xy)
+    turn = _floats(angle)
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def to_local(pose: ArrayLike, xy: ArrayLike) -> Floats:
+    """World points xy [..., 2] in the frame of pose [..., 3] (x, y, yaw): x forward, y left."""
+    frame = _floats(pose)
+    return rotate(np.subtract(_floats(xy), frame[..., :2]), -frame[..., 2])
+
+
+def to_world(pose: ArrayLike, xy: ArrayLike) -> Floats:
+    """Points xy [..., 2] of the frame pose [..., 3] (x, y, yaw) in the world frame; undoes `to_local`."""
+    frame = _floats(pose)
+    return np.asarray(rotate(xy, frame[..., 2]) + frame[..., :2])
+
+
+def corners(x: ArrayLike, y: ArrayLike, yaw: ArrayLike, length: ArrayLike, width: ArrayLike) -> Floats:
+    """Corners [..., 4, 2] of boxes: front left, rear left, rear right, front right (counter-clockwise)."""
+    x_, y_, yaw_, length_, width_ = np.broadcast_arrays(*(_floats(v) for v in (x, y, yaw, length, width)))
+    along = 0.5 * length_[..., None] * np.array([1.0, -1.0, -1.0, 1.0], length_.dtype)
+    across = 0.5 * width_[..., None] * np.array([1.0, 1.0, -1.0, -1.0], width_.dtype)
+    offset = rotate(np.stack([along, across], axis=-1), yaw_[..., None])
+    return offset + np.stack([x_, y_], axis=-1)[..., None, :]
+
+
+def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
+    """Distance [...] between oriented boxes, 0 where they overlap.
+
+    a, b [..., 5]: x, y, yaw, length, width (broadcast against each other). Two convex shapes which do not
+    overlap are nearest at a corner of one of them, so eight point-to-box distances and a separating-axis test
+    suffice.
+    """
+    first, second = np.broadcast_arrays(_floats(a), _floats(b))
+    one = corners(*(first[..., i] for i in range(5)))
+    two = corners(*(second[..., i] for i in range(5)))
+    two_local = to_local(first[..., None, :3], two)
+    one_local = to_local(second[..., None, :3], one)
+    half_first, half_second = 0.5 * first[..., None, 3:5], 0.5 * second[..., None, 3:5]
+    gap = np.minimum(_point_to_box(two_local, half_first), _point_to_box(one_local, half_second))
+    apart = _separated(two_local, half_first) | _separated(one_local, half_second)
+    return np.where(apart, gap, 0.0).astype(gap.dtype)
+
+
+def _point_to_box(points: Floats, half: Floats) -> Floats:
+    """Least distance [...] of points [..., 4, 2] from the box of half extents half [..., 1, 2] at the
+    origin.""" outside = np.maximum(np.abs(points) - half, 0.0)
+    return np.asarray(np.hypot(outside[..., 0], outside[..., 1]).min(axis=-1))
+
+
+def _separated(points: Floats, half: Floats) -> npt.NDArray[np.bool_]:
+    """Whether an axis of the box at the origin separates it from the hull of the points."""
+    low, high = points.min(axis=-2), points.max(axis=-2)
+    extent = half[..., 0, :]
+    return np.asarray(((low > extent) | (high < -extent)).any(axis=-1))
+
+
+def _floats(value: ArrayLike) -> Floats:
+    """As a floating array; whole numbers become float64."""
+    array = np.asarray(value)
+    return array if np.issubdtype(array.dtype, np.floating) else array.astype(np.float64)

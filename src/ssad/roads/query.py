@@ -1,0 +1,192 @@
+"""Nearest-lane and off-road queries on a uniform grid; the grid arrays also feed the world's kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.roads.graph import LaneGraph
+from ssad.types import F32, F64, I32, Bool, LaneType
+
+CELL = 2.0  # m; smaller cells list fewer segments, larger ones need less memory
+MARGIN = 3.0  # m outside a lane's edge up to which its cell still answers
+_BATCH = 1 << 18  # candidate rows handled at once, keeps them in cache
+
+DRIVABLE = (LaneType.DRIVING, LaneType.PARKING)
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Answer for n points. lane [n] (-1: none within reach), s [n] m along it, lateral [n] m (left positive,
+    +-inf-free: 0 where lane is -1), inside [n]: the point is within the lane's strip."""
+
+    lane: I32
+    s: F32
+    lateral: F32
+    inside: Bool
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        return iter((self.lane, self.s, self.lateral, self.inside))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Segments of centre lines, and for each cell those that can be the nearest to a point of that cell.
+
+    seg [M, 4]: x0, y0, x1, y1; seg_half [M, 2]: half widths at both ends; seg_lane [M]; seg_s [M]: arc length
+    at the first end; cell_offset [nx*ny+1], cell_seg [.]: segments of cell iy*nx+ix; origin: lower left
+    corner; cell: m. Nearness is distance from the centre line less the half width there, so that two lanes of
+    different width meet at their common edge. A cell answers exactly for every point up to `MARGIN` outside a
+    lane; it is empty beyond.
+    """
+
+    seg: F32
+    seg_half: F32
+    seg_lane: I32
+    seg_s: F32
+    cell_offset: I32
+    cell_seg: I32
+    origin: tuple[float, float]
+    cell: float
+    nx: int
+    ny: int
+
+
+class LaneQuery:
+    """Nearest lane of a town, batched. The grid of `types` is public and flat: seg, seg_half, cell_offset,
+    ...
+
+    nearest() with other lane types builds their grid once and keeps it.
+    """
+
+    def __init__(self, graph: LaneGraph, types: Sequence[LaneType] = DRIVABLE, *, cell: float = CELL) -> None:
+        self.graph = graph
+        self.types = tuple(types)
+        self.cell = float(cell)
+        self._grids: dict[tuple[int, ...], Grid] = {}
+        grid = self.grid(self.types)
+        self.seg, self.seg_half, self.seg_lane, self.seg_s = (
+            grid.seg,
+            grid.seg_half,
+            grid.seg_lane,
+            grid.seg_s,
+        )
+        self.cell_offset, self.cell_seg = grid.cell_offset, grid.cell_seg
+        self.origin, self.nx, self.ny = grid.origin, grid.nx, grid.ny
+
+    def grid(self, types: Sequence[LaneType]) -> Grid:
+        """The grid over lanes of the given types."""
+        key = tuple(sorted({int(t) for t in types}))
+        if key not in self._grids:
+            self._grids[key] = build_grid(self.graph, key, self.cell)
+        return self._grids[key]
+
+    def nearest(self, xy: npt.ArrayLike, types: Sequence[LaneType] = DRIVABLE) -> Nearest:
+        """Nearest lane of the given types to points xy [n, 2], up to `MARGIN` outside a lane's edge."""
+        grid = self.grid(types)
+        points = np.asarray(xy, np.float32).reshape(-1, 2)
+        n = len(points)
+        lane = np.full(n, -1, np.int32)
+        s, lateral = np.zeros(n, np.float32), np.zeros(n, np.float32)
+        inside = np.zeros(n, np.bool_)
+        where = np.floor((points - np.array(grid.origin, np.float32)) / np.float32(grid.cell))
+        size = np.array([grid.nx, grid.ny], np.float32)
+        known = np.flatnonzero(((where >= 0) & (where < size)).all(axis=1))
+        cell = where[known, 1].astype(np.int64) * grid.nx + where[known, 0].astype(np.int64)
+        count = (grid.cell_offset[cell + 1] - grid.cell_offset[cell]).astype(np.int64)
+        known, cell, count = known[count > 0], cell[count > 0], count[count > 0]
+        ends = np.cumsum(count)
+        start = 0
+        while start < len(known):
+            base = ends[start - 1] if start else 0
+            stop = max(start + 1, int(np.searchsorted(ends, base + _BATCH, side="right")))
+            part = slice(start, stop)
+            rows, some = known[part], count[part]
+            first = np.concatenate([[0], np.cumsum(some)[:-1]])
+            item = np.arange(int(some.sum())) - np.repeat(first - grid.cell_offset[cell[part]], some)
+            pick = grid.cell_seg[item]
+            gap, side, along = _measure(grid, pick, np.repeat(points[rows], some, axis=0))
+            best = np.minimum.reduceat(gap, first)
+            # the first of equally near segments wins: the same on every machine
+            hit = np.flatnonzero(gap == np.repeat(best, some))
+            owner = np.searchsorted(first, hit, side="right") - 1
+            _, unique = np.unique(owner, return_index=True)
+            hit = hit[unique]
+            near = best <= MARGIN
+            rows, hit = rows[near], hit[near]
+            lane[rows], s[rows] = grid.seg_lane[pick[hit]], along[hit]
+            lateral[rows], inside[rows] = side[hit], gap[hit] <= 0.0
+            start = stop
+        return Nearest(lane, s, lateral, inside)
+
+    def off_road(self, xy: npt.ArrayLike) -> Bool:
+        """Whether no driving and no parking lane lies under points xy [n, 2]."""
+        return ~self.nearest(xy, DRIVABLE).inside
+
+
+def _measure(grid: Grid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32, F32]:
+    """For pairs of segment and point: distance outside the strip, signed distance (left positive), arc
+    length.""" seg, half = grid.seg[pick], grid.seg_half[pick]
+    ax, ay = seg[:, 0], seg[:, 1]
+    dx, dy = seg[:, 2] - ax, seg[:, 3] - ay
+    px, py = xy[:, 0] - ax, xy[:, 1] - ay
+    square = np.maximum(dx * dx + dy * dy, np.float32(1e-12))
+    t = np.clip((px * dx + py * dy) / square, np.float32(0), np.float32(1))
+    distance = np.hypot(px - t * dx, py - t * dy)
+    gap = distance - (half[:, 0] + t * (half[:, 1] - half[:, 0]))
+    side = np.copysign(distance, dx * py - dy * px)
+    return gap, side, grid.seg_s[pick] + t * np.sqrt(square)
+
+
+def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32]:
+    """seg [M, 4], seg_half [M, 2], seg_lane [M], seg_s [M] of all lanes of the given types, lane by lane."""
+    lane = np.repeat(np.arange(graph.lanes, dtype=np.int32), np.diff(graph.offset))
+    keep = (lane[:-1] == lane[1:]) & np.isin(graph.kind[lane[:-1]], np.asarray(types, np.uint8))
+    i = np.flatnonzero(keep)
+    seg = np.concatenate([graph.xy[i], graph.xy[i + 1]], axis=1)
+    half = 0.5 * np.stack([graph.width[i], graph.width[i + 1]], axis=1)
+    return seg, half.astype(np.float32), lane[i], graph.s[i]
+
+
+def build_grid(graph: LaneGraph, types: Sequence[int], cell: float) -> Grid:
+    """List for each cell the segments that can be nearest to some point of it (see `Grid`)."""
+    seg, half, lane, s = segments(graph, types)
+    if not len(seg):
+        empty = np.zeros(0, np.int32)
+        return Grid(seg, half, lane, s, np.zeros(2, np.int32), empty, (0.0, 0.0), cell, 1, 1)
+    ends = seg.reshape(-1, 2, 2).astype(np.float64)
+    wide = half.max(axis=1).astype(np.float64)
+    reach = wide + MARGIN
+    low = ends.min(axis=1) - reach[:, None]
+    high = ends.max(axis=1) + reach[:, None]
+    origin = np.floor(low.min(axis=0) / cell) * cell
+    nx, ny = (np.floor((high.max(axis=0) - origin) / cell).astype(int) + 1).tolist()
+    first = np.floor((low - origin) / cell).astype(np.int64)
+    span = np.floor((high - origin) / cell).astype(np.int64) - first + 1
+    count = span[:, 0] * span[:, 1]
+    pick = np.repeat(np.arange(len(seg)), count)
+    item = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    ix = first[pick, 0] + item % span[pick, 0]
+    iy = first[pick, 1] + item // span[pick, 0]
+    centre = (np.stack([ix, iy], axis=1) + 0.5) * cell + origin
+    a, d = ends[pick, 0], ends[pick, 1] - ends[pick, 0]
+    p = centre - a
+    t = np.clip((p * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-12), 0.0, 1.0)
+    rest = p - t[:, None] * d
+    away: F64 = np.hypot(rest[:, 0], rest[:, 1])
+    # a point of the cell is at most `corner` from its centre: bounds on its distance from each strip
+    corner = cell * np.sqrt(0.5) + 1e-3
+    narrow = half.min(axis=1).astype(np.float64)
+    least, most = away - wide[pick] - corner, away - narrow[pick] + corner
+    here = iy * nx + ix
+    bound = np.full(nx * ny, np.inf)
+    np.minimum.at(bound, here, most)
+    keep = (least <= MARGIN) & (least <= bound[here])
+    here, pick = here[keep], pick[keep]
+    order = np.lexsort((pick, here))
+    offset = np.concatenate([[0], np.cumsum(np.bincount(here, minlength=nx * ny))]).astype(np.int32)
+    place = (float(origin[0]), float(origin[1]))
+    return Grid(seg, half, lane, s, offset, pick[order].astype(np.int32), place, float(cell), nx, ny)
