@@ -1,0 +1,40 @@
+"""The scenario classes by name."""
+
+from __future__ import annotations
+
+from ssad.errors import ConfigError
+from ssad.registry import resolve
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+
+_HERE = "ssad.scenarios.dynamic.knowledge"
+SCENARIOS: dict[str, str] = {
+    "StraightObstacle": f"{_HERE}.straight_obstacle:SCENARIO",
+    "TurningObstacle": f"{_HERE}.turning_obstacle:SCENARIO",
+    "LaneChanging": f"{_HERE}.lane_changing:SCENARIO",
+    "VehiclePassing": f"{_HERE}.vehicle_passing:SCENARIO",
+    "RedlightRunning": f"{_HERE}.redlight_running:SCENARIO",
+    "UnprotectedLeftTurn": f"{_HERE}.unprotected_left_turn:SCENARIO",
+    "RightTurn": f"{_HERE}.right_turn:SCENARIO",
+    "CrossingNegotiation": f"{_HERE}.crossing_negotiation:SCENARIO",
+    "NaturalJunction": f"{_HERE}.natural_junction:SCENARIO",
+}
+"""Scenario class name -> "module:object", a `ScenarioType`."""
+
+PRECRASH: tuple[str, ...] = tuple(SCENARIOS)[:8]
+"""The eight pre-crash classes, in the order of the paper's table."""
+
+CUSTOM = "Custom"
+"""The type whose scenarios list their actors themselves."""
+
+
+def scenario_type(name: str) -> ScenarioType:
+    """The class of that name, or behind "module:object". UnknownNameError, ConfigError."""
+    found = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
+    if not isinstance(found, ScenarioType):
+        raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(found).__name__}")
+    return found
+
+
+def parameter_box(type_name: str) -> dict[str, Parameter]:
+    """Parameters of a scenario class by name, with range, default and unit. UnknownNameError."""
+    return scenario_type(type_name).box

@@ -1,0 +1,38 @@
+"""Crossing Negotiation: two cars meet where nothing tells who goes first.
+
+SafeBench's NoSignalJunctionCrossingRoute.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, box, meeting_car
+from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import go_when_ego_moves
+from ssad.types import EpisodeAgent, Route, Scenario, SignalPlan
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Car (actor 0) on the crossing road, from the left if there is such an approach."""
+    value = SCENARIO.values(scenario.parameters)
+    phases = go_when_ego_moves(value["speed"], value["trigger_distance"])
+    return meeting_car(
+        SCENARIO, scenario, graph, route, name="crossing car", sides=(FROM_LEFT, FROM_RIGHT), phases=phases
+    )
+
+
+SCENARIO = ScenarioType(
+    name="CrossingNegotiation",
+    title="Crossing Negotiation",
+    nhtsa="The ego meets a crossing car at a junction without signals.",
+    build=build,
+    parameters=box(speed=10.0, trigger_distance=35.0),
+    signals=SignalPlan(ego="off", others="off"),
+    max_distance=150.0,
+)

@@ -1,0 +1,68 @@
+"""Lane Changing: the car ahead brakes hard while another fills the lane to the left.
+
+SafeBench's OtherLeadingVehicle.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.errors import RouteError
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead,
+    bending_route,
+    beside,
+    go,
+    pose_at,
+    scripted,
+    trigger_place,
+)
+from ssad.types import Condition, EpisodeAgent, Phase, Route, Scenario
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Leader (actor 0) in the ego's lane, neighbour (actor 1) to its left. RouteError without that lane."""
+    value = SCENARIO.values(scenario.parameters)
+    reference = trigger_place(graph, scenario, route)
+    front = ahead(graph, reference, value["distance"])
+    side = beside(graph, ahead(graph, reference, value["distance"] + value["gap"]), "left")
+    if side is None:
+        raise RouteError(f"scenario {scenario.name}: LaneChanging needs a lane to the left of the ego's")
+    start = go(value["leader_speed"], value["trigger_distance"])
+    brake = Phase(value["brake_speed"], Condition("travelled", value["brake_after"]))
+    return [
+        scripted("leader", "suv", pose_at(graph, front), [start, brake], bending_route(graph, front)),
+        scripted(
+            "neighbour",
+            "coupe",
+            pose_at(graph, side),
+            [go(value["neighbour_speed"], value["trigger_distance"])],
+            bending_route(graph, side),
+        ),
+    ]
+
+
+SCENARIO = ScenarioType(
+    name="LaneChanging",
+    title="Lane Changing",
+    nhtsa="The ego follows a car that decelerates suddenly; the lane it would evade to is taken.",
+    build=build,
+    parameters=(
+        Parameter(
+            "trigger_distance", 20.0, 50.0, 35.0, "m", "both start when the ego is this near to the leader"
+        ),
+        Parameter("distance", 30.0, 40.0, 35.0, "m", "from the trigger along the lane to the leader"),
+        Parameter("gap", 0.0, 5.0, 1.0, "m", "neighbour ahead of the leader"),
+        Parameter("leader_speed", 8.0, 16.0, 12.0, "m/s", "speed of the leader before it brakes"),
+        Parameter("neighbour_speed", 8.0, 16.0, 12.0, "m/s", "speed of the neighbour"),
+        Parameter("brake_after", 2.0, 20.0, 5.0, "m", "the leader brakes after driving this far"),
+        Parameter("brake_speed", 0.0, 6.0, 2.0, "m/s", "speed that the leader brakes to"),
+    ),
+    max_distance=200.0,
+)

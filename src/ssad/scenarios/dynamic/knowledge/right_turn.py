@@ -1,0 +1,38 @@
+"""Right-turn: a car from the left has green where the ego turns in.
+
+SafeBench's SignalizedJunctionRightTurn.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, box, meeting_car
+from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import go_when_ego_moves
+from ssad.types import EpisodeAgent, Route, Scenario, SignalPlan
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Car (actor 0) from the left, on the road that the ego turns into."""
+    value = SCENARIO.values(scenario.parameters)
+    phases = go_when_ego_moves(value["speed"], value["trigger_distance"])
+    return meeting_car(
+        SCENARIO, scenario, graph, route, name="car from the left", sides=(FROM_LEFT,), phases=phases
+    )
+
+
+SCENARIO = ScenarioType(
+    name="RightTurn",
+    title="Right-turn",
+    nhtsa="The ego turns right at red into a road where a car from the left has green.",
+    build=build,
+    parameters=box(speed=12.0, trigger_distance=35.0),
+    signals=SignalPlan(ego="red", others="green"),
+    max_distance=150.0,
+)

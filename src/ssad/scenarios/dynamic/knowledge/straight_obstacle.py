@@ -1,0 +1,76 @@
+"""Straight Obstacle: a walker steps from behind a vending machine onto the road.
+
+SafeBench's DynamicObjectCrossing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead,
+    go,
+    pose_at,
+    scripted,
+    shifted,
+    standing,
+    to_outermost,
+    trigger_place,
+    width_at,
+    wrap,
+)
+from ssad.types import EpisodeAgent, LaneType, Pose, Route, Scenario
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+_PER_LANE = 1.5  # m further on for each lane between the ego's and the kerb
+_BLOCKER = 0.9  # the vending machine stands at this share of the line from the trigger to the walker
+_LANES = (LaneType.DRIVING, LaneType.SHOULDER, LaneType.PARKING, LaneType.BIKING)
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Walker (actor 0) beside the outermost lane, facing the road; vending machine between it and the ego."""
+    value = SCENARIO.values(scenario.parameters)
+    reference = trigger_place(graph, scenario, route)
+    outer, crossed = to_outermost(graph, reference, kinds=_LANES)
+    in_junction = bool(graph.junction[outer.lane] >= 0)
+    spot = ahead(
+        graph, outer, value["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction
+    )
+    kerb = shifted(pose_at(graph, spot), 0.0, -value["lateral"] * width_at(graph, reference))
+    walker = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + value["yaw"])
+    origin = pose_at(graph, reference)
+    blocker = Pose(
+        origin.x + _BLOCKER * (walker.x - origin.x),
+        origin.y + _BLOCKER * (walker.y - origin.y),
+        wrap(walker.yaw + math.pi),
+    )
+    return [
+        scripted("walker", "walker", walker, [go(value["walker_speed"], value["trigger_distance"])]),
+        standing("vending machine", "vending_machine", blocker),
+    ]
+
+
+SCENARIO = ScenarioType(
+    name="StraightObstacle",
+    title="Straight Obstacle",
+    nhtsa="The ego drives straight and an unseen walker enters the road; it must brake or swerve.",
+    build=build,
+    parameters=(
+        Parameter(
+            "trigger_distance", 15.0, 50.0, 20.0, "m", "the walker starts when the ego is this near to it"
+        ),
+        Parameter("walker_speed", 0.5, 4.0, 2.5, "m/s", "speed of the walker"),
+        Parameter("start_distance", 35.0, 55.0, 45.0, "m", "from the trigger along the lane to the walker"),
+        Parameter(
+            "lateral", 0.0, 1.0, 1.0, "lane widths", "walker to the right of the outermost lane's centre"
+        ),
+        Parameter("yaw", -math.pi / 3, math.pi / 3, 0.0, "rad", "turn of the walker from facing the road"),
+    ),
+    max_distance=150.0,
+)

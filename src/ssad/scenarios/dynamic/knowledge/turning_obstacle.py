@@ -1,0 +1,65 @@
+"""Turning Obstacle: a cyclist crosses just behind the junction where the ego turns.
+
+SafeBench's VehicleTurningRoute.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead,
+    go,
+    junction_span,
+    pose_at,
+    route_place,
+    scripted,
+    shifted,
+    to_outermost,
+    width_at,
+)
+from ssad.types import EpisodeAgent, LaneType, Route, Scenario
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+_PER_LANE = 1.0  # m further on for each lane crossed on the way to the kerb
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Cyclist (actor 0) beside the exit road, facing it."""
+    value = SCENARIO.values(scenario.parameters)
+    _, leave = junction_span(graph, scenario, route)
+    after = ahead(graph, route_place(graph, scenario, route, leave), value["exit_distance"])
+    outer, crossed = to_outermost(graph, after, kinds=(LaneType.DRIVING, LaneType.PARKING))
+    spot = ahead(graph, outer, _PER_LANE * crossed + value["longitudinal"])
+    kerb = shifted(pose_at(graph, spot), 0.0, -value["lateral"] * width_at(graph, spot))
+    cyclist = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + value["yaw"])
+    return [scripted("cyclist", "bicycle", cyclist, [go(value["speed"], value["trigger_distance"])])]
+
+
+SCENARIO = ScenarioType(
+    name="TurningObstacle",
+    title="Turning Obstacle",
+    nhtsa="The ego turns at a junction and finds an unseen cyclist crossing the road that it enters.",
+    build=build,
+    parameters=(
+        Parameter(
+            "trigger_distance", 10.0, 50.0, 20.0, "m", "the cyclist starts when the ego is this near to it"
+        ),
+        Parameter("speed", 2.0, 12.0, 10.0, "m/s", "speed that the cyclist accelerates to"),
+        Parameter(
+            "exit_distance", 2.0, 20.0, 8.0, "m", "from the junction's exit along the route to the cyclist"
+        ),
+        Parameter("longitudinal", -5.0, 5.0, 0.0, "m", "shift along the exit road"),
+        Parameter(
+            "lateral", 0.0, 2.0, 1.0, "lane widths", "cyclist to the right of the outermost lane's centre"
+        ),
+        Parameter("yaw", -math.pi, math.pi, 0.0, "rad", "turn of the cyclist from facing the road"),
+    ),
+    max_distance=180.0,
+)

@@ -1,0 +1,69 @@
+"""Vehicle Passing: a parked car blocks the lane and another comes up beside it.
+
+SafeBench's ManeuverOppositeDirection.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssad.errors import RouteError
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import (
+    ahead,
+    bending_route,
+    beside,
+    go,
+    pose_at,
+    scripted,
+    standing,
+    trigger_place,
+)
+from ssad.types import EpisodeAgent, Route, Scenario
+
+if TYPE_CHECKING:
+    from ssad.roads.graph import LaneGraph
+
+
+def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
+    """Parked car (actor 0) in the ego's lane, oncoming car (actor 1) in the lane to the left."""
+    value = SCENARIO.values(scenario.parameters)
+    reference = trigger_place(graph, scenario, route)
+    parked = ahead(graph, reference, value["distance"])
+    side = beside(graph, ahead(graph, reference, value["distance"] + value["gap"]), "left")
+    if side is None:
+        raise RouteError(f"scenario {scenario.name}: VehiclePassing needs a lane to the left of the ego's")
+    return [
+        standing("parked car", "compact", pose_at(graph, parked)),
+        scripted(
+            "oncoming car",
+            "compact",
+            pose_at(graph, side),
+            [go(value["speed"], value["trigger_distance"])],
+            bending_route(graph, side),
+        ),
+    ]
+
+
+SCENARIO = ScenarioType(
+    name="VehiclePassing",
+    title="Vehicle Passing",
+    nhtsa="The ego's lane is blocked; to pass it must use the opposite lane, where a car comes towards it.",
+    build=build,
+    parameters=(
+        Parameter(
+            "trigger_distance",
+            20.0,
+            60.0,
+            45.0,
+            "m",
+            "the car starts when the ego is this near to the parked one",
+        ),
+        Parameter("distance", 40.0, 60.0, 50.0, "m", "from the trigger along the lane to the parked car"),
+        Parameter("gap", 20.0, 40.0, 30.0, "m", "oncoming car behind the parked one, along the ego's lane"),
+        Parameter("speed", 6.0, 10.0, 8.0, "m/s", "speed of the oncoming car"),
+    ),
+    max_distance=200.0,
+)

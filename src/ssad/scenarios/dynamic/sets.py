@@ -1,0 +1,95 @@
+"""Which scenarios a name means: shipped sets, imported sets, single scenarios, types, files and folders."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from ssad.errors import ConfigError, unknown_name
+from ssad.safeio import home
+from ssad.scenarios.dynamic.catalog import SCENARIOS
+from ssad.scenarios.dynamic.yamlio import read_scenarios
+from ssad.types import Scenario
+
+DATA = Path(__file__).parent / "data"
+IMPORTED = ("safebench", "frea")
+"""Sets that a user imports from SafeBench's and FREA's folders."""
+_TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
+_SUFFIXES = (".yaml", ".yml")
+
+
+def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
+    """The scenarios that `ref` names, in their order.
+
+    A set (precrash, natural, natural-twinford, natural-crossgate, or one that was imported, such as
+    safebench, frea), a scenario ("StraightObstacle/00"), a scenario class, a YAML file, or a folder of YAML
+    files. UnknownNameError shows the three closest names.
+    """
+    path = Path(ref)
+    if isinstance(ref, Path) or path.suffix in _SUFFIXES or path.is_dir():
+        return _from_path(path)
+    if ref in _TOWN_SETS:
+        name, town = _TOWN_SETS[ref]
+        return tuple(s for s in _cached(DATA / f"{name}.yaml") if s.town == town)
+    files = set_files()
+    if ref in files:
+        return _cached(files[ref])
+    if ref in IMPORTED:
+        raise ConfigError(
+            f"scenario set '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER"
+        )
+    shipped = [s for name in ("precrash", "natural") for s in _cached(files[name])]
+    if ref in SCENARIOS:
+        return tuple(s for s in shipped if s.type == ref)
+    everything = {s.name: s for s in shipped}
+    if ref not in everything:
+        for file in files.values():
+            everything.update((s.name, s) for s in _cached(file))
+    if ref in everything:
+        return (everything[ref],)
+    raise unknown_name("scenario", str(ref), [*set_names(), *SCENARIOS, *everything])
+
+
+def set_files() -> dict[str, Path]:
+    """Set name -> YAML file: the shipped sets, then the imported ones."""
+    found = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
+    return found | {name: DATA / f"{name}.yaml" for name in ("precrash", "natural")}
+
+
+def set_names() -> tuple[str, ...]:
+    """Names of all sets that can be loaded now."""
+    return tuple(sorted({*set_files(), *_TOWN_SETS}))
+
+
+def _from_path(path: Path) -> tuple[Scenario, ...]:
+    if not path.is_dir():
+        return read_scenarios(path)
+    files = sorted(file for file in path.iterdir() if file.suffix in _SUFFIXES)
+    if not files:
+        raise ConfigError(f"{path}: no scenario files (*.yaml) in this folder")
+    result: list[Scenario] = []
+    names: dict[str, Path] = {}
+    for file in files:
+        for scenario in read_scenarios(file):
+            if scenario.name in names:
+                raise ConfigError(
+                    f"{file}: scenario name '{scenario.name}' is in {names[scenario.name].name} too"
+                )
+            names[scenario.name] = file
+            result.append(scenario)
+    return tuple(result)
+
+
+def _cached(path: Path) -> tuple[Scenario, ...]:
+    """Scenarios of a set's file; parsed once while the file stays the same."""
+    try:
+        state = os.stat(path)
+    except OSError:
+        return read_scenarios(path)
+    return _parsed(str(path), state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=16)
+def _parsed(path: str, modified: int, size: int) -> tuple[Scenario, ...]:
+    return read_scenarios(path)
