@@ -68,8 +68,8 @@ def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
 
 
 def _point_to_box(points: Floats, half: Floats) -> Floats:
-    """Least distance [...] of points [..., 4, 2] from the box of half extents half [..., 1, 2] at the
-    origin.""" outside = np.maximum(np.abs(points) - half, 0.0)
+    """Least distance [...] of points [..., 4, 2] from the box of half extents [..., 1, 2] at the origin."""
+    outside = np.maximum(np.abs(points) - half, 0.0)
     return np.asarray(np.hypot(outside[..., 0], outside[..., 1]).min(axis=-1))
 
 

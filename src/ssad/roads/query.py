@@ -128,8 +128,8 @@ class LaneQuery:
 
 
 def _measure(grid: Grid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32, F32]:
-    """For pairs of segment and point: distance outside the strip, signed distance (left positive), arc
-    length.""" seg, half = grid.seg[pick], grid.seg_half[pick]
+    """For pairs of segment and point: distance outside the strip, signed distance (left +), arc length."""
+    seg, half = grid.seg[pick], grid.seg_half[pick]
     ax, ay = seg[:, 0], seg[:, 1]
     dx, dy = seg[:, 2] - ax, seg[:, 3] - ay
     px, py = xy[:, 0] - ax, xy[:, 1] - ay
