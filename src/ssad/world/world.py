@@ -127,7 +127,7 @@ class World:
         pairs = self.batch * self.agents * max(self.agents - 1, 1)
         self.work.pair = wp.zeros(pairs, dtype=wp.int32, device=device)
         # one thread walks the list on CPU; on CUDA enough to fill the device
-        workers = 1 if device == "cpu" else min(pairs, 1 << 18)
+        workers = 1 if device == "cpu" else min(pairs, 1 << 21)
         self._kinds = agent_kinds(self.bank)
         self._assign(order.astype(np.int32))
         flat = (self.batch, self.agents)
