@@ -131,9 +131,7 @@ def highway(repeats: int, steps: int) -> dict[str, float]:
 
 def main() -> None:
     """Print a table and, with --json, write the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, nargs="*", default=None)
     parser.add_argument("--no-highway", action="store_true")

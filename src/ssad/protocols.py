@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import numpy.typing as npt
 
 from ssad.types import F32, I32, Bool, Controller, Episode
@@ -71,7 +72,12 @@ class World(Protocol):
     agents: int
     episodes: tuple[Episode, ...]
 
-    def reset(self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None) -> None:
+    def reset(
+        self,
+        scenes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
+        *,
+        episodes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
+    ) -> None:
         """Start scenes again (default: all), with other episodes if given."""
 
     def step(self, actions: npt.ArrayLike | None = None) -> None:

@@ -1,4 +1,4 @@
-"""The feasibility witness: avoidable stays avoidable, unavoidable is called so, and the named driver really is clear."""
+"""The feasibility witness: verdicts on plain cases, and the driver it names really stays clear."""
 
 from __future__ import annotations
 

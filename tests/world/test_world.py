@@ -104,11 +104,12 @@ def test_fast_crossing_is_not_tunnelled() -> None:
 
 def test_autopilot_stops_behind_a_standing_car_and_follows_a_slow_one() -> None:
     standing = EpisodeAgent("s", "car", Controller.NONE, Pose(80.0, 0.0, 0.0))
-    slow = EpisodeAgent(
-        "m", "car", Controller.FOLLOW, Pose(40.0, 0.0, 0.0), 3.0, 3.0, route=line_route(40.0, 390.0)
-    )
+    slow = EpisodeAgent("m", "car", Controller.FOLLOW, Pose(40.0, 0.0, 0.0), 3.0, 3.0, route=line_route(40.0, 390.0))
     world = World(
-        [episode(ego(controller=Controller.AUTOPILOT), standing), episode(ego(controller=Controller.AUTOPILOT), slow)],
+        [
+            episode(ego(controller=Controller.AUTOPILOT), standing),
+            episode(ego(controller=Controller.AUTOPILOT), slow),
+        ],
         GRAPHS,
     )
     for _ in range(250):
@@ -207,10 +208,20 @@ def test_limits_end_an_episode() -> None:
 
 def bank() -> list:
     walker = EpisodeAgent(
-        "w", "walker", Controller.SCRIPT, Pose(40.0, -4.0, np.pi / 2), phases=(Phase(1.5, Condition("ego_speed", 2.0)),)
+        "w",
+        "walker",
+        Controller.SCRIPT,
+        Pose(40.0, -4.0, np.pi / 2),
+        phases=(Phase(1.5, Condition("ego_speed", 2.0)),),
     )
     traffic = EpisodeAgent(
-        "t", "truck", Controller.AUTOPILOT, Pose(100.0, 3.5, np.pi), 4.0, 8.0, route=line_route(100.0, 5.0, 3.5)
+        "t",
+        "truck",
+        Controller.AUTOPILOT,
+        Pose(100.0, 3.5, np.pi),
+        4.0,
+        8.0,
+        route=line_route(100.0, 5.0, 3.5),
     )
     return [
         episode(ego(speed=5.0), key="a"),
@@ -222,9 +233,7 @@ def bank() -> list:
 
 def test_world_keeps_its_promises() -> None:
     episodes = bank()
-    check_world(
-        lambda assign: World(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL), episodes=len(episodes)
-    )
+    check_world(lambda assign: World(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL), episodes=len(episodes))
 
 
 def test_check_world_catches_a_world_that_depends_on_its_batch() -> None:
@@ -237,7 +246,8 @@ def test_check_world_catches_a_world_that_depends_on_its_batch() -> None:
 
     with pytest.raises(AssertionError, match="a scene alone gives the bits"):
         check_world(
-            lambda assign: Leaky(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL), episodes=len(episodes)
+            lambda assign: Leaky(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL),
+            episodes=len(episodes),
         )
 
 

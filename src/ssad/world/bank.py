@@ -70,9 +70,7 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     )
 
 
-def _stop_lines(
-    route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]
-) -> None:
+def _stop_lines(route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]) -> None:
     """Fill `stop` (m ahead) and `signal` for every route point from the graph's stop lines on the route's lanes."""
     marks: list[tuple[float, int]] = []
     for k, lane in enumerate(graph.stop_lane):
@@ -103,7 +101,8 @@ def _junctions(
     entry = np.full(n, FAR)
     rank = np.zeros(n)
     edge = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
-    for start, stop in list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))[::-1]:
+    runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
+    for start, stop in reversed(list(runs)):
         turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
         kind = 0.0 if abs(turn) < TURN else (2.0 if turn > 0 else 1.0)
         entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
@@ -114,15 +113,15 @@ def _junctions(
 
 
 def signal_programs(graph: LaneGraph) -> F32:
-    """[S, 4] cycle, start of green, green, yellow in s: the phases of a junction take turns; virtual signals are off."""
+    """[S, 4] cycle, start of green, green, yellow in s: a junction's phases take turns; virtual signals are off."""
     out = np.zeros((len(graph.signal_phase), 4), np.float32)
     for order, junction in enumerate(np.unique(graph.signal_junction)):
         mine = np.flatnonzero((graph.signal_junction == junction) & ~graph.signal_virtual)
-        phases = {p: k for k, p in enumerate(np.unique(graph.signal_phase[mine]))}
+        phases = {int(p): k for k, p in enumerate(np.unique(graph.signal_phase[mine]).tolist())}
         one = GREEN + YELLOW + ALL_RED
         cycle = one * max(len(phases), 2)  # a lone phase still shows red now and then
         for s in mine:
-            begin = (phases[graph.signal_phase[s]] * one + 5.0 * order) % cycle
+            begin = (phases[int(graph.signal_phase[s])] * one + 5.0 * order) % cycle
             out[s] = cycle, begin, GREEN, YELLOW
     return out
 
@@ -155,7 +154,7 @@ def _check(episode: Episode) -> None:
         raise ConfigError(f"episode {episode.key}: the ego needs a route of at least two points")
 
 
-def _put_agent(
+def _put_agent(  # noqa: PLR0917
     a: dict[str, npt.NDArray[np.generic]],
     e: int,
     i: int,
@@ -185,8 +184,8 @@ def build(
         _check(episode)
     towns = sorted({e.town for e in episodes})
     count = max(len(e.agents) for e in episodes)
-    phases = max(1, max(len(a.phases) for e in episodes for a in e.agents))
-    signals = max(1, max(len(graphs[t].signal_phase) for t in towns))
+    phases = max(1, *(len(a.phases) for e in episodes for a in e.agents))
+    signals = max(1, *(len(graphs[t].signal_phase) for t in towns))
     names = {name: k for k, name in enumerate(MODELS)}
     shape = (len(episodes), count)
     a: dict[str, npt.NDArray[np.generic]] = {

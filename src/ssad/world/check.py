@@ -74,9 +74,7 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
     kept = world.snapshot()
     _run(world, order, 5, first=1000)
     world.restore(kept)
-    _need(
-        _run(world, order, steps - half, first=half) == told[half:], "a restored snapshot continues as before"
-    )
+    _need(_run(world, order, steps - half, first=half) == told[half:], "a restored snapshot continues as before")
 
     world = make(order)
     _run(world, order, half)

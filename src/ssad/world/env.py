@@ -147,7 +147,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
 
-class SingleEnv(gym.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class SingleEnv(gym.Env[Any, Any]):
     """One scene of the same world; reset draws the episode from its seeded generator."""
 
     metadata = {"render_modes": []}  # noqa: RUF012

@@ -17,7 +17,7 @@ STEER_TIME = 0.5
 REVERSE_SPEED = 5.0
 
 
-def _vehicle(
+def _vehicle(  # noqa: PLR0917
     name: str, kind: AgentKind, size: tuple[float, float, float], accel: float, brake: float, speed: float
 ) -> Model:
     return Model(name, kind, *size, 0.58 * size[0], _STEER, accel, brake, speed)

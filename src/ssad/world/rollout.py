@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -105,7 +106,9 @@ def _trace(world: World, rows: list[dict[str, npt.NDArray[np.generic]]], b: int,
     models = world.bank.model.numpy()[b, :n]
     body = world.bank.body.numpy()[models]
     agent = {name: np.stack([row[name][b, :n] for row in rows[:steps]]) for name in _AGENT}
-    ego = {name: np.array([row[name][b] for row in rows[:steps]], dtype) for name, dtype in _EGO.items()}
+    ego: dict[str, npt.NDArray[Any]] = {
+        name: np.array([row[name][b] for row in rows[:steps]], dtype) for name, dtype in _EGO.items()
+    }
     times = np.arange(steps) * world.dt
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built

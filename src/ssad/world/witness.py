@@ -81,9 +81,7 @@ def _drive(ego: EpisodeAgent, m: Manoeuvre, place: float) -> EpisodeAgent:
         Phase(m.speed, Condition("time", m.start)),
         Phase(cruise, Condition("time", m.start + m.hold)),
     )
-    return replace(
-        ego, controller=Controller.FOLLOW, phases=phases, route=shifted(ego.route, place, m.offset)
-    )
+    return replace(ego, controller=Controller.FOLLOW, phases=phases, route=shifted(ego.route, place, m.offset))
 
 
 def _manoeuvres(start: float, target: float) -> Iterator[Manoeuvre]:

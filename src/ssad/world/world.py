@@ -13,7 +13,7 @@ import warp as wp
 
 from ssad.errors import ConfigError
 from ssad.roads.graph import LaneGraph
-from ssad.types import I32, Controller, Episode, SignalState
+from ssad.types import Controller, Episode, SignalState
 from ssad.world.bank import agent_kinds, build, signal_programs
 from ssad.world.kernels.data import HORIZON, Ego, State, Work
 from ssad.world.kernels.drive import drive, meet, sight
@@ -86,7 +86,7 @@ class World:
         episodes: Sequence[Episode],
         graphs: Mapping[str, LaneGraph],
         *,
-        assign: Sequence[int] | I32 | None = None,
+        assign: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
         device: str = "cpu",
         dt: float = 0.1,
         substeps: int = 2,
@@ -160,7 +160,7 @@ class World:
         """A recorded launch: its arguments are packed once."""
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
 
-    def _assign(self, order: I32) -> None:
+    def _assign(self, order: npt.NDArray[np.int32]) -> None:
         self.state.episode.assign(order)
         self.kind = self._kinds[order]
 
@@ -171,7 +171,10 @@ class World:
         return out
 
     def reset(
-        self, scenes: Sequence[int] | I32 | None = None, *, episodes: Sequence[int] | I32 | None = None
+        self,
+        scenes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
+        *,
+        episodes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
     ) -> None:
         """Start the given scenes (default: all) again, with other episodes of the bank if given."""
         which = np.arange(self.batch) if scenes is None else np.asarray(scenes, np.int64)
@@ -241,7 +244,7 @@ class World:
         """`SignalState` of every signal of the scene's town at its present time, [S]."""
         episode = self.episodes[int(self.array("episode")[scene])]
         time = float(self.array("step")[scene]) * self.dt
-        return signal_states(episode, self.graphs[episode.town], np.array([time]))[0]
+        return signal_states(episode, self.graphs[episode.town], np.array([time])).reshape(-1)
 
     def snapshot(self) -> Snapshot:
         """Copy of all that changes."""
@@ -269,18 +272,12 @@ class World:
             for a in arrays:
                 row = a[b]
                 # empty slots that only the batch's widest scene needs do not count
-                h.update(
-                    np.ascontiguousarray(
-                        row[live] if np.ndim(row) and len(row) == len(live) else row
-                    ).tobytes()
-                )
+                h.update(np.ascontiguousarray(row[live] if np.ndim(row) and len(row) == len(live) else row).tobytes())
             out.append(h.hexdigest())
         return out
 
 
-def signal_states(
-    episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]
-) -> npt.NDArray[np.uint8]:
+def signal_states(episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
     """`SignalState` [T, S] of a town's signals at `times` [T] s: the host's twin of kernels.shared.signal_state."""
     programs = signal_programs(graph)
     out = np.zeros((len(times), len(programs)), np.uint8)

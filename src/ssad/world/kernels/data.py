@@ -35,9 +35,7 @@ class Roads:
 
     path: wp.array(dtype=wp.vec4)  # [N] x, y, yaw, curvature
     rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, turn rank there
-    bend: wp.array(
-        dtype=wp.float32
-    )  # [N] m that the next 64 m of path leave the straight line along its heading
+    bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
     segment_half: wp.array(dtype=wp.vec2)  # [M] half widths at both ends
@@ -73,9 +71,7 @@ class State:
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
-    lateral: wp.array2d(
-        dtype=wp.vec2
-    )  # [B, A] m left of that lane's centre line, half width of the lane there
+    lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
     touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Bank, Roads, State
+from ssad.world.kernels.data import FAR, Bank, Roads
 
 OFF = wp.constant(0)
 RED = wp.constant(1)
