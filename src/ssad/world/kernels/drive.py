@@ -106,8 +106,8 @@ def lead_gap(
     """
     q = state.pose[b, j]
     u = wp.clamp(lon, 0.0, SIGHT)
-    lateral = 0.0
-    rest = 0.0
+    lateral = float(0.0)
+    rest = float(0.0)
     at = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(4):
         at = route_frame(roads, route[0], route[1], u0 + u)
@@ -191,7 +191,7 @@ def conflict_gap(
     none); they are compared at the same time and half a second to either side.
     """
     gap = FAR
-    u = 0.0
+    u = float(0.0)
     w = v
     reach = own[0] + other[0] + 2.0
     reach2 = reach * reach
@@ -274,7 +274,7 @@ def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: f
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
     target = wp.min(bank.cruise[e, i][0], cap)
     state.aim[b, i] = wp.vec2(float(at) + part, target)
-    react = 0.0
+    react = float(0.0)
 
     index = roads.path_signal[first]
     if index >= 0:
@@ -321,13 +321,13 @@ def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: f
                 facing = wp.cos(turn)
                 # across straight lanes only the width of an aligned body counts
                 wide = own[1] + other[0] * wp.abs(wp.sin(turn)) + other[1] * wp.abs(facing) + 1.0
-                flags = 0
+                flags = int(0)
                 near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
                 if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
                     flags = 1
                 if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5):
                     # who is behind and goes my way keeps its distance itself
-                    bend_j = 0.0
+                    bend_j = float(0.0)
                     reach = wide
                     if bank.route[e, j][1] > 1:
                         bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
@@ -363,8 +363,8 @@ def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, worker
         other = bank.body[bank.model[e, j]]
         walks = bank.kind[bank.model[e, j]] == HALF_WALKER
         aim = state.aim[b, i]
-        react = 0.0
-        leads = 0
+        react = float(0.0)
+        leads = int(0)
         if flags != 2:
             c = wp.cos(pose[2])
             s = wp.sin(pose[2])
@@ -383,8 +383,9 @@ def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, worker
             if walks:
                 margin = 1.0
             gap = conflict_gap(roads, state, b, j, route, aim[0], v, aim[1], own, other, margin)
-            if gap < FAR and (gap < 0.5 * v or not has_priority(bank, roads, state, b, i, j, e)):
-                react = wp.min(react, idm_gap(v, 0.0, gap))
+            if gap < FAR:
+                if gap < 0.5 * v or not has_priority(bank, roads, state, b, i, j, e):
+                    react = wp.min(react, idm_gap(v, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)
         slot = slot + workers
@@ -409,7 +410,7 @@ def drive(bank: Bank, roads: Roads, state: State, dt: float):
     count = bank.phase_count[e, i]
     if count > 0:
         n = state.phase[b, i]
-        go = 1
+        go = int(1)
         while n < count and go == 1:
             if condition_holds(state, b, i, bank.phase_when[e, i, n], time):
                 n = n + 1
@@ -425,11 +426,11 @@ def drive(bank: Bank, roads: Roads, state: State, dt: float):
     elif who == C_SCRIPT:
         if count == 0:
             target = 0.0
-        steer = 0.0
+        steer = float(0.0)
         if bank.route[e, i][1] > 1:
             steer = steer_on_route(bank, roads, state, b, i, e, v)
-        throttle = 0.0
-        brake = 1.0
+        throttle = float(0.0)
+        brake = float(1.0)
         if bank.kind[m] == HALF_WALKER:
             throttle = target / power[2]
             brake = 0.0
@@ -437,9 +438,9 @@ def drive(bank: Bank, roads: Roads, state: State, dt: float):
             throttle = 1.0
             brake = 0.0
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
-    elif who in (C_AUTOPILOT, C_FOLLOW):
-        steer = 0.0
-        accel = 0.0
+    elif who == C_AUTOPILOT or who == C_FOLLOW:
+        steer = float(0.0)
+        accel = float(0.0)
         if bank.route[e, i][1] > 1:
             steer = steer_on_route(bank, roads, state, b, i, e, v)
         if who == C_AUTOPILOT:

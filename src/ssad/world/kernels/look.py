@@ -66,11 +66,11 @@ def look(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, out: wp.
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     body = bank.body[bank.model[e, 0]]
-    hazard = 0.0
-    first = -1
-    second = -1
-    d_first = 625.0
-    d_second = 625.0
+    hazard = float(0.0)
+    first = int(-1)
+    second = int(-1)
+    d_first = float(625.0)
+    d_second = float(625.0)
     lane = state.lane[b, 0]
     for j in range(1, agents):
         if state.active[b, j] != 0:
@@ -103,15 +103,15 @@ def look(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, out: wp.
     put_agent(bank, state, out, b, e, first, 10, pose)
     put_agent(bank, state, out, b, e, second, 16, pose)
     a = roads.path[route[0] + wp.min(at + 2, last)]
-    n = 11
-    found = 0
+    n = int(11)
+    found = int(0)
     z = roads.path[route[0] + wp.min(at + 2 + n, last)]
     while n > 1 and found == 0:
         z = roads.path[route[0] + wp.min(at + 2 + n, last)]
         zx = z[0] - a[0]
         zy = z[1] - a[1]
         norm = wp.max(wp.sqrt(zx * zx + zy * zy), 1.0e-6)
-        worst = 0.0
+        worst = float(0.0)
         for k in range(1, n):
             m = roads.path[route[0] + wp.min(at + 2 + k, last)]
             worst = wp.max(worst, wp.abs(zx * (m[1] - a[1]) - zy * (m[0] - a[0])) / norm)

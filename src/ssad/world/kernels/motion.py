@@ -47,7 +47,10 @@ def bicycle(
         before = v
         v = v + push * h
         drag = brake * power[1] * h
-        v = wp.max(v - drag, 0.0) if v > 0.0 else wp.min(v + drag, 0.0)
+        if v > 0.0:
+            v = wp.max(v - drag, 0.0)
+        else:
+            v = wp.min(v + drag, 0.0)
         v = wp.clamp(v, -REVERSE_LIMIT, power[2])
         mean = 0.5 * (before + v)
         slip = wp.atan(0.5 * wp.tan(w))
@@ -93,14 +96,15 @@ def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec
         pose = wp.vec3(pose[0] + go * wp.cos(pose[2]), pose[1] + go * wp.sin(pose[2]), pose[2])
         state.travelled[b, i] = state.travelled[b, i] + wp.abs(go)
         speed = after
-    elif power[2] > 0.0 and (speed != 0.0 or control[0] > 0.0):
-        out = bicycle(pose, speed, state.wheel[b, i], control, bank.body[m], power, dt, substeps)
-        moved = wp.vec3(out[0], out[1], out[2])
-        d = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
-        state.travelled[b, i] = state.travelled[b, i] + d
-        pose = moved
-        speed = out[3]
-        state.wheel[b, i] = out[4]
+    elif power[2] > 0.0:
+        if speed != 0.0 or control[0] > 0.0:
+            out = bicycle(pose, speed, state.wheel[b, i], control, bank.body[m], power, dt, substeps)
+            moved = wp.vec3(out[0], out[1], out[2])
+            d = wp.length(wp.vec2(moved[0] - pose[0], moved[1] - pose[1]))
+            state.travelled[b, i] = state.travelled[b, i] + d
+            pose = moved
+            speed = out[3]
+            state.wheel[b, i] = out[4]
     state.pose[b, i] = pose
     state.speed[b, i] = speed
 
@@ -108,7 +112,7 @@ def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec
     route = bank.route[e, i]
     at = state.progress[b, i]
     if route[1] > 1:
-        best = 1.0e12
+        best = float(1.0e12)
         found = at
         last = wp.min(at + 12, route[1] - 1)
         k = at

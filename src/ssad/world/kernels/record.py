@@ -92,8 +92,8 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
     now = state.touch[b, 0]
     fresh = now & (~ego.touching[b])
     ego.touching[b] = now
-    kinds = 0
-    other = -1
+    kinds = int(0)
+    other = int(-1)
     if fresh != wp.int64(0):
         for j in range(1, agents):
             if ((fresh >> wp.int64(j)) & wp.int64(1)) == wp.int64(1):
@@ -105,12 +105,12 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
 
     # road
     lane = state.lane[b, 0]
-    off = 0
+    off = int(0)
     if lane < 0:
         off = 1
     ego.off_road[b] = off
-    over = 0
-    inside = 0
+    over = int(0)
+    inside = int(0)
     if lane >= 0:
         inside = roads.lane_junction[lane]
         side = state.lateral[b, 0]
@@ -118,7 +118,7 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
             over = 1
     elif ego.over_line[b] == 1 or off == 1:
         over = 1
-    ego.invasion[b] = 0
+    ego.invasion[b] = int(0)
     if over == 1 and ego.over_line[b] == 0:
         ego.invasion[b] = 1
     ego.over_line[b] = over
@@ -165,7 +165,7 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
     c = wp.cos(p[2])
     s = wp.sin(p[2])
     left = -s * (pose[0] - p[0]) + c * (pose[1] - p[1])
-    ran = 0
+    ran = int(0)
     back = near - int(body[0] + 1.0)
     if back >= 0 and wp.abs(left) < 4.0:
         rule = roads.rule[route[0] + back]
@@ -234,7 +234,7 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
     state.lane[b, i] = -1
     state.aim[b, i] = wp.vec2(0.0, 0.0)
     state.react[b, i] = 0.0
-    awake = 2
+    awake = int(2)
     if bank.model[e, i] < 0:
         awake = 0
     elif bank.cruise[e, i][1] > 0.0:
