@@ -55,8 +55,9 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     kernel = np.ones(3) / 3.0
     smooth = np.convolve(np.pad(kappa, 1, mode="edge"), kernel, mode="valid")
     cap = np.minimum(route.speed_limit, np.sqrt(LATERAL_COMFORT / np.maximum(np.abs(smooth), 1e-4)))
-    for k in range(n - 2, -1, -1):
-        cap[k] = min(cap[k], np.sqrt(cap[k + 1] ** 2 + 2.0 * SLOW_DOWN * route.spacing))
+    # v^2 may fall by 2 a a metre: the least over all points ahead, in one sweep
+    fall = 2.0 * SLOW_DOWN * route.spacing * np.arange(n)
+    cap = np.sqrt(np.minimum.accumulate((cap.astype(np.float64) ** 2 + fall)[::-1])[::-1] - fall)
     stop = np.full(n, FAR)
     signal = np.full(n, -1, np.int32)
     _stop_lines(route, graph, stop, signal)
@@ -73,10 +74,9 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
 def _stop_lines(route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]) -> None:
     """Fill `stop` (m ahead) and `signal` for every route point from the graph's stop lines on the route's lanes."""
     marks: list[tuple[float, int]] = []
-    for k, lane in enumerate(graph.stop_lane):
+    for k in np.flatnonzero(np.isin(graph.stop_lane, route.lane)).tolist():
+        lane = int(graph.stop_lane[k])
         on = np.flatnonzero(route.lane == lane)
-        if not len(on):
-            continue
         a, b = int(graph.offset[lane]), int(graph.offset[lane + 1])
         at = [np.interp(graph.stop_s[k], graph.s[a:b], graph.xy[a:b, d]) for d in (0, 1)]
         i = int(on[np.argmin(np.hypot(*(route.xy[on] - at).T))])
