@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from ssad.errors import FormatError
-from ssad.safeio import read_json, read_xml
+from ssad.safeio import dotted, read_json, read_xml
 from ssad.scenarios.dynamic.catalog import PRECRASH
-from ssad.scenarios.dynamic.schema import check
+from ssad.scenarios.dynamic.schema import problems
 from ssad.types import Pose, Scenario
 
 NATURAL_ID = 9
@@ -173,7 +173,12 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
     )
     if kind in _PLACED and not scenario.placements:
         raise FormatError(f"{path}: its trigger names no other actor, which {kind} needs")
-    check(scenario)
+    return _checked(scenario, path)
+
+
+def _checked(scenario: Scenario, path: Path) -> Scenario:
+    for location, message in problems(scenario):
+        raise FormatError(f"{path}: {dotted(location)}: {message}")
     return scenario
 
 
@@ -231,8 +236,7 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
                     source=f"leaderboard route {road.ident} of {path.name}",
                 )
                 count[event.type] += 1
-                check(scenario)
-                result.append(scenario)
+                result.append(_checked(scenario, path))
     if not result:
         raise FormatError(f"{folder}: no trigger lies on any route (2 m, 10 degrees)")
     return tuple(result)

@@ -1,0 +1,198 @@
+"""Import of SafeBench, FREA and leaderboard folders: the real ones, and broken ones."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssad.errors import FormatError
+from ssad.scenarios.dynamic import PRECRASH, import_routes, load_scenarios, save_scenarios
+from ssad.types import Pose
+
+ROUTE = (
+    '<routes><route id="0" town="T"><waypoint x="0" y="10" yaw="0" z="0"/>'
+    '<waypoint x="50" y="10" yaw="0"/><waypoint x="60" y="20" yaw="90"/></route></routes>'
+)
+TRANSFORM = {"x": "20.5", "y": 10.5, "yaw": "365.0", "z": "0"}
+
+
+def event(**changes: Any) -> dict[str, Any]:
+    other = {"left": [{"x": "60", "y": "0", "yaw": "90"}], "front": [{"x": 80, "y": 12, "yaw": 180}]}
+    return {"transform": TRANSFORM, "other_actors": other, **changes}
+
+
+def make(
+    folder: Path,
+    *,
+    entries: Any = None,
+    events: Any = None,
+    route: str = ROUTE,
+    name: str = "OppositeVehicleRunningRedLight",
+) -> Path:
+    """A SafeBench folder with one scenario of kind 5."""
+    if entries is None:
+        entries = [{"data_id": 0, "scenario_id": 5, "route_id": 3, "risk_level": None, "parameters": None}]
+    configurations = {"available_event_configurations": [event()] if events is None else events}
+    table = {"available_scenarios": [{"T": [{**configurations, "scenario_name": name}]}]}
+    for path, text in {
+        "scenario_type/standard.json": json.dumps(entries),
+        "route/scenarios/scenario_05.json": json.dumps(table),
+        "route/scenario_05_routes/scenario_05_route_03.xml": route,
+    }.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    return folder
+
+
+def test_frames_are_converted(tmp_path: Path) -> None:
+    (s,) = import_routes(make(tmp_path))
+    assert (s.name, s.type, s.town) == ("safebench/RedlightRunning/03", "RedlightRunning", "T")
+    assert s.route == (Pose(0, -10), Pose(50, -10), Pose(60, -20, -math.pi / 2))
+    assert s.trigger is not None
+    assert (s.trigger.x, s.trigger.y) == (20.5, -10.5)
+    assert s.trigger.yaw == pytest.approx(-math.radians(5.0))
+    # front comes before left, as the leaderboard reads them
+    assert s.placements[0].yaw == pytest.approx(-math.pi)
+    assert s.placements[1] == Pose(60.0, 0.0, -math.pi / 2)
+
+
+def test_the_first_trigger_along_the_route_wins(tmp_path: Path) -> None:
+    def there(x: float, y: float = 10.0, yaw: float = 0.0) -> dict[str, Any]:
+        return event(transform={"x": x, "y": y, "yaw": yaw})
+
+    events = [there(40), there(30), there(10, y=12.5), there(12, yaw=20), there(5, yaw=180)]
+    (s,) = import_routes(make(tmp_path, events=events))
+    assert s.trigger == Pose(30.0, -10.0, 0.0)
+
+
+def test_repetitions_get_seeds_in_the_order_of_data_id(tmp_path: Path) -> None:
+    entries = [{"data_id": i, "scenario_id": 5, "route_id": 3, "parameters": None} for i in (2, 0, 1)]
+    found = import_routes(make(tmp_path, entries=entries))
+    assert [(s.name[-5:], s.seed) for s in found] == [("03/00", 0), ("03/01", 1), ("03/02", 2)]
+
+
+def _write(path: str, text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / path).write_text(text) and None
+
+
+def _remove(path: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / path).unlink()
+
+
+LIST, TABLE = "scenario_type/standard.json", "route/scenarios/scenario_05.json"
+XML = "route/scenario_05_routes/scenario_05_route_03.xml"
+BROKEN: list[tuple[dict[str, Any], Callable[[Path], None] | None, str]] = [
+    ({"entries": []}, None, "the list of episodes is empty"),
+    ({"entries": {}}, None, "expected a list of episodes"),
+    ({"entries": [1]}, None, "entry 0: expected an object"),
+    ({"entries": [{"data_id": 0, "scenario_id": 77, "route_id": 3}]}, None, "unknown scenario_id 77; known: 1 to 9"),
+    ({"entries": [{"data_id": 0, "scenario_id": "5", "route_id": 3}]}, None, "scenario_id should be a whole number"),
+    ({"entries": [{"data_id": 0, "scenario_id": 5}]}, None, "route_id should be a whole number, not None"),
+    (
+        {"entries": [{"data_id": 0, "scenario_id": 5, "route_id": 3, "parameters": [1.0]}]},
+        None,
+        "parameters of an entry are not read",
+    ),
+    (
+        {"entries": [{"data_id": 0, "scenario_id": 5, "route_id": 4}]},
+        None,
+        "scenario_05_route_04.xml: no such route file",
+    ),
+    ({}, _remove(XML), "scenario_05_route_03.xml: no such route file; standard.json asks for it"),
+    ({}, _remove(TABLE), "scenario_05.json: no such file"),
+    ({}, _write(LIST, "[{"), "standard.json:1: not valid JSON"),
+    ({}, _write(TABLE, "{}"), "available_scenarios"),
+    ({}, _write(TABLE, '{"available_scenarios": [[]]}'), "should hold objects"),
+    ({}, _write(TABLE, '{"available_scenarios": [{"T": 5}]}'), "T: expected a list"),
+    ({}, _write(XML, "<routes><route"), "scenario_05_route_03.xml:1: not valid XML"),
+    ({}, _write(XML, '<!DOCTYPE a [<!ENTITY b "c">]><routes>&b;</routes>'), "refused"),
+    ({}, _write(XML, "<routes/>"), "no <route> in it"),
+    ({}, _write(XML, ROUTE.replace('town="T"', "")), "names no town"),
+    ({}, _write(XML, ROUTE.replace('x="50"', 'x="nan"')), "waypoint 1: x is 'nan', not a finite number"),
+    ({}, _write(XML, ROUTE.replace('x="50"', 'x="5o"')), "waypoint 1: x is '5o', not a number"),
+    ({}, _write(XML, ROUTE.replace('x="50"', "")), "waypoint 1: 'x' is missing"),
+    ({}, _write(XML, ROUTE.replace('x="50"', 'x="5e7"')), "route[1]: beyond 100000 m"),
+    ({}, _write(XML, '<routes><route town="T"><waypoint x="0" y="0" yaw="0"/></route></routes>'), "at least two"),
+    ({"name": "Unheard"}, None, "unknown scenario 'Unheard'"),
+    ({"events": []}, None, "no trigger of RedlightRunning in T lies on the route"),
+    ({"events": [event(transform={"x": 1e400, "y": 0, "yaw": 0})]}, None, "not valid JSON"),
+    ({"events": [event(transform={"x": 1, "y": 0})]}, None, "'yaw' is missing"),
+    ({"events": [event(transform=None)]}, None, "expected x, y and yaw"),
+    ({"events": [event(other_actors={})]}, None, "names no other actor, which RedlightRunning needs"),
+    ({"events": [event(other_actors={"left": [{"x": "inf", "y": 1, "yaw": 1}]})]}, None, "left 0: x is 'inf'"),
+]
+
+
+@pytest.mark.parametrize(("parts", "damage", "message"), BROKEN, ids=[b[2][:50] for b in BROKEN])
+def test_broken_folders_say_what_is_wrong(
+    tmp_path: Path, parts: dict[str, Any], damage: Callable[[Path], None] | None, message: str
+) -> None:
+    make(tmp_path, **parts)
+    if damage:
+        damage(tmp_path)
+    with pytest.raises(FormatError) as raised:
+        import_routes(tmp_path)
+    assert message in str(raised.value)
+    assert str(tmp_path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_leaderboard_folder_gives_a_scenario_for_each_trigger(tmp_path: Path) -> None:
+    (tmp_path / "routes.xml").write_text(ROUTE)
+    kinds = {"Scenario1": [event()], "Scenario3": [event(), event(transform={"x": 40, "y": 10, "yaw": 0})]}
+    table = {
+        "available_scenarios": [
+            {
+                "T": [{"available_event_configurations": e, "scenario_type": k} for k, e in kinds.items()],
+                "Other": [{"available_event_configurations": [event()], "scenario_type": "Scenario5"}],
+            }
+        ]
+    }
+    (tmp_path / "all_towns.json").write_text(json.dumps(table))
+    found = import_routes(tmp_path)
+    assert [s.name for s in found] == [
+        "leaderboard/routes_0/StraightObstacle_00",
+        "leaderboard/routes_0/StraightObstacle_01",
+    ]
+    assert [s.trigger.x for s in found if s.trigger] == [20.5, 40.0]
+    (tmp_path / "all_towns.json").unlink()
+    with pytest.raises(FormatError, match="no JSON file with available_scenarios"):
+        import_routes(tmp_path)
+    (tmp_path / "routes.xml").unlink()
+    with pytest.raises(FormatError, match="no route files"):
+        import_routes(tmp_path)
+    with pytest.raises(FormatError, match="no such folder"):
+        import_routes(tmp_path / "absent")
+
+
+@pytest.mark.data
+def test_safebench_has_32_episodes(data_dir: Path, tmp_path: Path) -> None:
+    found = import_routes(data_dir / "routes" / "safebench")
+    assert [s.type for s in found] == [name for name in PRECRASH for _ in range(4)]
+    assert {s.town for s in found} == {"Town_Safebench_Light"}
+    assert all(s.trigger is not None for s in found)
+    assert [len(s.placements) for s in found] == [0] * 16 + [1] * 16
+    assert found[0].route == (Pose(62.5, -5.25), Pose(162.5, -5.25))
+    assert found[16].placements == (Pose(-18.5, -1.75),)
+    save_scenarios(tmp_path / "safebench.yaml", found)
+    assert load_scenarios(tmp_path / "safebench.yaml") == found
+
+
+@pytest.mark.data
+def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
+    found = import_routes(data_dir / "routes" / "frea")
+    assert len(found) == 150
+    assert Counter(s.town for s in found) == {"Town05": 80, "Town02": 70}
+    assert len({s.name for s in found}) == 150
+    assert all([s.seed for s in found[i : i + 10]] == list(range(10)) for i in range(0, 150, 10))
+    assert {s.type for s in found} == {"NaturalJunction"}
+    five = data_dir / "routes" / "frea" / "scenario_type" / "Scenario9_Town05_Town02_5x.json"
+    assert len(import_routes(five)) == 75
+    save_scenarios(tmp_path / "frea.yaml", found)
+    assert load_scenarios(tmp_path / "frea.yaml") == found
