@@ -31,7 +31,8 @@ def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:
 def to_local(pose: ArrayLike, xy: ArrayLike) -> Floats:
     """World points xy [..., 2] in the frame of pose [..., 3] (x, y, yaw): x forward, y left."""
     frame = _floats(pose)
-    return rotate(np.subtract(_floats(xy), frame[..., :2]), -frame[..., 2])
+    offset: Floats = np.subtract(_floats(xy), frame[..., :2])
+    return rotate(offset, -frame[..., 2])
 
 
 def to_world(pose: ArrayLike, xy: ArrayLike) -> Floats:
@@ -46,7 +47,7 @@ def corners(x: ArrayLike, y: ArrayLike, yaw: ArrayLike, length: ArrayLike, width
     along = 0.5 * length_[..., None] * np.array([1.0, -1.0, -1.0, 1.0], length_.dtype)
     across = 0.5 * width_[..., None] * np.array([1.0, 1.0, -1.0, -1.0], width_.dtype)
     offset = rotate(np.stack([along, across], axis=-1), yaw_[..., None])
-    return offset + np.stack([x_, y_], axis=-1)[..., None, :]
+    return np.asarray(offset + np.stack([x_, y_], axis=-1)[..., None, :])
 
 
 def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:

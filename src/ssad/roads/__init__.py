@@ -1,6 +1,22 @@
 """Roads: the lane graph of a town, its router, and nearest-lane and off-road queries."""
 
+from ssad.roads.bake import bake, import_map
 from ssad.roads.graph import LaneGraph, Marking, load_graph, save_graph
-from ssad.roads.query import LaneQuery
+from ssad.roads.library import load_town, town_names
+from ssad.roads.query import LaneQuery, Nearest
+from ssad.roads.router import random_route, route_along
 
-__all__ = ["LaneGraph", "LaneQuery", "Marking", "load_graph", "save_graph"]
+__all__ = [
+    "LaneGraph",
+    "LaneQuery",
+    "Marking",
+    "Nearest",
+    "bake",
+    "import_map",
+    "load_graph",
+    "load_town",
+    "random_route",
+    "route_along",
+    "save_graph",
+    "town_names",
+]

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import os
-import tempfile
-import zipfile
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from pathlib import Path
@@ -13,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ssad.errors import MapError
+from ssad.errors import FormatError, MapError
+from ssad.safeio import load_npz, save_npz
 from ssad.types import F32, I32, U8, Bool, LaneType
 
 FORMAT = 1  # of the .npz file
@@ -178,9 +175,7 @@ def _check(graph: LaneGraph) -> None:
     size = {"P": len(graph.xy), "L": len(graph.kind), "S": len(graph.signal_xy), "K": len(graph.stop_signal)}
     for letter, names in _PER.items():
         for name in names:
-            require(
-                getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows"
-            )
+            require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")
     for name in (
         "xy",
         "z",
@@ -221,41 +216,18 @@ def _check(graph: LaneGraph) -> None:
 
 
 def save_graph(graph: LaneGraph, path: Path | str) -> None:
-    """Write a lane graph as .npz without pickle, in one step (a reader never sees half a file)."""
-    target = Path(path)
-    buffer = io.BytesIO()
-    arrays = {name: getattr(graph, name) for name in _DTYPES}
+    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes. StoreError."""
     header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
-    np.savez_compressed(buffer, header=header, **arrays)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(buffer.getvalue())
-        Path(temporary).chmod(0o644)
-        os.replace(temporary, target)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
 
 
 def load_graph(path: Path | str) -> LaneGraph:
     """Read what `save_graph` wrote. MapError: missing, broken, too large, or not a lane graph."""
-    source = Path(path)
-    mend = "bake the map again with ssad import map"
+    source, mend = Path(path), "bake the map again with ssad import map"
     try:
-        with zipfile.ZipFile(source) as archive:
-            unpacked = sum(entry.file_size for entry in archive.infolist())
-        if unpacked > MAX_FILE:
-            raise MapError(f"{source}: {unpacked} bytes unpacked, more than a town has ({MAX_FILE}); {mend}")
-        with np.load(source, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise MapError(
-            f"{source}: no such file; give a baked town (.npz) or an OpenDRIVE map (.xodr)"
-        ) from None
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise MapError(f"{source}: not a baked town ({error}); {mend}") from None
+        arrays = load_npz(source, limit=MAX_FILE)
+    except FormatError as error:
+        raise MapError(f"{error}; {mend}") from None
     header = arrays.pop("header", None)
     if header is None or header.shape != (2,) or str(header[0]) != f"ssad-lane-graph {FORMAT}":
         raise MapError(f"{source}: not a baked town of format {FORMAT}; {mend}")

@@ -190,3 +190,20 @@ def build_grid(graph: LaneGraph, types: Sequence[int], cell: float) -> Grid:
     offset = np.concatenate([[0], np.cumsum(np.bincount(here, minlength=nx * ny))]).astype(np.int32)
     place = (float(origin[0]), float(origin[1]))
     return Grid(seg, half, lane, s, offset, pick[order].astype(np.int32), place, float(cell), nx, ny)
+
+
+def nearest_all(graph: LaneGraph, xy: tuple[float, float], types: Sequence[LaneType]) -> tuple[I32, F64, F64]:
+    """For one point, every lane of the given types: lane [n], arc length of its nearest place [n] m, and distance
+    from the lane's strip [n] m (negative inside). Looks at every segment; for a few points, at any distance."""
+    seg, half, lane, s = segments(graph, tuple(int(t) for t in types))
+    a, d = seg[:, :2].astype(np.float64), (seg[:, 2:] - seg[:, :2]).astype(np.float64)
+    p = np.asarray(xy, np.float64) - a
+    square = np.maximum((d * d).sum(axis=1), 1e-12)
+    t = np.clip((p * d).sum(axis=1) / square, 0.0, 1.0)
+    rest = p - t[:, None] * d
+    gap = np.hypot(rest[:, 0], rest[:, 1]) - (half[:, 0] + t * (half[:, 1] - half[:, 0]))
+    along = s + t * np.sqrt(square)
+    order = np.lexsort((gap, lane))
+    first = np.concatenate([[True], np.diff(lane[order]) != 0])
+    pick = order[first]
+    return lane[pick], along[pick], gap[pick]

@@ -1,0 +1,51 @@
+"""Towns by name: those that ship, those the user has imported, or a file."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from ssad.errors import MapError, unknown_name
+from ssad.roads.bake import bake
+from ssad.roads.graph import LaneGraph, load_graph
+from ssad.safeio import home
+
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround")
+
+
+def town_names() -> dict[str, str]:
+    """Name -> "built-in", or the path of an imported town. A built-in name cannot be taken by an import."""
+    found = dict.fromkeys(BUILT_IN, "built-in")
+    for path in sorted((home() / "towns").glob("*.npz")):
+        found.setdefault(path.stem, str(path))
+    return found
+
+
+def load_town(name: str) -> LaneGraph:
+    """The lane graph of a town: its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
+
+    UnknownNameError shows the closest names; MapError says what is wrong with a file. A graph is immutable and
+    kept, so that asking again is free.
+    """
+    if name in BUILT_IN:
+        return _built_in(name)
+    path = home() / "towns" / f"{name}.npz" if Path(name).name == name else Path(name)
+    if path.suffix == ".npz" and path.is_file():
+        return _stored(str(path), path.stat().st_mtime_ns)
+    if Path(name).suffix == ".xodr":
+        return bake(Path(name))
+    if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
+        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr)")
+    raise unknown_name("town", name, town_names())
+
+
+@lru_cache(maxsize=8)
+def _built_in(name: str) -> LaneGraph:
+    with as_file(files("ssad.roads.towns") / f"{name}.npz") as path:
+        return load_graph(path)
+
+
+@lru_cache(maxsize=8)
+def _stored(path: str, changed: int) -> LaneGraph:
+    return load_graph(path)

@@ -1,0 +1,163 @@
+"""Where signals stand, which lanes they stop, and which are green together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.roads.xodr import Network
+from ssad.types import F64, LaneType
+
+ARMS = 3  # a junction with fewer arms needs no signal
+SETBACK = 1.0  # m from the stop line to a crosswalk
+_TAIL = 15.0  # m before the end of a lane in which a crosswalk moves its stop line
+
+
+@dataclass(frozen=True)
+class Approaches:
+    """What signal placement needs to know of the lanes; rows are lanes."""
+
+    network: Network
+    keys: list[tuple[int, int, int]]
+    kind: npt.NDArray[Any]
+    junction: npt.NDArray[Any]
+    links: list[list[int]]
+    end: F64  # [L, 3] x, y, yaw
+    begin: F64
+    width: F64
+    line: list[tuple[F64, F64]]  # xy [., 2], s [.]
+    crosswalks: list[F64]
+    lights: dict[str, list[float]]  # x, y, yaw
+
+
+@dataclass
+class _Approach:
+    """Lanes of one arm that lead into a junction, and the light of the map that faces them (if any)."""
+
+    junction: int
+    lanes: list[int]
+    light: str | None = None
+
+
+def place_signals(data: Approaches) -> dict[str, Any]:
+    """The signal and stop arrays of a LaneGraph.
+
+    Every arm of a junction with lights gets one signal and a stop line on each of its lanes; a junction of at
+    least three arms without lights gets the same, marked virtual. Phases come from the map's controllers
+    where every light has one, else arms that face each other share a phase.
+    """
+    signals: list[tuple[float, float, float, int, int, bool]] = []
+    stops: list[tuple[int, int, float]] = []
+    for junction, arms in _arms(data).items():
+        approaches = [arm for arm in arms if arm.lanes]
+        inner = [i for i in range(len(data.keys)) if data.junction[i] == junction]
+        for arm in approaches:
+            arm.light = _facing(data, arm, inner)
+        real = any(arm.light for arm in approaches)
+        if not approaches or (not real and len(arms) < ARMS):
+            continue
+        for arm, phase in zip(approaches, _phases(data, approaches), strict=True):
+            outer = min(arm.lanes, key=lambda i: -abs(data.keys[i][2]))
+            x, y, yaw = data.end[outer]
+            if arm.light and arm.light in data.lights:
+                x, y = data.lights[arm.light][:2]
+            else:
+                aside = 0.5 * data.width[outer] + 1.0
+                x, y = x + aside * np.sin(yaw), y - aside * np.cos(yaw)
+            stops += [(len(signals), lane, _stop(data, lane)) for lane in arm.lanes]
+            signals.append((x, y, yaw, junction, phase, not real))
+    table = np.array(signals, np.float64).reshape(-1, 6)
+    line = np.array(stops, np.float64).reshape(-1, 3)
+    return {
+        "signal_xy": table[:, :2],
+        "signal_yaw": table[:, 2],
+        "signal_junction": table[:, 3].astype(np.int32),
+        "signal_phase": table[:, 4].astype(np.int32),
+        "signal_virtual": table[:, 5].astype(bool),
+        "stop_signal": line[:, 0].astype(np.int32),
+        "stop_lane": line[:, 1].astype(np.int32),
+        "stop_s": line[:, 2],
+    }
+
+
+def _arms(data: Approaches) -> dict[int, list[_Approach]]:
+    """Arms of every junction: (road, end) pairs, with the driving lanes that lead in (may be none)."""
+    arms: dict[int, dict[tuple[int, bool], _Approach]] = {}
+    for i, found in enumerate(data.links):
+        if data.kind[i] != LaneType.DRIVING:
+            continue
+        road, _, lane = data.keys[i]
+        for j in found:
+            if data.kind[j] != LaneType.DRIVING:
+                continue
+            here, there = int(data.junction[i]), int(data.junction[j])
+            if here == there:
+                continue
+            if there >= 0:
+                arm = arms.setdefault(there, {}).setdefault((road, lane < 0), _Approach(there, []))
+                if i not in arm.lanes:
+                    arm.lanes.append(i)
+            if here >= 0:
+                out, _, lane_out = data.keys[j]
+                arms.setdefault(here, {}).setdefault((out, lane_out > 0), _Approach(here, []))
+    return {junction: [found[k] for k in sorted(found)] for junction, found in sorted(arms.items())}
+
+
+def _facing(data: Approaches, arm: _Approach, inner: list[int]) -> str | None:
+    """The light that the map ties to an arm: on its own lanes, or on the connecting lanes after them."""
+    known = set(data.network.lights)
+    votes: Counter[str] = Counter()
+    after = {j for i in arm.lanes for j in data.links[i]} & set(inner)
+    for i in [*arm.lanes, *sorted(after)]:
+        road, _, lane = data.keys[i]
+        for place in data.network.roads[road].lights:
+            spans_all = place.low == 0 == place.high
+            if place.signal not in known or (spans_all and i in arm.lanes):
+                continue  # a post beside the approach without a list of lanes may face another road
+            if spans_all or place.low <= lane <= place.high:
+                votes[place.signal] += 1
+    return min(votes, key=lambda signal: (-votes[signal], signal)) if votes else None
+
+
+def _phases(data: Approaches, arms: list[_Approach]) -> list[int]:
+    """Phase of each arm."""
+    given = [data.network.phase.get(arm.light or "") for arm in arms]
+    if all(phase is not None for phase in given) and len(set(given)) > 1:
+        order = sorted({phase for phase in given if phase is not None})
+        return [order.index(phase) for phase in given if phase is not None]
+    phases: list[int] = []
+    for k, arm in enumerate(arms):
+        yaw = data.end[arm.lanes[0], 2]
+        same = -1
+        for m in range(k):
+            other = data.end[arms[m].lanes[0], 2]
+            if np.cos(yaw - other) < -0.7 and same < 0:
+                same = phases[m]
+        phases.append(same if same >= 0 else max(phases, default=-1) + 1)
+    return phases
+
+
+def _stop(data: Approaches, lane: int) -> float:
+    """Arc length of the stop line: the end of the lane, or before a crosswalk on its last metres."""
+    xy, s = data.line[lane]
+    at = np.arange(max(0.0, s[-1] - _TAIL), s[-1], 0.25)
+    points = np.stack([np.interp(at, s, xy[:, k]) for k in range(2)], axis=1)
+    stop = float(s[-1])
+    for area in data.crosswalks:
+        hit = _within(points, area)
+        if hit.any():
+            stop = min(stop, float(at[hit][0]) - SETBACK)
+    return max(stop, 0.0)
+
+
+def _within(points: F64, area: F64) -> npt.NDArray[np.bool_]:
+    """Whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
+    x, y = points[:, None, 0], points[:, None, 1]
+    (ax, ay), (bx, by) = area.T, np.roll(area, -1, axis=0).T
+    crosses = (ay > y) != (by > y)
+    at = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
+    return np.asarray((crosses & (x < at)).sum(axis=1) % 2 == 1)

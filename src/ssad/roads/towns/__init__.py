@@ -1,0 +1,1 @@
+"""Baked towns that ship with SSAD (*.npz); `ssad.roads.generate` writes their OpenDRIVE."""
