@@ -133,9 +133,7 @@ class _Builder:
         if repeated:
             self.aliased += 1
             if self.aliased > MAX_ALIASED_NODES:
-                raise self.fail(
-                    node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)"
-                )
+                raise self.fail(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
         if id(node) in self.open:
             raise self.fail(node, "an alias refers to the value that contains it")
         if len(place) > MAX_DEPTH:
@@ -197,21 +195,21 @@ def parse_yaml_document(text: str, name: str = "<text>") -> Document:
     import yaml
 
     loader = _with_resolvers(getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    depth = 0
+    event: Any
     try:
-        depth = 0
         for event in yaml.parse(text, Loader=loader):  # before the composer, which recurses in C
             if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
                 depth += 1
                 if depth > MAX_DEPTH:
-                    raise FormatError(
-                        f"{name}:{event.start_mark.line + 1}: nested deeper than {MAX_DEPTH} levels"
-                    )
+                    raise FormatError(f"{name}:{event.start_mark.line + 1}: nested deeper than {MAX_DEPTH} levels")
             elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
                 depth -= 1
         node = yaml.compose(text, Loader=loader)
     except yaml.MarkedYAMLError as error:
-        mark: Any = error.problem_mark or error.context_mark
-        where = f"{name}:{mark.line + 1}" if mark else name
+        mark = error.problem_mark if error.problem_mark is not None else error.context_mark
+        line = None if mark is None else mark.line
+        where = name if line is None else f"{name}:{line + 1}"
         raise FormatError(f"{where}: not valid YAML: {error.problem or error.context}") from None
     except (yaml.YAMLError, ValueError) as error:
         raise FormatError(f"{name}: not valid YAML: {error}") from None
@@ -242,11 +240,7 @@ def dump_yaml(data: Any) -> str:
 
     dumper = _with_resolvers(yaml.SafeDumper)
     dumper.ignore_aliases = lambda self, data: True
-    return str(
-        yaml.dump(
-            data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None
-        )
-    )
+    return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None))
 
 
 # ---------------------------------------------------------------- JSON, XML
@@ -283,9 +277,7 @@ def read_json(path: str | Path, *, limit: int = 256 * MIB) -> Any:
 def dump_json(data: Any, *, indent: int | None = None) -> str:
     """Canonical JSON: sorted keys, no spaces (unless `indent`), no NaN. ValueError for other values."""
     separators = (",", ":") if indent is None else (",", ": ")
-    return json.dumps(
-        data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators
-    )
+    return json.dumps(data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
 
 
 def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
@@ -299,9 +291,7 @@ def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
         root: Element = safe.fromstring(text, forbid_dtd=True)
     except defusedxml.DefusedXmlException as error:
         reason = type(error).__name__
-        raise FormatError(
-            f"{name}: refused: it declares a DTD, entities or external data ({reason})"
-        ) from None
+        raise FormatError(f"{name}: refused: it declares a DTD, entities or external data ({reason})") from None
     except ParseError as error:
         line = error.position[0]
         raise FormatError(f"{name}:{line}: not valid XML: {error}") from None
@@ -331,9 +321,7 @@ def npz_bytes(arrays: Mapping[str, npt.ArrayLike]) -> bytes:
             info.create_system = 3
             info.external_attr = 0o644 << 16
             member = io.BytesIO()
-            np.lib.format.write_array(
-                member, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False
-            )
+            np.lib.format.write_array(member, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
             archive.writestr(info, member.getvalue())
     return buffer.getvalue()
 
@@ -387,9 +375,7 @@ def make_folder(path: str | Path) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise StoreError(
-            f"{folder}: cannot write there: {error.strerror or error}; choose another folder"
-        ) from None
+        raise StoreError(f"{folder}: cannot write there: {error.strerror or error}; choose another folder") from None
     return folder
 
 
