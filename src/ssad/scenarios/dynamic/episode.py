@@ -114,13 +114,10 @@ def forced_signals(
 def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent]) -> None:
     """RouteError if an actor stands in the ego when the episode begins."""
     boxes = [
-        (a.pose.x, a.pose.y, a.pose.yaw, body.length, body.width)
-        for a, body in ((a, model(a.model)) for a in agents)
+        (a.pose.x, a.pose.y, a.pose.yaw, body.length, body.width) for a, body in ((a, model(a.model)) for a in agents)
     ]
     if len(boxes) < 2:
         return
     for agent, gap in zip(agents[1:], obb_distance(boxes[:1], boxes[1:]), strict=True):
         if gap <= 0.0:
-            raise RouteError(
-                f"scenario {scenario.name}: {agent.name} stands in the ego at the start; move one of them"
-            )
+            raise RouteError(f"scenario {scenario.name}: {agent.name} stands in the ego at the start; move one of them")

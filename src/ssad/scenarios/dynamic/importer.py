@@ -156,9 +156,7 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
         raise FormatError(f"{path}: expected one route, found {len(roads)}")
     road = roads[0]
     found = sorted(
-        (at, i)
-        for i, e in enumerate(events)
-        if e.town == road.town and (at := _along(road, e.trigger)) is not None
+        (at, i) for i, e in enumerate(events) if e.town == road.town and (at := _along(road, e.trigger)) is not None
     )
     if not found and kind != "NaturalJunction":
         raise FormatError(f"{path}: no trigger of {kind} in {road.town} lies on the route (2 m, 10 degrees)")
@@ -209,9 +207,7 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
         raise FormatError(f"{folder}: no scenario_type/*.json and no route files (*.xml) in it")
     events = [e for path in tables for e in _read_events(path, strict=False)]
     if not events:
-        raise FormatError(
-            f"{folder}: no JSON file with available_scenarios; put the scenarios beside the routes"
-        )
+        raise FormatError(f"{folder}: no JSON file with available_scenarios; put the scenarios beside the routes")
     result: list[Scenario] = []
     for path in routes:
         for road in _read_roads(path):
@@ -285,9 +281,7 @@ def _block_events(path: Path, block: Any, strict: bool) -> Iterator[_Event]:
             name = str(scenario.get("scenario_name", scenario.get("scenario_type")))
             if name not in _NAMES:
                 if strict:
-                    raise FormatError(
-                        f"{path}: {town}: unknown scenario '{name}'; known: {', '.join(_NAMES)}"
-                    )
+                    raise FormatError(f"{path}: {town}: unknown scenario '{name}'; known: {', '.join(_NAMES)}")
                 continue
             configurations = scenario.get("available_event_configurations")
             for i, event in enumerate(_list(configurations, f"{path}: {town}: {name}")):

@@ -73,9 +73,7 @@ def _from_path(path: Path) -> tuple[Scenario, ...]:
     for file in files:
         for scenario in read_scenarios(file):
             if scenario.name in names:
-                raise ConfigError(
-                    f"{file}: scenario name '{scenario.name}' is in {names[scenario.name].name} too"
-                )
+                raise ConfigError(f"{file}: scenario name '{scenario.name}' is in {names[scenario.name].name} too")
             names[scenario.name] = file
             result.append(scenario)
     return tuple(result)

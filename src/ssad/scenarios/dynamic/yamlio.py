@@ -25,9 +25,7 @@ def read_scenarios(path: str | Path) -> tuple[Scenario, ...]:
     for i, scenario in enumerate(scenarios):
         if scenario.name in first:
             line = document.line((first[scenario.name],))
-            raise document.error(
-                (i, "name"), f"'{scenario.name}' is the name of the scenario in line {line} too"
-            )
+            raise document.error((i, "name"), f"'{scenario.name}' is the name of the scenario in line {line} too")
         first[scenario.name] = i
     return scenarios
 

@@ -73,9 +73,7 @@ class ScenarioType:
         box = self.box
         for name, value in given.items():
             problem = (
-                box[name].problem(value)
-                if name in box
-                else f"no such parameter; known: {', '.join(box) or 'none'}"
+                box[name].problem(value) if name in box else f"no such parameter; known: {', '.join(box) or 'none'}"
             )
             if problem:
                 raise ConfigError(f"{self.name}: parameter {name}: {problem}")

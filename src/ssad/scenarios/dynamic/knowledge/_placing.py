@@ -21,9 +21,7 @@ EGO_SPEED = 8.0
 DEFAULT_TRIGGER = 30.0
 """Where on the route a scenario without a trigger has it, m from the start: as in SafeBench's routes."""
 _SHOULDER = 2.0  # CARLA's maps draw parking strips as shoulders wider than this
-_STRAIGHT = (
-    0.3  # a path that strays less than this from a straight line is driven straight, as SafeBench does
-)
+_STRAIGHT = 0.3  # a path that strays less than this from a straight line is driven straight, as SafeBench does
 _PATH = 150.0  # length of the path that an actor gets on a bending road, m
 
 
@@ -65,9 +63,7 @@ def project(graph: LaneGraph, lane: int, x: float, y: float) -> Place:
     span = graph.points(lane)
     xy, s = graph.xy[span].astype(np.float64), graph.s[span].astype(np.float64)
     a, d = xy[:-1], np.diff(xy, axis=0)
-    t = np.clip(
-        ((x - a[:, 0]) * d[:, 0] + (y - a[:, 1]) * d[:, 1]) / np.maximum((d**2).sum(1), 1e-12), 0.0, 1.0
-    )
+    t = np.clip(((x - a[:, 0]) * d[:, 0] + (y - a[:, 1]) * d[:, 1]) / np.maximum((d**2).sum(1), 1e-12), 0.0, 1.0)
     off = a + t[:, None] * d - (x, y)
     i = int(np.argmin((off**2).sum(1)))
     return Place(lane, float(s[i] + t[i] * (s[i + 1] - s[i])))
@@ -177,9 +173,7 @@ def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) 
     """The lane under a point of the route. RouteError where the route has left the lane graph."""
     lane = int(route.lane[index])
     if lane < 0:
-        raise RouteError(
-            f"scenario {scenario.name}: no lane under the route at {index * route.spacing:.0f} m"
-        )
+        raise RouteError(f"scenario {scenario.name}: no lane under the route at {index * route.spacing:.0f} m")
     return project(graph, lane, float(route.xy[index, 0]), float(route.xy[index, 1]))
 
 
@@ -340,9 +334,7 @@ def go_when_ego_moves(speed: float, trigger_distance: float) -> tuple[Phase, ...
     )
 
 
-def scripted(
-    name: str, body: str, pose: Pose, phases: Sequence[Phase], route: Route | None = None
-) -> EpisodeAgent:
+def scripted(name: str, body: str, pose: Pose, phases: Sequence[Phase], route: Route | None = None) -> EpisodeAgent:
     """An agent that stands until its first phase begins."""
     return EpisodeAgent(
         name=name,

@@ -54,9 +54,7 @@ SCENARIO = ScenarioType(
     nhtsa="The ego follows a car that decelerates suddenly; the lane it would evade to is taken.",
     build=build,
     parameters=(
-        Parameter(
-            "trigger_distance", 20.0, 50.0, 35.0, "m", "both start when the ego is this near to the leader"
-        ),
+        Parameter("trigger_distance", 20.0, 50.0, 35.0, "m", "both start when the ego is this near to the leader"),
         Parameter("distance", 30.0, 40.0, 35.0, "m", "from the trigger along the lane to the leader"),
         Parameter("gap", 0.0, 5.0, 1.0, "m", "neighbour ahead of the leader"),
         Parameter("leader_speed", 8.0, 16.0, 12.0, "m/s", "speed of the leader before it brakes"),

@@ -72,7 +72,9 @@ def candidates(graph: LaneGraph, route: Route) -> list[tuple[Place, Pose]]:
     if not len(on_graph):
         raise RouteError("the route is nowhere on the lane graph")
     own = {(int(graph.road[n]), int(graph.lane_id[n])) for n in np.unique(on_graph)}
-    first = int(on_graph[0])
+    # a route may begin inside a junction; "the ego's road" is then the one after it
+    roads = on_graph[graph.junction[on_graph] < 0]
+    first = int(roads[0] if len(roads) else on_graph[0])
     inside = (route.lane >= 0) & (graph.junction[np.maximum(route.lane, 0)] >= 0)
     near = [(route.xy[0], NEAR_START), (route.xy[-1], NEAR_END)]
     if inside.any():

@@ -22,9 +22,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     """Car (actor 0) from the left, on the road that the ego turns into."""
     value = SCENARIO.values(scenario.parameters)
     phases = go_when_ego_moves(value["speed"], value["trigger_distance"])
-    return meeting_car(
-        SCENARIO, scenario, graph, route, name="car from the left", sides=(FROM_LEFT,), phases=phases
-    )
+    return meeting_car(SCENARIO, scenario, graph, route, name="car from the left", sides=(FROM_LEFT,), phases=phases)
 
 
 SCENARIO = ScenarioType(

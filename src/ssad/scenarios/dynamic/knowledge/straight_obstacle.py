@@ -39,9 +39,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     reference = trigger_place(graph, scenario, route)
     outer, crossed = to_outermost(graph, reference, kinds=_LANES)
     in_junction = bool(graph.junction[outer.lane] >= 0)
-    spot = ahead(
-        graph, outer, value["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction
-    )
+    spot = ahead(graph, outer, value["start_distance"] + _PER_LANE * crossed, stop_at_junction=not in_junction)
     kerb = shifted(pose_at(graph, spot), 0.0, -value["lateral"] * width_at(graph, reference))
     walker = shifted(kerb, 0.0, 0.0, math.pi / 2.0 + value["yaw"])
     origin = pose_at(graph, reference)
@@ -62,14 +60,10 @@ SCENARIO = ScenarioType(
     nhtsa="The ego drives straight and an unseen walker enters the road; it must brake or swerve.",
     build=build,
     parameters=(
-        Parameter(
-            "trigger_distance", 15.0, 50.0, 20.0, "m", "the walker starts when the ego is this near to it"
-        ),
+        Parameter("trigger_distance", 15.0, 50.0, 20.0, "m", "the walker starts when the ego is this near to it"),
         Parameter("walker_speed", 0.5, 4.0, 2.5, "m/s", "speed of the walker"),
         Parameter("start_distance", 35.0, 55.0, 45.0, "m", "from the trigger along the lane to the walker"),
-        Parameter(
-            "lateral", 0.0, 1.0, 1.0, "lane widths", "walker to the right of the outermost lane's centre"
-        ),
+        Parameter("lateral", 0.0, 1.0, 1.0, "lane widths", "walker to the right of the outermost lane's centre"),
         Parameter("yaw", -math.pi / 3, math.pi / 3, 0.0, "rad", "turn of the walker from facing the road"),
     ),
     max_distance=150.0,

@@ -22,9 +22,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     """Car (actor 0) on the opposite approach; it goes straight on."""
     value = SCENARIO.values(scenario.parameters)
     phases = [go(value["speed"], value["trigger_distance"])]
-    return meeting_car(
-        SCENARIO, scenario, graph, route, name="oncoming car", sides=(ONCOMING,), phases=phases
-    )
+    return meeting_car(SCENARIO, scenario, graph, route, name="oncoming car", sides=(ONCOMING,), phases=phases)
 
 
 SCENARIO = ScenarioType(

@@ -1,0 +1,239 @@
+"""Makes the shipped scenario sets: `python -m ssad.scenarios.dynamic.make_sets`.
+
+Routes are searched on the towns' lane graphs: every stretch of road that a class needs (a clear lane, a lane with a
+neighbour, a turn with crossing traffic), then those that lie farthest apart, so that arms, bends and junctions vary.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ssad.errors import RouteError
+from ssad.roads import load_town
+from ssad.roads.graph import LaneGraph
+from ssad.safeio import write_atomic
+from ssad.scenarios.dynamic.catalog import PRECRASH
+from ssad.scenarios.dynamic.episode import build_episode
+from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
+from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
+from ssad.scenarios.dynamic.sets import DATA
+from ssad.scenarios.dynamic.yamlio import scenario_text
+from ssad.types import F64, LaneType, Pose, Scenario
+
+PRECRASH_TOWN = "ProvingGround"
+NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 7, "Crossgate": 8}
+"""Town -> number of junction routes, as FREA has on Town02 and Town05."""
+REPETITIONS = 10
+Turn = Literal["left", "straight", "right"]
+_TURNS: tuple[Turn, ...] = ("left", "straight", "right")
+_HEADING = 20.0  # m that half a turn counts when routes are compared
+_MARGIN = 2.0  # m kept free at the ends of a road
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A way along lanes: key points, where its trigger is, and what it passes."""
+
+    points: tuple[Pose, ...]
+    trigger: Pose
+    turn: Turn | None
+    junction: int
+    lanes: tuple[int, ...]
+
+    def place(self) -> F64:
+        """Numbers [6] whose distance says how different two stretches are, about in metres."""
+        a, b = self.points[0], self.points[-1]
+        return np.array([a.x, a.y, b.x, b.y, _HEADING * math.cos(a.yaw), _HEADING * math.sin(a.yaw)], dtype=np.float64)
+
+
+def _pose(graph: LaneGraph, lane: int, s: float) -> Pose:
+    """A pose on a lane, rounded so that the files stay readable (1 cm, 0.01 degrees)."""
+    x, y, yaw, _ = graph.at(lane, s)
+    return Pose(round(x, 2) + 0.0, round(y, 2) + 0.0, round(wrap(yaw), 4) + 0.0)
+
+
+def _clear(graph: LaneGraph, lane: int) -> bool:
+    return bool(graph.kind[lane] == LaneType.DRIVING and graph.junction[lane] < 0)
+
+
+def stretches(graph: LaneGraph, length: float, trigger: float) -> Iterator[Stretch]:
+    """Ways of `length` m on driving lanes outside junctions, one every 20 m along each lane."""
+    for lane in range(graph.lanes):
+        if not _clear(graph, lane):
+            continue
+        for start in np.arange(_MARGIN, float(graph.length[lane]), 20.0):
+            lanes, free = [lane], float(graph.length[lane]) - float(start)
+            while free < length + _MARGIN:
+                after = [int(n) for n in graph.successors(lanes[-1]) if _clear(graph, int(n))]
+                if len(after) != 1 or after[0] in lanes:
+                    break
+                lanes.append(after[0])
+                free += float(graph.length[after[0]])
+            if free < length + _MARGIN:
+                continue
+            marks = [_along(graph, lanes, float(start) + at) for at in (0.0, trigger, length)]
+            yield Stretch((marks[0], marks[2]), marks[1], None, -1, tuple(lanes))
+
+
+def _along(graph: LaneGraph, lanes: list[int], s: float) -> Pose:
+    for lane in lanes:
+        if s <= float(graph.length[lane]) or lane == lanes[-1]:
+            return _pose(graph, lane, s)
+        s -= float(graph.length[lane])
+    raise AssertionError("a stretch has lanes")
+
+
+def passages(graph: LaneGraph, before: float, after: float) -> Iterator[Stretch]:
+    """Ways through one junction: `before` m on the approach, a turn, `after` m on the exit."""
+    for inside in np.flatnonzero((graph.junction >= 0) & (graph.kind == LaneType.DRIVING)):
+        exits = [int(n) for n in graph.successors(int(inside)) if _clear(graph, int(n))]
+        for approach in map(int, graph.predecessors(int(inside))):
+            if len(exits) != 1 or not _clear(graph, approach):
+                continue
+            if graph.length[approach] < before + _MARGIN or graph.length[exits[0]] < after + _MARGIN:
+                continue
+            end = float(graph.length[approach])
+            angle = math.degrees(turn_of(graph, int(inside)))
+            turn: Turn = "straight" if abs(angle) < 30.0 else "left" if angle > 0.0 else "right"
+            points = (
+                _pose(graph, approach, end - before),
+                _pose(graph, approach, end - 2.0),
+                _pose(graph, exits[0], 2.0),
+                _pose(graph, exits[0], after),
+            )
+            trigger = _pose(graph, approach, end - min(before - 20.0, 20.0))
+            yield Stretch(points, trigger, turn, int(graph.junction[inside]), (approach, int(inside), exits[0]))
+
+
+def _left_of(graph: LaneGraph, stretch: Stretch, *, same: bool) -> bool:
+    """Whether each lane of a stretch has a driving lane to its left that runs the same (the other) way."""
+    for lane in stretch.lanes:
+        left = int(graph.left[lane])
+        if left < 0 or graph.kind[left] != LaneType.DRIVING or graph.same_direction(lane, left) != same:
+            return False
+    return True
+
+
+def _outermost(graph: LaneGraph, stretch: Stretch) -> bool:
+    right = [int(graph.right[lane]) for lane in stretch.lanes]
+    return all(n < 0 or graph.kind[n] != LaneType.DRIVING for n in right)
+
+
+def _pool(graph: LaneGraph, kind: str) -> list[Stretch]:
+    """Every stretch that a class can be played on, by road alone. Lengths as SafeBench's routes have them."""
+    ways: dict[str, Callable[[], Iterator[Stretch]]] = {
+        "StraightObstacle": lambda: (p for p in stretches(graph, 100.0, 30.0) if _outermost(graph, p)),
+        "LaneChanging": lambda: (p for p in stretches(graph, 130.0, 30.0) if _left_of(graph, p, same=True)),
+        "VehiclePassing": lambda: (p for p in stretches(graph, 148.0, 50.0) if _left_of(graph, p, same=False)),
+        "TurningObstacle": lambda: (p for p in passages(graph, 40.0, 35.0) if p.turn != "straight"),
+        "RedlightRunning": lambda: (p for p in passages(graph, 50.0, 40.0) if p.turn == "straight"),
+        "UnprotectedLeftTurn": lambda: (p for p in passages(graph, 50.0, 45.0) if p.turn == "left"),
+        "RightTurn": lambda: (p for p in passages(graph, 50.0, 45.0) if p.turn == "right"),
+        "CrossingNegotiation": lambda: (p for p in passages(graph, 60.0, 40.0) if p.turn == "straight"),
+    }
+    return list(ways[kind]())
+
+
+def _spread(pool: list[Stretch], count: int, works: Callable[[Stretch], bool]) -> list[Stretch]:
+    """`count` stretches that work, each the farthest from those before it."""
+    rest = list(pool)
+    chosen: list[Stretch] = []
+    while rest and len(chosen) < count:
+        if chosen:
+            gap = [min(float(np.linalg.norm(p.place() - c.place())) for c in chosen) for p in rest]
+            pick = int(np.argmax(gap))
+        else:
+            pick = 0
+        stretch = rest.pop(pick)
+        if works(stretch):
+            chosen.append(stretch)
+    return chosen
+
+
+def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
+    """The eight classes, `routes` scenarios each."""
+    result = []
+    for kind in PRECRASH:
+
+        def scenario(stretch: Stretch, number: int, kind: str = kind) -> Scenario:
+            return Scenario(
+                name=f"{kind}/{number:02d}",
+                type=kind,
+                town=graph.name,
+                route=stretch.points,
+                trigger=stretch.trigger,
+                group=kind,
+            )
+
+        def works(stretch: Stretch, kind: str = kind) -> bool:
+            try:
+                build_episode(scenario(stretch, 0, kind), graph, seed=0)
+            except RouteError:
+                return False
+            return True
+
+        chosen = _spread(_pool(graph, kind), routes, works)
+        if len(chosen) < routes:
+            raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} roads for {kind}")
+        result += [scenario(stretch, i, kind) for i, stretch in enumerate(chosen)]
+    return result
+
+
+def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> list[Scenario]:
+    """Routes through junctions, turns in rotation, each with `repetitions` draws of traffic."""
+    from ssad.roads import route_along
+
+    def works(stretch: Stretch) -> bool:
+        try:
+            found = candidates(graph, route_along(graph, stretch.points))
+        except RouteError:
+            return False
+        return len(found) >= 8
+
+    pool = list(passages(graph, 30.0, 30.0))
+    chosen: list[Stretch] = []
+    for turn in itertools.islice(itertools.cycle(_TURNS), routes):
+        rest = [p for p in pool if p.turn == turn and p not in chosen and works(p)]
+        rest = rest or [p for p in pool if p not in chosen and works(p)]
+        if not rest:
+            raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} junction routes")
+        gap = [min((float(np.linalg.norm(p.place() - c.place())) for c in chosen), default=0.0) for p in rest]
+        chosen.append(rest[int(np.argmax(gap))])
+    return [
+        Scenario(
+            name=f"natural/{graph.name}_{i:02d}/{k:02d}",
+            type="NaturalJunction",
+            town=graph.name,
+            route=stretch.points,
+            seed=k,
+            group=graph.name,
+        )
+        for i, stretch in enumerate(chosen)
+        for k in range(repetitions)
+    ]
+
+
+def make() -> dict[str, str]:
+    """File name -> text of every shipped set."""
+    drives = [s for town, routes in NATURAL_TOWNS.items() for s in natural(load_town(town), routes)]
+    return {
+        "precrash.yaml": scenario_text(precrash(load_town(PRECRASH_TOWN))),
+        "natural.yaml": scenario_text(drives),
+    }
+
+
+def main(folder: Path = DATA) -> None:
+    """Write the shipped sets."""
+    for name, text in make().items():
+        write_atomic(folder / name, text)
+
+
+if __name__ == "__main__":
+    main()
