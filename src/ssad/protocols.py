@@ -42,8 +42,8 @@ class DrivingSystem(Protocol):
     """What drives the ego.
 
     controller: EXTERNAL calls `act` each step (10 Hz); AUTOPILOT and FOLLOW run inside the world and `act` is never
-    called. `reset` is called once before a batch of episodes with one seed an episode. A result must not depend on
-    which episodes share the batch.
+    called. `reset` is called once before a batch of episodes. A result must not depend on which episodes share the
+    batch. A system that has an attribute `target_speed` (m/s) drives at that speed instead of the episode's.
     """
 
     name: str

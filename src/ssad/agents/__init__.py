@@ -37,5 +37,6 @@ class _Named:
     def __init__(self, name: str, controller: Controller, system: DrivingSystem) -> None:
         self.name = name
         self.controller = controller
+        self.target_speed: float | None = getattr(system, "target_speed", None)
         self.reset = system.reset
         self.act = system.act

@@ -175,9 +175,16 @@ def _put_agent(  # noqa: PLR0917
 
 
 def build(
-    episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], device: str, ego: Controller | None
+    episodes: Sequence[Episode],
+    graphs: Mapping[str, LaneGraph],
+    device: str,
+    ego: Controller | None,
+    speed: float | None = None,
 ) -> tuple[Bank, Roads, int]:
-    """Arrays of all episodes on `device`, and the number of agent slots. `ego` replaces the ego's controller."""
+    """Arrays of all episodes on `device`, and the number of agent slots.
+
+    `ego` and `speed` replace the egos' controller and target speed.
+    """
     if not episodes:
         raise ConfigError("a world needs at least one episode")
     for episode in episodes:
@@ -211,6 +218,8 @@ def build(
             _put_agent(a, e, i, agent, names, route)
         if ego is not None:
             a["controller"][e, 0] = int(ego)
+        if speed is not None:
+            a["cruise"][e, 0, 0] = speed
         a["town"][e] = towns.index(episode.town)
         for index, state in episode.signal_override.items():
             a["signal"][e, index] = int(state)

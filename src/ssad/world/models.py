@@ -34,7 +34,8 @@ MODELS: dict[str, Model] = {
         _vehicle("truck", AgentKind.TRUCK, (8.47, 2.50, 3.40), 1.5, 6.0, 30.0),
         _vehicle("bus", AgentKind.BUS, (10.27, 2.50, 3.30), 1.3, 6.0, 28.0),
         _vehicle("motorcycle", AgentKind.MOTORCYCLE, (2.20, 0.85, 1.60), 4.5, 7.5, 55.0),
-        _vehicle("bicycle", AgentKind.BICYCLE, (1.65, 0.60, 1.75), 3.0, 4.0, 12.0),  # diamondback.century
+        # diamondback.century; a strong rider's start, about 1.5 m/s^2
+        _vehicle("bicycle", AgentKind.BICYCLE, (1.65, 0.60, 1.75), 1.5, 4.0, 12.0),
         Model("walker", AgentKind.WALKER, 0.50, 0.50, 1.86, max_accel=20.0, max_brake=20.0, max_speed=4.0),
         Model("vending_machine", AgentKind.PROP, 1.00, 0.90, 1.90),
         Model("barrier", AgentKind.PROP, 1.50, 0.50, 1.00),

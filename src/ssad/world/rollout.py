@@ -69,7 +69,8 @@ def rollout(
 
     Raises ConfigError if the system returns controls of a wrong shape or not finite; what the system raises passes.
     """
-    world = World(episodes, graphs, device=device, ego=system.controller)
+    speed = getattr(system, "target_speed", None)
+    world = World(episodes, graphs, device=device, ego=system.controller, ego_speed=speed)
     external = system.controller == Controller.EXTERNAL
     if external:
         system.reset(episodes)

@@ -76,7 +76,8 @@ class World:
     """Episodes run side by side.
 
     `episodes` are the bank; scene b runs episode `assign[b]` (default: one scene an episode). `graphs` maps each
-    town named by them to its lane graph. `ego` replaces the controller of every ego. With `autoreset` a scene whose
+    town named by them to its lane graph. `ego` and `ego_speed` replace every ego's
+    controller and target speed. With `autoreset` a scene whose
     episode has ended starts it again at the next step. A scene's bits depend on its episode and actions alone: not on
     the batch, its order, or what the other scenes do. Raises ConfigError for an episode that cannot be built.
     """
@@ -91,6 +92,7 @@ class World:
         dt: float = 0.1,
         substeps: int = 2,
         ego: Controller | None = None,
+        ego_speed: float | None = None,
         autoreset: bool = False,
     ) -> None:
         if dt <= 0.0 or substeps < 1:
@@ -101,7 +103,7 @@ class World:
         self.graphs = dict(graphs)
         self.dt = dt
         self.device = device
-        self.bank, self.roads, self.agents = build(self.episodes, graphs, device, ego)
+        self.bank, self.roads, self.agents = build(self.episodes, graphs, device, ego, ego_speed)
         order = np.arange(len(self.episodes)) if assign is None else np.asarray(assign)
         if len(order) == 0 or order.min() < 0 or order.max() >= len(self.episodes):
             raise ConfigError(f"scenes must be assigned episodes 0 to {len(self.episodes) - 1}")
