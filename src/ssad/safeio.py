@@ -196,13 +196,14 @@ def parse_yaml_document(text: str, name: str = "<text>") -> Document:
 
     loader = _with_resolvers(getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     depth = 0
-    event: Any
+
     try:
         for event in yaml.parse(text, Loader=loader):  # before the composer, which recurses in C
             if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
                 depth += 1
                 if depth > MAX_DEPTH:
-                    raise FormatError(f"{name}:{event.start_mark.line + 1}: nested deeper than {MAX_DEPTH} levels")
+                    line = getattr(event.start_mark, "line", 0) + 1
+                    raise FormatError(f"{name}:{line}: nested deeper than {MAX_DEPTH} levels")
             elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
                 depth -= 1
         node = yaml.compose(text, Loader=loader)

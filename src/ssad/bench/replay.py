@@ -1,0 +1,45 @@
+"""`ssad replay`: run one cell again, alone, and compare every bit with what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ssad.bench.cells import Cell, find_cell
+from ssad.bench.run import read_plan
+from ssad.bench.store import RESULTS, read_lines
+from ssad.errors import StoreError
+from ssad.roads import LaneGraph
+from ssad.traces import first_difference, load_trace
+from ssad.types import EpisodeTrace
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A cell run again. difference: None when equal to the bit, else where the two part."""
+
+    cell: Cell
+    trace: EpisodeTrace
+    graph: LaneGraph
+    difference: str | None
+
+
+def replay(folder: str | Path, name: str) -> Replay:
+    """Run the cell that `name` means (key, unique start of it, or "system/scenario") once more.
+
+    StoreError when it was not recorded; ConfigError when there is no such cell or the code has changed since.
+    """
+    from ssad.bench.execute import drive, town
+
+    todo = read_plan(folder)
+    cell = find_cell(todo.cells, name)
+    record = next((r for r in read_lines(Path(folder) / RESULTS) if r["key"] == cell.key), None)
+    if record is None:
+        raise StoreError(f"{folder}: cell {cell.key} ({cell.name}) has not run yet; run the suite again first")
+    if record["status"] != "ok":
+        raise StoreError(
+            f"{folder}: cell {cell.key} ({cell.name}) left no trace: {record['status']}, {record['reason']}"
+        )
+    recorded = load_trace(Path(folder) / record["artefacts"]["trace"])
+    _, traces = drive([cell.as_dict()], device=todo.device)
+    return Replay(cell, traces[0], town(traces[0].town), first_difference(recorded, traces[0]))

@@ -1,0 +1,216 @@
+"""The command line: one thin function a verb. Heavy imports are inside, so that --help is quick."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ssad.errors import ConfigError, SSADError, unknown_name
+
+app = typer.Typer(
+    help="SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+imports = typer.Typer(help="Bring in OpenDRIVE maps and SafeBench / FREA / leaderboard routes.", no_args_is_help=True)
+app.add_typer(imports, name="import")
+
+Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `ssad run` wrote.")]
+
+
+@app.command()
+def run(
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="Name (see: ssad list suites) or YAML file.")],
+    out: Annotated[Path | None, typer.Option(help="Results folder.  [default: runs/SUITE]")] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the suite.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+) -> None:
+    """Run a suite and write its report; run again to resume.
+
+    Exit code 0: every episode ran; 1: some failed (they are in the results with the reason); 2: wrong input.
+    """
+    from rich.console import Console
+
+    from ssad.bench.run import pick_device, plan
+    from ssad.bench.run import run as run_plan
+    from ssad.bench.suite import load_suite
+    from ssad.bench.summary import table
+
+    chosen = load_suite(suite, settings or [])
+    folder = out or Path("runs") / chosen.name
+    todo = plan(chosen, device=pick_device(device))
+    try:
+        records = run_plan(todo, folder, workers=workers)
+    except KeyboardInterrupt:
+        print(f"stopped; what is done is kept in {folder}: the same command goes on from there", file=sys.stderr)
+        raise typer.Exit(130) from None
+    console = Console()
+    console.print(table(chosen.title or chosen.name, records))
+    failed = [r for r in records if r["status"] != "ok"]
+    for record in failed[:5]:
+        name = f"{record['system']}/{record['spec']['scenario']['name']}"
+        console.print(f"{record['status']}: {name}: {record['reason']}", markup=False, soft_wrap=True)
+    if len(failed) > 5:
+        console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
+    report(folder)
+    raise typer.Exit(1 if failed else 0)
+
+
+@app.command()
+def report(folder: Dir) -> None:
+    """Write DIR/report.html and DIR/tables from the results in DIR."""
+    from ssad.bench.store import read_run
+    from ssad.report import write_report
+
+    read_run(folder)
+    print(f"report: {write_report(folder)}")
+
+
+@app.command()
+def replay(
+    folder: Dir,
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key, start of a key, or system/scenario.")],
+    out: Annotated[Path | None, typer.Option(help="Where to write.  [default: DIR/replays]")] = None,
+) -> None:
+    """Run one cell again, compare it bit for bit with the record, and write its video and recording.
+
+    Exit code 1 when the two differ.
+    """
+    from ssad.bench.replay import replay as run_again
+    from ssad.report import write_video
+    from ssad.safeio import make_folder
+    from ssad.traces import save_trace
+
+    found = run_again(folder, cell)
+    target = make_folder(out or folder / "replays") / found.cell.key
+    save_trace(target.with_suffix(".npz"), found.trace)
+    write_video(found.trace, found.graph, target.with_suffix(".mp4"))
+    verdict = f"differs: {found.difference}" if found.difference else "identical"
+    print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
+    print(f"video: {target.with_suffix('.mp4')}\nrecording: {target.with_suffix('.npz')}")
+    raise typer.Exit(1 if found.difference else 0)
+
+
+def _scenario_list() -> dict[str, str]:
+    from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
+
+    sets = {name: load_scenarios(name) for name in set_names()}
+    rows = {name: f"set of {len(found)}" for name, found in sets.items()}
+    rows |= {name: f"class, {sum(s.type == name for s in sets['precrash'])} pre-crash" for name in SCENARIOS}
+    return rows | {s.name: f"{s.type} in {s.town}" for found in sets.values() for s in found}
+
+
+def _system_list() -> dict[str, str]:
+    from ssad.agents import SYSTEMS
+    from ssad.registry import names
+
+    return names("system", SYSTEMS) | {"module:object": "a driving system of your own, see README"}
+
+
+def _town_list() -> dict[str, str]:
+    from ssad.roads import town_names
+
+    return town_names()
+
+
+def _suite_list() -> dict[str, str]:
+    from ssad.bench.suite import load_suite, suite_files
+
+    return {name: load_suite(name).title for name in suite_files()}
+
+
+KINDS = {"suites": _suite_list, "scenarios": _scenario_list, "systems": _system_list, "towns": _town_list}
+ALIASES = {"agents": "systems"}
+
+
+@app.command("list")
+def list_names(
+    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, towns.")] = None,
+) -> None:
+    """List what can be named: suites, scenarios, systems (agents), towns."""
+    chosen = ALIASES.get(kind or "", kind)
+    if chosen is not None and chosen not in KINDS:
+        raise unknown_name("kind", str(kind), [*KINDS, *ALIASES])
+    for name, rows in KINDS.items():
+        if chosen not in (None, name):
+            continue
+        found = rows()
+        if chosen is None:
+            print(f"{name}:")
+            if name == "scenarios":  # hundreds of single ones: only when asked for
+                found = {key: text for key, text in found.items() if text.startswith(("set", "class"))}
+        width = max((len(key) for key in found), default=0)
+        for key, text in found.items():
+            print(f"{'  ' if chosen is None else ''}{key:<{width}}  {text}".rstrip())
+
+
+@imports.command("map")
+def import_map(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE map.")],
+    name: Annotated[str | None, typer.Option(help="Name of the town.  [default: that of the file]")] = None,
+) -> None:
+    """Turn an OpenDRIVE map into a town (needs the extra `carla`)."""
+    from ssad.roads import import_map as bake
+    from ssad.roads import load_town, town_names
+    from ssad.safeio import home
+
+    label = name or file.stem
+    if town_names().get(label) == "built-in":
+        raise ConfigError(f"'{label}' is the name of a built-in town; choose another with --name")
+    path = bake(file, label, home())
+    print(f"town {label}: {len(load_town(label).kind)} lanes, written to {path}")
+
+
+@imports.command("routes")
+def import_routes(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="SafeBench, FREA or leaderboard routes.")],
+    name: Annotated[str | None, typer.Option(help="Name of the set.  [default: that of the folder]")] = None,
+) -> None:
+    """Turn a folder of routes into a set of scenarios that suites can name."""
+    from ssad.safeio import home
+    from ssad.scenarios.dynamic import import_routes as read
+    from ssad.scenarios.dynamic import save_scenarios
+
+    label = name or folder.resolve().name
+    if not label.replace("-", "").replace("_", "").isalnum():
+        raise ConfigError(f"'{label}' cannot name a set of scenarios; use letters, digits, _ and - with --name")
+    if label in ("precrash", "natural"):
+        raise ConfigError(f"'{label}' is the name of a built-in set; choose another with --name")
+    scenarios = read(folder)
+    path = home() / "scenarios" / f"{label}.yaml"
+    save_scenarios(path, scenarios)
+    towns = ", ".join(sorted({s.town for s in scenarios}))
+    print(f"set {label}: {len(scenarios)} scenarios on {towns}, written to {path}")
+
+
+@app.command()
+def doctor() -> None:
+    """Say what works on this machine and what is missing. Exit code 1 when nothing can run."""
+    from ssad.bench.doctor import examine
+
+    broken = False
+    for finding in examine():
+        broken |= finding.state == "broken"
+        print(f"{finding.state:<8} {finding.what:<12} {finding.detail}")
+    raise typer.Exit(1 if broken else 0)
+
+
+def main() -> None:
+    """Entry point: an error that the user can mend becomes one line and exit code 2."""
+    try:
+        app()
+    except SSADError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
