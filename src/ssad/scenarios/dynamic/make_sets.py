@@ -63,53 +63,61 @@ def _clear(graph: LaneGraph, lane: int) -> bool:
     return bool(graph.kind[lane] == LaneType.DRIVING and graph.junction[lane] < 0)
 
 
+def _extend(graph: LaneGraph, lane: int, length: float, *, forward: bool) -> tuple[list[int], float]:
+    """The lane and those that go on from it outside junctions while there is no choice, and their length, m."""
+    lanes, total = [lane], float(graph.length[lane])
+    while total < length:
+        options = graph.successors(lanes[-1]) if forward else graph.predecessors(lanes[0])
+        clear = [int(n) for n in options if _clear(graph, int(n))]
+        if len(clear) != 1 or clear[0] in lanes:
+            break
+        lanes = [*lanes, clear[0]] if forward else [clear[0], *lanes]
+        total += float(graph.length[clear[0]])
+    return lanes, total
+
+
+def _along(graph: LaneGraph, lanes: list[int], s: float) -> Pose:
+    """The pose at arc length s of lanes that follow each other."""
+    for lane in lanes[:-1]:
+        if s <= float(graph.length[lane]):
+            return _pose(graph, lane, s)
+        s -= float(graph.length[lane])
+    return _pose(graph, lanes[-1], s)
+
+
 def stretches(graph: LaneGraph, length: float, trigger: float) -> Iterator[Stretch]:
     """Ways of `length` m on driving lanes outside junctions, one every 20 m along each lane."""
     for lane in range(graph.lanes):
         if not _clear(graph, lane):
             continue
-        for start in np.arange(_MARGIN, float(graph.length[lane]), 20.0):
-            lanes, free = [lane], float(graph.length[lane]) - float(start)
-            while free < length + _MARGIN:
-                after = [int(n) for n in graph.successors(lanes[-1]) if _clear(graph, int(n))]
-                if len(after) != 1 or after[0] in lanes:
-                    break
-                lanes.append(after[0])
-                free += float(graph.length[after[0]])
-            if free < length + _MARGIN:
+        for start in np.arange(_MARGIN, float(graph.length[lane]), 20.0).tolist():
+            lanes, total = _extend(graph, lane, start + length + _MARGIN, forward=True)
+            if total < start + length + _MARGIN:
                 continue
-            marks = [_along(graph, lanes, float(start) + at) for at in (0.0, trigger, length)]
-            yield Stretch((marks[0], marks[2]), marks[1], None, -1, tuple(lanes))
-
-
-def _along(graph: LaneGraph, lanes: list[int], s: float) -> Pose:
-    for lane in lanes:
-        if s <= float(graph.length[lane]) or lane == lanes[-1]:
-            return _pose(graph, lane, s)
-        s -= float(graph.length[lane])
-    raise AssertionError("a stretch has lanes")
+            first, mark, last = (_along(graph, lanes, start + at) for at in (0.0, trigger, length))
+            yield Stretch((first, last), mark, None, -1, tuple(lanes))
 
 
 def passages(graph: LaneGraph, before: float, after: float) -> Iterator[Stretch]:
     """Ways through one junction: `before` m on the approach, a turn, `after` m on the exit."""
-    for inside in np.flatnonzero((graph.junction >= 0) & (graph.kind == LaneType.DRIVING)):
-        exits = [int(n) for n in graph.successors(int(inside)) if _clear(graph, int(n))]
-        for approach in map(int, graph.predecessors(int(inside))):
-            if len(exits) != 1 or not _clear(graph, approach):
+    for inside in np.flatnonzero((graph.junction >= 0) & (graph.kind == LaneType.DRIVING)).tolist():
+        for approach, leave in itertools.product(graph.predecessors(inside), graph.successors(inside)):
+            if not (_clear(graph, int(approach)) and _clear(graph, int(leave))):
                 continue
-            if graph.length[approach] < before + _MARGIN or graph.length[exits[0]] < after + _MARGIN:
+            to, end = _extend(graph, int(approach), before + _MARGIN, forward=False)
+            on, free = _extend(graph, int(leave), after + _MARGIN, forward=True)
+            if end < before + _MARGIN or free < after + _MARGIN:
                 continue
-            end = float(graph.length[approach])
-            angle = math.degrees(turn_of(graph, int(inside)))
+            angle = math.degrees(turn_of(graph, inside))
             turn: Turn = "straight" if abs(angle) < 30.0 else "left" if angle > 0.0 else "right"
             points = (
-                _pose(graph, approach, end - before),
-                _pose(graph, approach, end - 2.0),
-                _pose(graph, exits[0], 2.0),
-                _pose(graph, exits[0], after),
+                _along(graph, to, end - before),
+                _along(graph, to, end - 2.0),
+                _along(graph, on, 2.0),
+                _along(graph, on, after),
             )
-            trigger = _pose(graph, approach, end - min(before - 20.0, 20.0))
-            yield Stretch(points, trigger, turn, int(graph.junction[inside]), (approach, int(inside), exits[0]))
+            trigger = _along(graph, to, end - min(before - 20.0, 20.0))
+            yield Stretch(points, trigger, turn, int(graph.junction[inside]), (*to, inside, *on))
 
 
 def _left_of(graph: LaneGraph, stretch: Stretch, *, same: bool) -> bool:
@@ -195,7 +203,7 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
             found = candidates(graph, route_along(graph, stretch.points))
         except RouteError:
             return False
-        return len(found) >= 8
+        return len(found) >= 6
 
     pool = list(passages(graph, 30.0, 30.0))
     chosen: list[Stretch] = []
