@@ -151,8 +151,8 @@ def lead_gap(
 def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
     """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
 
-    Only another Autopilot can be relied on to give way: inside a junction before outside, then straight before
-    right before left, then whoever is nearer to the junction, then the lower number.
+    Only another Autopilot can be relied on to give way: straight before right before left, then whoever is inside
+    the junction, then whoever is nearer to it, then the lower number.
     """
     if bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2:
         return False
@@ -162,10 +162,10 @@ def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int,
     c = roads.rule[rj[0] + state.progress[b, j]]
     inside_i = a[2] <= 0.0
     inside_j = c[2] <= 0.0
-    if inside_i != inside_j:
-        return inside_i
     if a[3] != c[3]:
         return a[3] < c[3]
+    if inside_i != inside_j:
+        return inside_i
     if wp.abs(a[2] - c[2]) > 1.0:
         return a[2] < c[2]
     return i < j
