@@ -13,7 +13,7 @@ from ssad.errors import ConfigError, RouteError
 from ssad.roads.graph import LaneGraph
 from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, parameter_box, scenario_type
 from ssad.scenarios.dynamic.episode import forced_signals
-from ssad.scenarios.dynamic.knowledge._placing import polyline_route, time_to_cover
+from ssad.scenarios.dynamic.knowledge._placing import ego_times, polyline_route, time_to_cover
 from ssad.types import (
     Actor,
     Condition,
@@ -134,13 +134,14 @@ def test_a_computed_place_lets_the_car_meet_the_ego(kind: str, crossroads: LaneG
     ahead = np.array([math.cos(heading), math.sin(heading)])
     start = np.array([car.pose.x, car.pose.y])
     assert start @ ahead < -15.0  # before the junction
-    # the ego at 8 m/s along its route, the car at full throttle from the moment it is triggered
+    # the ego along its route, the car at full throttle from the moment it is triggered
+    times = ego_times(route)
     xy = route.xy.astype(float)
     triggered = int(np.flatnonzero(np.hypot(*(xy - start).T) < trigger)[0])
     assert triggered > 10
     gaps = []
     for i in range(triggered, len(xy)):
-        t = (i - triggered) / 8.0
+        t = float(times[i] - times[triggered])
         ramp = speed / model("coupe").max_accel
         gone = 0.5 * model("coupe").max_accel * min(t, ramp) ** 2 + speed * max(t - ramp, 0.0)
         gaps.append(float(np.hypot(*(xy[i] - start - gone * ahead))))
@@ -164,6 +165,14 @@ def test_a_trigger_off_the_route_is_an_error(crossroads: LaneGraph, routes: Any)
 def test_time_to_cover_is_that_of_uniform_acceleration() -> None:
     assert time_to_cover(8.0, 10.0, 4.0) == pytest.approx(2.0)  # still accelerating
     assert time_to_cover(12.5 + 20.0, 10.0, 4.0) == pytest.approx(2.5 + 2.0)
+
+
+def test_the_assumed_ego_keeps_8_m_s_and_slows_down_for_bends() -> None:
+    straight = polyline_route(np.array([[0.0, 0.0], [80.0, 0.0]]))
+    assert ego_times(straight)[-1] == pytest.approx(10.0)
+    angle = np.linspace(0.0, 3.0, 400)
+    circle = polyline_route(10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    assert ego_times(circle)[20] - ego_times(circle)[10] == pytest.approx(10.0 / 5.0, rel=0.02)  # sqrt(2.5 * 10)
 
 
 def test_signals_of_the_ego_and_of_the_others(crossroads: LaneGraph, routes: Any) -> None:

@@ -149,19 +149,32 @@ def _pool(graph: LaneGraph, kind: str) -> list[Stretch]:
     return list(ways[kind]())
 
 
-def _spread(pool: list[Stretch], count: int, works: Callable[[Stretch], bool]) -> list[Stretch]:
-    """`count` stretches that work, each the farthest from those before it."""
+def _look(graph: LaneGraph, stretch: Stretch) -> tuple[bool, bool, str]:
+    """What kind of road a stretch is: bent, more than one lane a direction, which turn."""
+    a, b = stretch.points[0], stretch.points[-1]
+    bent = stretch.turn is None and abs(wrap(b.yaw - a.yaw)) > math.radians(20.0)
+    lane = stretch.lanes[0]
+    beside = [int(n) for n in (graph.left[lane], graph.right[lane]) if n >= 0]
+    wide = any(graph.kind[n] == LaneType.DRIVING and graph.same_direction(lane, n) for n in beside)
+    return bent, not wide, stretch.turn or ""
+
+
+def _spread(graph: LaneGraph, pool: list[Stretch], count: int, works: Callable[[Stretch], bool]) -> list[Stretch]:
+    """`count` stretches that work: kinds of road in rotation, of each the farthest from those before it."""
     rest = list(pool)
     chosen: list[Stretch] = []
-    while rest and len(chosen) < count:
-        if chosen:
-            gap = [min(float(np.linalg.norm(p.place() - c.place())) for c in chosen) for p in rest]
-            pick = int(np.argmax(gap))
-        else:
-            pick = 0
-        stretch = rest.pop(pick)
-        if works(stretch):
-            chosen.append(stretch)
+    looks = sorted({_look(graph, p) for p in rest})
+    for look in itertools.cycle(looks):
+        if not rest or len(chosen) == count:
+            return chosen
+        like = [p for p in rest if _look(graph, p) == look]
+        while like:
+            gap = [min((float(np.linalg.norm(p.place() - c.place())) for c in chosen), default=0.0) for p in like]
+            stretch = like.pop(int(np.argmax(gap)))
+            rest.remove(stretch)
+            if works(stretch):
+                chosen.append(stretch)
+                break
     return chosen
 
 
@@ -187,7 +200,7 @@ def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
                 return False
             return True
 
-        chosen = _spread(_pool(graph, kind), routes, works)
+        chosen = _spread(graph, _pool(graph, kind), routes, works)
         if len(chosen) < routes:
             raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} roads for {kind}")
         result += [scenario(stretch, i, kind) for i, stretch in enumerate(chosen)]

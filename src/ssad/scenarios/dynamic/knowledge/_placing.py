@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 EGO_SPEED = 8.0
 """Speed (m/s) that the ego is taken to keep when an actor is placed to meet it: SafeBench's desired speed."""
+_LATERAL = 2.5  # m/s^2 in bends, and
+_SLOW_DOWN = 2.0  # m/s^2 before them: how drivers take a turn at a junction
 DEFAULT_TRIGGER = 30.0
 """Where on the route a scenario without a trigger has it, m from the start: as in SafeBench's routes."""
 _SHOULDER = 2.0  # CARLA's maps draw parking strips as shoulders wider than this
@@ -223,6 +225,16 @@ def time_to_cover(distance: float, top_speed: float, acceleration: float) -> flo
     return top_speed / acceleration + (distance - ramp) / top_speed
 
 
+def ego_times(route: Route) -> F64:
+    """Seconds [N] at which an ego that keeps 8 m/s, and slows down for bends only, passes the route's points."""
+    turn = np.abs(np.gradient(np.unwrap(route.yaw.astype(np.float64)), route.spacing))
+    turn = np.convolve(np.pad(turn, 1, mode="edge"), np.ones(3) / 3.0, mode="valid")
+    speed = np.minimum(EGO_SPEED, np.sqrt(_LATERAL / np.maximum(turn, 1e-6)))
+    room = 2.0 * _SLOW_DOWN * route.spacing * np.arange(len(speed))
+    speed = np.sqrt(np.minimum.accumulate((speed**2 + room)[::-1])[::-1] - room)
+    return np.concatenate([[0.0], np.cumsum(2.0 * route.spacing / (speed[:-1] + speed[1:]))])
+
+
 def _approaches(graph: LaneGraph, junction: int) -> Iterator[tuple[int, int]]:
     """(approach lane, lane inside the junction that goes on from it) for driving lanes."""
     for lane in np.flatnonzero((graph.junction == junction) & (graph.kind == LaneType.DRIVING)):
@@ -241,7 +253,7 @@ def meeting_place(
     speed: float,
     body: str,
 ) -> Place:
-    """Where an actor stands on an approach of the ego's junction so that it meets an ego that keeps 8 m/s.
+    """Where an actor stands on an approach of the ego's junction so that it meets an ego of `ego_times`.
 
     sides: wanted headings of the approach relative to the ego's, rad, best first (-pi/2: from the left).
     The actor starts when the ego is within `trigger_distance`, at full throttle up to `speed`; it stands
@@ -303,6 +315,7 @@ def _meet(
     j = int(np.argmin(gap[k]))
     along = float(np.hypot(*np.diff(path[: j + 1], axis=0).T).sum())
     conflict = enter + k
+    times = ego_times(route)
     best: tuple[float, Place] | None = None
     for back in np.arange(1.0, float(graph.length[before]), 0.5):
         place = Place(before, float(graph.length[before]) - float(back))
@@ -311,7 +324,7 @@ def _meet(
         within = np.flatnonzero(off < trigger_distance)
         if not len(within) or within[0] == 0:
             continue
-        ego_time = (conflict - int(within[0])) * route.spacing / EGO_SPEED
+        ego_time = float(times[conflict] - times[int(within[0])])
         wait = abs(time_to_cover(float(back) + along, speed, acceleration) - ego_time)
         if best is None or wait < best[0] - 1e-9:
             best = (wait, place)
