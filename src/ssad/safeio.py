@@ -394,7 +394,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise StoreError(f"{target}: cannot be written: {error.strerror or error}") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, data: str | bytes) -> None:

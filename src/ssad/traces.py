@@ -45,9 +45,7 @@ def load_trace(path: str | Path) -> EpisodeTrace:
         raise FormatError(f"{path}: not an episode trace")
     meta = safeio.parse_json(data.pop("meta").tobytes(), str(path))
     if not isinstance(meta, dict) or meta.pop("format", None) != FORMAT:
-        raise FormatError(
-            f"{path}: an episode trace of another format; run the suite again into a new folder"
-        )
+        raise FormatError(f"{path}: an episode trace of another format; run the suite again into a new folder")
     missing = (set(_META) - set(meta)) | (set(_ARRAYS) - set(data))
     wrong = [name for name, dtype in _ARRAYS.items() if name in data and data[name].dtype != dtype]
     if missing or wrong:
@@ -82,9 +80,8 @@ def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
         if x.shape != y.shape:
             found.append((min(len(x), len(y)), f"{name}: shape {x.shape} against {y.shape}"))
             continue
-        unequal = x.view(np.uint8).reshape(*x.shape, -1) != y.view(np.uint8).reshape(*y.shape, -1)
-        if unequal.any():
-            step = int(np.nonzero(unequal.reshape(len(x), -1).any(axis=1))[0][0])
+        if x.tobytes() != y.tobytes():
+            step = next(i for i in range(len(x)) if x[i].tobytes() != y[i].tobytes())
             found.append((step, f"{name}: {x[step]} against {y[step]}"))
     if not found:
         return None

@@ -53,8 +53,9 @@ def _warp() -> Iterator[Finding]:
     try:
         import warp
 
-        warp.config.quiet = True
-        warp.init()
+        from ssad.bench.execute import quiet_warp
+
+        quiet_warp()
         devices = ", ".join(f"{d.alias} ({d.name})" for d in warp.get_devices())
         yield Finding("warp", "ok", f"{version('warp-lang')}: {devices}")
         gpu = warp.is_cuda_available()

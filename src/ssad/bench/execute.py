@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,10 +36,41 @@ def _system(name: str) -> DrivingSystem:
     return make_system(name)
 
 
+def cuda_driver() -> bool:
+    """Whether this machine has NVIDIA's driver; asked before Warp is loaded, which warns when there is none."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def quiet_warp() -> None:
+    """Start Warp and keep its banner and its notes about the kernel cache off the terminal."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+    if cuda_driver():
+        warp.init()
+        return
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:  # its native part warns of the missing driver on the descriptor itself
+        os.dup2(null, 2)
+        warp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
+
+
 def warm_up(settings: Mapping[str, Any]) -> None:
     """Load the world's kernels (compiled on first use), so that no cell's time-out pays for it."""
-    del settings
-    import ssad.world.rollout  # noqa: F401
+    import warp
+
+    import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+    quiet_warp()
+    warp.force_load(device=settings["device"])
 
 
 def episode_of(cell: Mapping[str, Any]) -> Episode:

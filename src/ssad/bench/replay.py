@@ -29,8 +29,9 @@ def replay(folder: str | Path, name: str) -> Replay:
 
     StoreError when it was not recorded; ConfigError when there is no such cell or the code has changed since.
     """
-    from ssad.bench.execute import drive, town
+    from ssad.bench.execute import drive, quiet_warp, town
 
+    quiet_warp()
     todo = read_plan(folder)
     cell = find_cell(todo.cells, name)
     record = next((r for r in read_lines(Path(folder) / RESULTS) if r["key"] == cell.key), None)

@@ -66,11 +66,14 @@ def pick_device(wanted: str) -> str:
         return "cpu"
     if wanted not in ("auto", "cuda"):
         raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
-    import warp
+    from ssad.bench.execute import cuda_driver, quiet_warp
 
-    warp.config.quiet = True
-    if warp.is_cuda_available():
-        return "cuda"
+    if cuda_driver():
+        import warp
+
+        quiet_warp()
+        if warp.is_cuda_available():
+            return "cuda"
     if wanted == "cuda":
         raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
     return "cpu"

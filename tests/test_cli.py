@@ -1,0 +1,155 @@
+"""The command line: names, exit codes, one-line errors, start-up time."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+COMMANDS = ("run", "report", "replay", "list", "import", "doctor")
+
+
+def ssad(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ssad.cli", *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=cwd,
+        env=os.environ | environment,
+        timeout=300,
+    )
+
+
+def fails(done: subprocess.CompletedProcess[str], *parts: str) -> None:
+    """Exit code 2, one line that begins with error:, and nothing else."""
+    lines = done.stderr.strip().splitlines()
+    assert done.returncode == 2, done
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("error: ")
+    for part in parts:
+        assert part in lines[0]
+    assert done.stdout == ""
+
+
+def best_of(count: int, *command: str) -> float:
+    times = []
+    for _ in range(count):
+        began = time.perf_counter()
+        subprocess.run([sys.executable, *command], check=True, capture_output=True)
+        times.append(time.perf_counter() - began)
+    return min(times)
+
+
+def test_help_names_every_command() -> None:
+    done = ssad("--help")
+    assert done.returncode == 0
+    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+
+
+def test_start_up_is_quick() -> None:
+    assert best_of(5, "-c", "import ssad") < 0.3
+    assert best_of(5, "-m", "ssad.cli", "--help") < 0.5
+
+
+def test_nothing_heavy_is_imported_for_help() -> None:
+    code = "import sys, ssad.cli; print([m for m in ('numpy', 'warp', 'pydantic', 'rich', 'cv2') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (("run", "quik"), ("unknown suite 'quik'", "closest: quick")),
+        (("run", "nowhere.yaml"), ("nowhere.yaml: no such file",)),
+        (("run", "quick", "--set", "sistems=x"), ("unknown key 'sistems'", "systems")),
+        (("run", "quick", "--set", "systems=[autopilo]"), ("unknown system 'autopilo'", "autopilot")),
+        (("run", "quick", "--set", "systems=[not_here:X]"), ("not_here", "looked in")),
+        (("run", "quick", "--set", "scenarios=[safebanch]"), ("unknown scenario 'safebanch'", "precrash")),
+        (("run", "quick", "--set", "scenarios=[safebench]"), ("ssad import routes",)),
+        (("run", "quick", "--device", "tpu"), ("auto, cpu or cuda",)),
+        (("report", "nowhere"), ("nowhere: not a results folder", "ssad run")),
+        (("replay", "nowhere", "x"), ("nowhere: not a results folder",)),
+        (("list", "towms"), ("unknown kind 'towms'", "towns")),
+        (("import", "map", "nowhere.xodr"), ("nowhere.xodr",)),
+        (("import", "map", "x.xodr", "--name", "Twinford"), ("built-in town",)),
+        (("import", "routes", "nowhere"), ("nowhere: no such folder",)),
+        (("import", "routes", ".", "--name", "../x"), ("cannot name a set",)),
+        (("import", "routes", ".", "--name", "precrash"), ("built-in set",)),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(
+    tmp_path: Path, arguments: tuple[str, ...], parts: tuple[str, ...]
+) -> None:
+    home = tmp_path / "home"
+    work = tmp_path / "work"
+    work.mkdir()
+    fails(ssad(*arguments, cwd=work, SSAD_HOME=str(home)), *parts)
+    assert os.listdir(work) == []
+    assert not home.exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [("run",), ("run", "quick", "--nope"), ("nope",), ("run", "quick", "--workers", "0")]
+)
+def test_usage_errors_have_exit_code_2(arguments: tuple[str, ...]) -> None:
+    assert ssad(*arguments).returncode == 2
+
+
+SCENARIO = """
+name: Mine/00
+type: StraightObstacle
+town: ProvingGround
+route: [{x: 0, y: 0}, {x: 50, y: 0}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (("town: ProvingGround", "town: ProvingGrund"), ("unknown town 'ProvingGrund'", "ProvingGround")),
+        (("name: Mine/00", "nam: Mine/00"), ("mine.yaml:2", "nam")),
+        (("x: 0,", "x: zero,"), ("mine.yaml:5", "route")),
+        (("{x: 50, y: 0}", "{x: 50000, y: 0}"), ("Mine/00",)),
+        (("type: StraightObstacle", "type: StrightObstacle"), ("StraightObstacle",)),
+        (("town: ProvingGround", "town: [*a, *a]"), ("mine.yaml", "not valid YAML")),
+    ],
+)
+def test_a_bad_scenario_file_is_one_line(tmp_path: Path, change: tuple[str, str], parts: tuple[str, ...]) -> None:
+    (tmp_path / "mine.yaml").write_text(SCENARIO.replace(*change))
+    fails(ssad("run", "quick", "--set", "scenarios=mine.yaml", cwd=tmp_path), *parts)
+    assert os.listdir(tmp_path) == ["mine.yaml"]
+
+
+def test_unwritable_folder_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    setting = "scenarios=[StraightObstacle/00]"
+    fails(ssad("run", "quick", "--set", setting, "--out", str(tmp_path / "file" / "run")), "cannot write")
+
+
+def test_doctor() -> None:
+    done = ssad("doctor")
+    assert done.returncode == 0, done.stdout
+    assert {"python", "warp", "carla", "SSAD_HOME", "towns"} <= {line.split()[1] for line in done.stdout.splitlines()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        ("suites", "quick"),
+        ("systems", "blind"),
+        ("agents", "autopilot"),
+        ("towns", "ProvingGround"),
+        ("scenarios", "StraightObstacle/00"),
+        ("scenarios", "natural"),
+    ],
+)
+def test_list(kind: str, name: str) -> None:
+    done = ssad("list", kind)
+    assert done.returncode == 0
+    assert name in [line.split()[0] for line in done.stdout.splitlines()]

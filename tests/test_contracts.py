@@ -1,0 +1,45 @@
+"""The rules that hold the tree together: imports run one way, files stay short, the public face is small."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCE = sorted((ROOT / "src" / "ssad").rglob("*.py"))
+
+
+def test_imports_run_one_way() -> None:
+    tool = Path(sys.executable).with_name("lint-imports")
+    done = subprocess.run([str(tool), "--no-cache"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("path", SOURCE, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_files_stay_short_and_say_what_they_are(path: Path) -> None:
+    text = path.read_text()
+    assert len(text.splitlines()) <= 600
+    if text:
+        assert text.startswith('"""')
+
+
+def test_import_ssad_loads_no_heavy_package() -> None:
+    code = "import sys, ssad; print([m for m in ('torch', 'warp', 'cv2', 'matplotlib') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_no_pickle_and_no_bare_yaml_or_xml() -> None:
+    doors = {"safeio.py"}
+    words = ("import pickle", "allow_pickle=True", "yaml.load(", "import xml.etree", "import yaml")
+    found = [
+        f"{path.name}: {word}"
+        for path in SOURCE
+        if path.name not in doors
+        for word in words
+        if word in path.read_text()
+    ]
+    assert found == []
