@@ -1,62 +1,60 @@
-"""The table that a run ends with: systems x metrics x scenario groups."""
+"""The table that a run ends with: scenario groups x systems, with the main metrics."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.table import Table
 
-if TYPE_CHECKING:
-    from ssad.metrics import Estimate
-
 SHOWN = ("CR", "OR", "DR", "RC")
-"""Metrics of the table; the report has all of them."""
-
-AVERAGE = "all"
-
-
-def estimates(records: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, Estimate]]]:
-    """system -> group (and "all") -> metric -> Estimate. A record that is not ok counts as a failed episode."""
-    from ssad.metrics import EpisodeMetrics, aggregate
-
-    found: dict[str, dict[str, list[EpisodeMetrics | None]]] = {}
-    for record in records:
-        one = EpisodeMetrics.from_dict(record["metrics"]) if record["status"] == "ok" else None
-        groups = found.setdefault(record["system"], {})
-        for group in (record["group"], AVERAGE):
-            groups.setdefault(group, []).append(one)
-    return {
-        system: {group: aggregate(episodes) for group, episodes in groups.items()} for system, groups in found.items()
-    }
+"""Metrics of the table; the report has all of them, with intervals."""
 
 
 def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
-    """A Rich table; groups are rows and systems x metrics are columns, so that it fits a terminal."""
-    systems = estimates(records)
-    result = Table(title=title, title_justify="left", header_style="bold")
-    result.add_column("scenario", no_wrap=True)
-    result.add_column("n", justify="right")
-    for system in systems:
-        for i, metric in enumerate(SHOWN):
-            name = system.rsplit(":", maxsplit=1)[-1]
-            result.add_column(f"{name}\n{metric}" if i == 0 else f"\n{metric}", justify="right")
-    groups = list(dict.fromkeys(r["group"] for r in records))
-    for group in [*groups, AVERAGE]:
-        members = [r for r in records if group in (r["group"], AVERAGE)]
-        each = {r["system"]: sum(m["system"] == r["system"] for m in members) for r in members}
-        cells = [group, str(max(each.values(), default=0))]
-        for groups_of in systems.values():
-            cells += [_shown(groups_of.get(group, {}).get(metric)) for metric in SHOWN]
-        result.add_row(*cells, style="bold" if group == AVERAGE else None, end_section=group == groups[-1])
+    """A Rich table. A record that is not ok is a failed episode; the last rows are the means of the groups."""
+    from rich import box
+
+    from ssad.metrics import EpisodeMetrics, aggregate_groups
+
+    rows = aggregate_groups(
+        (r["system"], r["group"], EpisodeMetrics.from_dict(r["metrics"]) if r["status"] == "ok" else None)
+        for r in records
+    )
+    systems = list(dict.fromkeys(row.system for row in rows))
+    average = rows[-1].group
+    groups = [*dict.fromkeys(row.group for row in rows if row.group != average), average]
     failed = sum(r["status"] != "ok" for r in records)
-    caption = "CR collisions per episode, OR m driven off road, DR m from the route, RC share of the route"
-    result.caption = caption + (f"; {failed} of {len(records)} episodes failed" if failed else "")
+    result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    result.caption = (
+        "CR collisions per episode with its 95 % interval; OR m driven off the road; DR m from\nthe route; "
+        + ("RC share of the route" + (f"; {failed} of {len(records)} episodes failed and count" if failed else ""))
+    )
     result.caption_justify = "left"
+    result.add_column("scenario", no_wrap=True)
+    result.add_column("system", overflow="fold")
+    for name in ("n", "CR", "", *SHOWN[1:]):
+        result.add_column(name, justify="right", no_wrap=True)
+    for group in groups:
+        last = group == average
+        found = {row.system: row.values for row in rows if row.group == group}
+        for i, system in enumerate(s for s in systems if s in found):
+            count = sum(r["system"] == system and (last or r["group"] == group) for r in records)
+            crash, *others = (found[system][metric] for metric in SHOWN)
+            interval = f"{_shown(crash.low)}-{_shown(crash.high)}"
+            cells = [_shown(crash.mean), interval, *(_shown(other.mean) for other in others)]
+            end = i == len(found) - 1
+            result.add_row(
+                "" if i else group,
+                system.rsplit(":", maxsplit=1)[-1],
+                str(count),
+                *cells,
+                style="bold" if last else None,
+                end_section=end and group == groups[-2],
+            )
     return result
 
 
-def _shown(estimate: Estimate | None) -> str:
-    if estimate is None or estimate.mean is None or estimate.mean != estimate.mean:
-        return "-"
-    return f"{estimate.mean:.2f}"
+def _shown(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.2f}"
