@@ -167,8 +167,8 @@ def test_time_to_cover_is_that_of_uniform_acceleration() -> None:
     assert time_to_cover(12.5 + 20.0, 10.0, 4.0) == pytest.approx(2.5 + 2.0)
 
 
-def test_the_assumed_ego_keeps_8_m_s_and_slows_down_for_bends() -> None:
-    straight = polyline_route(np.array([[0.0, 0.0], [80.0, 0.0]]))
+def test_the_assumed_ego_keeps_9_m_s_and_slows_down_for_bends() -> None:
+    straight = polyline_route(np.array([[0.0, 0.0], [90.0, 0.0]]))
     assert ego_times(straight)[-1] == pytest.approx(10.0)
     angle = np.linspace(0.0, 3.0, 400)
     circle = polyline_route(10.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1))

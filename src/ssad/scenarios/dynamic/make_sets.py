@@ -32,6 +32,15 @@ NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 7, "Crossgate": 8}
 """Town -> number of junction routes, as FREA has on Town02 and Town05."""
 REPETITIONS = 10
 Turn = Literal["left", "straight", "right"]
+# Trigger distances, m, at which an ego that does not react is hit at any speed from 8 to 10 m/s on these roads. The
+# others keep SafeBench's value, which is the default of their class.
+_TRIGGERS: Mapping[tuple[str, Turn | None], float] = {
+    ("StraightObstacle", None): 16.0,
+    ("TurningObstacle", "left"): 22.0,
+    ("TurningObstacle", "right"): 17.0,
+    ("RedlightRunning", "straight"): 36.0,
+    ("CrossingNegotiation", "straight"): 36.0,
+}
 _TURNS: tuple[Turn, ...] = ("left", "straight", "right")
 _HEADING = 20.0  # m that half a turn counts when routes are compared
 _MARGIN = 2.0  # m kept free at the ends of a road
@@ -184,12 +193,14 @@ def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
     for kind in PRECRASH:
 
         def scenario(stretch: Stretch, number: int, kind: str = kind) -> Scenario:
+            tuned = _TRIGGERS.get((kind, stretch.turn))
             return Scenario(
                 name=f"{kind}/{number:02d}",
                 type=kind,
                 town=graph.name,
                 route=stretch.points,
                 trigger=stretch.trigger,
+                parameters={} if tuned is None else {"trigger_distance": tuned},
                 group=kind,
             )
 
@@ -216,7 +227,7 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
             found = candidates(graph, route_along(graph, stretch.points))
         except RouteError:
             return False
-        return len(found) >= 6
+        return len(found) >= 4
 
     pool = list(passages(graph, 30.0, 30.0))
     chosen: list[Stretch] = []

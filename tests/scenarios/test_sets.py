@@ -1,0 +1,184 @@
+"""The shipped sets: made by the generator, valid on their towns, dangerous and avoidable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ssad.geometry import obb_distance
+from ssad.roads import LaneQuery, load_town
+from ssad.roads.graph import LaneGraph
+from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scenario_type
+from ssad.scenarios.dynamic.make_sets import make
+from ssad.scenarios.dynamic.sets import DATA
+from ssad.types import Controller, Episode, LaneType, Scenario, SignalState
+from ssad.world.models import model
+from ssad.world.rollout import rollout
+
+SHIPPED = load_scenarios("precrash")
+NATURAL = load_scenarios("natural")
+
+
+@cache
+def town(name: str) -> LaneGraph:
+    return load_town(name)
+
+
+@cache
+def episode(name: str) -> Episode:
+    (scenario,) = load_scenarios(name)
+    return build_episode(scenario, town(scenario.town), seed=0)
+
+
+def boxes(e: Episode) -> np.ndarray:
+    rows = []
+    for agent in e.agents:
+        body = model(agent.model)
+        rows.append((agent.pose.x, agent.pose.y, agent.pose.yaw, body.length, body.width))
+    return np.array(rows)
+
+
+def test_the_generator_makes_the_shipped_files() -> None:
+    for name, text in make().items():
+        assert (DATA / name).read_text() == text, f"{name}: run python -m ssad.scenarios.dynamic.make_sets"
+
+
+@pytest.mark.parametrize("name", [s.name for s in SHIPPED])
+def test_conformance(name: str) -> None:
+    e = episode(name)
+    graph, kind = town(e.town), scenario_type(e.scenario.type)
+    ego, *actors = e.agents
+    assert (ego.model, ego.controller, ego.speed, ego.target_speed) == ("car", Controller.EXTERNAL, 0.0, 8.0)
+    assert ego.route is not None
+    route = ego.route.xy.astype(float)
+    assert 85.0 <= ego.route.length <= kind.max_distance
+    assert e.limits.max_distance == kind.max_distance
+    assert (ego.route.lane >= 0).all()
+    # nobody stands in anybody
+    rows = boxes(e)
+    for i in range(len(rows)):
+        for j in range(i):
+            assert obb_distance(rows[i], rows[j]) > 0.0
+    # actors are on the road, or within two lane widths of it
+    query = LaneQuery(graph)
+    xy = rows[1:, :2].astype(np.float32)
+    off = query.off_road(xy)
+    for agent, is_off in zip(actors, off, strict=True):
+        if model(agent.model).max_speed > 4.0 and agent.model != "bicycle":
+            assert not is_off, agent.name
+        near = np.hypot(
+            *(
+                graph.xy[np.repeat(graph.kind == LaneType.DRIVING, np.diff(graph.offset))]
+                - (agent.pose.x, agent.pose.y)
+            ).T
+        )
+        assert near.min() <= 2 * 3.5 + 0.5, agent.name
+    # the trigger is reached on the way, and not at the start
+    first = next(a for a in actors if a.phases)
+    when = first.phases[0].when
+    reference = actors[when.actor]
+    assert when.kind == "ego_distance"
+    gap = np.hypot(route[:, 0] - reference.pose.x, route[:, 1] - reference.pose.y)
+    assert gap[0] > when.value
+    assert gap.min() < when.value
+    # every moving actor waits for it
+    assert all(a.phases[0].when == when for a in actors if a.phases)
+    # vehicles on lanes drive with or against the ego as their lane does
+    for agent in actors:
+        if agent.model in ("suv", "coupe", "compact"):
+            lane, s, _, _ = query.nearest(np.array([[agent.pose.x, agent.pose.y]], np.float32))
+            yaw = graph.at(int(lane[0]), float(s[0]))[2]
+            assert abs(math.remainder(yaw - agent.pose.yaw, 2 * math.pi)) < 0.1
+
+
+def test_signals_follow_the_plans() -> None:
+    expected = {"RedlightRunning": {1, 3}, "UnprotectedLeftTurn": {3}, "RightTurn": {1, 3}, "CrossingNegotiation": {0}}
+    for s in SHIPPED:
+        forced = {int(v) for v in episode(s.name).signal_override.values()}
+        assert forced == expected.get(s.type, set()), s.name
+    # the ego of a right turn faces red and its partner green
+    e = episode("RightTurn/00")
+    graph, route = town(e.town), e.agents[0].route
+    assert route is not None
+    on_route = np.isin(graph.stop_lane, route.lane)
+    own = [int(k) for k in graph.stop_signal[on_route] if int(k) in e.signal_override]
+    assert own
+    assert all(e.signal_override[k] == SignalState.RED for k in own)
+
+
+def test_an_ego_that_does_not_react_is_hit_in_all_32() -> None:
+    class Follow:
+        name, controller = "follow", Controller.FOLLOW
+
+        def reset(self, episodes: object) -> None: ...
+
+        def act(self, view: object) -> np.ndarray:
+            raise AssertionError("the world drives it")
+
+    graphs = {"ProvingGround": town("ProvingGround")}
+    for speed in (8.0, 9.0, 10.0):
+        episodes = [build_episode(replace(s, target_speed=speed), graphs["ProvingGround"], seed=0) for s in SHIPPED]
+        ends = {t.key.split("@")[0]: t.end for t in rollout(episodes, graphs, Follow())}
+        assert {name for name, end in ends.items() if end != "collision"} == set(), f"at {speed} m/s"
+
+
+def test_routes_differ() -> None:
+    for kind in PRECRASH:
+        starts = [s.route[0] for s in SHIPPED if s.type == kind]
+        for i, a in enumerate(starts):
+            assert all(math.hypot(a.x - b.x, a.y - b.y) > 5.0 for b in starts[:i])
+
+
+@pytest.mark.parametrize("name", [s.name for s in NATURAL if s.seed in (0, 7)])
+def test_natural_episodes(name: str) -> None:
+    e = episode(name)
+    graph = town(e.town)
+    route = e.agents[0].route
+    assert route is not None
+    assert 50.0 <= route.length <= 100.0
+    assert len({int(j) for j in graph.junction[route.lane] if j >= 0}) == 1
+    assert 3 <= len(e.agents) - 1 <= 18
+    rows = boxes(e)
+    for i in range(1, len(rows)):
+        assert (obb_distance(rows[i], rows[:i]) > 0.0).all()
+    assert (e.limits.max_steps, e.limits.max_time) == (300, 60.0)
+    real = set(np.flatnonzero(~graph.signal_virtual).tolist())
+    assert set(e.signal_override) == real
+    assert set(e.signal_override.values()) <= {SignalState.GREEN}
+
+
+def test_turns_are_mixed() -> None:
+    for name, least in (("Twinford", 2), ("Crossgate", 2)):
+        turns = [0, 0, 0]
+        for s in NATURAL:
+            if s.town == name and s.seed == 0:
+                turn = math.remainder(s.route[-1].yaw - s.route[0].yaw, 2 * math.pi)
+                turns[0 if turn > 0.7 else 2 if turn < -0.7 else 1] += 1
+        assert min(turns) >= least, (name, turns)
+
+
+def test_repetitions_share_the_route_and_differ_in_traffic() -> None:
+    first, second = NATURAL[0], NATURAL[1]
+    assert first.route == second.route
+    assert [a.pose for a in episode(first.name).agents[1:]] != [a.pose for a in episode(second.name).agents[1:]]
+
+
+def strip(e: Episode) -> list[tuple[object, ...]]:
+    return [(a.name, a.model, a.pose, a.target_speed, a.phases, a.route and a.route.xy.tobytes()) for a in e.agents]
+
+
+@pytest.mark.parametrize("scenario", [SHIPPED[0], SHIPPED[20], NATURAL[3]], ids=lambda s: s.name)
+def test_episodes_depend_on_scenario_and_seed_alone(scenario: Scenario) -> None:
+    graph = town(scenario.town)
+    once, again = (build_episode(scenario, graph, seed=5) for _ in range(2))
+    assert strip(once) == strip(again)
+    assert once.key == again.key
+    assert once.key != build_episode(scenario, graph, seed=6).key
+    if scenario.type == "NaturalJunction":
+        assert strip(once) != strip(build_episode(scenario, graph, seed=6))
+    else:
+        assert strip(once) == strip(build_episode(scenario, graph, seed=6))
