@@ -100,7 +100,8 @@ def _check(cell: Cell, build: Any) -> None:
     try:
         build(cell.as_dict())
     except SSADError as error:
-        raise type(error)(f"scenario {cell.scenario['name']}: {error}") from None
+        name = f"scenario {cell.scenario['name']}"
+        raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None
 
 
 def default_workers() -> int:

@@ -28,8 +28,9 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     failed = sum(r["status"] != "ok" for r in records)
     result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     result.caption = (
-        "CR collisions per episode with its 95 % interval; OR m driven off the road; DR m from\nthe route; "
-        + ("RC share of the route" + (f"; {failed} of {len(records)} episodes failed and count" if failed else ""))
+        "CR collisions per episode and its 95 % interval; OR m driven off the road;\n"
+        "DR m from the route; RC share of the route"
+        + (f"\n{failed} of {len(records)} episodes failed and count" if failed else "")
     )
     result.caption_justify = "left"
     result.add_column("scenario", no_wrap=True)
