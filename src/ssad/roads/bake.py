@@ -97,7 +97,8 @@ def _sample(path: Path, network: Network, keys: list[Key]) -> Answer:
         except subprocess.TimeoutExpired:
             raise MapError(f"{path}: carla.Map did not read it in {TIMEOUT:.0f} s; make it smaller") from None
         if done.returncode != 0 or not answer.exists():
-            said = (done.stderr.strip().splitlines() or ["no message"])[-1][:200]
+            lines = [line for line in done.stderr.strip().splitlines() if not line.startswith("WARNING")]
+            said = (lines or ["no message"])[-1][:200]
             how = f"signal {-done.returncode}" if done.returncode < 0 else f"code {done.returncode}"
             raise MapError(f"{path}: carla.Map cannot read it and stopped ({how}: {said}); correct the map")
         with np.load(answer, allow_pickle=False) as data:

@@ -18,7 +18,7 @@ from ssad.types import F64, I32, LaneType, Pose, Route
 CHANGE = 20.0  # m of road that a lane change takes
 CHANGE_COST = 15.0  # m of detour that one lane change is worth
 HASTE = 10.0  # m of detour that each metre is worth by which a lane change is shorter than CHANGE
-LEAST_CHANGE = 4.0  # m; no change is made in less
+LEAST_CHANGE = 10.0  # m; no change is made in less
 BESIDE_COST = 25.0  # m of detour for passing an inner key point one lane aside
 SNAP = 4.0  # m from a lane's edge at which a key point still belongs to it
 _SLACK = 1.5  # m further than the nearest lane at which another lane is still a candidate for a key point

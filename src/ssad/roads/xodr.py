@@ -224,10 +224,15 @@ class _Reader:
         for element in root.findall("junction"):
             where = f"junction {element.get('id')}"
             junctions[self.whole(element, "id", where)] = self.connections(element, where, roads)
+        posts = {s.get("id") for r in root.findall("road") for s in r.findall("signals/signal")}
+        for element in root.findall("road"):
+            for other in element.findall("signals/signalReference"):
+                if other.get("id") not in posts:
+                    self.fail(f"road {element.get('id')}", f"it refers to signal {other.get('id')}, which is nowhere")
         for road in roads.values():
             self.linked(road, roads, junctions)
-        posts = [s for r in root.findall("road") for s in r.findall("signals/signal") if _light(s)]
-        lights = [post.get("id", "") for post in posts]
+        lamps = [s for r in root.findall("road") for s in r.findall("signals/signal") if _light(s)]
+        lights = [post.get("id", "") for post in lamps]
         phase: dict[str, int] = {}
         for element in root.findall("controller"):
             for control in element.findall("control"):
@@ -247,6 +252,9 @@ class _Reader:
         plans = element.findall("planView/geometry")
         if not plans:
             self.fail(where, "<planView> has no <geometry>")
+        starts = [self.number(plan, "s", where) for plan in plans]
+        if abs(starts[0]) > 1e-3 or starts != sorted(starts):
+            self.fail(where, f"its <geometry> elements are not in order from s=0 (the first has s={starts[0]:g})")
         for plan in plans:
             for name in ("s", "x", "y", "hdg", "length"):
                 self.number(plan, name, where)
