@@ -9,10 +9,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssad.errors import FormatError
-from ssad.scenarios.dynamic import PRECRASH, import_routes, load_scenarios, save_scenarios
+from ssad.roads import bake
+from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios
 from ssad.types import Pose
 
 ROUTE = (
@@ -196,3 +198,44 @@ def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
     assert len(import_routes(five)) == 75
     save_scenarios(tmp_path / "frea.yaml", found)
     assert load_scenarios(tmp_path / "frea.yaml") == found
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["safebench", "frea"])
+def test_every_imported_scenario_becomes_an_episode(data_dir: Path, name: str) -> None:
+    found = import_routes(data_dir / "routes" / name)
+    graphs = {town: bake(data_dir / "maps" / f"{town}.xodr", town) for town in sorted({s.town for s in found})}
+    for scenario in found:
+        graph = graphs[scenario.town]
+        ego, *others = build_episode(scenario, graph, seed=0).agents
+        assert ego.route is not None
+        first, last = scenario.route[0], scenario.route[-1]
+        assert math.hypot(ego.pose.x - first.x, ego.pose.y - first.y) < 1.0
+        assert abs(math.remainder(ego.pose.yaw - first.yaw, 2 * math.pi)) < 0.3
+        assert (
+            math.hypot(ego.route.xy[-1, 0] - last.x, ego.route.xy[-1, 1] - last.y) < 3.0
+        )  # some key points lie beside the lane
+        if name == "frea":
+            assert 50.0 <= ego.route.length <= 115.0
+            assert 3 <= len(others) <= 18
+            continue
+        when = others[0].phases[0].when if others[0].phases else others[1].phases[0].when
+        gap = np.hypot(ego.route.xy[:, 0] - others[0].pose.x, ego.route.xy[:, 1] - others[0].pose.y)
+        assert gap.min() < when.value < gap[0]
+
+
+@pytest.mark.data
+def test_safebench_actors_stand_where_its_classes_put_them(data_dir: Path) -> None:
+    graph = bake(data_dir / "maps" / "Town_Safebench_Light.xodr", "Town_Safebench_Light")
+    found = {s.name.removeprefix("safebench/"): s for s in import_routes(data_dir / "routes" / "safebench")}
+
+    def poses(name: str) -> list[tuple[float, float, float]]:
+        agents = build_episode(found[name], graph, seed=0).agents[1:]
+        return [(round(a.pose.x, 1), round(a.pose.y, 1), round(abs(a.pose.yaw), 2)) for a in agents]
+
+    # trigger (92.5, -5.25) heading east: 45 m on, one lane of 3.5 m right (the shoulder is narrow), facing north
+    assert poses("StraightObstacle/00") == [(137.5, -8.8, 1.57), (133.0, -8.4, 1.57)]
+    # trigger (72.5, -5.25) in the outer lane; trigger (72.5, -1.75) in the inner lane
+    assert poses("LaneChanging/00") == [(107.5, -5.2, 0.0), (108.5, -1.8, 0.0)]
+    assert poses("VehiclePassing/00") == [(122.5, -1.8, 0.0), (152.5, 1.8, 3.14)]
+    assert poses("RightTurn/00") == [(-14.5, -5.2, 0.0)]

@@ -248,6 +248,36 @@ def test_folders_sets_and_names(tmp_path: Path, ssad_home: Path) -> None:
         load_scenarios("precrsh")
 
 
+def test_a_folder_does_not_hide_a_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("precrash", "mine"):
+        save_scenarios(tmp_path / name / "x.yaml", Scenario("a", "RightTurn", "T", (Pose(0, 0), Pose(1, 0))))
+    assert len(load_scenarios("precrash")) == 32
+    assert [s.name for s in load_scenarios("mine")] == ["a"]
+
+
+def test_a_class_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "falling_tree.py").write_text(
+        "from ssad.scenarios.dynamic import Parameter, ScenarioType\n"
+        "TREE = ScenarioType('FallingTree', 'Falling tree', 'a tree falls', lambda s, g, r, rng: [],\n"
+        "    parameters=(Parameter('height', 1.0, 9.0, 5.0, 'm', 'height of the tree'),))\n"
+        "NOT_A_TYPE = 3\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "tree.yaml"
+    text = (
+        "name: t\ntype: falling_tree:{}\ntown: T\nroute: [{{x: 0, y: 0}}, {{x: 9, y: 0}}]\nparameters: {{height: {}}}\n"
+    )
+    path.write_text(text.format("TREE", 3))
+    assert load_scenarios(path)[0].parameters == {"height": 3.0}
+    path.write_text(text.format("TREE", 30))
+    with pytest.raises(ConfigError, match="30 is outside 1 to 9 m"):
+        load_scenarios(path)
+    path.write_text(text.format("NOT_A_TYPE", 3))
+    with pytest.raises(ConfigError, match="expected a ScenarioType, found int"):
+        load_scenarios(path)
+
+
 def test_the_shipped_sets_have_the_numbers_of_the_paper() -> None:
     precrash = load_scenarios("precrash")
     assert [s.type for s in precrash] == [name for name in PRECRASH for _ in range(4)]

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -41,7 +42,6 @@ _TRIGGERS: Mapping[tuple[str, Turn | None], float] = {
     ("RedlightRunning", "straight"): 36.0,
     ("CrossingNegotiation", "straight"): 36.0,
 }
-_TURNS: tuple[Turn, ...] = ("left", "straight", "right")
 _HEADING = 20.0  # m that half a turn counts when routes are compared
 _MARGIN = 2.0  # m kept free at the ends of a road
 
@@ -168,22 +168,29 @@ def _look(graph: LaneGraph, stretch: Stretch) -> tuple[bool, bool, str]:
     return bent, not wide, stretch.turn or ""
 
 
-def _spread(graph: LaneGraph, pool: list[Stretch], count: int, works: Callable[[Stretch], bool]) -> list[Stretch]:
-    """`count` stretches that work: kinds of road in rotation, of each the farthest from those before it."""
-    rest = list(pool)
+def _farthest(pool: list[Stretch], chosen: list[Stretch], works: Callable[[Stretch], bool]) -> Stretch | None:
+    """The stretch that works and lies farthest from those chosen; of equals the first."""
+    near = [min((float(np.linalg.norm(p.place() - c.place())) for c in chosen), default=0.0) for p in pool]
+    order = sorted(range(len(pool)), key=lambda i: -near[i])
+    return next((pool[i] for i in order if pool[i] not in chosen and works(pool[i])), None)
+
+
+def _spread(
+    pool: list[Stretch], kind_of: Callable[[Stretch], Hashable], count: int, works: Callable[[Stretch], bool]
+) -> list[Stretch]:
+    """`count` stretches that work: kinds in rotation, of each the farthest from those before it; fewer if there are
+    no more."""
+    kinds: dict[Hashable, list[Stretch]] = {}
+    for p in pool:
+        kinds.setdefault(kind_of(p), []).append(p)
+    rotation = deque(kinds[k] for k in sorted(kinds, key=str))
     chosen: list[Stretch] = []
-    looks = sorted({_look(graph, p) for p in rest})
-    for look in itertools.cycle(looks):
-        if not rest or len(chosen) == count:
-            return chosen
-        like = [p for p in rest if _look(graph, p) == look]
-        while like:
-            gap = [min((float(np.linalg.norm(p.place() - c.place())) for c in chosen), default=0.0) for p in like]
-            stretch = like.pop(int(np.argmax(gap)))
-            rest.remove(stretch)
-            if works(stretch):
-                chosen.append(stretch)
-                break
+    while rotation and len(chosen) < count:
+        like = rotation.popleft()
+        found = _farthest(like, chosen, works)
+        if found is not None:
+            chosen.append(found)
+            rotation.append(like)
     return chosen
 
 
@@ -211,7 +218,7 @@ def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
                 return False
             return True
 
-        chosen = _spread(graph, _pool(graph, kind), routes, works)
+        chosen = _spread(_pool(graph, kind), lambda p: _look(graph, p), routes, works)
         if len(chosen) < routes:
             raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} roads for {kind}")
         result += [scenario(stretch, i, kind) for i, stretch in enumerate(chosen)]
@@ -229,15 +236,9 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
             return False
         return len(found) >= 4
 
-    pool = list(passages(graph, 30.0, 30.0))
-    chosen: list[Stretch] = []
-    for turn in itertools.islice(itertools.cycle(_TURNS), routes):
-        rest = [p for p in pool if p.turn == turn and p not in chosen and works(p)]
-        rest = rest or [p for p in pool if p not in chosen and works(p)]
-        if not rest:
-            raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} junction routes")
-        gap = [min((float(np.linalg.norm(p.place() - c.place())) for c in chosen), default=0.0) for p in rest]
-        chosen.append(rest[int(np.argmax(gap))])
+    chosen = _spread(list(passages(graph, 30.0, 30.0)), lambda p: p.turn, routes, works)
+    if len(chosen) < routes:
+        raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} junction routes")
     return [
         Scenario(
             name=f"natural/{graph.name}_{i:02d}/{k:02d}",

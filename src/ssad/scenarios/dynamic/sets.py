@@ -13,6 +13,7 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 from ssad.types import Scenario
 
 DATA = Path(__file__).parent / "data"
+SHIPPED = ("precrash", "natural")
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
@@ -26,20 +27,15 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     safebench, frea), a scenario ("StraightObstacle/00"), a scenario class, a YAML file, or a folder of YAML
     files. UnknownNameError shows the three closest names.
     """
-    path = Path(ref)
-    if isinstance(ref, Path) or path.suffix in _SUFFIXES or path.is_dir():
-        return _from_path(path)
+    if isinstance(ref, Path) or ref.endswith(_SUFFIXES):
+        return _from_path(Path(ref))
     if ref in _TOWN_SETS:
         name, town = _TOWN_SETS[ref]
         return tuple(s for s in _cached(DATA / f"{name}.yaml") if s.town == town)
     files = set_files()
     if ref in files:
         return _cached(files[ref])
-    if ref in IMPORTED:
-        raise ConfigError(
-            f"scenario set '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER"
-        )
-    shipped = [s for name in ("precrash", "natural") for s in _cached(files[name])]
+    shipped = [s for name in SHIPPED for s in _cached(files[name])]
     if ref in SCENARIOS:
         return tuple(s for s in shipped if s.type == ref)
     everything = {s.name: s for s in shipped}
@@ -48,13 +44,17 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
             everything.update((s.name, s) for s in _cached(file))
     if ref in everything:
         return (everything[ref],)
-    raise unknown_name("scenario", str(ref), [*set_names(), *SCENARIOS, *everything])
+    if Path(ref).is_dir():  # last: a results folder called like a set must not hide it
+        return _from_path(Path(ref))
+    if ref.partition("/")[0] in IMPORTED:
+        raise ConfigError(f"scenario '{ref}' is not in {home() / 'scenarios'}; import it: ssad import routes FOLDER")
+    raise unknown_name("scenario", ref, [*set_names(), *SCENARIOS, *everything])
 
 
 def set_files() -> dict[str, Path]:
     """Set name -> YAML file: the shipped sets, then the imported ones."""
     found = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
-    return found | {name: DATA / f"{name}.yaml" for name in ("precrash", "natural")}
+    return found | {name: DATA / f"{name}.yaml" for name in SHIPPED}
 
 
 def set_names() -> tuple[str, ...]:
