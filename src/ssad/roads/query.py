@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +21,18 @@ DRIVABLE = (LaneType.DRIVING, LaneType.PARKING)
 
 @dataclass(frozen=True)
 class Nearest:
-    """Answer for n points. lane [n] (-1: none within reach), s [n] m along it, lateral [n] m (left positive,
-    +-inf-free: 0 where lane is -1), inside [n]: the point is within the lane's strip."""
+    """Answer for n points; unpacks as (lane, s, lateral, inside).
+
+    lane [n], -1 where none is within reach; s [n] m along it; lateral [n] m from its centre line, left positive (s
+    and lateral are 0 where lane is -1); inside [n]: the point is within the lane's strip.
+    """
 
     lane: I32
     s: F32
     lateral: F32
     inside: Bool
 
-    def __iter__(self):  # type: ignore[no-untyped-def]
+    def __iter__(self) -> Iterator[npt.NDArray[Any]]:
         return iter((self.lane, self.s, self.lateral, self.inside))
 
 
