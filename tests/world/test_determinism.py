@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import multiprocessing as mp
+import json
+import subprocess
+import sys
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
-import pytest
 
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -46,10 +48,22 @@ def test_hashes_after_1000_steps_do_not_depend_on_batch_order_or_processes() -> 
         assert _hashes([k]) == {k: batch[k]}
 
 
-@pytest.mark.slow
 def test_four_processes_give_the_bits_of_one() -> None:
     here = _hashes(list(range(COUNT)))
-    parts = [list(range(COUNT))[k::4] for k in range(4)]
-    with mp.get_context("spawn").Pool(4) as pool:
-        found = pool.map(_hashes, parts)
-    assert {k: v for part in found for k, v in part.items()} == here
+    root = str(Path(__file__).parents[2])
+    code = (
+        "import json, sys; sys.path.insert(0, sys.argv[1]); from tests.world.test_determinism import _hashes; "
+        "print(json.dumps(_hashes(json.loads(sys.argv[2]))))"
+    )
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, root, json.dumps(list(range(COUNT))[k::4])], stdout=subprocess.PIPE, text=True
+        )
+        for k in range(4)
+    ]
+    found: dict[int, str] = {}
+    for process in processes:
+        out, _ = process.communicate(timeout=120)
+        assert process.returncode == 0
+        found |= {int(k): v for k, v in json.loads(out.strip().splitlines()[-1]).items()}
+    assert found == here
