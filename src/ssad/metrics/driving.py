@@ -106,6 +106,8 @@ def episode_metrics(trace: EpisodeTrace) -> EpisodeMetrics:
     fraction = min(off / driven, 1.0) if driven > 0.0 else 0.0
     completion = min(max(float(trace.route_complete[-1]) / 100.0, 0.0), 1.0)
     deviation = _mean(trace.route_distance[1:])
+    # bodies may touch between two rows
+    touched = bool((trace.contact_agent >= 0).any())
     infractions = kinds | {"red_lights": int(trace.red_light.sum()), "stop_signs": int(trace.stop_sign.sum())}
     return EpisodeMetrics(
         collision=collided(trace),
@@ -122,9 +124,9 @@ def episode_metrics(trace: EpisodeTrace) -> EpisodeMetrics:
         lane_invasions=int(trace.lane_invasion.sum()),
         in_route_failure=in_route_failure(trace),
         driving_score=driving_score(completion, infractions, fraction),
-        min_ttc=min_ttc(trace),
-        pet=post_encroachment_time(trace),
-        min_distance=min_distance(trace),
+        min_ttc=0.0 if touched else min_ttc(trace),
+        pet=0.0 if touched else post_encroachment_time(trace),
+        min_distance=0.0 if touched else min_distance(trace),
         **infractions,
     )
 
