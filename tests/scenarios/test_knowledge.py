@@ -13,7 +13,8 @@ from ssad.errors import ConfigError, RouteError
 from ssad.roads.graph import LaneGraph
 from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, parameter_box, scenario_type
 from ssad.scenarios.dynamic.episode import forced_signals
-from ssad.scenarios.dynamic.knowledge._placing import ego_times, polyline_route, time_to_cover
+from ssad.scenarios.dynamic.knowledge._meeting import ego_times, time_to_cover
+from ssad.scenarios.dynamic.knowledge._placing import polyline_route
 from ssad.types import (
     Actor,
     Condition,

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._meeting import meeting_place
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
     bending_route,
-    meeting_place,
     pose_at,
     scripted,
     shifted,
