@@ -116,17 +116,24 @@ def execute(cells: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> 
             "artefacts": {"trace": artefact},
         }
         if settings.get("witness") and trace.end == "collision":
-            result["witness"] = witness(folder, episode, settings["device"])
+            speed = getattr(_system(cell["system"]), "target_speed", None)
+            result["witness"] = witness(folder, episode, speed, settings["device"])
         results.append(result | {"wall_s": round(shared + time.perf_counter() - began, 4)})
     return results
 
 
-def witness(folder: Path, episode: Episode, device: str) -> dict[str, Any]:
-    """Could anybody have avoided the collision? Searched once an episode, whichever systems collide in it."""
+def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
+    """Could anybody have avoided the collision, coming at the speed (m/s) of the system that had it?
+
+    Searched once for an episode and speed, whichever systems collide in it.
+    """
     from ssad.seeding import digest
     from ssad.world.witness import find_witness
 
-    name = digest("witness", safeio.dump_json(_scenario(episode)), episode.seed)[:16]
+    if speed is not None:
+        ego = replace(episode.agents[0], target_speed=speed)
+        episode = replace(episode, agents=(ego, *episode.agents[1:]))
+    name = digest("witness", safeio.dump_json(_scenario(episode)), episode.seed, speed)[:16]
     path = folder / "witness" / f"{name}.json"
     if path.exists():
         found: dict[str, Any] = safeio.read_json(path)
