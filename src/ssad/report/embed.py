@@ -1,0 +1,171 @@
+"""Replays as compact data inside the page: quantised, differenced, deflated, base64.
+
+Coordinates are int16 in units of `SCALE` m from the town's origin, angles int16 in units of pi / 32767. A block holds
+its columns one after the other, each as differences along time (with int16 wrap-around, so nothing is lost).
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.roads.graph import LaneGraph
+from ssad.types import EpisodeTrace, LaneType
+
+SCALE = 0.03  # m
+SPEED = 0.01  # m/s
+SHARE = 1000.0  # throttle, brake, steer, completion as thousandths
+NEAR = 80.0  # m around the episodes in which lanes are kept
+KINDS = {LaneType.SIDEWALK: 0, LaneType.SHOULDER: 1, LaneType.PARKING: 2, LaneType.BIKING: 2, LaneType.DRIVING: 3}
+
+
+def pack(columns: npt.NDArray[np.int16]) -> str:
+    """int16 [C, T] -> text: differences along T, little-endian, zlib, base64."""
+    wide = np.diff(columns.astype(np.int32), axis=1, prepend=0)
+    return base64.b64encode(zlib.compress(wide.astype("<i2").tobytes(), 9)).decode()
+
+
+def unpack(text: str, rows: int) -> npt.NDArray[np.int16]:
+    """The inverse of `pack`: [rows, T]. The page does the same in JavaScript."""
+    flat = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i2").reshape(rows, -1)
+    return np.cumsum(flat, axis=1, dtype=np.int64).astype(np.int16)
+
+
+def _i16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
+    return np.clip(np.round(values), -32767, 32767).astype(np.int16)
+
+
+def origin(graph: LaneGraph) -> tuple[float, float]:
+    """Centre of the town's extent, m: what coordinates are relative to."""
+    middle = 0.5 * (graph.xy.min(axis=0).astype(np.float64) + graph.xy.max(axis=0))
+    return float(np.round(middle[0], 1)), float(np.round(middle[1], 1))
+
+
+def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
+    """One episode: agents' bodies, packed motion [3 A + 1 rows of T] x, y, yaw per agent, then presence, and the ego's
+    record, packed too. Events are (step, what)."""
+    ox, oy = origin(graph)
+    agents = len(trace.names)
+    rows = []
+    for a in range(agents):
+        rows += [(trace.x[:, a] - ox) / SCALE, (trace.y[:, a] - oy) / SCALE]
+        rows.append(np.arctan2(np.sin(trace.yaw[:, a]), np.cos(trace.yaw[:, a])) / np.pi * 32767)
+    # presence as bits of 15 agents a row
+    words = []
+    for first in range(0, agents, 15):
+        bits = 1 << np.arange(min(15, agents - first))
+        words.append(trace.active[:, first : first + 15].astype(np.int64) @ bits)
+    record = [
+        trace.speed[:, 0] / SPEED,
+        trace.throttle * SHARE,
+        trace.brake * SHARE,
+        trace.steer * SHARE,
+        trace.route_complete * 10.0,
+        _gap(trace) / SPEED,
+        trace.off_road.astype(np.float64),
+    ]
+    hits = [[int(t), int(trace.contact_agent[t])] for t in np.flatnonzero(trace.contact)]
+    return {
+        "dt": trace.dt,
+        "steps": len(trace.accel),
+        "names": list(trace.names),
+        "kinds": trace.kind.tolist(),
+        "size": np.round(np.stack([trace.length, trace.width], 1), 2).tolist(),
+        "motion": pack(np.stack([_i16(np.asarray(r)) for r in [*rows, *words]])),
+        "record": pack(np.stack([_i16(r) for r in record])),
+        "route": pack(_i16((thin(trace.route.astype(np.float64)) - [ox, oy]) / SCALE).T),
+        "hits": hits,
+        "red": np.flatnonzero(trace.red_light).tolist(),
+        "signals": [_changes(trace.signal[:, s], int(i)) for s, i in enumerate(trace.signal_ids)],
+        "end": trace.end,
+    }
+
+
+def _gap(trace: EpisodeTrace) -> npt.NDArray[np.float64]:
+    """Rough free distance to the nearest other agent, m (centres less half lengths): for the read-out only."""
+    if len(trace.names) < 2:
+        return np.full(len(trace.accel), 300.0)
+    d = np.hypot(trace.x[:, 1:] - trace.x[:, :1], trace.y[:, 1:] - trace.y[:, :1])
+    d = d - 0.5 * (trace.length[1:] + trace.length[0])
+    least = np.where(trace.active[:, 1:], d, np.inf).min(axis=1)
+    out: npt.NDArray[np.float64] = np.clip(np.nan_to_num(least.astype(np.float64), posinf=300.0), 0.0, 300.0)
+    return out
+
+
+def _changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
+    """[signal, [[step, state], ...]]: only where the state changes."""
+    at = np.flatnonzero(np.diff(states.astype(np.int16), prepend=-1))
+    return [index, [[int(t), int(states[t])] for t in at]]
+
+
+def thin(xy: npt.NDArray[np.float64], tolerance: float = 0.04) -> npt.NDArray[np.float64]:
+    """A polyline without the points that leave its shape within `tolerance` m (Douglas-Peucker)."""
+    keep = np.zeros(len(xy), bool)
+    keep[[0, -1]] = True
+    stack = [(0, len(xy) - 1)]
+    while stack:
+        a, b = stack.pop()
+        if b - a < 2:
+            continue
+        d = xy[b] - xy[a]
+        rest = xy[a + 1 : b] - xy[a]
+        off = np.abs(rest[:, 0] * d[1] - rest[:, 1] * d[0]) / max(float(np.hypot(*d)), 1e-9)
+        k = int(np.argmax(off))
+        if off[k] > tolerance:
+            keep[a + 1 + k] = True
+            stack += [(a, a + 1 + k), (a + 1 + k, b)]
+    return xy[keep]
+
+
+def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any]:
+    """Lanes within `NEAR` m of the episodes' routes as strips and edge lines, and the signals."""
+    places = np.concatenate([t.route[::10] for t in traces]).astype(np.float64)
+    cells = {tuple(c) for c in np.floor(places / NEAR).astype(int)}
+    near = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
+    ox, oy = origin(graph)
+    strips: list[list[Any]] = []
+    for lane in np.argsort([KINDS.get(LaneType(int(k)), -1) for k in graph.kind], kind="stable"):
+        kind = KINDS.get(LaneType(int(graph.kind[lane])), -1)
+        span = slice(int(graph.offset[lane]), int(graph.offset[lane + 1]))
+        xy = graph.xy[span].astype(np.float64)
+        if kind < 0 or not any(tuple(c) in near for c in np.floor(xy / NEAR).astype(int)):
+            continue
+        normal = np.stack([-np.sin(graph.yaw[span]), np.cos(graph.yaw[span])], 1)
+        half = 0.5 * graph.width[span, None]
+        left, right = thin(xy + normal * half), thin(xy - normal * half)
+        junction = int(graph.junction[lane] >= 0)
+        lines = _lines(graph, int(lane))
+        ring = np.concatenate([left, right[::-1]])
+        strips.append([kind, junction, lines, len(left), _flat(ring, ox, oy)])
+    signals = [[round(float(x) - ox, 2), round(float(y) - oy, 2)] for x, y in graph.signal_xy]
+    return {"origin": [ox, oy], "strips": strips, "signals": signals, "crosswalks": _crosswalks(graph, ox, oy)}
+
+
+def _lines(graph: LaneGraph, lane: int) -> list[int]:
+    """How the left and right edge are drawn: 0 nothing, 1 broken, 2 solid, 3 double (between opposing lanes)."""
+    out = []
+    for side in (graph.left, graph.right):
+        other = int(side[lane])
+        if graph.junction[lane] >= 0 or graph.kind[lane] != LaneType.DRIVING:
+            out.append(0)
+        elif other < 0 or graph.kind[other] != LaneType.DRIVING:
+            out.append(2)
+        elif np.sign(graph.lane_id[other]) == np.sign(graph.lane_id[lane]):
+            out.append(1)
+        else:
+            out.append(3)
+    return out
+
+
+def _flat(xy: npt.NDArray[np.float64], ox: float, oy: float) -> list[float]:
+    return [round(float(v), 2) for v in (xy - [ox, oy]).reshape(-1)]
+
+
+def _crosswalks(graph: LaneGraph, ox: float, oy: float) -> list[list[float]]:
+    ends: Sequence[int] = graph.crosswalk_offset.tolist()
+    return [_flat(graph.crosswalk_xy[a:b].astype(np.float64), ox, oy) for a, b in zip(ends[:-1], ends[1:], strict=True)]

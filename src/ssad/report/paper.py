@@ -1,0 +1,54 @@
+"""The paper's own tables of whole driving systems (Li et al., "Towards Benchmarking and Assessing the Safety and
+Robustness of Autonomous Driving on Safety-critical Scenarios"), to be shown beside ours.
+
+They were measured in CARLA 0.9.13 with SafeBench's agents; ours are another simulator. A test holds them against the
+paper's source.
+"""
+
+from __future__ import annotations
+
+SOURCE = "published by the paper: CARLA 0.9.13, SafeBench's agents"
+
+SCENARIOS: dict[str, str] = {
+    "StraightObstacle": "Straight Obstacle",
+    "TurningObstacle": "Turning Obstacle",
+    "LaneChanging": "Lane Changing",
+    "VehiclePassing": "Vehicle Passing",
+    "RedlightRunning": "Red-light Running",
+    "UnprotectedLeftTurn": "Unprotected Left-turn",
+    "RightTurn": "Right-turn",
+    # the table's head says "Dynamic Object Crossing", the text "Crossing Negotiation"
+    "CrossingNegotiation": "Crossing Negotiation",
+}
+
+# metric -> system -> eight scenarios in the order of SCENARIOS, then the average
+PRECRASH: dict[str, dict[str, tuple[float, ...]]] = {
+    "CR": {
+        "PPO": (0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.25),
+        "SAC": (1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.63),
+        "TD3": (1.0, 0.25, 0.75, 0.0, 1.0, 1.0, 1.0, 1.0, 0.75),
+    },
+    "OR": {
+        "PPO": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.00),
+        "SAC": (0.44, 0.71, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.14),
+        "TD3": (0.0, 0.0, 0.34, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04),
+    },
+    "DR": {
+        "PPO": (0.43, 0.59, 0.71, 0.44, 0.43, 0.45, 0.51, 0.44, 0.50),
+        "SAC": (0.0, 0.77, 1.12, 1.23, 0.41, 0.45, 0.70, 0.44, 0.64),
+        "TD3": (0.35, 0.72, 0.44, 1.04, 0.68, 0.33, 0.40, 0.35, 0.54),
+    },
+    "RC": {
+        "PPO": (1.0, 1.0, 0.66, 0.60, 1.0, 1.0, 1.0, 1.0, 0.91),
+        "SAC": (0.74, 0.77, 1.0, 1.0, 0.53, 0.46, 1.0, 0.62, 0.77),
+        "TD3": (0.74, 0.95, 0.75, 1.0, 0.53, 0.47, 0.50, 0.62, 0.70),
+    },
+}
+
+# (system under test, surrounding vehicles) -> town -> CR, OR, DR
+NATURAL: dict[tuple[str, str], dict[str, tuple[float, float, float]]] = {
+    ("Autopilot", "Autopilot"): {"Town02": (0.01, 0.00, 0.03), "Town05": (0.00, 0.00, 0.07)},
+    ("PPO", "Autopilot"): {"Town02": (0.34, 0.04, 0.19), "Town05": (0.11, 0.01, 0.16)},
+    ("Autopilot", "Adv. PPO"): {"Town02": (0.17, 0.00, 0.07), "Town05": (0.21, 0.00, 0.06)},
+    ("PPO", "Adv. PPO"): {"Town02": (0.81, 0.05, 0.22), "Town05": (0.59, 0.03, 0.12)},
+}
