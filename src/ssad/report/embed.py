@@ -7,6 +7,7 @@ its columns one after the other, each as differences along time (with int16 wrap
 from __future__ import annotations
 
 import base64
+import itertools
 import zlib
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -168,4 +169,4 @@ def _flat(xy: npt.NDArray[np.float64], ox: float, oy: float) -> list[float]:
 
 def _crosswalks(graph: LaneGraph, ox: float, oy: float) -> list[list[float]]:
     ends: Sequence[int] = graph.crosswalk_offset.tolist()
-    return [_flat(graph.crosswalk_xy[a:b].astype(np.float64), ox, oy) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [_flat(graph.crosswalk_xy[a:b].astype(np.float64), ox, oy) for a, b in itertools.pairwise(ends)]

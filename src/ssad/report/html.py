@@ -24,7 +24,7 @@ from ssad.traces import load_trace
 from ssad.types import EpisodeTrace
 
 VERDICTS = {
-    "harmless": "clear even when driving blindly",
+    "harmless": "a blind driver at the system's speed stays clear",
     "avoidable": "avoidable by reacting once the danger has begun",
     "anticipation": "avoidable only by acting earlier",
     "autopilot": "avoided only by the privileged Autopilot",

@@ -105,6 +105,8 @@ def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (96
             if (low > np.add(centre, reach)).any() or (high < np.subtract(centre, reach)).any():
                 continue
             canvas.fill(ring, WALK if kind == 0 else ROAD)
+            if junction:  # connecting lanes leave small holes between them
+                canvas.line(ring, ROAD, 12, closed=True)
             if kind == 3 and not junction:
                 canvas.line(left, EDGE, 1)
                 canvas.line(right, EDGE, 1)
