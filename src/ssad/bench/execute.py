@@ -122,15 +122,6 @@ def execute(cells: Sequence[Mapping[str, Any]], settings: Mapping[str, Any]) -> 
     return results
 
 
-def _at_speed(episode: Episode, system: DrivingSystem) -> Episode:
-    """The episode with the speed that the system drives at: its collision is to be avoided at that speed."""
-    speed = getattr(system, "target_speed", None)
-    if speed is None:
-        return episode
-    ego, *others = episode.agents
-    return replace(episode, agents=(replace(ego, target_speed=speed), *others))
-
-
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
     """Could anybody have avoided the collision, coming at the speed (m/s) of the system that had it?
 

@@ -219,7 +219,7 @@ $("seek").oninput = (e) => jump(Number(e.target.value));
 document.addEventListener("keydown", (e) => {
   if (/^(INPUT|SELECT)$/.test(e.target.tagName) && e.target.id !== "seek") return;
   const keys = { " ": toggle, ArrowRight: () => jump(Math.round(time) + 1), ArrowLeft: () => jump(Math.round(time) - 1), f: () => $("follow").click(), 0: fit };
-  if (keys[e.key] && document.activeElement.tagName !== "BUTTON") { e.preventDefault(); keys[e.key](); }
+  if (keys[e.key]) { e.preventDefault(); keys[e.key](); }
 });
 canvas.addEventListener("wheel", (e) => {
   e.preventDefault();
