@@ -89,6 +89,7 @@ def test_records(done: Path) -> None:
     assert not crashed["autopilot", "StraightObstacle"]
     run_json = read_json(done / "run.json")
     assert run_json["suite"]["name"] == "small"
+    assert sorted(p.name for p in (done / "towns").iterdir()) == ["Crossgate.npz", "ProvingGround.npz"]
     assert [c["key"] for c in run_json["cells"]] == [c.key for c in plan(suite()).cells]
 
 

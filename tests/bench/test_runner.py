@@ -157,10 +157,11 @@ def test_kill_9_at_20_moments(tmp_path: Path) -> None:
 def test_children_die_with_the_runner(tmp_path: Path) -> None:
     process = start(tmp_path, 5000)
     children: list[int] = []
-    while not children:
+    while not children and process.poll() is None:
         listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, check=False)
         children = [int(pid) for pid in listed.stdout.split()]
         time.sleep(0.05)
+    assert children
     process.kill()
     process.wait()
     for _ in range(100):
@@ -172,7 +173,7 @@ def test_children_die_with_the_runner(tmp_path: Path) -> None:
 
 def test_ctrl_c_leaves_a_folder_to_go_on_with(tmp_path: Path) -> None:
     process = start(tmp_path, 150)
-    while size(tmp_path) == 0:
+    while size(tmp_path) == 0 and process.poll() is None:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     assert process.wait(timeout=10) != 0

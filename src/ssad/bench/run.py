@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -122,6 +122,7 @@ def run(
     suite, header = todo.suite, todo.run_json()
     with Store.open(folder, header) as store:
         missing = [cell for cell in todo.cells if cell.key not in store.results]
+        _keep_towns(Path(folder), todo.towns)
         settings = {"folder": str(Path(folder).resolve()), "device": todo.device, "witness": suite.witness}
         count = min(workers or default_workers(), max(1, len(missing)))
         # with few cells a smaller chunk keeps all workers busy
@@ -137,6 +138,17 @@ def run(
 
                 runner.run(missing, finish, live.tick)
         return [store.results[cell.key] for cell in todo.cells]
+
+
+def _keep_towns(folder: Path, towns: Iterable[str]) -> None:
+    """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
+    from ssad.bench.execute import town
+    from ssad.roads import save_graph
+
+    for name in towns:
+        path = folder / "towns" / f"{name}.npz"
+        if Path(name).name == name and not path.exists():
+            save_graph(town(name), path)
 
 
 def _records(
