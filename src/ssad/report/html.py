@@ -13,12 +13,12 @@ import jinja2
 
 from ssad import safeio
 from ssad.errors import SSADError
-from ssad.metrics import METRICS, Estimate, aggregate
+from ssad.metrics import METRICS, aggregate
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
 from ssad.report.figures import interval_plot
 from ssad.report.load import Record, Run, load_run
 from ssad.report.paper import SCENARIOS
-from ssad.report.tables import Cell, Row, Table, tables, write_tables
+from ssad.report.tables import Cell, Table, tables, write_tables
 from ssad.roads.graph import LaneGraph, load_graph
 from ssad.traces import load_trace
 from ssad.types import EpisodeTrace
@@ -69,6 +69,7 @@ def render(run: Run, found: list[Table]) -> str:
         precrash=named.get("precrash"),
         natural=named.get("natural"),
         full=named["metrics"],
+        normalised=named["normalised"],
         plot=interval_plot(run),
         matrix=_matrix(run),
         failures=[r for r in run.records if r.status != "ok"],
@@ -206,11 +207,3 @@ def _witness_words(witness: Mapping[str, Any] | None) -> str:
         side = "" if not m["offset"] else f", {abs(m['offset']):.1f} m to the {'left' if m['offset'] > 0 else 'right'}"
         words += f": from {m['start']:.1f} s on {m['speed']:.1f} m/s for {m['hold']:.0f} s{side}"
     return f"{words} ({witness['clear']} of {witness['tried']} drivers tried stay clear)"
-
-
-def estimate_cell(estimate: Estimate) -> Cell:
-    """An Estimate as a table cell."""
-    return Cell(estimate.mean, estimate.low, estimate.high, estimate.n, estimate.failed)
-
-
-__all__ = ["Row", "estimate_cell", "render", "replay_data", "write_report"]

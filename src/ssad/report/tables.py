@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ssad import safeio
 from ssad.metrics import METRICS, Estimate, GroupRow, aggregate, aggregate_groups
+from ssad.metrics.driving import DIVISORS, normalised
 from ssad.report.load import Run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS, SOURCE
 
@@ -138,9 +139,47 @@ def full_table(run: Run) -> Table:
     return Table("metrics", "All metrics", ("System", "Group"), tuple(METRICS), tuple(rows))
 
 
+def normalised_table(run: Run) -> Table:
+    """The terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
+    rows = []
+    for row in aggregate_groups([(r.system, r.group, r.metrics) for r in run.records]):
+        terms = {"CR": row.values["CR"], "OR": row.values["OR"], "DR": row.values["DR"], "TS": row.values["TS"]}
+        cells = {name: _scaled(name, estimate) for name, estimate in terms.items()}
+        rc, score = row.values["RC"], row.values["OS"]
+        cells["IR"] = Cell(1.0 - rc.mean, 1.0 - rc.high, 1.0 - rc.low, rc.n, rc.failed)
+        frea = Cell(1.0 - score.mean, 1.0 - score.high, 1.0 - score.low, score.n, score.failed)
+        shown = (cells["CR"], cells["OR"], cells["DR"], cells["IR"], cells["TS"], _cell(score), frea)
+        rows.append(Row((row.system, SCENARIOS.get(row.group, row.group)), shown))
+    return Table(
+        "normalised",
+        "Normalised metrics and overall scores",
+        ("System", "Group"),
+        (
+            "CR",
+            f"OR / {DIVISORS['OR']:g} m",
+            f"DR / {DIVISORS['DR']:g} m",
+            "1 - RC",
+            f"TS / {DIVISORS['TS']:g} s",
+            "SafeBench score (lower is better)",
+            "FREA score (higher is better)",
+        ),
+        tuple(rows),
+        "SafeBench's score weighs CR 0.4, OR 0.1, DR 0.1, 1 - RC 0.3, TS 0.1; FREA's is one minus it.",
+    )
+
+
+def _scaled(name: str, estimate: Estimate) -> Cell:
+    """A raw metric over its divisor, cut at 1."""
+    mean, low, high = (
+        v if math.isnan(v) else normalised(name, v) for v in (estimate.mean, estimate.low, estimate.high)
+    )
+    return Cell(mean, low, high, estimate.n, estimate.failed)
+
+
 def tables(run: Run) -> list[Table]:
     """All tables of a run."""
-    return [t for t in (precrash_table(run), natural_table(run), full_table(run)) if t is not None]
+    found = (precrash_table(run), natural_table(run), normalised_table(run), full_table(run))
+    return [t for t in found if t is not None]
 
 
 def to_csv(table: Table) -> str:

@@ -1,0 +1,256 @@
+"""The report: its tables against hand counts, its page as a browser would take it, its data back to the traces."""
+
+from __future__ import annotations
+
+import csv
+import html.parser
+import io
+import json
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ssad import safeio
+from ssad.agents import make_system
+from ssad.bench.execute import plain
+from ssad.errors import ConfigError, FormatError, StoreError
+from ssad.metrics import episode_metrics
+from ssad.report import write_report, write_video
+from ssad.report.embed import SCALE, episode_data, origin, pack, thin, unpack
+from ssad.report.load import load_run
+from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
+from ssad.report.tables import precrash_table, tex, to_csv, to_latex, to_markdown
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.traces import load_trace, save_trace
+from ssad.world.rollout import rollout
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Real episodes of two systems, one failed cell, one hostile name, and a torn last line."""
+    folder = tmp_path_factory.mktemp("run")
+    names = ["StraightObstacle/00", "StraightObstacle/01", "RedlightRunning/00", "natural/Twinford_00/00"]
+    scenarios = [load_scenarios(n)[0] for n in names]
+    graphs = {s.town: load_town(s.town) for s in scenarios}
+    lines, episodes, cells = [], [], []
+    for system in ("autopilot", "blind"):
+        built = [build_episode(s, graphs[s.town], seed=1) for s in scenarios]
+        for k, (s, trace) in enumerate(zip(scenarios, rollout(built, graphs, make_system(system)), strict=True)):
+            key = f"{system}{k}"
+            save_trace(folder / "traces" / f"{key}.npz", trace)
+            name = HOSTILE if k == 1 else s.name
+            common = {"key": key, "suite": "t", "system": system, "group": s.group, "seed": 1}
+            spec = {"scenario": {"name": name, "type": s.type, "town": s.town}, "system": system, "repetition": 0}
+            line = common | {"status": "ok", "reason": "", "spec": spec, "n": 1, "versions": {}, "wall_s": 0.1}
+            line["metrics"] = plain(episode_metrics(trace).as_dict())
+            line["artefacts"] = {"trace": f"traces/{key}.npz"}
+            lines.append(line)
+            episodes.append(common | {"scenario": name, "end": trace.end, "town": s.town})
+            cells.append({"key": key})
+    failed = {k: v for k, v in lines[0].items() if k not in ("metrics", "artefacts")}
+    failed |= {"key": "broken", "status": "timeout", "reason": f"no answer {HOSTILE} in 120 s", "metrics": {}}
+    lines.append(failed)
+    text = "".join(json.dumps(line) + "\n" for line in lines)
+    (folder / "results.jsonl").write_text(text + '{"key": "torn')
+    (folder / "episodes.jsonl").write_text("".join(json.dumps(e) + "\n" for e in episodes))
+    header = {"suite": {"name": "t", "title": "A <b>title</b>", "seed": 1}, "versions": {"ssad": "0"}, "cells": cells}
+    (folder / "run.json").write_text(json.dumps(header))
+    return folder
+
+
+def test_precrash_table_counts_failed_episodes_and_holds_the_papers_rows(run_folder: Path) -> None:
+    table = precrash_table(load_run(run_folder))
+    assert table is not None
+    rows = {row.head: row for row in table.rows}
+    column = list(SCENARIOS).index("StraightObstacle")
+    ours = rows["CR", "autopilot"].cells[column]
+    assert (ours.n, ours.failed, ours.mean) == (3, 1, 0.0)
+    assert rows["RC", "autopilot"].cells[column].mean == pytest.approx(2 / 3, abs=1e-6)
+    assert rows["CR", "blind"].cells[column].mean == 1.0
+    assert rows["CR", "blind"].cells[list(SCENARIOS).index("RightTurn")].text == "-"
+    assert rows["CR", "TD3"].published
+    assert rows["CR", "TD3"].cells[-1].mean == 0.75
+    read = list(csv.DictReader(io.StringIO(to_csv(table))))
+    assert len(read) == len(table.rows) * 9
+    assert {r["source"] for r in read} == {"ours", "published"}
+    assert to_markdown(table).count("\n|") == len(table.rows) + 2
+
+
+def test_latex_is_balanced_and_escaped(run_folder: Path) -> None:
+    table = precrash_table(load_run(run_folder))
+    assert table is not None
+    text = to_latex(table)
+    body = [line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
+    assert {len(re.findall(r"(?<!\\)&", line)) for line in body} == {10}
+    assert text.count("{") == text.count("}")
+    assert tex("50 % & a_b #1 {x} ~ ^ \\") == (
+        r"50 \% \& a\_b \#1 \{x\} \textasciitilde{} \textasciicircum{} \textbackslash{}"
+    )
+
+
+class _Page(html.parser.HTMLParser):
+    """Open elements, addresses and script texts of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.loads: list[str] = []
+        self.keys: list[str] = []
+        self.scripts = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in ("meta", "input", "br", "link", "img", "line", "circle"):
+            self.stack.append(tag)
+        named = dict(attrs)
+        self.scripts += tag == "script"
+        self.loads += [v for k, v in attrs if k in ("src", "href") and v and not v.startswith("#")]
+        if "data-key" in named:
+            self.keys.append(str(named["data-key"]))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("line", "circle"):
+            assert self.stack.pop() == tag
+
+
+def test_page_is_well_formed_self_contained_and_escapes_names(run_folder: Path) -> None:
+    path = write_report(run_folder)
+    text = path.read_text()
+    page = _Page()
+    page.feed(text)
+    assert page.stack == []
+    assert page.scripts == 2
+    assert all(link.startswith("tables/") for link in page.loads)
+    assert all((run_folder / link).is_file() for link in page.loads)
+    assert HOSTILE not in text
+    assert "A &lt;b&gt;title" in text
+    assert sorted(page.keys) == sorted(r.key for r in load_run(run_folder).records)
+    assert "no answer &lt;script&gt;" in text
+
+
+def test_embedded_replay_gives_back_the_trace(run_folder: Path) -> None:
+    text = write_report(run_folder).read_text()
+    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found
+    data = json.loads(found[1])
+    assert set(data["episodes"]) == {r.key for r in load_run(run_folder).records if r.trace}
+    for key, episode in data["episodes"].items():
+        trace = load_trace(run_folder / "traces" / f"{key}.npz")
+        agents = len(trace.names)
+        columns = unpack(episode["motion"], 3 * agents + -(-agents // 15))
+        ox, oy = data["towns"][trace.town]["origin"]
+        for a in range(agents):
+            here = trace.active[:, a]
+            np.testing.assert_allclose(columns[3 * a][here] * SCALE + ox, trace.x[here, a], atol=SCALE)
+            np.testing.assert_allclose(columns[3 * a + 1][here] * SCALE + oy, trace.y[here, a], atol=SCALE)
+            np.testing.assert_array_equal((columns[3 * agents + a // 15] >> (a % 15)) & 1, here)
+        assert len(episode["hits"]) == np.count_nonzero(trace.contact)
+
+
+def test_pack_survives_wrap_around() -> None:
+    columns = np.array([[32767, -32767, 0, 12], [-5, -5, 7, 32767]], np.int16)
+    np.testing.assert_array_equal(unpack(pack(columns), 2), columns)
+
+
+def test_thin_keeps_the_shape() -> None:
+    angle = np.linspace(0, np.pi / 2, 200)
+    arc = 20 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    kept = thin(arc, 0.05)
+    assert len(kept) < 20
+    middle = 0.5 * (kept[1:] + kept[:-1])
+    assert np.abs(np.hypot(*middle.T) - 20).max() < 0.06
+
+
+def test_episode_record_is_in_thousandths(run_folder: Path) -> None:
+    trace = load_trace(run_folder / "traces" / "blind0.npz")
+    graph = load_town(trace.town)
+    record = unpack(episode_data(trace, graph)["record"], 7)
+    np.testing.assert_allclose(record[0] * 0.01, trace.speed[:, 0], atol=0.01)
+    np.testing.assert_allclose(record[4] / 10, trace.route_complete, atol=0.1)
+    assert origin(graph) == origin(graph)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_video_has_the_episodes_frames(run_folder: Path, tmp_path: Path, suffix: str) -> None:
+    trace = load_trace(run_folder / "traces" / "blind0.npz")
+    path = write_video(trace, load_town(trace.town), tmp_path / f"a{suffix}")
+    if suffix == ".mp4":
+        reader = cv2.VideoCapture(str(path))
+        count = 0
+        while reader.read()[0]:
+            count += 1
+        assert count == len(trace.accel)
+    else:
+        from PIL import Image
+
+        with Image.open(path) as picture:
+            assert picture.n_frames == -(-len(trace.accel) // 2)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_bad_folders_and_suffixes_end_in_one_line(run_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"run\.json is missing"):
+        write_report(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(StoreError, match="no results yet"):
+        write_report(tmp_path)
+    (tmp_path / "results.jsonl").write_text("nonsense\n")
+    with pytest.raises(FormatError, match=r"results\.jsonl:1"):
+        write_report(tmp_path)
+    trace = load_trace(run_folder / "traces" / "blind0.npz")
+    with pytest.raises(ConfigError, match=r"\.mp4 or \.gif"):
+        write_video(trace, load_town(trace.town), tmp_path / "a.avi")
+
+
+def test_a_lost_trace_costs_only_its_replay(run_folder: Path, tmp_path: Path) -> None:
+    for name in ("run.json", "results.jsonl", "episodes.jsonl"):
+        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    text = write_report(tmp_path).read_text()
+    assert "8 episodes have no replay" in text
+    assert (tmp_path / "tables" / "precrash.csv").is_file()
+
+
+@pytest.mark.data
+def test_the_papers_tables_are_as_the_paper_has_them(data_dir: Path) -> None:
+    sources = sorted((data_dir.parent / "paper").glob("*.txt"))
+    if not sources:
+        pytest.skip("the paper's source is not beside the data folder")
+    text = sources[0].read_text()
+    block = text[text.index("pre-crash safety-critical scenarios. CR") : text.index("tablescenario1")]
+    metric = ""
+    seen = 0
+    for line in block.splitlines():
+        name = re.search(r"\{\*\}\{(CR|OR|DR|RC)\}", line)
+        metric = name[1] if name else metric
+        row = re.search(r"&(PPO|SAC|TD3)&(.*?)\\\\", line)
+        if row and metric:
+            assert tuple(float(v) for v in row[2].split("&")) == PRECRASH[metric][row[1]]
+            seen += 1
+    assert seen == 12
+    block = text[text.index("Adv.PPO on Town02 and Town05 maps") : text.index("label{tablescenario2}")]
+    rows = re.findall(r"^(Autopilot|PPO)&(Autopilot|Adv\. PPO)&(.*?)\\\\", block, re.MULTILINE)
+    assert len(rows) == 4
+    for system, traffic, numbers in rows:
+        values = tuple(float(v) for v in numbers.split("&"))
+        assert (values[:3], values[3:]) == tuple(NATURAL[system, traffic][t] for t in ("Town02", "Town05"))
+
+
+def test_report_needs_no_world(run_folder: Path) -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom ssad.report import write_report\n"
+        "write_report(Path(sys.argv[1]))\n"
+        "assert not {'torch', 'warp', 'carla', 'gymnasium'} & set(sys.modules), 'heavy imports'"
+    )
+    done = subprocess.run(  # noqa: PLW1510
+        [sys.executable, "-c", code, str(run_folder)], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert safeio.read_json(run_folder / "run.json")["suite"]["name"] == "t"
