@@ -153,3 +153,33 @@ def test_list(kind: str, name: str) -> None:
     done = ssad("list", kind)
     assert done.returncode == 0
     assert name in [line.split()[0] for line in done.stdout.splitlines()]
+
+
+def test_run_report_and_replay(tmp_path: Path) -> None:
+    settings = ("--set", "scenarios=[StraightObstacle/00,RightTurn/01]", "--set", "name=little")
+    first = ssad("run", "quick", *settings, "--workers", "2", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "StraightObstacle" in first.stdout
+    assert "report: runs/little/report.html" in first.stdout
+    folder = tmp_path / "runs" / "little"
+    results = (folder / "results.jsonl").read_bytes()
+    assert results.count(b"\n") == 4
+    assert {p.suffix for p in (folder / "tables").iterdir()} == {".csv", ".md", ".tex"}
+
+    again = ssad("run", "quick", *settings, cwd=tmp_path)
+    assert again.returncode == 0
+    assert again.stdout == first.stdout
+    assert (folder / "results.jsonl").read_bytes() == results
+    fails(ssad("run", "quick", *settings, "--set", "seed=5", cwd=tmp_path), "differs in seed", "--out")
+
+    page = (folder / "report.html").read_bytes()
+    (folder / "report.html").unlink()
+    assert ssad("report", "runs/little", cwd=tmp_path).returncode == 0
+    assert (folder / "report.html").read_bytes() == page
+
+    replayed = ssad("replay", "runs/little", "blind/StraightObstacle/00", cwd=tmp_path)
+    assert replayed.returncode == 0, replayed.stderr
+    assert "identical" in replayed.stdout
+    assert {p.suffix for p in (folder / "replays").iterdir()} == {".mp4", ".npz"}
+    assert all(p.stat().st_size > 1000 for p in (folder / "replays").iterdir())
+    fails(ssad("replay", "runs/little", "blind/StraightObstacle/01", cwd=tmp_path), "closest: blind/Str")
