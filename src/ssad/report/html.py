@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 
 from ssad import safeio
+from ssad.bench.suite import load_suite
 from ssad.errors import SSADError
 from ssad.metrics import METRICS, aggregate
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
@@ -82,12 +83,18 @@ def render(run: Run, found: list[Table]) -> str:
 
 
 def _command(run: Run) -> str:
-    suite = run.header.get("suite", {})
-    sets = [f"scenarios=[{','.join(suite['scenarios'])}]"] if suite.get("scenarios") else []
-    systems = [f"systems=[{','.join(suite['systems'])}]"] if suite.get("systems") else []
-    words = ["ssad", "run", str(suite.get("name", "quick"))]
-    for item in [*sets, *systems, f"seed={suite.get('seed', 0)}"]:
-        words += ["--set", item]
+    """The command that runs the same suite again; only what differs from the suite of that name is spelt out."""
+    suite = dict(run.header.get("suite", {}))
+    name = str(suite.pop("name", "quick"))
+    try:
+        stock = load_suite(name).model_dump(mode="json")
+    except SSADError:  # a suite of the user's own, by its file
+        stock = suite
+    words = ["ssad", "run", name]
+    for key, value in suite.items():
+        if value != stock.get(key):
+            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            words += ["--set", f"{key}={text}"]
     return shlex.join(words)
 
 
