@@ -97,7 +97,6 @@ class World:
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
-        wp.config.quiet = True
         wp.init()
         self.episodes = tuple(episodes)
         self.graphs = dict(graphs)
