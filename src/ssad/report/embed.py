@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssad.report.lanes import strips, thin
 from ssad.roads.graph import LaneGraph
 from ssad.types import EpisodeTrace, LaneType
 
@@ -22,7 +23,6 @@ SCALE = 0.03  # m
 SPEED = 0.01  # m/s
 SHARE = 1000.0  # throttle, brake, steer, completion as thousandths
 NEAR = 80.0  # m around the episodes in which lanes are kept
-KINDS = {LaneType.SIDEWALK: 0, LaneType.SHOULDER: 1, LaneType.PARKING: 2, LaneType.BIKING: 2, LaneType.DRIVING: 3}
 
 
 def pack(columns: npt.NDArray[np.int16]) -> str:
@@ -104,47 +104,21 @@ def _changes(states: npt.NDArray[np.uint8], index: int) -> list[Any]:
     return [index, [[int(t), int(states[t])] for t in at]]
 
 
-def thin(xy: npt.NDArray[np.float64], tolerance: float = 0.04) -> npt.NDArray[np.float64]:
-    """A polyline without the points that leave its shape within `tolerance` m (Douglas-Peucker)."""
-    keep = np.zeros(len(xy), bool)
-    keep[[0, -1]] = True
-    stack = [(0, len(xy) - 1)]
-    while stack:
-        a, b = stack.pop()
-        if b - a < 2:
-            continue
-        d = xy[b] - xy[a]
-        rest = xy[a + 1 : b] - xy[a]
-        off = np.abs(rest[:, 0] * d[1] - rest[:, 1] * d[0]) / max(float(np.hypot(*d)), 1e-9)
-        k = int(np.argmax(off))
-        if off[k] > tolerance:
-            keep[a + 1 + k] = True
-            stack += [(a, a + 1 + k), (a + 1 + k, b)]
-    return xy[keep]
-
-
 def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any]:
     """Lanes within `NEAR` m of the episodes' routes as strips and edge lines, and the signals."""
     places = np.concatenate([t.route[::10] for t in traces]).astype(np.float64)
     cells = {tuple(c) for c in np.floor(places / NEAR).astype(int)}
     near = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
     ox, oy = origin(graph)
-    strips: list[list[Any]] = []
-    for lane in np.argsort([KINDS.get(LaneType(int(k)), -1) for k in graph.kind], kind="stable"):
-        kind = KINDS.get(LaneType(int(graph.kind[lane])), -1)
-        span = slice(int(graph.offset[lane]), int(graph.offset[lane + 1]))
-        xy = graph.xy[span].astype(np.float64)
-        if kind < 0 or not any(tuple(c) in near for c in np.floor(xy / NEAR).astype(int)):
-            continue
-        normal = np.stack([-np.sin(graph.yaw[span]), np.cos(graph.yaw[span])], 1)
-        half = 0.5 * graph.width[span, None]
-        left, right = thin(xy + normal * half), thin(xy - normal * half)
-        junction = int(graph.junction[lane] >= 0)
-        lines = _lines(graph, int(lane))
-        ring = np.concatenate([left, right[::-1]])
-        strips.append([kind, junction, lines, len(left), _flat(ring, ox, oy)])
+    drawn: list[list[Any]] = []
+    for strip in strips(graph):
+        middle = 0.5 * (strip.left[[0, -1]] + strip.right[[0, -1]])
+        both = np.concatenate([strip.ring, middle])
+        if any(tuple(c) in near for c in np.floor(both / NEAR).astype(int)):
+            lines = _lines(graph, strip.lane)
+            drawn.append([strip.layer, int(strip.junction), lines, len(strip.left), _flat(strip.ring, ox, oy)])
     signals = [[round(float(x) - ox, 2), round(float(y) - oy, 2)] for x, y in graph.signal_xy]
-    return {"origin": [ox, oy], "strips": strips, "signals": signals, "crosswalks": _crosswalks(graph, ox, oy)}
+    return {"origin": [ox, oy], "strips": drawn, "signals": signals, "crosswalks": _crosswalks(graph, ox, oy)}
 
 
 def _lines(graph: LaneGraph, lane: int) -> list[int]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from ssad.errors import ConfigError
-from ssad.report.embed import thin
+from ssad.report.lanes import LAYERS, strips
 from ssad.roads.graph import LaneGraph
 from ssad.safeio import atomic_path
 from ssad.types import AgentKind, EpisodeTrace, LaneType
@@ -74,42 +74,26 @@ def box_corners(x: float, y: float, yaw: float, length: float, width: float) -> 
     return out
 
 
-def _strips(graph: LaneGraph) -> list[tuple[int, bool, npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
-    """(kind, inside a junction, left edge, right edge) of the lanes, sidewalks first."""
-    out = []
-    order = {LaneType.SIDEWALK: 0, LaneType.SHOULDER: 1, LaneType.PARKING: 2, LaneType.BIKING: 2, LaneType.DRIVING: 3}
-    for lane in range(len(graph.kind)):
-        kind = order.get(LaneType(int(graph.kind[lane])), -1)
-        if kind < 0:
-            continue
-        span = slice(int(graph.offset[lane]), int(graph.offset[lane + 1]))
-        xy = graph.xy[span].astype(np.float64)
-        normal = np.stack([-np.sin(graph.yaw[span]), np.cos(graph.yaw[span])], 1)
-        half = 0.5 * graph.width[span, None]
-        out.append((kind, bool(graph.junction[lane] >= 0), thin(xy + normal * half), thin(xy - normal * half)))
-    return sorted(out, key=lambda strip: strip[0])
-
-
 def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (960, 540)) -> Iterator[Frame]:
     """RGB frames [H, W, 3], one a step, the camera following the ego from above."""
-    strips = _strips(graph)
+    lanes = strips(graph)
     scale = size[0] / 90.0
     reach = 0.6 * max(size) / scale
     first_hit = next(iter(np.flatnonzero(trace.contact)), None)
     for t in range(len(trace.accel)):
         centre = (float(trace.x[t, 0]), float(trace.y[t, 0]))
         canvas = _Canvas(size, scale, centre)
-        for kind, junction, left, right in strips:
-            ring = np.concatenate([left, right[::-1]])
+        for lane in lanes:
+            ring = lane.ring
             low, high = ring.min(axis=0), ring.max(axis=0)
             if (low > np.add(centre, reach)).any() or (high < np.subtract(centre, reach)).any():
                 continue
-            canvas.fill(ring, WALK if kind == 0 else ROAD)
-            if junction:  # connecting lanes leave small holes between them
+            canvas.fill(ring, WALK if lane.layer == 0 else ROAD)
+            if lane.junction:  # connecting lanes leave small holes between them
                 canvas.line(ring, ROAD, 12, closed=True)
-            if kind == 3 and not junction:
-                canvas.line(left, EDGE, 1)
-                canvas.line(right, EDGE, 1)
+            elif lane.layer == LAYERS[LaneType.DRIVING]:
+                canvas.line(lane.left, EDGE, 1)
+                canvas.line(lane.right, EDGE, 1)
         canvas.line(trace.route, ROUTE, 2)
         _signals(canvas, trace, graph, t)
         for a in range(len(trace.names) - 1, -1, -1):
