@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.report.lanes import strips, thin
+from ssad.report.lanes import LAYERS, junction_areas, strips, thin
 from ssad.roads.graph import LaneGraph
 from ssad.types import EpisodeTrace, LaneType
 
@@ -111,7 +111,11 @@ def town_data(graph: LaneGraph, traces: Iterable[EpisodeTrace]) -> dict[str, Any
     near = {(x + i, y + j) for x, y in cells for i in (-1, 0, 1) for j in (-1, 0, 1)}
     ox, oy = origin(graph)
     drawn: list[list[Any]] = []
-    for strip in strips(graph):
+    lanes = strips(graph)
+    for area in junction_areas(graph, lanes):
+        if any(tuple(c) in near for c in np.floor(area / NEAR).astype(int)):
+            drawn.append([LAYERS[LaneType.DRIVING], 1, [0, 0], len(area), _flat(area, ox, oy)])
+    for strip in lanes:
         middle = 0.5 * (strip.left[[0, -1]] + strip.right[[0, -1]])
         both = np.concatenate([strip.ring, middle])
         if any(tuple(c) in near for c in np.floor(both / NEAR).astype(int)):

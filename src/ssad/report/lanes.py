@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ssad.roads.graph import LaneGraph
@@ -49,6 +51,28 @@ def strips(graph: LaneGraph) -> list[Strip]:
         inside = bool(graph.junction[lane] >= 0)
         out.append(Strip(lane, layer, inside, thin(xy + normal * half), thin(xy - normal * half)))
     return sorted(out, key=lambda strip: strip.layer)
+
+
+def junction_areas(graph: LaneGraph, drawn: Sequence[Strip], *, scale: float = 5.0) -> list[F64]:
+    """Outlines [N, 2] m of the junctions' road surface: connecting lanes together, without the holes between them.
+
+    The union is taken on a raster of `scale` pixels a metre, slits under 1 m closed.
+    """
+    out = []
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (int(scale) | 1, int(scale) | 1))
+    for junction in np.unique(graph.junction[graph.junction >= 0]):
+        rings = [s.ring for s in drawn if graph.junction[s.lane] == junction and s.layer == LAYERS[LaneType.DRIVING]]
+        if not rings:
+            continue
+        low = np.min([r.min(axis=0) for r in rings], axis=0) - 2.0
+        size = np.ceil((np.max([r.max(axis=0) for r in rings], axis=0) + 2.0 - low) * scale).astype(int)
+        mask = np.zeros((size[1], size[0]), np.uint8)
+        for ring in rings:
+            cv2.fillPoly(mask, [np.round((ring - low) * scale).astype(np.int32)], 1)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel)
+        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        out += [thin(c[:, 0].astype(np.float64) / scale + low, 0.15) for c in contours if len(c) > 8]
+    return out
 
 
 def thin(xy: F64, tolerance: float = 0.04) -> F64:

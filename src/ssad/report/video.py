@@ -12,13 +12,13 @@ import numpy.typing as npt
 from PIL import Image
 
 from ssad.errors import ConfigError
-from ssad.report.lanes import LAYERS, strips
+from ssad.report.lanes import LAYERS, junction_areas, strips
 from ssad.roads.graph import LaneGraph
 from ssad.safeio import atomic_path
 from ssad.types import AgentKind, EpisodeTrace, LaneType
 
 Frame = npt.NDArray[np.uint8]
-GROUND, ROAD, WALK, EDGE = (231, 236, 226), (92, 86, 82), (196, 198, 194), (236, 236, 236)
+GROUND, ROAD, WALK, EDGE = (231, 236, 226), (82, 86, 96), (196, 198, 194), (236, 236, 236)
 EGO, CRASH, ROUTE = (37, 99, 235), (220, 38, 38), (96, 165, 250)
 BODY = {
     AgentKind.WALKER: (219, 39, 119),
@@ -77,21 +77,22 @@ def box_corners(x: float, y: float, yaw: float, length: float, width: float) -> 
 def frames(trace: EpisodeTrace, graph: LaneGraph, *, size: tuple[int, int] = (960, 540)) -> Iterator[Frame]:
     """RGB frames [H, W, 3], one a step, the camera following the ego from above."""
     lanes = strips(graph)
+    areas = junction_areas(graph, lanes)
     scale = size[0] / 90.0
     reach = 0.6 * max(size) / scale
     first_hit = next(iter(np.flatnonzero(trace.contact)), None)
     for t in range(len(trace.accel)):
         centre = (float(trace.x[t, 0]), float(trace.y[t, 0]))
         canvas = _Canvas(size, scale, centre)
+        for area in areas:
+            canvas.fill(area, ROAD)
         for lane in lanes:
             ring = lane.ring
             low, high = ring.min(axis=0), ring.max(axis=0)
             if (low > np.add(centre, reach)).any() or (high < np.subtract(centre, reach)).any():
                 continue
             canvas.fill(ring, WALK if lane.layer == 0 else ROAD)
-            if lane.junction:  # connecting lanes leave small holes between them
-                canvas.line(ring, ROAD, 12, closed=True)
-            elif lane.layer == LAYERS[LaneType.DRIVING]:
+            if lane.layer == LAYERS[LaneType.DRIVING] and not lane.junction:
                 canvas.line(lane.left, EDGE, 1)
                 canvas.line(lane.right, EDGE, 1)
         canvas.line(trace.route, ROUTE, 2)

@@ -119,7 +119,7 @@ function draw() {
   const fill = [css("--walk"), css("--shoulder"), css("--shoulder"), css("--road")], edge = css("--edge");
   const lanes = strips(town);
   for (const lane of lanes) {
-    pen.fillStyle = pen.strokeStyle = fill[lane.kind]; pen.lineWidth = lane.junction ? 1.5 : 0.12;  // connecting lanes leave small holes between them
+    pen.fillStyle = pen.strokeStyle = fill[lane.kind]; pen.lineWidth = 0.12;
     pen.fill(lane.path); pen.stroke(lane.path);
   }
   pen.fillStyle = "rgba(255,255,255,.16)";
