@@ -28,15 +28,16 @@ def section(name: str, data: dict[str, Any]) -> list[str]:
     limit, what = CEILING["cpu" if data["device"] == "cpu" else "cuda"]
     lines += [
         "",
-        f"The best row is {best / limit:.0%} of {limit:.0e} agent-steps/s, the estimated bound by {what} of a",
+        f"The best row is {best / limit:.0%} of {limit:.0e} agent-steps/s, the estimated bound by {what} of a bare step",
+        "(bicycle, contacts and nearest lane alone).",
     ]
-    lines[-1] += " bare step; the full step below does about five times a bare step's work."
     if "highway" in data:
         other = data["highway"]
-        lines.append(
-            f"highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle sub-steps/s with "
-            f"{other['agents']:.1f} vehicles; one scene of ours is {data['ratio_at_B1']:.0f} times as fast."
-        )
+        lines += [
+            "",
+            f"highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle sub-steps/s with",
+            f"{other['agents']:.1f} vehicles. One scene of ours gives {data['ratio_at_B1']:.0f} times as many agent-steps/s.",
+        ]
     parts = {key: value for key, value in data.items() if key.startswith("parts_us_B")}
     names = list(next(iter(parts.values())))
     lines += ["", "| kernel | " + " | ".join(f"{key[10:]} scenes" for key in parts) + " |"]
@@ -52,9 +53,9 @@ def main() -> None:
     lines = [
         "# Speed of the world",
         "",
-        "Made by `python benchmarks/page.py` from `benchmarks/results`, which `benchmarks/world_speed.py --json` writes.",
-        "The full step: Autopilot traffic, signals, motion, contacts, the ego's record, restart of ended scenes, and the",
-        "observation of 28 numbers a scene, on natural junction episodes. Medians of five repeats.",
+        "Made by `benchmarks/page.py` from `benchmarks/results`, which `benchmarks/world_speed.py --json` writes.",
+        "The full step: Autopilot traffic, signals, motion, contacts, the ego's record, restart of ended scenes,",
+        "and the observation of 28 numbers a scene, on natural junction episodes. Medians of five repeats.",
         "",
     ]
     for name in RUNS:
