@@ -28,15 +28,16 @@ def section(name: str, data: dict[str, Any]) -> list[str]:
     limit, what = CEILING["cpu" if data["device"] == "cpu" else "cuda"]
     lines += [
         "",
-        f"The best row is {best / limit:.0%} of {limit:.0e} agent-steps/s, the estimated bound by {what} of a bare step",
-        "(bicycle, contacts and nearest lane alone).",
+        f"The best row is {best / limit:.0%} of {limit:.0e} agent-steps/s, the estimated bound by {what}",
+        "of a bare step (bicycle, contacts and nearest lane alone).",
     ]
     if "highway" in data:
         other = data["highway"]
         lines += [
             "",
-            f"highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle sub-steps/s with",
-            f"{other['agents']:.1f} vehicles. One scene of ours gives {data['ratio_at_B1']:.0f} times as many agent-steps/s.",
+            f"highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle sub-steps/s",
+            f"with {other['agents']:.1f} vehicles. One scene of ours gives {data['ratio_at_B1']:.0f} times as many",
+            "agent-steps/s.",
         ]
     parts = {key: value for key, value in data.items() if key.startswith("parts_us_B")}
     names = list(next(iter(parts.values())))
