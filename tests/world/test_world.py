@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.errors import ConfigError, UnknownNameError
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.types import Condition, Controller, EpisodeAgent, Limits, Phase, Pose
 from ssad.world.check import check_world
+from ssad.world.kernels.drive import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.world import ENDS, World
 from tests.world.worlds import GRAPHS, ego, episode, line_route
@@ -263,3 +268,33 @@ def test_bad_episodes_are_refused() -> None:
         World([episode(ego(), *many)], GRAPHS)
     with pytest.raises(ConfigError, match="assigned"):
         World([episode(ego())], GRAPHS, assign=[1])
+
+
+def test_follower_keeps_its_route_without_wobble() -> None:
+    """On a real route with a bend: no steering on the straight, little change of it in the bend, near the path."""
+    scenario = load_scenarios("TurningObstacle/00")[0]
+    town = load_town(scenario.town)
+    one = build_episode(scenario, town, seed=0)
+    alone = replace(one, agents=one.agents[:1])
+    world = World([alone], {scenario.town: town}, ego=Controller.FOLLOW)
+    steer, lateral = [], []
+    route = one.agents[0].route
+    assert route is not None
+    while not world.ended()[0]:
+        world.step()
+        steer.append(float(world.array("control")[0, 0, 2]))
+        x, y, _ = (float(v) for v in world.array("pose")[0, 0])
+        k = int(np.argmin(np.hypot(route.xy[:, 0] - x, route.xy[:, 1] - y)))
+        c, s = np.cos(route.yaw[k]), np.sin(route.yaw[k])
+        lateral.append(-s * (x - route.xy[k, 0]) + c * (y - route.xy[k, 1]))
+    assert ENDS[world.ended()[0]] == "complete"
+    assert np.abs(lateral).max() < 0.4
+    turning = np.abs(steer) > 0.02
+    first = int(np.argmax(turning))
+    assert np.abs(steer[: first - 5]).max() < 1e-3
+    # a limit cycle of the steering would swing by tenths from step to step
+    assert np.abs(np.diff(steer, n=2)).max() < 0.12
+
+
+def test_no_model_is_longer_than_the_autopilot_reckons_with() -> None:
+    assert max(m.length for m in MODELS.values()) / 2 <= float(LONGEST)

@@ -8,7 +8,7 @@ the stop line of a red signal, and the near edge of a predicted conflict it must
 import warp as wp
 
 from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State, Work
-from ssad.world.kernels.shared import RED, YELLOW, route_frame, signal_state, wrap
+from ssad.world.kernels.shared import RED, YELLOW, boxes_touch, route_frame, signal_state, wrap
 
 IDM_ACCEL = wp.constant(2.5)
 IDM_BRAKE = wp.constant(3.0)
@@ -71,13 +71,15 @@ def steer_on_route(bank: Bank, roads: Roads, state: State, b: int, i: int, e: in
     s = wp.sin(p[2])
     dx = pose[0] - p[0]
     dy = pose[1] - p[1]
-    left = -s * dx + c * dy
-    here = wp.min(at + int(wp.max(v, 0.0) * 0.15 + 0.5), route[1] - 1)
+    part = c * dx + s * dy
+    left = c * dy - s * dx - 0.5 * p[3] * part * part
+    v0 = wp.max(v, 0.0)
+    here = wp.clamp(at + int(wp.floor(part + 0.15 * v0 + 0.5)), 0, route[1] - 1)
     k_ref = roads.path[route[0] + here][3]
     body = bank.body[bank.model[e, i]]
-    slip = wp.atan(0.5 * wp.tan(state.wheel[b, i]))
-    aim = wp.min(at + 1, route[1] - 1)
-    off = wp.clamp(wrap(pose[2] + slip - roads.path[route[0] + aim][2]), -1.2, 1.2)
+    # on the path the body lags by the slip of its curvature; taking the present slip would feed back on itself
+    slip = wp.asin(wp.clamp(0.5 * k_ref * body[2], -0.95, 0.95))
+    off = wp.clamp(wrap(pose[2] + slip - p[2] - p[3] * (part + 0.1 * v0)), -1.2, 1.2)
     soft = 1.0 / (1.0 + 0.05 * v * v / 10.0)
     k = k_ref - 0.25 * soft * wp.clamp(left, -3.0, 3.0) - 0.9 * soft * off
     # curvature k of the box centre: sin(slip) = k L / 2, tan(wheel) = 2 tan(slip)
@@ -99,10 +101,12 @@ def lead_gap(
     other: wp.vec4,
     heading: wp.vec2,
     margin: float,
+    bend: float,
 ) -> wp.vec2:
     """Where agent j stands on a route that begins `u0` metres along: (gap bumper to bumper m or FAR, speed along it).
 
-    lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading.
+    lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading; bend:
+    metres that the route ahead leaves its straight line.
     """
     q = state.pose[b, j]
     u = wp.clamp(lon, 0.0, SIGHT)
@@ -129,21 +133,15 @@ def lead_gap(
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
     if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin + sweep:
         result = wp.vec2(u - own[0] - along, state.speed[b, j] * c)
-    if wp.abs(rest) >= 0.3 and lon < 25.0:
-        # inside a tight bend a projection need not converge: try the body against the path piece by piece
-        for k in range(16):
-            u = 1.5 * float(k + 1)
+    if result[0] >= FAR and bend > 1.5 and lon < 20.0:
+        # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
+        # 0.2 m of room to either side, checked every metre
+        for k in range(14):
+            u = float(k + 1)
             at = route_frame(roads, route[0], route[1], u0 + u)
-            rx = q[0] - at[0]
-            ry = q[1] - at[1]
-            c = heading[0] * at[2] + heading[1] * at[3]
-            s = wp.abs(heading[0] * at[3] - heading[1] * at[2])
-            along = other[0] * wp.abs(c) + other[1] * s
-            across = other[0] * s + other[1] * wp.abs(c)
-            rest = rx * at[2] + ry * at[3]
-            lateral = ry * at[2] - rx * at[3]
-            if wp.abs(lateral) < own[1] + across + margin and wp.abs(rest) < along + 0.75 and result[0] >= FAR:
-                result = wp.vec2(u + rest - along - own[0], state.speed[b, j] * c)
+            body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
+            if result[0] >= FAR and boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
+                result = wp.vec2(u - 1.0, state.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
     return result
 
 
@@ -373,7 +371,8 @@ def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, worker
             margin = 0.3
             if walks:
                 margin = 0.6
-            lead = lead_gap(roads, state, b, j, route, aim[0], lon, own, other, heading, margin)
+            bend = roads.bend[route[0] + state.progress[b, i]]
+            lead = lead_gap(roads, state, b, j, route, aim[0], lon, own, other, heading, margin, bend)
             if lead[0] < FAR:
                 react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
                 if heading[0] * c + heading[1] * s > 0.7:

@@ -5,7 +5,7 @@ to its start; shuffled; a share `intensity` of them, between `minimum` and `maxi
 is within 50 m. Other than in FREA: places are every 25 m on driving lanes outside junctions (CARLA's spawn
 points are not part of a map file); no two vehicles start within 8 m; the shuffle depends on the scenario's
 seed (FREA: always seed 2000); each vehicle drives a random route of its own near 8 m/s (FREA: CARLA's
-traffic manager).
+traffic manager); long vehicles drive only where they can turn.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ssad.types import (
     SignalPlan,
     TrafficPlan,
 )
+from ssad.world.models import model
 
 if TYPE_CHECKING:
     from ssad.roads.graph import LaneGraph
@@ -41,6 +42,7 @@ APART = 8.0
 _SPACING = 25.0
 _FROM_END = 6.0  # no vehicle starts nearer than this to a lane's end
 _ROUTE = 400.0  # m; more than anyone drives in an episode of 60 s at town speed
+_NOSE = 2.2  # m from the path: a lane's half width and a little
 _MIX: dict[str, float] = {
     "car": 0.30,
     "suv": 0.20,
@@ -95,6 +97,20 @@ def candidates(graph: LaneGraph, route: Route) -> list[tuple[Place, Pose]]:
     return found
 
 
+def fits(body: str, route: Route) -> bool:
+    """Whether a vehicle can drive a route's tightest bend without its nose swinging into the oncoming lane.
+
+    At curvature k of its centre's path the body lags by the slip asin(k wheelbase / 2), so that its front
+    corner reaches length / 2 sin(slip) + width / 2 outwards; at most `_NOSE` m are allowed.
+    """
+    vehicle = model(body)
+    turn = np.abs(np.diff(np.unwrap(route.yaw.astype(np.float64)))) / route.spacing
+    # over 3 m, as a single kink between two lanes is none
+    smooth = np.convolve(turn, np.ones(3) / 3.0, mode="valid")
+    slip = min(0.5 * float(smooth.max(initial=0.0)) * vehicle.wheelbase, 1.0)
+    return 0.5 * vehicle.length * slip + 0.5 * vehicle.width <= _NOSE
+
+
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Vehicles that drive on their own."""
     from ssad.roads import random_route
@@ -111,6 +127,9 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         if any(math.hypot(pose.x - a.pose.x, pose.y - a.pose.y) < APART for a in agents):
             continue
         body = str(rng.choice(list(_MIX), p=list(_MIX.values())))
+        path = random_route(graph, place.lane, place.s, _ROUTE, rng)
+        if not fits(body, path):
+            body = "compact"
         speed = value["speed"] + value["speed_spread"] * float(rng.uniform(-1.0, 1.0))
         agents.append(
             EpisodeAgent(
@@ -119,7 +138,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
                 controller=Controller.AUTOPILOT,
                 pose=pose,
                 target_speed=min(speed, float(graph.speed_limit[place.lane])),
-                route=random_route(graph, place.lane, place.s, _ROUTE, rng),
+                route=path,
                 wake_distance=plan.wake_distance,
             )
         )
