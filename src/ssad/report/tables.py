@@ -126,7 +126,8 @@ def natural_table(run: Run) -> Table | None:
         ("System", "Traffic", "Town"),
         SHOWN,
         tuple(rows),
-        f"Shaded rows: {SOURCE}.",
+        f"Shaded rows: {SOURCE}. Their DR fits SafeBench's normalised scale (DR / 5 m); ours here is in metres, and "
+        "includes up to half a metre of spacing between route points. See also the normalised table.",
     )
 
 

@@ -149,10 +149,11 @@ def lead_gap(
 def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
     """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
 
-    Only another Autopilot can be relied on to give way: straight before right before left, then whoever is inside
-    the junction, then whoever is nearer to it, then the lower number.
+    Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
+    test. Scripted actors and walkers are not. Straight goes before right before left, then whoever is inside the
+    junction, then whoever is nearer to it, then the lower number.
     """
-    if bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2:
+    if j != 0 and (bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2):
         return False
     ri = bank.route[e, i]
     rj = bank.route[e, j]
