@@ -298,3 +298,21 @@ def test_follower_keeps_its_route_without_wobble() -> None:
 
 def test_no_model_is_longer_than_the_autopilot_reckons_with() -> None:
     assert max(m.length for m in MODELS.values()) / 2 <= float(LONGEST)
+
+
+@pytest.mark.parametrize(("system", "runs"), [(Controller.AUTOPILOT, 0), (Controller.FOLLOW, 1)])
+def test_right_turn_on_red_counts_as_run_only_without_a_stop(system: Controller, runs: int) -> None:
+    scenario = load_scenarios("RightTurn/00")[0]
+    town = load_town(scenario.town)
+    one = build_episode(scenario, town, seed=0)
+    alone = replace(one, agents=one.agents[:1])
+    world = World([alone], {scenario.town: town}, ego=system)
+    counted, slowest = 0, 99.0
+    while not world.ended()[0]:
+        world.step()
+        counted += int(world.array("ego.red_light")[0] == 1)
+        if world.array("step")[0] > 20:
+            slowest = min(slowest, float(world.array("speed")[0, 0]))
+    assert ENDS[world.ended()[0]] == "complete"
+    assert counted == runs
+    assert (slowest < 0.3) == (system == Controller.AUTOPILOT)

@@ -100,8 +100,18 @@ def precrash_table(run: Run) -> Table | None:
         (*SCENARIOS.values(), "Avg."),
         tuple(rows),
         f"Shaded rows: {SOURCE}. 95 % intervals: Wilson for CR, bootstrap for the others; Avg. is the mean of the "
-        "scenarios' values. A failed episode counts in the denominator.",
+        f"scenarios' values. A failed episode counts in the denominator. {_counts(rows)}",
     )
+
+
+def _counts(rows: Sequence[Row]) -> str:
+    """How many episodes are behind the numbers, in a sentence."""
+    parts = []
+    for row in rows:
+        ns = sorted({c.n for c in row.cells[:-1] if c.n})
+        if ns and not row.published and row.head[0] == rows[0].head[0]:
+            parts.append(f"{row.head[1]} {ns[0]}" if len(ns) == 1 else f"{row.head[1]} {ns[0]} to {ns[-1]}")
+    return f"Episodes in a cell (n): {', '.join(parts)}."
 
 
 def natural_table(run: Run) -> Table | None:
@@ -116,7 +126,9 @@ def natural_table(run: Run) -> Table | None:
             members = [r.metrics for r in mine if r.system == system and r.town == town]
             if members:
                 values = aggregate(members)
-                rows.append(Row((system, "Autopilot", town), tuple(_cell(values[s]) for s in SHOWN)))
+                rows.append(
+                    Row((system, f"Autopilot, n = {len(members)}", town), tuple(_cell(values[s]) for s in SHOWN))
+                )
     for (system, traffic), by_town in NATURAL.items():
         for town, numbers in by_town.items():
             rows.append(Row((system, traffic, town), (*(Cell(v) for v in numbers), Cell(math.nan)), published=True))

@@ -460,4 +460,9 @@ def drive(bank: Bank, roads: Roads, state: State, dt: float):
     if v < 0.3:
         state.waited[b, i] = state.waited[b, i] + dt
     elif v > 3.0:
-        state.waited[b, i] = 0.0
+        # who stopped before a junction has stopped for it until it is behind
+        junction = FAR
+        if bank.route[e, i][1] > 1:
+            junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
+        if junction > 10.0:
+            state.waited[b, i] = 0.0
