@@ -1,11 +1,10 @@
-"""The command line: names, exit codes, one-line errors, start-up time."""
+"""The command line: names, exit codes, one-line errors, a light start."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -36,24 +35,10 @@ def fails(done: subprocess.CompletedProcess[str], *parts: str) -> None:
     assert done.stdout == ""
 
 
-def best_of(count: int, *command: str) -> float:
-    times = []
-    for _ in range(count):
-        began = time.perf_counter()
-        subprocess.run([sys.executable, *command], check=True, capture_output=True)
-        times.append(time.perf_counter() - began)
-    return min(times)
-
-
 def test_help_names_every_command() -> None:
     done = ssad("--help")
     assert done.returncode == 0
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
-
-
-def test_start_up_is_quick() -> None:
-    assert best_of(5, "-c", "import ssad") < 0.3
-    assert best_of(5, "-m", "ssad.cli", "--help") < 0.5
 
 
 def test_nothing_heavy_is_imported_for_help() -> None:
@@ -98,7 +83,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
     "arguments", [("run",), ("run", "quick", "--nope"), ("nope",), ("run", "quick", "--workers", "0")]
 )
 def test_usage_errors_have_exit_code_2(arguments: tuple[str, ...]) -> None:
-    assert ssad(*arguments).returncode == 2
+    fails(ssad(*arguments), "--help")
 
 
 SCENARIO = """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -205,11 +205,20 @@ def doctor() -> None:
 
 def main() -> None:
     """Entry point: an error that the user can mend becomes one line and exit code 2."""
+    # click's UsageError, which typer carries along under a name of its own
+    usage_error: Any = typer.BadParameter.__mro__[1]
     try:
-        app()
+        code = app(standalone_mode=False)
     except SSADError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except typer.Abort:
+        sys.exit(130)
+    except usage_error as error:
+        command = error.ctx.command_path if error.ctx is not None else "ssad"
+        print(f"error: {error.format_message()} (see: {command} --help)", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 if __name__ == "__main__":
