@@ -14,7 +14,7 @@ from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.types import Condition, Controller, EpisodeAgent, Limits, Phase, Pose
 from ssad.world.check import check_world
-from ssad.world.kernels.drive import LONGEST
+from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.world import ENDS, World
 from tests.world.worlds import GRAPHS, ego, episode, line_route

@@ -16,10 +16,11 @@ from ssad.roads.graph import LaneGraph
 from ssad.types import Controller, Episode, SignalState
 from ssad.world.bank import agent_kinds, build, signal_programs
 from ssad.world.kernels.data import HORIZON, Ego, State, Work
-from ssad.world.kernels.drive import drive, meet, sight
+from ssad.world.kernels.drive import drive
 from ssad.world.kernels.look import look
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
+from ssad.world.kernels.traffic import meet, sight
 
 ENDS = ("", "collision", "complete", "max_steps", "max_distance", "max_time")
 OBSERVATION = 28  # see kernels.look

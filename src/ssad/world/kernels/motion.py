@@ -3,14 +3,13 @@
 import warp as wp
 
 from ssad.world.kernels.data import FORECAST, STRIDE, Bank, Roads, State
-from ssad.world.kernels.shared import lane_under, route_at, wrap
+from ssad.world.kernels.shared import C_AUTOPILOT, KIND_WALKER, lane_under, route_at, wrap
+from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
-WALKER = wp.constant(6)
-GRIP_LIMIT = wp.constant(7.0)
-STEER_SECONDS = wp.constant(0.5)
-REVERSE_LIMIT = wp.constant(5.0)
-AUTOPILOT = wp.constant(2)
+GRIP_LIMIT = wp.constant(GRIP)
+STEER_SECONDS = wp.constant(STEER_TIME)
+REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
 
 
 @wp.func
@@ -87,8 +86,8 @@ def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec
     speed = state.speed[b, i]
     kind = bank.kind[m]
     power = bank.power[m]
-    if kind == WALKER:
-        # steer is the wanted speed over the model's top speed; a walker turns and stops at once
+    if kind == KIND_WALKER:
+        # throttle is the wanted speed over the model's top speed; a walker turns and stops at once
         aim = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
         after = speed + wp.clamp(aim - speed, -change, change)
@@ -129,7 +128,7 @@ def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec
             k = k + 1
         at = found
         state.progress[b, i] = at
-        if i > 0 and bank.controller[e, i] == AUTOPILOT and at >= route[1] - 3:
+        if i > 0 and bank.controller[e, i] == C_AUTOPILOT and at >= route[1] - 3:
             state.active[b, i] = 0  # background traffic leaves at the end of its route
 
     under = lane_under(roads, bank.town[e], pose[0], pose[1])

@@ -4,6 +4,9 @@ import warp as wp
 
 from ssad.world.kernels.data import FAR, Bank, Roads
 
+C_AUTOPILOT = wp.constant(2)
+KIND_WALKER = wp.constant(6)
+IDM_ACCEL = wp.constant(2.5)
 OFF = wp.constant(0)
 RED = wp.constant(1)
 YELLOW = wp.constant(2)

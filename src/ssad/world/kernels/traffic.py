@@ -1,0 +1,339 @@
+"""What the Autopilot does about others: following, stopping for, and giving way. Its interaction terms.
+
+Its acceleration is IDM's (Treiber et al. 2000): the free-road term under the route's speed profile (`drive`), and the
+hardest interaction term of: whoever is in its corridor, the stop line of a red signal, and the near edge of a
+predicted conflict that it must yield to (here).
+"""
+
+import warp as wp
+
+from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State, Work
+from ssad.world.kernels.shared import (
+    C_AUTOPILOT,
+    IDM_ACCEL,
+    KIND_WALKER,
+    RED,
+    YELLOW,
+    boxes_touch,
+    route_frame,
+    signal_state,
+)
+
+IDM_BRAKE = wp.constant(3.0)
+IDM_HEADWAY = wp.constant(1.2)
+IDM_GAP = wp.constant(2.0)
+SIGHT = wp.constant(60.0)
+LONGEST = wp.constant(5.2)  # half length of the longest model, m
+RIGHT_TURN = wp.constant(1.0)
+
+
+@wp.func
+def idm_gap(v: float, lead: float, gap: float) -> float:
+    """IDM's interaction term, m/s^2 (negative): how hard to brake behind something `gap` metres ahead."""
+    close = v * (v - lead) / (2.0 * wp.sqrt(IDM_ACCEL * IDM_BRAKE))
+    wish = IDM_GAP + wp.max(0.0, v * IDM_HEADWAY + close)
+    ratio = wish / wp.max(gap, 0.1)
+    return -IDM_ACCEL * ratio * ratio
+
+
+@wp.func
+def lead_gap(
+    roads: Roads,
+    state: State,
+    b: int,
+    j: int,
+    route: wp.vec2i,
+    u0: float,
+    lon: float,
+    own: wp.vec4,
+    other: wp.vec4,
+    heading: wp.vec2,
+    margin: float,
+    bend: float,
+) -> wp.vec2:
+    """Where agent j stands on a route that begins `u0` metres along: (gap bumper to bumper m or FAR, speed along it).
+
+    lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading; bend:
+    metres that the route ahead leaves its straight line.
+    """
+    q = state.pose[b, j]
+    u = wp.clamp(lon, 0.0, SIGHT)
+    lateral = float(0.0)
+    rest = float(0.0)
+    at = wp.vec4(0.0, 0.0, 1.0, 0.0)
+    for _ in range(4):
+        at = route_frame(roads, route[0], route[1], u0 + u)
+        rx = q[0] - at[0]
+        ry = q[1] - at[1]
+        rest = rx * at[2] + ry * at[3]
+        lateral = ry * at[2] - rx * at[3]
+        if wp.abs(rest) < 0.05:
+            break
+        u = wp.clamp(u + rest, 0.0, SIGHT)
+    c = heading[0] * at[2] + heading[1] * at[3]
+    s = wp.abs(heading[0] * at[3] - heading[1] * at[2])
+    along = other[0] * wp.abs(c) + other[1] * s
+    across = other[0] * s + other[1] * wp.abs(c)
+    result = wp.vec2(FAR, 0.0)
+    # in a bend the corners sweep wider than the body
+    spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+    sweep = wp.min(0.5 * wp.abs(roads.path[spot][3]) * own[0] * own[0], 1.0)
+    # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
+    if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin + sweep:
+        result = wp.vec2(u - own[0] - along, state.speed[b, j] * c)
+    if result[0] >= FAR and bend > 1.5 and lon < 20.0:
+        # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
+        # 0.2 m of room to either side, checked every metre
+        for k in range(14):
+            u = float(k + 1)
+            at = route_frame(roads, route[0], route[1], u0 + u)
+            body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
+            if result[0] >= FAR and boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
+                result = wp.vec2(u - 1.0, state.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
+    return result
+
+
+@wp.func
+def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
+    """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
+
+    Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
+    test. Scripted actors and walkers are not. Straight goes before right before left, then whoever is inside the
+    junction, then whoever is nearer to it, then the lower number.
+    """
+    if j != 0 and (bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2):
+        return False
+    ri = bank.route[e, i]
+    rj = bank.route[e, j]
+    a = roads.rule[ri[0] + state.progress[b, i]]
+    c = roads.rule[rj[0] + state.progress[b, j]]
+    inside_i = a[2] <= 0.0
+    inside_j = c[2] <= 0.0
+    if a[3] != c[3]:
+        return a[3] < c[3]
+    if inside_i != inside_j:
+        return inside_i
+    if wp.abs(a[2] - c[2]) > 1.0:
+        return a[2] < c[2]
+    return i < j
+
+
+@wp.func
+def conflict_gap(
+    roads: Roads,
+    state: State,
+    b: int,
+    j: int,
+    route: wp.vec2i,
+    u0: float,
+    v: float,
+    target: float,
+    own: wp.vec4,
+    other: wp.vec4,
+    lat_margin: float,
+) -> float:
+    """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
+
+    i is where it intends to be, j where it will be if it keeps its speed along its own route (its heading if it has
+    none); they are compared at the same time and half a second to either side.
+    """
+    gap = FAR
+    u = float(0.0)
+    w = v
+    reach = own[0] + other[0] + 2.0
+    reach2 = reach * reach
+    for k in range(FORECAST):
+        after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
+        u = u + 0.5 * (w + after) * STRIDE
+        w = after
+        at = route_frame(roads, route[0], route[1], u0 + u)
+        for n in range(k - 1, wp.min(k + 2, FORECAST)):
+            q = state.pose[b, j]
+            if n >= 0:
+                q = state.forecast[b, j, n]
+            rx = q[0] - at[0]
+            ry = q[1] - at[1]
+            if rx * rx + ry * ry < reach2:
+                along = rx * at[2] + ry * at[3]
+                across = ry * at[2] - rx * at[3]
+                qc = wp.cos(q[2])
+                qs = wp.sin(q[2])
+                ct = wp.abs(qc * at[2] + qs * at[3])
+                st = wp.abs(qs * at[2] - qc * at[3])
+                he = other[0] * ct + other[1] * st
+                we = other[0] * st + other[1] * ct
+                if wp.abs(across) < own[1] + we + lat_margin and wp.abs(along) < own[0] + he + 1.0:
+                    edge = u + along - he - own[0]
+                    # already past the near edge with j behind the middle: braking would only stay in its way
+                    if edge > 0.0 or along > 0.0:
+                        gap = wp.min(gap, wp.max(edge, 0.0))
+    return gap
+
+
+@wp.func
+def apart(
+    state: State,
+    b: int,
+    j: int,
+    pose: wp.vec3,
+    c: float,
+    s: float,
+    lon: float,
+    lat: float,
+    ahead: float,
+    off: float,
+) -> bool:
+    """Whether j's next 4 s cannot meet mine, by the boxes that hold both in my frame: cheap and never wrong.
+
+    lon, lat: where j is now; ahead: metres I can go; off: what bent paths and the bodies' reach add.
+    """
+    q = state.forecast[b, j, FORECAST - 1]
+    dx = q[0] - pose[0]
+    dy = q[1] - pose[1]
+    lon1 = dx * c + dy * s
+    lat1 = dy * c - dx * s
+    aside = wp.min(lat, lat1) > off or wp.max(lat, lat1) < -off
+    return aside or wp.min(lon, lon1) - off > ahead or wp.max(lon, lon1) + off < 0.0
+
+
+@wp.kernel(enable_backward=False)
+def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: float):
+    """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
+
+    The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
+    their order does not matter, since only the hardest reaction counts.
+    """
+    b, i = wp.tid()
+    if state.end[b] != 0 or state.active[b, i] != 2:
+        return
+    e = state.episode[b]
+    route = bank.route[e, i]
+    if bank.controller[e, i] != C_AUTOPILOT or route[1] < 2:
+        return
+    at = state.progress[b, i]
+    first = route[0] + at
+    rule = roads.rule[first]
+    pose = state.pose[b, i]
+    v = state.speed[b, i]
+    own = bank.body[bank.model[e, i]]
+    p = roads.path[first]
+    part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
+    cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
+    target = wp.min(bank.cruise[e, i][0], cap)
+    state.aim[b, i] = wp.vec2(float(at) + part, target)
+    react = float(0.0)
+
+    index = roads.path_signal[first]
+    if index >= 0:
+        ahead = rule[1] - part - own[0]
+        if ahead > -0.5 and ahead < SIGHT + 20.0:
+            light = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+            stop = light == RED
+            if light == YELLOW:
+                stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
+            if light == RED and rule[3] == RIGHT_TURN and state.waited[b, i] >= 1.0:
+                stop = False  # right turn on red, after a stop; it yields below
+            if stop:
+                react = idm_gap(v, 0.0, ahead + 1.0)
+    state.react[b, i] = react
+
+    c = wp.cos(pose[2])
+    s = wp.sin(pose[2])
+    # how far ahead anybody matters: 4 s of driving, and the distance to brake in comfort
+    goes = wp.max(target, v) * STRIDE * float(FORECAST)
+    sees = wp.min(wp.max(goes, 15.0 + 3.0 * v), SIGHT)
+    # a path that is not followed exactly leaves the straight line a little more
+    bend = roads.bend[first] + 1.0
+    low = wp.vec2(pose[0], pose[1])
+    high = low
+    for k in range(5):
+        at_k = route_frame(roads, route[0], route[1], float(at) + part + 0.2 * float(k + 1) * sees)
+        low = wp.vec2(wp.min(low[0], at_k[0]), wp.min(low[1], at_k[1]))
+        high = wp.vec2(wp.max(high[0], at_k[0]), wp.max(high[1], at_k[1]))
+    # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
+    pad = own[0] + LONGEST + 4.0
+    low = wp.vec2(low[0] - pad, low[1] - pad)
+    high = wp.vec2(high[0] + pad, high[1] + pad)
+    for j in range(agents):
+        if j != i and state.active[b, j] != 0:
+            box = state.span[b, j]
+            if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
+                other = bank.body[bank.model[e, j]]
+                q = state.pose[b, j]
+                dx = q[0] - pose[0]
+                dy = q[1] - pose[1]
+                lon = dx * c + dy * s
+                lat = dy * c - dx * s
+                turn = q[2] - pose[2]
+                facing = wp.cos(turn)
+                # across straight lanes only the width of an aligned body counts
+                wide = own[1] + other[0] * wp.abs(wp.sin(turn)) + other[1] * wp.abs(facing) + 1.0
+                flags = int(0)
+                near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
+                if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
+                    flags = 1
+                if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5):
+                    # who is behind and goes my way keeps its distance itself
+                    bend_j = float(0.0)
+                    reach = wide
+                    if bank.route[e, j][1] > 1:
+                        bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
+                    if bend_j > 1.0 or bend > 2.0:
+                        reach = own[0] + other[0] + 2.0
+                    if not apart(state, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
+                        flags = flags + 2
+                if flags > 0:
+                    slot = wp.atomic_add(work.count, 0, 1)
+                    work.pair[slot] = ((b * agents + i) * agents + j) * 4 + flags
+
+
+@wp.kernel(enable_backward=False)
+def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, workers: int):
+    """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
+    tid = wp.tid()
+    total = work.count[0]
+    slot = int(tid)
+    while slot < total:
+        code = work.pair[slot]
+        flags = code % 4
+        code = code / 4
+        j = code % agents
+        code = code / agents
+        i = code % agents
+        b = code / agents
+        e = state.episode[b]
+        route = bank.route[e, i]
+        pose = state.pose[b, i]
+        q = state.pose[b, j]
+        v = wp.max(state.speed[b, i], 0.0)
+        own = bank.body[bank.model[e, i]]
+        other = bank.body[bank.model[e, j]]
+        walks = bank.kind[bank.model[e, j]] == KIND_WALKER
+        aim = state.aim[b, i]
+        react = float(0.0)
+        leads = int(0)
+        if flags != 2:
+            c = wp.cos(pose[2])
+            s = wp.sin(pose[2])
+            heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
+            lon = (q[0] - pose[0]) * c + (q[1] - pose[1]) * s
+            margin = 0.3
+            if walks:
+                margin = 0.6
+            bend = roads.bend[route[0] + state.progress[b, i]]
+            lead = lead_gap(roads, state, b, j, route, aim[0], lon, own, other, heading, margin, bend)
+            if lead[0] < FAR:
+                react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
+                if heading[0] * c + heading[1] * s > 0.7:
+                    leads = 1
+        if flags >= 2 and leads == 0:
+            margin = 0.4
+            if walks:
+                margin = 1.0
+            gap = conflict_gap(roads, state, b, j, route, aim[0], v, aim[1], own, other, margin)
+            if gap < FAR:
+                if gap < 0.5 * v or not has_priority(bank, roads, state, b, i, j, e):
+                    react = wp.min(react, idm_gap(v, 0.0, gap))
+        if react < 0.0:
+            wp.atomic_min(state.react, b, i, react)
+        slot = slot + workers

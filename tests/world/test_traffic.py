@@ -1,0 +1,47 @@
+"""The Autopilot among others: who goes first at a junction, and a whole set of natural traffic without trouble."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.types import Controller
+from ssad.world.world import ENDS, World
+
+
+def run(name: str, egos: Controller, **changes: object) -> World:
+    scenario = load_scenarios(name)[0]
+    town = load_town(scenario.town)
+    episode = build_episode(scenario, town, seed=0)
+    agents = tuple(replace(a, **changes) if k else a for k, a in enumerate(episode.agents))
+    world = World([replace(episode, agents=agents)], {scenario.town: town}, ego=egos)
+    while not world.ended()[0]:
+        world.step()
+    return world
+
+
+@pytest.mark.parametrize(
+    "name", ["RedlightRunning/00", "CrossingNegotiation/00", "UnprotectedLeftTurn/00", "RightTurn/00"]
+)
+def test_autopilot_gives_way_to_those_who_do_not(name: str) -> None:
+    assert ENDS[run(name, Controller.FOLLOW).ended()[0]] == "collision"
+    assert ENDS[run(name, Controller.AUTOPILOT).ended()[0]] == "complete"
+
+
+def test_natural_traffic_hurts_nobody_and_gets_through() -> None:
+    scenarios = load_scenarios("natural")
+    graphs = {s.town: load_town(s.town) for s in scenarios}
+    world = World([build_episode(s, graphs[s.town], seed=0) for s in scenarios], graphs, ego=Controller.AUTOPILOT)
+    touched = np.zeros(world.batch, bool)
+    for _ in range(300):
+        world.step()
+        touched |= (world.array("touch") != 0).any(axis=1)
+    assert (world.ended() == ENDS.index("collision")).mean() <= 0.02
+    assert touched.mean() <= 0.02
+    assert world.array("ego.complete").mean() >= 95.0
+    moved = world.array("travelled")[world.kind > 0]
+    assert np.median(moved) > 20.0  # not by standing still
