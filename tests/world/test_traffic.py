@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -13,12 +11,11 @@ from ssad.types import Controller
 from ssad.world.world import ENDS, World
 
 
-def run(name: str, egos: Controller, **changes: object) -> World:
+def run(name: str, ego: Controller) -> World:
     scenario = load_scenarios(name)[0]
     town = load_town(scenario.town)
     episode = build_episode(scenario, town, seed=0)
-    agents = tuple(replace(a, **changes) if k else a for k, a in enumerate(episode.agents))
-    world = World([replace(episode, agents=agents)], {scenario.town: town}, ego=egos)
+    world = World([episode], {scenario.town: town}, ego=ego)
     while not world.ended()[0]:
         world.step()
     return world
