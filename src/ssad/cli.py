@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,13 @@ imports = typer.Typer(help="Bring in OpenDRIVE maps and SafeBench / FREA / leade
 app.add_typer(imports, name="import")
 
 Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `ssad run` wrote.")]
+
+
+class Video(StrEnum):
+    """Kinds of video that `ssad replay` writes."""
+
+    mp4 = "mp4"
+    gif = "gif"
 
 
 @app.command()
@@ -79,6 +87,7 @@ def replay(
     folder: Dir,
     cell: Annotated[str, typer.Argument(metavar="CELL", help="Key, start of a key, or system/scenario.")],
     out: Annotated[Path | None, typer.Option(help="Where to write.  [default: DIR/replays]")] = None,
+    video: Annotated[Video, typer.Option(help="Kind of video.")] = Video.mp4,
 ) -> None:
     """Run one cell again, compare it bit for bit with the record, and write its video and recording.
 
@@ -92,10 +101,10 @@ def replay(
     found = run_again(folder, cell)
     target = make_folder(out or folder / "replays") / found.cell.key
     save_trace(target.with_suffix(".npz"), found.trace)
-    write_video(found.trace, found.graph, target.with_suffix(".mp4"))
+    film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
     verdict = f"differs: {found.difference}" if found.difference else "identical"
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
-    print(f"video: {target.with_suffix('.mp4')}\nrecording: {target.with_suffix('.npz')}")
+    print(f"video: {film}\nrecording: {target.with_suffix('.npz')}")
     raise typer.Exit(1 if found.difference else 0)
 
 
