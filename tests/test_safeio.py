@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import pickle
+import tempfile
 import zipfile
 from pathlib import Path
 
@@ -165,13 +166,11 @@ def test_npz_refuses_what_unpacks_too_large(tmp_path: Path) -> None:
 @given(st.integers(0, 400))
 def test_npz_truncated_is_one_line(cut: int) -> None:
     data = safeio.npz_bytes({"a": np.arange(50)})
-    path = Path(f"/tmp/ssad-test-{os.getpid()}.npz")
-    path.write_bytes(data[: min(cut, len(data) - 1)])
-    try:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.npz"
+        path.write_bytes(data[: min(cut, len(data) - 1)])
         with pytest.raises(FormatError):
             safeio.load_npz(path)
-    finally:
-        path.unlink()
 
 
 def test_missing_large_and_binary_files(tmp_path: Path) -> None:
