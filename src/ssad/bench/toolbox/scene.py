@@ -1,0 +1,195 @@
+"""The shifts on the fly: a scene of a nuScenes folder whose images and sweeps come out shifted."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ssad.datasets.nuscenes.files import read_image, read_points
+from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
+from ssad.errors import FormatError
+from ssad.frames import Applied, Boxes3D, Camera, Frame, SceneContext, SweepFrame
+from ssad.scenarios.static.shifts import (
+    ShiftSpec,
+    random_severity,
+    shift_images,
+    shift_points,
+    sky_light,
+    transformed_boxes,
+    viewing_direction,
+)
+from ssad.types import F32, F64, U8
+
+# least visible fraction for a visibility token
+VISIBLE: Final = {"1": 0.0, "2": 0.4, "3": 0.6, "4": 0.8}
+LIDAR: Final = "LIDAR_TOP"
+
+
+def boxes_of(found: Annotations) -> Boxes3D:
+    """Annotations as boxes; an unknown visibility counts as visible."""
+    visible = np.array([VISIBLE.get(token, 1.0) for token in found.visibility])
+    return Boxes3D(found.instance, found.centre, found.size, found.rotation, found.velocity, visible)
+
+
+class SceneShifter:
+    """A scene seen through a shift; pure: what a frame gives depends on the scene, the frame and the spec alone.
+
+    root: the dataset's folder; scene: from `NuScenes.scene`; spec: the shift; random: draw its severity anew (by
+    sample in the paper's calibration, by scene in the physical one).
+    """
+
+    def __init__(self, root: Path, scene: SceneData, spec: ShiftSpec, *, random: bool = False) -> None:
+        self.root, self.scene, self.base, self.random = Path(root), scene, spec, random
+        self._clouds: OrderedDict[str, F32] = OrderedDict()
+        self._tracks: dict[str, tuple[F64, F64]] = {}
+        for channel in {f.channel for f in scene.frames}:
+            track = [f for f in scene.frames if f.channel == channel]
+            times = np.array([f.timestamp_us for f in track]) / 1e6
+            self._tracks[channel] = times, np.array([f.ego_to_world[:3, 3] for f in track])
+        self._sweeps = [f for f in scene.frames if f.channel == LIDAR]
+        self._sweep_times = np.array([f.timestamp_us for f in self._sweeps])
+
+    def spec(self, frame: SensorFrame) -> ShiftSpec:
+        """The shift of a frame, its severity drawn where it is random."""
+        if not self.random:
+            return self.base
+        return self.base.at(random_severity(self.base, frame.scene_token, frame.sample_token))
+
+    @cached_property
+    def context(self) -> SceneContext:
+        """Brightness of the sky and viewing directions, from the first sample whose images can be read."""
+        start = self.scene.frames[0].timestamp_us / 1e6 if self.scene.frames else 0.0
+        token = self.scene.record.token
+        for sample in self.scene.samples:
+            cameras = [
+                f
+                for f in self.scene.frames
+                if f.key_frame and f.modality == "camera" and f.sample_token == sample.token
+            ]
+            try:
+                images = [read_image(self.root / f.filename) for f in cameras]
+            except FormatError:
+                continue
+            if images:
+                views = tuple(viewing_direction(self._frame(f, Boxes3D.empty(), None)) for f in cameras)
+                return SceneContext(token, sky_light(images), views, start)
+        return SceneContext(token, start=start)
+
+    def velocity(self, frame: SensorFrame) -> F64:
+        """Velocity [3] of the ego, m/s, world: from the poses of the channel before and after."""
+        times, places = self._tracks[frame.channel]
+        now = int(np.searchsorted(times, frame.timestamp_us / 1e6))
+        before, after = max(now - 1, 0), min(now + 1, len(times) - 1)
+        span = times[after] - times[before]
+        return np.asarray((places[after] - places[before]) / span) if span > 0 else np.zeros(3)
+
+    def _cloud(self, frame: SensorFrame) -> F32:
+        """Points of the sweep, the last few kept."""
+        if frame.token not in self._clouds:
+            self._clouds[frame.token] = read_points(self.root / frame.filename)
+            while len(self._clouds) > 4:
+                self._clouds.popitem(last=False)
+        return self._clouds[frame.token]
+
+    def _points(self, frame: SensorFrame) -> F32 | None:
+        """The nearest sweep in time, in the frame of a camera; None without LiDAR or when it cannot be read."""
+        if not self._sweeps:
+            return None
+        sweep = self._sweeps[int(np.abs(self._sweep_times - frame.timestamp_us).argmin())]
+        try:
+            cloud = self._cloud(sweep)
+        except FormatError:
+            return None
+        to_camera = np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego) @ sweep.ego_to_world @ sweep.sensor_to_ego
+        return np.asarray(cloud[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3], np.float32)
+
+    def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None) -> Frame:
+        if frame.intrinsic is None:
+            raise FormatError(f"{frame.filename}: the camera {frame.channel} has no intrinsic matrix")
+        camera = Camera(frame.width, frame.height, frame.intrinsic, frame.sensor_to_ego, frame.channel)
+        return Frame(
+            camera,
+            frame.scene_token,
+            frame.sample_token if self.base.family == "object" else frame.token,
+            frame.timestamp_us / 1e6,
+            frame.ego_to_world,
+            self.velocity(frame),
+            boxes,
+            points=points,
+        )
+
+    def camera_frame(self, frame: SensorFrame) -> Frame:
+        """What the shift is told about an image."""
+        family, name = self.base.family, self.base.name
+        boxes = boxes_of(self.scene.annotations_of(frame)) if family == "object" else Boxes3D.empty()
+        depth = family == "environment" and self.base.calibration == "physical"
+        points = self._points(frame) if depth and name in ("fog", "rain", "snow", "sunlight") else None
+        return self._frame(frame, boxes, points)
+
+    def read(self, frame: SensorFrame) -> U8:
+        """The clean image. FormatError, also when its size is not what the tables say."""
+        image = read_image(self.root / frame.filename)
+        if frame.width and image.shape[:2] != (frame.height, frame.width):
+            raise FormatError(
+                f"{self.root / frame.filename}: {image.shape[1]} x {image.shape[0]} pixels, "
+                f"the tables say {frame.width} x {frame.height}"
+            )
+        return image
+
+    def images(self, frames: Sequence[SensorFrame], *, device: str | None = None) -> tuple[list[U8], list[Applied]]:
+        """Shifted images [H, W, 3] of camera frames of one size, and what was done. FormatError."""
+        clean = np.stack([self.read(f) for f in frames])
+        specs = [self.spec(f) for f in frames]
+        views = [self.camera_frame(f) for f in frames]
+        contexts = {self.context.scene: self.context} if self.base.family == "environment" else None
+        out, done = shift_images(clean, views, specs, contexts=contexts, device=device)
+        return list(out), done
+
+    def image(self, frame: SensorFrame) -> tuple[U8, Applied]:
+        """One shifted image. FormatError."""
+        images, done = self.images([frame])
+        return images[0], done[0]
+
+    def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
+        """The shifted points [P, 5] of a LiDAR frame. FormatError."""
+        boxes = boxes_of(self.scene.annotations_of(frame)) if self.base.family == "object" else Boxes3D.empty()
+        sweep = SweepFrame(
+            frame.scene_token,
+            frame.sample_token if self.base.family == "object" else frame.token,
+            frame.timestamp_us / 1e6,
+            frame.sensor_to_ego,
+            frame.ego_to_world,
+            self.velocity(frame),
+            boxes,
+        )
+        contexts = {self.context.scene: self.context} if self.base.family == "environment" else None
+        return shift_points(self._cloud(frame), sweep, self.spec(frame), contexts=contexts)
+
+    def labels(self, sample_token: str) -> Annotations:
+        """The boxes of a sample as they stand after the shift, with the points that are left in each."""
+        found = self.scene.annotations(sample_token)
+        sweep = next((f for f in self._sweeps if f.key_frame and f.sample_token == sample_token), None)
+        frame = sweep or next(f for f in self.scene.frames if f.sample_token == sample_token)
+        boxes = transformed_boxes(self.spec(frame), boxes_of(found), scene=frame.scene_token, sample=sample_token)
+        points = found.lidar_points
+        if sweep is not None and len(boxes):
+            points = _count(self.points(sweep)[0], sweep, boxes)
+        return replace(found, centre=boxes.centre, size=boxes.size, rotation=boxes.rotation, lidar_points=points)
+
+
+def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
+    """Points in each box."""
+    from ssad.scenarios.static.shifts.lidar import inside
+    from ssad.scenarios.static.shifts.objects import affine
+
+    pose = sweep.ego_to_world @ sweep.sensor_to_ego
+    world = np.asarray(cloud[:, :3] @ pose[:3, :3].T + pose[:3, 3])
+    matrix, centre = affine(boxes)
+    counts = [int(inside(world, matrix[n], centre[n]).sum()) for n in range(len(boxes))]
+    return np.array(counts, np.int32)

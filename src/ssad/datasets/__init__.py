@@ -1,0 +1,1 @@
+"""Recorded data: the nuScenes schema, readers and writers."""

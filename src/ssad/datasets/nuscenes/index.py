@@ -1,0 +1,248 @@
+"""Look-up of nuScenes rows by token and by parent, for tables of any size.
+
+A small version is held in memory. A large one is indexed once into an SQLite file,
+$SSAD_HOME/cache/nuscenes/<digest>.sqlite, which every later process opens read-only; the digest covers the folder
+and the size and modification time of all tables, so that a changed table is indexed anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+import msgspec
+
+from ssad.datasets.nuscenes.schema import TABLES, Record
+from ssad.datasets.nuscenes.tables import stream, table_path
+from ssad.errors import FormatError, StoreError
+from ssad.safeio import atomic_path, home
+from ssad.seeding import digest
+
+SMALL = 32 << 20  # bytes of all tables; below it an index in memory is quicker than a file
+LAYOUT = 1
+PARENT: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample_annotation": "sample_token"}
+_NAME: Final = {kind: name for name, kind in TABLES.items()}
+_BATCH = 500
+
+R = TypeVar("R", bound=Record)
+
+
+class Index(Protocol):
+    """What the reader asks of an index; the rows of a table, or of one parent, come in table order."""
+
+    def rows(self, kind: type[R]) -> list[R]:
+        """A whole table."""
+
+    def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
+        """Rows by token; absent tokens are left out."""
+
+    def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
+        """Rows whose parent (`PARENT`) is one of the given tokens."""
+
+    def close(self) -> None:
+        """Give back what is open; a later call opens it again."""
+
+
+def fingerprint(root: Path, version: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, size and modification time (ns) of every table. FormatError when one is missing."""
+    found = []
+    for name in TABLES:
+        path = table_path(root, version, name)
+        try:
+            stat = path.stat()
+        except FileNotFoundError:
+            raise FormatError(f"{path}: no such file; a nuScenes version has {len(TABLES)} tables") from None
+        except OSError as error:
+            raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
+        found.append((name, stat.st_size, stat.st_mtime_ns))
+    return tuple(found)
+
+
+def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
+    """The index of a version folder, built where there is none yet. FormatError for broken tables, StoreError.
+
+    small: bytes of all tables below which the index is in memory (default `SMALL`).
+    """
+    state = fingerprint(root, version)
+    if sum(size for _, size, _ in state) < (SMALL if small is None else small):
+        return MemoryIndex(root, version)
+    place = digest(str((root / version).resolve()))[:16]
+    folder = home() / "cache" / "nuscenes"
+    path = folder / f"{place}{digest(LAYOUT, state)[:16]}.sqlite"
+    if not path.exists():
+        build(path, root, version)
+        if fingerprint(root, version) != state:
+            path.unlink(missing_ok=True)
+            raise FormatError(f"{root / version}: a table changed while it was indexed; try again")
+        for old in folder.glob(f"{place}*.sqlite"):  # of the same folder, before its tables changed
+            if old != path:
+                with contextlib.suppress(OSError):
+                    old.unlink()
+    return FileIndex(path)
+
+
+def build(path: Path, root: Path, version: str) -> None:
+    """Write the index file, atomically; memory stays that of a block of a table. FormatError, StoreError."""
+    advice = "set SSAD_HOME to a folder that can be written and has room"
+    try:
+        with atomic_path(path) as temporary:
+            connection = sqlite3.connect(temporary, isolation_level=None)
+            try:
+                _fill(connection, root, version)
+            finally:
+                connection.close()
+    except StoreError as error:
+        raise StoreError(f"{error}; {advice}") from None
+    except sqlite3.Error as error:
+        raise StoreError(f"{path}: the index cannot be written: {error}; {advice}") from None
+
+
+def _fill(connection: sqlite3.Connection, root: Path, version: str) -> None:
+    for setting in ("journal_mode=OFF", "synchronous=OFF", "locking_mode=EXCLUSIVE", "page_size=8192"):
+        connection.execute(f"PRAGMA {setting}")
+    connection.execute("BEGIN")
+    for name in TABLES:
+        connection.execute(f"CREATE TABLE {name} (token, parent, body BLOB)")
+        connection.executemany(f"INSERT INTO {name} VALUES (?, ?, ?)", _packed(root, version, name))
+        try:
+            connection.execute(f"CREATE UNIQUE INDEX {name}_token ON {name} (token)")
+        except sqlite3.IntegrityError:
+            query = f"SELECT token FROM {name} GROUP BY token HAVING count(*) > 1 LIMIT 1"
+            key = connection.execute(query).fetchone()[0]
+            raise _twice(table_path(root, version, name), _unpack_key(key)) from None
+        if name in PARENT:
+            connection.execute(f"CREATE INDEX {name}_parent ON {name} (parent)")
+    connection.execute(f"PRAGMA user_version={LAYOUT}")
+    connection.execute("COMMIT")
+
+
+def _packed(root: Path, version: str, name: str) -> Iterator[tuple[bytes | str, bytes | str | None, bytes]]:
+    encode = msgspec.msgpack.Encoder().encode
+    parent = PARENT.get(name)
+    for block in stream(table_path(root, version, name), TABLES[name]):
+        for record in block:
+            above = None if parent is None else _key(getattr(record, parent))
+            yield _key(record.token), above, encode(msgspec.structs.astuple(record))
+
+
+def _key(token: str) -> bytes | str:
+    """A token as it is stored: 32 hexadecimal digits in 16 bytes, other text as it is."""
+    if len(token) == 32 and token.isascii() and token.isalnum() and token == token.lower():
+        with contextlib.suppress(ValueError):
+            return bytes.fromhex(token)
+    return token
+
+
+def _unpack_key(key: bytes | str) -> str:
+    return key.hex() if isinstance(key, bytes) else key
+
+
+def _twice(path: Path, token: str) -> FormatError:
+    return FormatError(f"{path}: two records have the token '{token}'")
+
+
+@cache
+def _decoder(kind: type[Record]) -> Any:
+    """A typed decoder of the row as a list of its fields."""
+    fields = tuple(field.type for field in msgspec.structs.fields(kind))
+    return msgspec.msgpack.Decoder(tuple.__class_getitem__(fields))
+
+
+class MemoryIndex:
+    """An index of dictionaries."""
+
+    def __init__(self, root: Path, version: str) -> None:
+        self._rows: dict[str, dict[str, Record]] = {}
+        self._children: dict[str, dict[str, list[Record]]] = {name: {} for name in PARENT}
+        for name, kind in TABLES.items():
+            path = table_path(root, version, name)
+            table: dict[str, Record] = {}
+            parent, below = PARENT.get(name), self._children.get(name, {})
+            for block in stream(path, kind):
+                for record in block:
+                    if table.setdefault(record.token, record) is not record:
+                        raise _twice(path, record.token)
+                    if parent is not None:
+                        below.setdefault(getattr(record, parent), []).append(record)
+            self._rows[name] = table
+
+    def rows(self, kind: type[R]) -> list[R]:
+        return list(self._table(kind).values())
+
+    def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
+        table = self._table(kind)
+        return {token: table[token] for token in tokens if token in table}
+
+    def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
+        below: Any = self._children[_NAME[kind]]
+        return [row for parent in dict.fromkeys(parents) for row in below.get(parent, ())]
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def _table(self, kind: type[R]) -> dict[str, R]:
+        table: Any = self._rows[_NAME[kind]]
+        return table  # type: ignore[no-any-return]
+
+
+class FileIndex:
+    """An index in an SQLite file; each process and thread opens it for itself, so that it may pass through a fork."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._local = threading.local()
+
+    def rows(self, kind: type[R]) -> list[R]:
+        return [self._row(kind, body) for (body,) in self._ask(f"SELECT body FROM {_NAME[kind]} ORDER BY rowid", ())]
+
+    def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
+        found = self._in(kind, "token", list(dict.fromkeys(tokens)))
+        return {row.token: row for row in found}
+
+    def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
+        return self._in(kind, "parent", list(dict.fromkeys(parents)))
+
+    def close(self) -> None:
+        connection = getattr(self._local, "connection", None)
+        if connection is not None:
+            connection.close()
+            del self._local.connection
+
+    def __del__(self) -> None:
+        self.close()
+
+    def _in(self, kind: type[R], column: str, tokens: list[str]) -> list[R]:
+        rows: list[tuple[int, bytes]] = []
+        for start in range(0, len(tokens), _BATCH):
+            keys = [_key(token) for token in tokens[start : start + _BATCH]]
+            marks = ",".join("?" * len(keys))
+            rows += self._ask(f"SELECT rowid, body FROM {_NAME[kind]} WHERE {column} IN ({marks})", keys)
+        rows.sort()
+        return [self._row(kind, body) for _, body in rows]
+
+    def _row(self, kind: type[R], body: bytes) -> R:
+        return kind(*_decoder(kind).decode(body))
+
+    def _ask(self, query: str, values: Sequence[bytes | str]) -> list[Any]:
+        try:
+            return self._connection().execute(query, values).fetchall()
+        except sqlite3.Error as error:
+            raise StoreError(f"{self.path}: the index cannot be read: {error}; delete the file and try again") from None
+
+    def _connection(self) -> sqlite3.Connection:
+        if getattr(self._local, "pid", None) != os.getpid():
+            self.close()
+            uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
+            self._local.connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            self._local.pid = os.getpid()
+        connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
+        if connection is None:
+            self._local.pid = None
+            return self._connection()
+        return connection

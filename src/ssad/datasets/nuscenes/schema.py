@@ -1,0 +1,201 @@
+"""The nuScenes schema: one typed record for each of its 13 tables, and the classes of its detection task.
+
+Tokens are strings (32 hexadecimal digits in the original; any non-empty text here). Frames: global (x east, y north,
+z up, metres), ego (x forward, y left, z up), sensor (camera: x right, y down, z forward). Quaternions are (w, x, y, z),
+sizes (width, length, height), times in microseconds. Source: nuscenes.org, schema of version 1.0.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import msgspec
+
+CLASSES: Final = (
+    "car",
+    "truck",
+    "bus",
+    "trailer",
+    "construction_vehicle",
+    "pedestrian",
+    "motorcycle",
+    "bicycle",
+    "traffic_cone",
+    "barrier",
+)
+ATTRIBUTES: Final = (
+    "pedestrian.moving",
+    "pedestrian.sitting_lying_down",
+    "pedestrian.standing",
+    "cycle.with_rider",
+    "cycle.without_rider",
+    "vehicle.moving",
+    "vehicle.parked",
+    "vehicle.stopped",
+)
+CATEGORY_TO_CLASS: Final = {
+    "movable_object.barrier": "barrier",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "movable_object.trafficcone": "traffic_cone",
+    "vehicle.trailer": "trailer",
+    "vehicle.truck": "truck",
+}
+CAMERAS: Final = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Record(msgspec.Struct, frozen=True, gc=False):
+    """A row of a table."""
+
+    token: str
+
+
+class Attribute(Record, frozen=True, gc=False):
+    """A property of an instance that may change, such as vehicle.parked."""
+
+    name: str
+    description: str = ""
+
+
+class CalibratedSensor(Record, frozen=True, gc=False):
+    """Pose of a sensor on the ego; `camera_intrinsic` is 3 x 3, empty for other sensors."""
+
+    sensor_token: str
+    translation: Vector
+    rotation: Quaternion
+    camera_intrinsic: tuple[tuple[float, ...], ...]
+
+
+class Category(Record, frozen=True, gc=False):
+    """An object category such as vehicle.car."""
+
+    name: str
+    description: str = ""
+
+
+class EgoPose(Record, frozen=True, gc=False):
+    """Pose of the ego in the global frame."""
+
+    translation: Vector
+    rotation: Quaternion
+    timestamp: int
+
+
+class Instance(Record, frozen=True, gc=False):
+    """An object followed over a scene."""
+
+    category_token: str
+    nbr_annotations: int = 0
+    first_annotation_token: str = ""
+    last_annotation_token: str = ""
+
+
+class Log(Record, frozen=True, gc=False):
+    """A drive that scenes were cut from."""
+
+    logfile: str = ""
+    vehicle: str = ""
+    date_captured: str = ""
+    location: str = ""
+
+
+class Map(Record, frozen=True, gc=False):
+    """A top view of a place, shared by logs."""
+
+    log_tokens: tuple[str, ...] = ()
+    category: str = ""
+    filename: str = ""
+
+
+class Sample(Record, frozen=True, gc=False):
+    """A key frame: annotated, twice a second."""
+
+    timestamp: int
+    scene_token: str
+    prev: str = ""
+    next: str = ""
+
+
+class SampleAnnotation(Record, frozen=True, gc=False):
+    """A 3D box of an instance in a sample, in the global frame."""
+
+    sample_token: str
+    instance_token: str
+    visibility_token: str
+    attribute_tokens: tuple[str, ...]
+    translation: Vector
+    size: Vector
+    rotation: Quaternion
+    num_lidar_pts: int = 0
+    num_radar_pts: int = 0
+    prev: str = ""
+    next: str = ""
+
+
+class SampleData(Record, frozen=True, gc=False):
+    """A file of a sensor; those between key frames (sweeps) carry the token of the sample that follows."""
+
+    sample_token: str
+    ego_pose_token: str
+    calibrated_sensor_token: str
+    timestamp: int
+    is_key_frame: bool
+    filename: str
+    fileformat: str = ""
+    height: int | None = None
+    width: int | None = None
+    prev: str = ""
+    next: str = ""
+
+
+class Scene(Record, frozen=True, gc=False):
+    """A stretch of about 20 s."""
+
+    name: str
+    log_token: str = ""
+    description: str = ""
+    nbr_samples: int = 0
+    first_sample_token: str = ""
+    last_sample_token: str = ""
+
+
+class Sensor(Record, frozen=True, gc=False):
+    """A sensor: channel such as CAM_FRONT, modality camera, lidar or radar."""
+
+    channel: str
+    modality: str
+
+
+class Visibility(Record, frozen=True, gc=False):
+    """Fraction of an object seen over all six cameras: tokens '1' (0-40 %) to '4' (80-100 %)."""
+
+    level: str
+    description: str = ""
+
+
+TABLES: Final[dict[str, type[Record]]] = {
+    "attribute": Attribute,
+    "calibrated_sensor": CalibratedSensor,
+    "category": Category,
+    "ego_pose": EgoPose,
+    "instance": Instance,
+    "log": Log,
+    "map": Map,
+    "sample": Sample,
+    "sample_annotation": SampleAnnotation,
+    "sample_data": SampleData,
+    "scene": Scene,
+    "sensor": Sensor,
+    "visibility": Visibility,
+}

@@ -1,0 +1,394 @@
+"""A nuScenes folder from typed calls: 13 tables that the official toolkit loads, and the sensor files.
+
+Tokens are digests of names (scene, channel, time), so that the same calls give the same bytes. Chains (prev, next),
+first and last tokens, counts and the samples of sweeps are worked out in `close`, which writes the tables.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain, count
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+
+from ssad.datasets.nuscenes.schema import (
+    ATTRIBUTES,
+    CATEGORY_TO_CLASS,
+    TABLES,
+    Attribute,
+    CalibratedSensor,
+    Category,
+    EgoPose,
+    Instance,
+    Log,
+    Map,
+    Quaternion,
+    Record,
+    Sample,
+    SampleAnnotation,
+    SampleData,
+    Scene,
+    Sensor,
+    Vector,
+    Visibility,
+)
+from ssad.datasets.nuscenes.tables import table_path
+from ssad.errors import FormatError
+from ssad.safeio import atomic_path, dump_json, make_folder, write_atomic
+from ssad.seeding import digest
+
+CATEGORIES: Final = (
+    *CATEGORY_TO_CLASS,
+    "animal",
+    "human.pedestrian.personal_mobility",
+    "human.pedestrian.stroller",
+    "human.pedestrian.wheelchair",
+    "movable_object.debris",
+    "movable_object.pushable_pullable",
+    "static_object.bicycle_rack",
+    "vehicle.emergency.ambulance",
+    "vehicle.emergency.police",
+)
+MINI_VAL: Final = ("scene-0103", "scene-0916")
+MINI_TRAIN: Final = tuple(f"scene-{i:04d}" for i in (61, 553, 655, 757, 796, 1077, 1094, 1100))
+_LEVELS: Final = ("v0-40", "v40-60", "v60-80", "v80-100")
+_FORMATS: Final = {"camera": (".jpg", "jpg"), "lidar": (".pcd.bin", "pcd"), "radar": (".pcd", "pcd")}
+_FIRST_FREE = 9001
+
+R = TypeVar("R", bound=Record)
+IDENTITY: Final[Quaternion] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A row of sample_data before its chain is known."""
+
+    row: SampleData
+    scene: str
+    channel: str
+
+
+class NuScenesWriter:
+    """Collects the records of a version; sensor files are written at once, the tables by `close`.
+
+    As a context manager it closes when the block ends well, and writes no tables otherwise. Wrong use (an unknown
+    token, a time given twice) is a ValueError; a folder that cannot be written is a StoreError.
+    """
+
+    def __init__(self, root: Path, version: str = "v1.0-mini") -> None:
+        self.root, self.version = Path(root), version
+        make_folder(self.root / version)
+        self._rows: dict[type[Record], dict[str, Any]] = {kind: {} for kind in TABLES.values()}
+        self._frames: dict[str, _Frame] = {}
+        self._mounted: dict[tuple[str, str], tuple[str, str]] = {}
+        self._instance_scene: dict[str, str] = {}
+        self._order: dict[str, list[Sample]] = {}
+        self._splits: dict[str, list[str]] = {}
+        for name in CATEGORIES:
+            self._add(Category(_token("category", name), name=name))
+        for name in ATTRIBUTES:
+            self._add(Attribute(_token("attribute", name), name=name))
+        for number, level in enumerate(_LEVELS, start=1):
+            described = f"visibility of whole object is between {level[1:].replace('-', ' and ')}%"
+            self._add(Visibility(str(number), level=level, description=described))
+
+    def __enter__(self) -> NuScenesWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+
+    def add_log(
+        self, logfile: str, *, vehicle: str = "ssad", date_captured: str = "2020-01-01", location: str = "drawn"
+    ) -> str:
+        """A drive; the token of the one there is when the name was given before."""
+        token = _token("log", logfile)
+        if token not in self._rows[Log]:
+            self._add(Log(token, logfile, vehicle, date_captured, location))
+        return token
+
+    def add_scene(self, name: str | None = None, *, description: str = "", log_token: str | None = None) -> str:
+        """A scene. Without a name it gets the next one of mini_val, mini_train, then scene-9001 and so on."""
+        taken = {scene.name for scene in self._rows[Scene].values()}
+        if name is None:
+            known = chain(MINI_VAL, MINI_TRAIN, (f"scene-{number:04d}" for number in count(_FIRST_FREE)))
+            name = next(free for free in known if free not in taken)
+        if name in taken:
+            raise ValueError(f"scene '{name}' was added before")
+        log = self.add_log(f"log-{name}") if log_token is None else log_token
+        self._known(Log, log)
+        return self._add(Scene(_token("scene", name), name, log, description))
+
+    def add_sensor(
+        self,
+        scene: str,
+        channel: str,
+        *,
+        modality: str,
+        translation: Vector,
+        rotation: Quaternion,
+        intrinsic: Sequence[Sequence[float]] = (),
+    ) -> str:
+        """A sensor on the ego in a scene: pose in the ego frame, intrinsic 3 x 3 for cameras. Calibration token."""
+        if modality not in _FORMATS:
+            raise ValueError(f"modality '{modality}' is none of {', '.join(_FORMATS)}")
+        sensor = _token("sensor", channel)
+        if sensor not in self._rows[Sensor]:
+            self._add(Sensor(sensor, channel, modality))
+        token = _token("calibrated_sensor", self._known(Scene, scene).name, channel)
+        matrix = tuple(tuple(float(value) for value in row) for row in intrinsic)
+        self._add(CalibratedSensor(token, sensor, _floats(translation), _floats(rotation), matrix))
+        self._mounted[scene, channel] = token, modality
+        return token
+
+    def add_sample(self, scene: str, timestamp_us: int) -> str:
+        """A key frame of a scene, in any order."""
+        name = self._known(Scene, scene).name
+        return self._add(Sample(_token("sample", name, timestamp_us), timestamp_us, scene))
+
+    def add_sensor_frame(
+        self,
+        scene: str,
+        channel: str,
+        *,
+        timestamp_us: int,
+        data: bytes | Path,
+        ego_translation: Vector,
+        ego_rotation: Quaternion = IDENTITY,
+        sample: str | None = None,
+        size: tuple[int, int] = (0, 0),
+        suffix: str | None = None,
+    ) -> str:
+        """A file of a sensor: its bytes, or a file to link to (copied where it cannot be linked).
+
+        sample: the key frame it belongs to, None for a sweep, which gets the sample that follows it; size: width and
+        height of an image in pixels; suffix: of the file, such as .png (default: .jpg, .pcd.bin, .pcd).
+        """
+        record = self._known(Scene, scene)
+        if (scene, channel) not in self._mounted:
+            raise ValueError(f"scene '{record.name}' has no sensor '{channel}': call add_sensor first")
+        calibration, modality = self._mounted[scene, channel]
+        if sample is not None and self._known(Sample, sample).scene_token != scene:
+            raise ValueError(f"sample '{sample}' is of another scene")
+        ending, kind = _FORMATS[modality]
+        if suffix is not None:
+            ending, kind = suffix, suffix.lstrip(".").split(".")[0]
+        folder = "sweeps" if sample is None else "samples"
+        filename = f"{folder}/{channel}/{record.name}__{channel}__{timestamp_us}{ending}"
+        token = _token("sample_data", record.name, channel, timestamp_us)
+        row = SampleData(
+            token,
+            sample_token=sample or "",
+            ego_pose_token=token,
+            calibrated_sensor_token=calibration,
+            timestamp=timestamp_us,
+            is_key_frame=sample is not None,
+            filename=filename,
+            fileformat=kind,
+            height=size[1],
+            width=size[0],
+        )
+        if token in self._frames:
+            raise ValueError(f"'{channel}' has two files at {timestamp_us} in scene '{record.name}'")
+        self._add(EgoPose(token, _floats(ego_translation), _floats(ego_rotation), timestamp_us))
+        self._frames[token] = _Frame(row, scene, channel)
+        _place(self.root / filename, data)
+        return token
+
+    def add_instance(self, scene: str, key: str, *, category: str) -> str:
+        """An object of a scene, such as key 'car-3'; its annotations are added one a sample."""
+        token = _token("instance", self._known(Scene, scene).name, key)
+        self._instance_scene[token] = scene
+        return self._add(Instance(token, self._named(Category, category)))
+
+    def add_annotation(
+        self,
+        sample: str,
+        instance: str,
+        *,
+        translation: Vector,
+        size: Vector,
+        rotation: Quaternion,
+        visibility: str = "4",
+        attributes: Iterable[str] = (),
+        lidar_points: int = 0,
+        radar_points: int = 0,
+    ) -> str:
+        """The box of an object in a key frame: centre and rotation in the global frame, size width, length, height."""
+        self._known(Instance, instance)
+        if self._instance_scene[instance] != self._known(Sample, sample).scene_token:
+            raise ValueError(f"instance '{instance}' and sample '{sample}' are of different scenes")
+        self._known(Visibility, visibility)
+        return self._add(
+            SampleAnnotation(
+                _token("sample_annotation", sample, instance),
+                sample_token=sample,
+                instance_token=instance,
+                visibility_token=visibility,
+                attribute_tokens=tuple(self._named(Attribute, name) for name in attributes),
+                translation=_floats(translation),
+                size=_floats(size),
+                rotation=_floats(rotation),
+                num_lidar_pts=int(lidar_points),
+                num_radar_pts=int(radar_points),
+            )
+        )
+
+    def set_split(self, name: str, scenes: Iterable[str]) -> None:
+        """A split of splits.json: scene names. Without any, `close` writes all, mini_train and mini_val."""
+        self._splits[name] = list(scenes)
+
+    def close(self) -> None:
+        """Work out the chains and write the 13 tables, the maps and splits.json. ValueError for an empty scene."""
+        if not self._rows[Scene]:
+            raise ValueError("a version needs at least one scene")
+        self._chain_samples()
+        self._chain_frames()
+        self._chain_annotations()
+        self._draw_maps()
+        for name, kind in TABLES.items():
+            _write_table(table_path(self.root, self.version, name), self._rows[kind].values())
+        names = [scene.name for scene in self._rows[Scene].values()]
+        parts: Mapping[str, Sequence[str]] = {"all": names, "mini_train": MINI_TRAIN, "mini_val": MINI_VAL}
+        default = {split: [name for name in names if name in members] for split, members in parts.items()}
+        splits = self._splits or {split: members for split, members in default.items() if members}
+        write_atomic(self.root / self.version / "splits.json", dump_json(splits, indent=1) + "\n")
+
+    def _add(self, record: Record) -> str:
+        table = self._rows[type(record)]
+        if record.token in table:
+            raise ValueError(f"a {type(record).__name__} with the same key was added before: {record.token}")
+        table[record.token] = record
+        return record.token
+
+    def _known(self, kind: type[R], token: str) -> R:
+        record: R | None = self._rows[kind].get(token)
+        if record is None:
+            raise ValueError(f"no {kind.__name__} has the token '{token}'")
+        return record
+
+    def _named(self, kind: type[Category] | type[Attribute], name: str) -> str:
+        """Token of a category or attribute; one that the original does not have is added."""
+        token = _token("category" if kind is Category else "attribute", name)
+        if token not in self._rows[kind]:
+            self._add(kind(token, name=name))
+        return token
+
+    def _link(self, kind: type[Record], rows: Sequence[Any]) -> None:
+        """Store rows of one chain, in time order, with prev and next."""
+        for number, row in enumerate(rows):
+            before = rows[number - 1].token if number else ""
+            after = rows[number + 1].token if number + 1 < len(rows) else ""
+            self._rows[kind][row.token] = msgspec.structs.replace(row, prev=before, next=after)
+
+    def _chain_samples(self) -> None:
+        self._order = {token: [] for token in self._rows[Scene]}
+        for sample in sorted(self._rows[Sample].values(), key=lambda row: row.timestamp):
+            self._order[sample.scene_token].append(sample)
+        for token, samples in self._order.items():
+            scene: Scene = self._rows[Scene][token]
+            if not samples:
+                raise ValueError(f"scene '{scene.name}' has no sample")
+            self._link(Sample, samples)
+            self._rows[Scene][token] = msgspec.structs.replace(
+                scene,
+                nbr_samples=len(samples),
+                first_sample_token=samples[0].token,
+                last_sample_token=samples[-1].token,
+            )
+
+    def _chain_frames(self) -> None:
+        chains: dict[tuple[str, str], list[SampleData]] = {}
+        for frame in self._frames.values():
+            row = frame.row
+            if not row.sample_token:
+                samples = self._order[frame.scene]
+                after = bisect_left([sample.timestamp for sample in samples], row.timestamp)
+                row = msgspec.structs.replace(row, sample_token=samples[min(after, len(samples) - 1)].token)
+            self._rows[SampleData][row.token] = row
+            chains.setdefault((frame.scene, frame.channel), []).append(row)
+        for rows in chains.values():
+            self._link(SampleData, sorted(rows, key=lambda row: row.timestamp))
+
+    def _chain_annotations(self) -> None:
+        time = {token: sample.timestamp for token, sample in self._rows[Sample].items()}
+        chains: dict[str, list[SampleAnnotation]] = {}
+        for row in self._rows[SampleAnnotation].values():
+            chains.setdefault(row.instance_token, []).append(row)
+        for token, instance in list(self._rows[Instance].items()):
+            rows = sorted(chains.get(token, []), key=lambda row: time[row.sample_token])
+            if not rows:
+                del self._rows[Instance][token]  # never seen
+                continue
+            self._link(SampleAnnotation, rows)
+            self._rows[Instance][token] = msgspec.structs.replace(
+                instance,
+                nbr_annotations=len(rows),
+                first_annotation_token=rows[0].token,
+                last_annotation_token=rows[-1].token,
+            )
+
+    def _draw_maps(self) -> None:
+        """A blank map for each location: the official toolkit wants one for each log."""
+        places: dict[str, list[str]] = {}
+        for log in self._rows[Log].values():
+            places.setdefault(log.location, []).append(log.token)
+        for place, logs in places.items():
+            token = _token("map", place)
+            filename = f"maps/{token}.png"
+            _, png = cv2.imencode(".png", np.zeros((64, 64), np.uint8))
+            write_atomic(self.root / filename, png.tobytes())
+            self._rows[Map][token] = Map(token, tuple(logs), "semantic_prior", filename)
+
+
+def _token(*key: object) -> str:
+    return digest("nuscenes", *key)[:32]
+
+
+def _floats(values: Sequence[float]) -> Any:
+    """As a tuple of plain finite numbers. ValueError."""
+    plain = tuple(float(value) for value in values)
+    if not np.isfinite(plain).all():
+        raise ValueError(f"{plain} is not finite")
+    return plain
+
+
+def _place(path: Path, data: bytes | Path) -> None:
+    """Write the bytes, or link (else copy) the file."""
+    if isinstance(data, bytes):
+        write_atomic(path, data)
+        return
+    source = data.resolve()
+    if not source.is_file():
+        raise FormatError(f"{data}: no such file to link to")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        os.link(source, path)
+        return
+    with atomic_path(path) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+def _write_table(path: Path, rows: Iterable[Record]) -> None:
+    """A JSON list, one record a line, atomically. StoreError."""
+    encoder = msgspec.json.Encoder()
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        separator = b"[\n"
+        for row in rows:
+            file.write(separator + encoder.encode(row))
+            separator = b",\n"
+        file.write(b"\n]\n" if separator == b",\n" else b"[]\n")
+
+
+__all__ = ["CATEGORIES", "IDENTITY", "MINI_TRAIN", "MINI_VAL", "NuScenesWriter"]

@@ -1,0 +1,209 @@
+"""3D boxes as columns, the official settings of the nuScenes detection task, and which boxes it counts.
+
+Source: nuscenes-devkit 1.2.0, eval/common/loaders.py (`filter_eval_boxes`) and configs/detection_cvpr_2019.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.errors import FormatError
+from ssad.types import F64, I32, Bool
+
+I8 = npt.NDArray[np.int8]
+I64 = npt.NDArray[np.int64]
+
+TP_METRICS: Final = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
+RACKED: Final = ("bicycle", "motorcycle")
+_RANGES: Final = {
+    "car": 50.0,
+    "truck": 50.0,
+    "bus": 50.0,
+    "trailer": 50.0,
+    "construction_vehicle": 50.0,
+    "pedestrian": 40.0,
+    "motorcycle": 40.0,
+    "bicycle": 40.0,
+    "traffic_cone": 30.0,
+    "barrier": 30.0,
+}
+
+
+@dataclass(frozen=True)
+class BoxTable:
+    """Boxes of a set, one row a box; the rows of a sample stand together, in the order of the devkit's lists.
+
+    sample [N]: index of the sample; label [N]: index of the class; translation [N, 3] global, m; size [N, 3] width,
+    length, height, m; rotation [N, 4] quaternion w, x, y, z; velocity [N, 2] global, m/s, NaN where not known;
+    attribute [N]: index, -1 for none; score [N], -1 for ground truth; ego_distance [N]: in the plane, m.
+    """
+
+    sample: I32
+    label: I8
+    translation: F64
+    size: F64
+    rotation: F64
+    velocity: F64
+    attribute: I8
+    score: F64
+    ego_distance: F64
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+    def take(self, index: npt.NDArray[Any]) -> BoxTable:
+        """The rows that `index` (positions or a mask) names."""
+        return BoxTable(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    @staticmethod
+    def empty(n: int = 0) -> BoxTable:
+        """A table of n rows of zeros: attribute and score -1, velocity and ego_distance NaN."""
+        return BoxTable(
+            sample=np.zeros(n, np.int32),
+            label=np.zeros(n, np.int8),
+            translation=np.zeros((n, 3)),
+            size=np.zeros((n, 3)),
+            rotation=np.zeros((n, 4)),
+            velocity=np.full((n, 2), np.nan),
+            attribute=np.full(n, -1, np.int8),
+            score=np.full(n, -1.0),
+            ego_distance=np.full(n, np.nan),
+        )
+
+
+@dataclass(frozen=True)
+class BikeRacks:
+    """Bicycle racks: sample [R], translation [R, 3] global, size [R, 3] (w, l, h), rotation [R, 4] (w, x, y, z)."""
+
+    sample: I32
+    translation: F64
+    size: F64
+    rotation: F64
+
+
+@dataclass(frozen=True)
+class DetectionConfig:
+    """Settings of the task; the defaults are the official detection_cvpr_2019.
+
+    class_range: class -> range in metres, in the order of the labels; dist_ths: thresholds of a match, m.
+    """
+
+    class_range: Mapping[str, float] = field(default_factory=lambda: MappingProxyType(_RANGES))
+    dist_ths: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    dist_th_tp: float = 2.0
+    min_recall: float = 0.1
+    min_precision: float = 0.1
+    max_boxes_per_sample: int = 500
+    mean_ap_weight: int = 5
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes in the order of the labels."""
+        return tuple(self.class_range)
+
+    def serialize(self) -> dict[str, Any]:
+        """The devkit's `cfg` entry."""
+        return {
+            "class_range": {name: int(r) if r == int(r) else r for name, r in self.class_range.items()},
+            "dist_fcn": "center_distance",
+            "dist_ths": list(self.dist_ths),
+            "dist_th_tp": self.dist_th_tp,
+            "min_recall": self.min_recall,
+            "min_precision": self.min_precision,
+            "max_boxes_per_sample": self.max_boxes_per_sample,
+            "mean_ap_weight": self.mean_ap_weight,
+        }
+
+
+CVPR_2019: Final = DetectionConfig()
+
+
+def check_counts(boxes: BoxTable, *, config: DetectionConfig = CVPR_2019, names: Sequence[str] | None = None) -> None:
+    """Refuse more predictions in a sample than the task allows. FormatError names the sample (token, else index)."""
+    counts = np.bincount(boxes.sample)
+    if counts.size and counts.max() > config.max_boxes_per_sample:
+        worst = int(counts.argmax())
+        raise FormatError(
+            f"sample {worst if names is None else names[worst]}: {counts[worst]} boxes, but at most "
+            f"{config.max_boxes_per_sample} are allowed; keep the best of them"
+        )
+
+
+def keep_boxes(
+    boxes: BoxTable,
+    *,
+    config: DetectionConfig = CVPR_2019,
+    points: npt.NDArray[Any] | None = None,
+    racks: BikeRacks | None = None,
+) -> Bool:
+    """Which boxes [N] the task counts: nearer than the range of their class, not empty, not parked in a rack.
+
+    points [N]: LiDAR and radar points in the box; boxes with 0 are left out (negative: not known). racks: bicycles and
+    motorcycles whose centre lies in a rack of the same sample are left out.
+    """
+    ranges = np.array(list(config.class_range.values()), np.float64)
+    keep: Bool = boxes.ego_distance < ranges[boxes.label]
+    if points is not None:
+        keep &= points != 0
+    if racks is not None and len(racks.sample):
+        racked = np.array([name in RACKED for name in config.classes])
+        rows = np.flatnonzero(keep & racked[boxes.label])
+        keep[rows[_in_racks(boxes.sample[rows], boxes.translation[rows], racks)]] = False
+    return keep
+
+
+def filter_boxes(
+    boxes: BoxTable,
+    *,
+    config: DetectionConfig = CVPR_2019,
+    points: npt.NDArray[Any] | None = None,
+    racks: BikeRacks | None = None,
+) -> BoxTable:
+    """The boxes that the task counts, in their order (see `keep_boxes`)."""
+    return boxes.take(np.flatnonzero(keep_boxes(boxes, config=config, points=points, racks=racks)))
+
+
+def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
+    """Which points [N] lie in a rack of their sample, bounds included, with the devkit's arithmetic."""
+    order = np.argsort(racks.sample, kind="stable")
+    low = np.searchsorted(racks.sample[order], sample, side="left")
+    count = np.searchsorted(racks.sample[order], sample, side="right") - low
+    point = np.repeat(np.arange(len(sample)), count)
+    rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - low, count)]
+
+    w, length, h = 0.5 * racks.size[rack].T
+    turn = rotation_matrix(racks.rotation[rack])
+    corner = np.empty((4, len(rack), 3))
+    for i, (a, b, c) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
+        local = np.stack([a * length, b * w, c * h], axis=-1)
+        corner[i] = np.einsum("nij,nj->ni", turn, local) + racks.translation[rack]
+    offset = centre[point] - corner[0]
+    inside = np.ones(len(rack), np.bool_)
+    for edge in corner[1:] - corner[0]:
+        along = (edge * offset).sum(axis=-1)
+        inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=-1))
+    return np.bincount(point[inside], minlength=len(sample)) > 0
+
+
+def rotation_matrix(quaternion: F64) -> F64:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), brought to unit length (0 stays 0)."""
+    norm = np.sqrt((quaternion * quaternion).sum(axis=-1, keepdims=True))
+    w, x, y, z = (quaternion / np.where(norm > 0.0, norm, 1.0)).T
+    rows = (
+        (w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def yaw(quaternion: F64) -> F64:
+    """Heading [N] of quaternions [N, 4]: direction of the turned x axis in the plane, radians."""
+    w, x, y, z = quaternion.T
+    return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))

@@ -1,0 +1,1 @@
+"""Static safety-critical scenarios: what changes in an image or a sweep, not in the traffic."""

@@ -1,0 +1,137 @@
+"""Images of any kind as flat bytes on a device, and back."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ssad.errors import ConfigError
+from ssad.types import U8
+
+wp.config.log_level = wp.LOG_ERROR
+
+
+@dataclass(slots=True)
+class Batch:
+    """B images of `height` x `width`, RGB interleaved, one byte a value, each `stride` bytes (a multiple of four)."""
+
+    data: Any
+    count: int
+    height: int
+    width: int
+    stride: int
+    device: str
+
+    def like(self) -> Batch:
+        """Another batch of the same shape, its values not set."""
+        data = wp.empty(self.count * self.stride, dtype=wp.uint8, device=self.device)
+        return Batch(data, self.count, self.height, self.width, self.stride, self.device)
+
+    def copy(self) -> Batch:
+        """A copy on the same device."""
+        return Batch(wp.clone(self.data), self.count, self.height, self.width, self.stride, self.device)
+
+    def words(self) -> Any:
+        """The same memory, four bytes at a time."""
+        size = self.count * self.stride // 4
+        view = wp.array(ptr=self.data.ptr, dtype=wp.uint32, shape=size, device=self.device)
+        view._keep = self.data  # the memory belongs to the bytes
+        return view
+
+    def numpy(self) -> U8:
+        """The images [B, H, W, 3] in main memory."""
+        size = self.height * self.width * 3
+        rows = self.data.numpy().reshape(self.count, self.stride)[:, :size]
+        return np.ascontiguousarray(rows).reshape(self.count, self.height, self.width, 3)
+
+
+def to_batch(images: Any, device: str | None = None) -> Batch:
+    """uint8 [H, W, 3] or [B, H, W, 3], numpy or torch, or torch float32 [B, 3, H, W] in [0, 1] -> Batch.
+
+    device: "cpu" or "cuda..."; None: where the images are. ConfigError for other shapes and kinds.
+    """
+    if isinstance(images, Batch):
+        return images
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(images, torch.Tensor):
+        values = images.detach()
+        if values.is_floating_point():
+            if values.ndim != 4 or values.shape[1] != 3:
+                raise ConfigError(f"float images must be [B, 3, H, W], not {list(values.shape)}")
+            values = (values.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1)
+        where = device or ("cpu" if values.device.type == "cpu" else f"cuda:{values.device.index or 0}")
+        if values.device.type == "cpu":
+            return to_batch(values.numpy(), where)
+        count, height, width = _shape(tuple(values.shape))
+        stride = (height * width * 3 + 3) // 4 * 4
+        flat = torch.zeros(count, stride, dtype=torch.uint8, device=values.device)
+        flat[:, : height * width * 3] = values.reshape(count, -1)
+        return Batch(wp.from_torch(flat.reshape(-1)), count, height, width, stride, where)
+    array = np.asarray(images)
+    if array.dtype != np.uint8:
+        raise ConfigError(f"images must be uint8 [H, W, 3] or [B, H, W, 3], not {array.dtype} {list(array.shape)}")
+    count, height, width = _shape(array.shape)
+    size = height * width * 3
+    stride = (size + 3) // 4 * 4
+    rows = np.ascontiguousarray(array).reshape(count, size)
+    if stride != size:
+        rows = np.pad(rows, ((0, 0), (0, stride - size)))
+    flat_bytes = wp.array(rows.reshape(-1), dtype=wp.uint8, device=device or "cpu", copy=False)
+    return Batch(flat_bytes, count, height, width, stride, device or "cpu")
+
+
+def _shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    if len(shape) == 3:
+        shape = (1, *shape)
+    if len(shape) != 4 or shape[3] != 3:
+        raise ConfigError(f"images must be [H, W, 3] or [B, H, W, 3] with three colours, not {list(shape)}")
+    if min(shape) < 1 or shape[1] < 8 or shape[2] < 8:
+        raise ConfigError(f"images must be at least 8 x 8, not {shape[2]} x {shape[1]}")
+    return shape[0], shape[1], shape[2]
+
+
+def like_input(batch: Batch, images: Any) -> Any:
+    """The images of a batch as the kind, shape and place that `images` had."""
+    if isinstance(images, Batch):
+        return batch
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(images, torch.Tensor):
+        size = batch.height * batch.width * 3
+        flat = wp.to_torch(batch.data).reshape(batch.count, batch.stride)[:, :size].to(images.device)
+        values = flat.reshape(batch.count, batch.height, batch.width, 3)
+        if images.is_floating_point():
+            return values.permute(0, 3, 1, 2).to(images.dtype) / 255
+        return values.reshape(images.shape).clone()
+    return batch.numpy().reshape(np.asarray(images).shape)
+
+
+def on(batch: Batch, values: Any, dtype: Any) -> Any:
+    """Small parameters on the device of a batch."""
+    return wp.array(values, dtype=dtype, device=batch.device)
+
+
+def keys_on(batch: Batch, keys: Sequence[int]) -> Any:
+    """64-bit keys on the device of a batch."""
+    return wp.array(np.asarray(keys, np.uint64), dtype=wp.uint64, device=batch.device)
+
+
+def check_batch(batch: Batch, frames: Sequence[Any]) -> None:
+    """ConfigError unless there is a frame of the right size for each image."""
+    if len(frames) != batch.count:
+        raise ConfigError(f"{batch.count} images, but {len(frames)} frames")
+    for frame in frames:
+        camera = frame.camera
+        if (camera.height, camera.width) != (batch.height, batch.width):
+            raise ConfigError(
+                f"camera {camera.channel} is {camera.width} x {camera.height}, its image {batch.width} x {batch.height}"
+            )
+
+
+def structs(batch: Batch, rows: Sequence[tuple[Any, ...]], kind: Any) -> Any:
+    """Rows of a kernel's struct on the device of a batch."""
+    return wp.array(np.array(rows, dtype=kind.numpy_dtype()), dtype=kind, device=batch.device)

@@ -1,0 +1,313 @@
+"""Objects moved, resized, sheared or blurred inside their projected 3D boxes."""
+
+import warp as wp
+
+
+@wp.struct
+class Item:
+    """A box in one image, before (old) and after (new); camera frame, metres; pixels for the rest.
+
+    into, into_origin: camera frame -> unit cube of the new box; back, back_origin: unit cube -> the old box;
+    middle: a point inside both outlines; new_first, new_count, old_first, old_count: their outlines (convex, in
+    `points`); low, high: pixels that may change; node_first, node_wide: its displacement nodes; rank: order among the
+    boxes of the image, the farthest 1; skip: nothing to paint, it only hides others.
+    """
+
+    image: int
+    into: wp.mat33
+    into_origin: wp.vec3
+    back: wp.mat33
+    back_origin: wp.vec3
+    middle: wp.vec2
+    new_first: int
+    new_count: int
+    old_first: int
+    old_count: int
+    low_x: int
+    low_y: int
+    high_x: int
+    high_y: int
+    node_first: int
+    node_wide: int
+    node_high: int
+    rank: int
+    skip: int
+    streak: wp.vec2
+
+
+STEP = wp.constant(4)
+
+
+@wp.func
+def outline_reach(points: wp.array(dtype=wp.vec2), first: int, count: int, origin: wp.vec2, u: wp.vec2) -> float:
+    """How far a convex outline reaches from a point inside it in the direction `u` (unit)."""
+    best = float(1.0e6)
+    for k in range(count):
+        a = points[first + k] - origin
+        b = points[first + (k + 1) % count] - origin
+        e = b - a
+        normal = wp.vec2(e[1], -e[0])
+        above = wp.dot(normal, a)
+        if above < 0.0:
+            normal = -normal
+            above = -above
+        slope = wp.dot(normal, u)
+        if slope > 1.0e-6:
+            best = wp.min(best, above / slope)
+    return best
+
+
+@wp.func
+def row_span(points: wp.array(dtype=wp.vec2), first: int, count: int, y: float) -> wp.vec2:
+    """Least and largest x of a convex outline on a row; (1, 0) where it has none."""
+    low = float(1.0e9)
+    high = float(-1.0e9)
+    for k in range(count):
+        a = points[first + k]
+        b = points[first + (k + 1) % count]
+        if (a[1] <= y and b[1] >= y) or (b[1] <= y and a[1] >= y):
+            d = b[1] - a[1]
+            if wp.abs(d) < 1.0e-6:
+                low = wp.min(low, wp.min(a[0], b[0]))
+                high = wp.max(high, wp.max(a[0], b[0]))
+            else:
+                x = a[0] + (b[0] - a[0]) * (y - a[1]) / d
+                low = wp.min(low, x)
+                high = wp.max(high, x)
+    if low > high:
+        return wp.vec2(1.0, 0.0)
+    return wp.vec2(low, high)
+
+
+@wp.kernel
+def stamp(
+    items: wp.array(dtype=Item),
+    item_first: wp.array(dtype=int),
+    points: wp.array(dtype=wp.vec2),
+    owner: wp.array3d(dtype=wp.int16),
+):
+    """owner[b, y, x]: rank of the nearest box whose old outline covers the pixel; 0, as it came, for none."""
+    b, y = wp.tid()
+    width = owner.shape[2]
+    for k in range(item_first[b], item_first[b + 1]):
+        span = row_span(points, items[k].old_first, items[k].old_count, float(y))
+        if span[0] <= span[1]:
+            low = wp.clamp(int(wp.ceil(span[0])), 0, width)
+            high = wp.clamp(int(wp.floor(span[1])) + 1, 0, width)
+            for x in range(low, high):
+                owner[b, y, x] = wp.int16(items[k].rank)
+
+
+@wp.kernel
+def displace(
+    items: wp.array(dtype=Item),
+    points: wp.array(dtype=wp.vec2),
+    lens: wp.array(dtype=wp.vec4),
+    nodes: wp.array(dtype=wp.vec3),
+):
+    """Where each node of an item's grid takes its colour from: (dx, dy), and 1 inside the new box.
+
+    Inside, the viewing ray meets the surface of the new box, and the same point of the old box is looked up. Around it
+    the surroundings stretch or shrink radially up to a margin, so that no hole opens.
+    """
+    k, row = wp.tid()
+    item = items[k]
+    if item.skip == 1 or row >= item.node_high:
+        return
+    focal = lens[item.image]
+    for column in range(item.node_wide):
+        p = wp.vec2(float(item.low_x + column * STEP), float(item.low_y + row * STEP))
+        ray = wp.vec3((p[0] - focal[2]) / focal[0], (p[1] - focal[3]) / focal[1], 1.0)
+        d = item.into * ray
+        o = item.into_origin
+        enter = float(-1.0e9)
+        leave = float(1.0e9)
+        for axis in range(3):
+            speed = d[axis]
+            if wp.abs(speed) < 1.0e-9:
+                speed = 1.0e-9
+            t0 = (-0.5 - o[axis]) / speed
+            t1 = (0.5 - o[axis]) / speed
+            enter = wp.max(enter, wp.min(t0, t1))
+            leave = wp.min(leave, wp.max(t0, t1))
+        result = wp.vec3(0.0, 0.0, 0.0)
+        if enter <= leave and enter > 0.0:
+            q = item.back * (o + d * enter) + item.back_origin
+            z = wp.max(q[2], 0.2)
+            result = wp.vec3(focal[0] * q[0] / z + focal[2] - p[0], focal[1] * q[1] / z + focal[3] - p[1], 1.0)
+        else:
+            away = p - item.middle
+            r = wp.length(away)
+            if r > 1.0e-3:
+                u = away / r
+                new = outline_reach(points, item.new_first, item.new_count, item.middle, u)
+                old = outline_reach(points, item.old_first, item.old_count, item.middle, u)
+                edge = wp.max(new, old) * 1.25 + 8.0
+                if r < edge:
+                    source = old + (wp.max(r, new) - new) * (edge - old) / (edge - new)
+                    result = wp.vec3(u[0] * (source - r), u[1] * (source - r), 0.0)
+        nodes[item.node_first + row * item.node_wide + column] = result
+
+
+@wp.kernel
+def paint(
+    image: wp.array(dtype=wp.uint8),
+    items: wp.array(dtype=Item),
+    item_first: wp.array(dtype=int),
+    owner: wp.array3d(dtype=wp.int16),
+    nodes: wp.array(dtype=wp.vec3),
+    respect: int,
+    stride: int,
+    out: wp.array(dtype=wp.uint8),
+):
+    """Draws the items of an image row by row, the farthest first, always from the unchanged image.
+
+    respect = 1: an item is not drawn over a nearer box nor with a nearer box's pixels.
+    """
+    b, y = wp.tid()
+    height = owner.shape[1]
+    width = owner.shape[2]
+    start = b * stride
+    for k in range(item_first[b], item_first[b + 1]):
+        if items[k].skip == 0 and y >= items[k].low_y and y < items[k].high_y:
+            rank = items[k].rank
+            low = items[k].low_x
+            wide = items[k].node_wide
+            ny = (y - items[k].low_y) / STEP
+            ty = float(y - items[k].low_y - ny * STEP) * 0.25
+            first = items[k].node_first + ny * wide
+            end = items[k].high_x
+            left = nodes[first] * (1.0 - ty) + nodes[first + wide] * ty
+            for nx in range(wide - 1):
+                j = first + nx + 1
+                right = nodes[j] * (1.0 - ty) + nodes[j + wide] * ty
+                still = wp.abs(left[0]) + wp.abs(left[1]) + wp.abs(right[0]) + wp.abs(right[1])
+                if still > 0.05 or left[2] + right[2] > 0.0:
+                    for m in range(STEP):
+                        x = low + nx * STEP + m
+                        if x < end:
+                            hidden = int(owner[b, y, x])
+                            if respect == 0 or hidden <= rank:
+                                n = left + (right - left) * (float(m) * 0.25)
+                                inside = n[2] > 0.5
+                                if inside or wp.abs(n[0]) + wp.abs(n[1]) > 0.05:
+                                    sx = wp.clamp(float(x) + n[0], 0.0, float(width) - 2.0)
+                                    sy = wp.clamp(float(y) + n[1], 0.0, float(height) - 2.0)
+                                    x0 = int(sx)
+                                    y0 = int(sy)
+                                    fine = respect == 0
+                                    if respect == 1:
+                                        seen = int(owner[b, y0, x0])
+                                        fine = seen <= rank
+                                        if not inside:
+                                            fine = (seen == 0 or seen == rank) and (hidden == 0 or hidden == rank)
+                                    if fine:
+                                        ax = int((sx - float(x0)) * 64.0)
+                                        ay = int((sy - float(y0)) * 64.0)
+                                        w00 = (64 - ax) * (64 - ay)
+                                        w01 = ax * (64 - ay)
+                                        w10 = (64 - ax) * ay
+                                        w11 = ax * ay
+                                        i = start + (y0 * width + x0) * 3
+                                        d = i + width * 3
+                                        o = start + (y * width + x) * 3
+                                        for c in range(3):
+                                            total = int(image[i + c]) * w00 + int(image[i + 3 + c]) * w01
+                                            total += int(image[d + c]) * w10 + int(image[d + 3 + c]) * w11
+                                            out[o + c] = wp.uint8((total + 2048) >> 12)
+                left = right
+
+
+@wp.kernel
+def smear(
+    image: wp.array(dtype=wp.uint8),
+    items: wp.array(dtype=Item),
+    chosen: wp.array(dtype=int),
+    owner: wp.array3d(dtype=wp.int16),
+    respect: int,
+    stride: int,
+    out: wp.array(dtype=wp.uint8),
+):
+    """Blurs items along their streak: a box filter over the pixels of the item, one thread a line of pixels.
+
+    A line steps one pixel along the longer side of the streak; lines of one slope cover every pixel once. The sum
+    over the window is carried along, so that the cost does not depend on the length of the streak.
+    """
+    n, line = wp.tid()
+    k = chosen[n]
+    item = items[k]
+    b = item.image
+    width = owner.shape[2]
+    height = owner.shape[1]
+    dx = item.streak[0]
+    dy = item.streak[1]
+    flat = wp.abs(dx) >= wp.abs(dy)
+    slope = float(0.0)
+    low = item.low_y
+    steps = item.high_y - item.low_y
+    lanes = item.high_x - item.low_x
+    across = item.low_x
+    reach = wp.abs(dy)
+    if flat:
+        slope = dy / dx
+        low = item.low_x
+        steps = item.high_x - item.low_x
+        lanes = item.high_y - item.low_y
+        across = item.low_y
+        reach = wp.abs(dx)
+    else:
+        slope = dx / dy
+    extra = int(wp.ceil(wp.abs(slope) * float(steps))) + 1
+    if line >= lanes + extra:
+        return
+    first = across + line
+    if slope > 0.0:
+        first = across + line - extra
+    half = int(reach * 0.5 + 0.5)
+    total = wp.vec3i(0, 0, 0)
+    weight = int(0)
+    start = b * stride
+    window = float(2 * half + 1)
+    for s in range(-half, steps + half):
+        # the pixel that enters the window, half a streak ahead
+        ahead = s + half
+        if ahead < steps:
+            side = first + int(wp.floor(slope * float(ahead) + 0.5))
+            x = side
+            y = low + ahead
+            if flat:
+                x = low + ahead
+                y = side
+            if x >= 0 and x < width and y >= 0 and y < height:
+                if int(owner[b, y, x]) == item.rank:
+                    i = start + (y * width + x) * 3
+                    total = total + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
+                    weight += 1
+        if s >= 0 and s < steps and weight > 0:
+            side = first + int(wp.floor(slope * float(s) + 0.5))
+            x = side
+            y = low + s
+            if flat:
+                x = low + s
+                y = side
+            if x >= 0 and x < width and y >= 0 and y < height:
+                if respect == 0 or int(owner[b, y, x]) <= item.rank:
+                    i = start + (y * width + x) * 3
+                    alpha = float(weight) / window
+                    scale = alpha / float(weight)
+                    out[i] = wp.uint8(float(out[i]) * (1.0 - alpha) + float(total[0]) * scale + 0.5)
+                    out[i + 1] = wp.uint8(float(out[i + 1]) * (1.0 - alpha) + float(total[1]) * scale + 0.5)
+                    out[i + 2] = wp.uint8(float(out[i + 2]) * (1.0 - alpha) + float(total[2]) * scale + 0.5)
+        behind = s - half
+        if behind >= 0 and behind < steps:
+            side = first + int(wp.floor(slope * float(behind) + 0.5))
+            x = side
+            y = low + behind
+            if flat:
+                x = low + behind
+                y = side
+            if x >= 0 and x < width and y >= 0 and y < height:
+                if int(owner[b, y, x]) == item.rank:
+                    i = start + (y * width + x) * 3
+                    total = total - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
+                    weight -= 1

@@ -1,0 +1,150 @@
+"""Rain drops and snow flakes in the air of the world, as a camera with an exposure time sees them."""
+
+import warp as wp
+
+from ssad.scenarios.static.shifts.kernels.shared import draw, unit
+
+
+@wp.struct
+class Air:
+    """What falls, the same for all cameras of a scene. Lengths in metres, diameters in millimetres.
+
+    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low, high: least
+    and largest diameter; snow: 1 for flakes, 0 for drops; growth: visible over melted diameter.
+    """
+
+    key: wp.uint64
+    tile: wp.vec3
+    wind: wp.vec3
+    slope: float
+    low: float
+    high: float
+    growth: float
+    snow: int
+    count: int
+
+
+@wp.func
+def wrapped(value: float, period: float) -> float:
+    """A coordinate of a periodic field, in [-period / 2, period / 2)."""
+    return value - period * wp.floor(value / period + 0.5)
+
+
+@wp.func
+def deposit(layer: wp.array3d(dtype=int), b: int, y: int, x: int, amount: float):
+    """Adds opacity (of 65536) to a cell; whole numbers, so that the order of the particles is of no consequence."""
+    if y >= 0 and y < layer.shape[1] and x >= 0 and x < layer.shape[2]:
+        wp.atomic_add(layer, b, y, x, int(amount * 65536.0))
+
+
+@wp.kernel
+def splat(
+    airs: wp.array(dtype=Air),
+    time: wp.array(dtype=float),
+    to_camera: wp.array(dtype=wp.mat33),
+    position: wp.array(dtype=wp.vec3),
+    velocity: wp.array(dtype=wp.vec3),
+    lens: wp.array(dtype=wp.vec4),
+    exposure: float,
+    aperture: float,
+    layer: wp.array3d(dtype=int),
+):
+    """One thread a particle and image: its streak over the exposure, in cells of two pixels.
+
+    position: of the camera, modulo the tile; velocity: of the ego, m/s; aperture: diameter of the lens, m (near
+    particles are out of focus). Opacity times area is kept, whatever the blur.
+    """
+    b, i = wp.tid()
+    air = airs[b]
+    if i >= air.count:
+        return
+    first = draw(air.key, i * 2)
+    second = draw(air.key, i * 2 + 1)
+    # diameter: exponential between low and high (Marshall-Palmer, Sekhon-Srivastava)
+    reach = 1.0 - wp.exp(-air.slope * (air.high - air.low))
+    melted = air.low - wp.log(1.0 - unit(second, 0) * reach) / air.slope
+    fall = 9.65 - 10.3 * wp.exp(-0.6 * melted)  # Atlas, Srivastava and Sekhon 1973
+    wobble = wp.vec3(0.0, 0.0, 0.0)
+    t = time[b]
+    if air.snow == 1:
+        fall = 0.8 + 0.2 * melted
+        phase = unit(second, 16) * 6.2831853
+        pace = 1.0 + 2.0 * unit(second, 32)
+        wobble = wp.vec3(wp.sin(pace * t + phase), wp.cos(pace * t * 0.8 + phase), 0.0) * 0.08
+    drift = air.wind + wp.vec3(0.0, 0.0, -fall)
+    base = wp.vec3(
+        unit(first, 0) * air.tile[0] + unit(first, 48) * 0.0002,
+        unit(first, 16) * air.tile[1],
+        unit(first, 32) * air.tile[2],
+    )
+    p = base + drift * t + wobble - position[b]
+    p = wp.vec3(wrapped(p[0], air.tile[0]), wrapped(p[1], air.tile[1]), wrapped(p[2], air.tile[2]))
+    # fades out towards the border of the tile, so that nothing pops up there
+    away = wp.length(wp.cw_div(p, air.tile)) * 2.0
+    if away >= 1.0:
+        return
+    fade = wp.clamp((1.0 - away) * 4.0, 0.0, 1.0)
+    path = (drift - velocity[b]) * (exposure * 0.5)
+    a = to_camera[b] * (p - path)
+    c = to_camera[b] * (p + path)
+    z = 0.5 * (a[2] + c[2])
+    if a[2] < 0.25 or c[2] < 0.25:
+        return
+    focal = lens[b]
+    # half-resolution cells: pixel u lies in cell (u + 0.5) / 2 - 0.5
+    ax = (focal[0] * a[0] / a[2] + focal[2] + 0.5) * 0.5 - 0.5
+    ay = (focal[1] * a[1] / a[2] + focal[3] + 0.5) * 0.5 - 0.5
+    cx = (focal[0] * c[0] / c[2] + focal[2] + 0.5) * 0.5 - 0.5
+    cy = (focal[1] * c[1] / c[2] + focal[3] + 0.5) * 0.5 - 0.5
+    size = melted * air.growth * 0.001 * focal[0] / z * 0.5
+    blur = aperture * focal[0] / z * 0.5
+    wide = wp.sqrt(size * size + blur * blur + 0.36)
+    rows = float(layer.shape[1])
+    columns = float(layer.shape[2])
+    if wp.max(ax, cx) < -wide or wp.min(ax, cx) > columns + wide:
+        return
+    if wp.max(ay, cy) < -wide or wp.min(ay, cy) > rows + wide:
+        return
+    dx = cx - ax
+    dy = cy - ay
+    long = wp.sqrt(dx * dx + dy * dy)
+    opacity = wp.min(fade * 0.785 * size * size / (wide * (long + 0.785 * wide)), 0.95)
+    half = wide * 0.5
+    if long < 1.0:
+        # a disc
+        mx = 0.5 * (ax + cx)
+        my = 0.5 * (ay + cy)
+        span = int(half + 1.0)
+        x0 = int(wp.floor(mx + 0.5))
+        y0 = int(wp.floor(my + 0.5))
+        for j in range(-span, span + 1):
+            for k in range(-span, span + 1):
+                ex = float(x0 + k) - mx
+                ey = float(y0 + j) - my
+                cover = wp.clamp(half + 0.5 - wp.sqrt(ex * ex + ey * ey), 0.0, 1.0)
+                if cover > 0.0:
+                    deposit(layer, b, y0 + j, x0 + k, opacity * cover)
+    elif wp.abs(dy) >= wp.abs(dx):
+        slope = dx / dy
+        thick = half * wp.sqrt(1.0 + slope * slope)
+        low = wp.max(wp.min(ay, cy) - half, 0.0)
+        high = wp.min(wp.max(ay, cy) + half, rows - 1.0)
+        for y in range(int(low), int(high) + 1):
+            middle = ax + (float(y) - ay) * slope
+            end = wp.clamp(wp.min(float(y) - wp.min(ay, cy), wp.max(ay, cy) - float(y)) + 0.5 + half, 0.0, 1.0)
+            for x in range(int(wp.floor(middle - thick)), int(wp.floor(middle + thick)) + 2):
+                cover = wp.clamp(thick + 0.5 - wp.abs(float(x) - middle), 0.0, 1.0) * end
+                if cover > 0.0:
+                    deposit(layer, b, y, x, opacity * cover)
+    else:
+        slope = dy / dx
+        thick = half * wp.sqrt(1.0 + slope * slope)
+        low = wp.max(wp.min(ax, cx) - half, 0.0)
+        high = wp.min(wp.max(ax, cx) + half, columns - 1.0)
+        for x in range(int(low), int(high) + 1):
+            middle = ay + (float(x) - ax) * slope
+            end = wp.clamp(wp.min(float(x) - wp.min(ax, cx), wp.max(ax, cx) - float(x)) + 0.5 + half, 0.0, 1.0)
+            for y in range(int(wp.floor(middle - thick)), int(wp.floor(middle + thick)) + 2):
+                cover = wp.clamp(thick + 0.5 - wp.abs(float(y) - middle), 0.0, 1.0) * end
+                if cover > 0.0:
+                    deposit(layer, b, y, x, opacity * cover)

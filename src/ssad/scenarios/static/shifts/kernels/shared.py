@@ -1,0 +1,73 @@
+"""Hashes and interpolation that several kernels use."""
+
+import warp as wp
+
+GOLDEN = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
+
+
+@wp.func
+def mix(value: wp.uint64) -> wp.uint64:
+    """The finaliser of splitmix64: 64 well-mixed bits of a counter (Steele, Lea and Flood 2014)."""
+    x = (value ^ (value >> wp.uint64(30))) * wp.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> wp.uint64(27))) * wp.uint64(0x94D049BB133111EB)
+    return x ^ (x >> wp.uint64(31))
+
+
+@wp.func
+def draw(key: wp.uint64, counter: int) -> wp.uint64:
+    """64 random bits for a key and a counter, whatever was drawn before."""
+    return mix(key + wp.uint64(counter) * GOLDEN)
+
+
+@wp.func
+def unit(bits: wp.uint64, shift: int) -> float:
+    """Uniform in [0, 1) from 16 of 64 bits."""
+    return (float(int((bits >> wp.uint64(shift)) & wp.uint64(65535))) + 0.5) / 65536.0
+
+
+@wp.func
+def byte(value: float) -> wp.uint8:
+    """Nearest grey level in 0..255."""
+    return wp.uint8(wp.clamp(int(value + 0.5), 0, 255))
+
+
+@wp.func
+def cell(grid: wp.array3d(dtype=float), b: int, row: int, fraction: float, column: int) -> float:
+    """Value of a grid between two of its rows, columns held at the border."""
+    x = wp.clamp(column, 0, grid.shape[2] - 1)
+    low = wp.clamp(row, 0, grid.shape[1] - 1)
+    high = wp.clamp(row + 1, 0, grid.shape[1] - 1)
+    return grid[b, low, x] * (1.0 - fraction) + grid[b, high, x] * fraction
+
+
+@wp.func
+def lattice(key: wp.uint64, x: int, y: int, z: int) -> float:
+    """Uniform in [0, 1) at a point of the integer lattice."""
+    counter = (
+        wp.uint64(wp.uint32(x)) * wp.uint64(0x8DA6B343)
+        + wp.uint64(wp.uint32(y)) * wp.uint64(0xD8163841)
+        + wp.uint64(wp.uint32(z)) * wp.uint64(0xCB1AB31F)
+    )
+    return unit(mix(key + counter * GOLDEN), 0)
+
+
+@wp.func
+def smooth(x: float) -> float:
+    """Hermite step."""
+    return x * x * (3.0 - 2.0 * x)
+
+
+@wp.func
+def value_noise(key: wp.uint64, p: wp.vec3) -> float:
+    """Smooth noise in [0, 1] with unit cells in three dimensions."""
+    x = int(wp.floor(p[0]))
+    y = int(wp.floor(p[1]))
+    z = int(wp.floor(p[2]))
+    u = smooth(p[0] - float(x))
+    v = smooth(p[1] - float(y))
+    w = smooth(p[2] - float(z))
+    a = wp.lerp(lattice(key, x, y, z), lattice(key, x + 1, y, z), u)
+    b = wp.lerp(lattice(key, x, y + 1, z), lattice(key, x + 1, y + 1, z), u)
+    c = wp.lerp(lattice(key, x, y, z + 1), lattice(key, x + 1, y, z + 1), u)
+    d = wp.lerp(lattice(key, x, y + 1, z + 1), lattice(key, x + 1, y + 1, z + 1), u)
+    return wp.lerp(wp.lerp(a, b, v), wp.lerp(c, d, v), w)

@@ -1,0 +1,83 @@
+"""What a shift is called, how strong it is, and where its random numbers come from.
+
+The 11 shifts are those of the paper (III.A.2). Two calibrations: `paper`, the published severity tables of
+3D_Corruptions_AD (Dong et al., CVPR 2023), image by image; `physical` (default), parameters with units, one weather in
+the world for all cameras and the LiDAR, object by object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from ssad.errors import ConfigError, unknown_name
+from ssad.seeding import digest, generator
+
+Calibration = Literal["physical", "paper"]
+Family = Literal["environment", "sensor", "object"]
+SHIFTS: Final[dict[str, tuple[Family, str]]] = {
+    "snow": ("environment", "falling snow: flakes in the air of the world, and the veil of those far away"),
+    "rain": ("environment", "falling rain: streaks of drops in the air of the world, and the veil of those far away"),
+    "fog": ("environment", "fog by depth (Koschmieder), patchy in the world"),
+    "sunlight": ("environment", "a low sun in front of some cameras: glare, bloom, ghosts"),
+    "uniform": ("sensor", "uniform noise"),
+    "gaussian": ("sensor", "gaussian noise"),
+    "impulse": ("sensor", "salt and pepper, some of it stuck pixels"),
+    "scale": ("object", "objects larger or smaller"),
+    "shear": ("object", "objects sheared"),
+    "rotation": ("object", "objects turned about the vertical"),
+    "motion_blur": ("object", "objects blurred along their motion"),
+}
+SEVERITIES: Final = (1, 2, 3, 4, 5)
+# a change of what a shift computes changes its bits, hence its keys and manifests
+VERSION: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftSpec:
+    """A shift to apply: name, severity (0: identity), seed, calibration. ConfigError for unknown ones.
+
+    Random numbers depend on the seed, the shift and what they are for, not on the severity: a sun stays where it is
+    when it becomes stronger, so that severities can be compared in pairs.
+    """
+
+    name: str
+    severity: int = 3
+    seed: int = 0
+    calibration: Calibration = "physical"
+
+    def __post_init__(self) -> None:
+        if self.name not in SHIFTS:
+            raise unknown_name("shift", self.name, SHIFTS)
+        if isinstance(self.severity, bool) or self.severity not in (0, *SEVERITIES):
+            raise ConfigError(f"severity {self.severity!r} of shift '{self.name}': expected 0 to 5")
+        if self.calibration not in get_args(Calibration):
+            raise unknown_name("calibration", self.calibration, get_args(Calibration))
+
+    @property
+    def family(self) -> Family:
+        """environment, sensor or object."""
+        return SHIFTS[self.name][0]
+
+    def at(self, severity: int) -> ShiftSpec:
+        """The same shift at another severity."""
+        return replace(self, severity=severity)
+
+    def key(self, *scope: object) -> int:
+        """64 bits for what the random numbers are for, such as ("air", scene)."""
+        return int(digest("shift", VERSION, self.name, self.calibration, self.seed, *scope)[:16], 16)
+
+    def generator(self, *scope: object) -> np.random.Generator:
+        """A generator for what the random numbers are for."""
+        return generator("shift", VERSION, self.name, self.calibration, self.seed, *scope)
+
+
+def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:
+    """Severity 1 to 5 for "random": by sample in the paper's calibration, by scene in the physical one.
+
+    The paper says only that the strength is a random value from 1 to 5; weather does not change twice a second.
+    """
+    scope = sample if spec.calibration == "paper" else scene
+    return int(spec.generator("severity", scope).integers(1, 6))

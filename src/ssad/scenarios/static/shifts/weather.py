@@ -1,0 +1,202 @@
+"""Fog, rain and snow of the physical calibration.
+
+One weather a scene: its key, wind and density come from the scene alone, positions from the world, so that all cameras
+and consecutive images agree. Colour is that of the sky (dark at night).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ssad.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.scenarios.static.shifts import parameters as table
+from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
+from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, lens
+from ssad.scenarios.static.shifts.kernels import particles, veil
+from ssad.scenarios.static.shifts.spec import ShiftSpec
+from ssad.types import F64
+
+# period of the particle fields, metres; drops per m^3 follow from the size distributions
+TILE = (8.0, 8.0, 6.0)
+RAIN_LEAST, RAIN_LARGEST = 2.3, 6.0  # mm; smaller drops are part of the veil
+SNOW_LEAST, SNOW_LARGEST = 1.0, 6.0  # mm of water
+SNOW_GROWTH = 3.0  # diameter of a flake over that of its water: a density of 40 kg / m^3
+_CLOCK = 4096.0  # s after which the air repeats
+_CELLS = 16  # pixels a node of the fog's patchiness
+
+
+@dataclass(frozen=True, slots=True)
+class Weather:
+    """What is drawn once a scene: wind [3] m/s (world), colour of the air [3] in 0..1 relative to the sky's light."""
+
+    wind: F64
+    colour: F64
+    patches: float
+
+
+def scene_weather(spec: ShiftSpec, scene: str) -> Weather:
+    """The weather of a scene."""
+    draws = spec.generator("weather", scene)
+    heading = draws.uniform(-np.pi, np.pi)
+    speed = draws.uniform(0.5, 4.0) if spec.name != "snow" else draws.uniform(0.2, 2.5)
+    warm = draws.uniform(-0.02, 0.02)
+    wind = np.array([np.cos(heading) * speed, np.sin(heading) * speed, 0.0])
+    return Weather(wind, np.array([0.97 + warm, 0.98, 1.0 - warm]), float(draws.uniform(0.25, 0.5)))
+
+
+def _ages(frames: Sequence[Frame], contexts: Sequence[SceneContext]) -> list[float]:
+    """Seconds since the start of the scene."""
+    return [(f.time - c.start) % _CLOCK for f, c in zip(frames, contexts, strict=True)]
+
+
+def extinction(spec: ShiftSpec) -> float:
+    """Extinction of light by the weather, 1/m; the LiDAR twin uses the same."""
+    if spec.severity == 0:
+        return 0.0
+    step = spec.severity - 1
+    if spec.name == "fog":
+        return 3.0 / table.FOG_RANGE[step]
+    if spec.name == "rain":
+        return table.rain_extinction(table.RAIN_RATE[step])
+    return table.snow_extinction(table.SNOW_RATE[step])
+
+
+def _clear(
+    batch: Batch,
+    frames: Sequence[Frame],
+    specs: Sequence[ShiftSpec],
+    weathers: Sequence[Weather],
+    ages: Sequence[float],
+) -> tuple[Any, list[str]]:
+    """Transmittance of the air [B, h, w] at the nodes of the quarter grid, and where the depth comes from."""
+    rows, columns = grid_size(batch)
+    depth, sources = depth_grid(batch, frames)
+    density = wp.empty(
+        (batch.count, -(-batch.height // _CELLS), -(-batch.width // _CELLS)), dtype=float, device=batch.device
+    )
+    poses = np.stack([camera_to_world(f) for f in frames])
+    drift = np.stack([w.wind * age for w, age in zip(weathers, ages, strict=True)])
+    view = lens(batch, frames)
+    wp.launch(
+        veil.patchiness,
+        dim=density.shape,
+        inputs=[
+            keys_on(batch, [s.key("air", f.scene) for s, f in zip(specs, frames, strict=True)]),
+            on(batch, poses.astype(np.float32), wp.mat44),
+            view,
+            depth,
+            on(batch, drift.astype(np.float32), wp.vec3),
+            on(
+                batch, [w.patches if s.name == "fog" else 0.0 for w, s in zip(weathers, specs, strict=True)], wp.float32
+            ),
+            float(_CELLS),
+        ],
+        outputs=[density],
+        device=batch.device,
+    )
+    clear = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
+    betas = [extinction(s) for s in specs]
+    wp.launch(
+        veil.transmittance,
+        dim=(batch.count, rows),
+        inputs=[depth, view, density, on(batch, betas, wp.float32), FARTHEST],
+        outputs=[clear],
+        device=batch.device,
+    )
+    return clear, sources
+
+
+def add_fog(
+    batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
+) -> tuple[Batch, list[Applied]]:
+    """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) (Koschmieder 1924)."""
+    weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
+    ages = _ages(frames, contexts)
+    clear, sources = _clear(batch, frames, specs, weathers, ages)
+    air = np.stack([w.colour * c.light * 245 for w, c in zip(weathers, contexts, strict=True)])
+    out = batch.like()
+    wp.launch(
+        veil.blend_air,
+        dim=(batch.count, batch.height),
+        inputs=[batch.data, clear, on(batch, air.astype(np.float32), wp.vec3), batch.height, batch.width, batch.stride],
+        outputs=[out.data],
+        device=batch.device,
+    )
+    done = [
+        Applied(True, {"range_m": table.FOG_RANGE[s.severity - 1], "depth": source})
+        for s, source in zip(specs, sources, strict=True)
+    ]
+    return out, done
+
+
+def _air(spec: ShiftSpec, frame: Frame, weather: Weather) -> tuple[Any, ...]:
+    """What falls, as a row of the kernel's `Air`."""
+    snow = spec.name == "snow"
+    least, largest = (SNOW_LEAST, SNOW_LARGEST) if snow else (RAIN_LEAST, RAIN_LARGEST)
+    rate = (table.SNOW_RATE if snow else table.RAIN_RATE)[spec.severity - 1]
+    slope = table.snow_slope(rate) if snow else table.rain_slope(rate)
+    density = 2500 * rate**-0.94 if snow else 8000.0
+    in_air = density / slope * (np.exp(-slope * least) - np.exp(-slope * largest))
+    count = int(in_air * TILE[0] * TILE[1] * TILE[2])
+    growth = SNOW_GROWTH if snow else 1.0
+    wind = tuple(weather.wind)
+    return (spec.key("air", frame.scene), TILE, wind, slope, least, largest, growth, int(snow), count)
+
+
+def add_precipitation(
+    batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
+) -> tuple[Batch, list[Applied]]:
+    """rain or snow: the veil of what is far away, and streaks of what is within a few metres."""
+    weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
+    ages = _ages(frames, contexts)
+    clear, sources = _clear(batch, frames, specs, weathers, ages)
+    airs = [_air(s, f, w) for s, f, w in zip(specs, frames, weathers, strict=True)]
+    most = max(a[-1] for a in airs)
+    poses = np.stack([camera_to_world(f) for f in frames])
+    layer = wp.zeros((batch.count, -(-batch.height // 2), -(-batch.width // 2)), dtype=int, device=batch.device)
+    wp.launch(
+        particles.splat,
+        dim=(batch.count, most),
+        inputs=[
+            structs(batch, airs, particles.Air),
+            on(batch, ages, wp.float32),
+            on(batch, np.swapaxes(poses[:, :3, :3], 1, 2).astype(np.float32), wp.mat33),
+            on(batch, (poses[:, :3, 3] % np.array(TILE)).astype(np.float32), wp.vec3),
+            on(batch, np.stack([f.ego_velocity for f in frames]).astype(np.float32), wp.vec3),
+            lens(batch, frames),
+            table.EXPOSURE,
+            table.APERTURE,
+        ],
+        outputs=[layer],
+        device=batch.device,
+    )
+    sky = np.stack([w.colour * c.light for w, c in zip(weathers, contexts, strict=True)])
+    bright = np.array([255.0 if s.name == "snow" else 235.0 for s in specs])[:, None]
+    out = batch.like()
+    wp.launch(
+        veil.blend_particles,
+        dim=(batch.count, batch.height),
+        inputs=[
+            batch.data,
+            clear,
+            on(batch, (sky * 235).astype(np.float32), wp.vec3),
+            layer,
+            on(batch, (sky * bright).astype(np.float32), wp.vec3),
+            batch.height,
+            batch.width,
+            batch.stride,
+        ],
+        outputs=[out.data],
+        device=batch.device,
+    )
+    rates = [(table.SNOW_RATE if s.name == "snow" else table.RAIN_RATE)[s.severity - 1] for s in specs]
+    done = [
+        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "depth": source})
+        for rate, air, source in zip(rates, airs, sources, strict=True)
+    ]
+    return out, done

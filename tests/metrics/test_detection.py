@@ -1,0 +1,285 @@
+"""nuScenes detection scores: against a slow transcription of the rules, by hand, and under weights of the samples."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssad.datasets.nuscenes.schema import CLASSES
+from ssad.errors import FormatError
+from ssad.metrics.detection import (
+    CVPR_2019,
+    BikeRacks,
+    BoxTable,
+    DetectionConfig,
+    check_counts,
+    filter_boxes,
+    keep_boxes,
+    match,
+    scene_intervals,
+    score_detections,
+)
+from ssad.seeding import generator
+
+CAR, PEDESTRIAN, BICYCLE, CONE, BARRIER = (
+    CLASSES.index(name) for name in ("car", "pedestrian", "bicycle", "traffic_cone", "barrier")
+)
+
+
+def boxes(rows: list[tuple[Any, ...]], **columns: Any) -> BoxTable:
+    """A table of (sample, label, x, y[, score]) rows; the rest is alike unless given."""
+    n = len(rows)
+    x, y = ([float(row[i]) for row in rows] for i in (2, 3))
+    table = replace(
+        BoxTable.empty(n),
+        sample=np.array([row[0] for row in rows], np.int32),
+        label=np.array([row[1] for row in rows], np.int8),
+        translation=np.stack([x, y, np.zeros(n)], axis=-1) if n else np.zeros((0, 3)),
+        size=np.tile([2.0, 4.0, 1.5], (n, 1)),
+        rotation=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        velocity=np.zeros((n, 2)),
+        score=np.array([row[4] if len(row) > 4 else -1.0 for row in rows], np.float64),
+        ego_distance=np.hypot(x, y) if n else np.zeros(0),
+    )
+    return replace(table, **columns)
+
+
+def random_tables(key: int, *, samples: int = 6, grid: float = 0.0, levels: int = 0) -> tuple[BoxTable, BoxTable]:
+    """Truth and predictions near each other; a grid and few levels of scores make ties."""
+    random = generator("detection test", key)
+    truth, found = [], []
+    for sample in range(samples):
+        for _ in range(int(random.integers(0, 12))):
+            label = int(random.choice([CAR, PEDESTRIAN, BARRIER]))
+            place = random.uniform(-8.0, 8.0, 2)
+            place = np.round(place / grid) * grid if grid else place
+            truth.append((sample, label, *place))
+            for _ in range(int(random.integers(0, 3))):
+                near = place + random.normal(0.0, 1.0, 2)
+                near = np.round(near / grid) * grid if grid else near
+                score = int(random.integers(1, levels + 1)) / 10 if levels else random.random()
+                found.append((sample, label, *near, score))
+    real, predicted = boxes(truth), boxes(found)
+    n = len(predicted)
+    attribute = random.integers(-1, 2, len(real)).astype(np.int8)
+    real = replace(real, velocity=np.where(random.random((len(real), 2)) < 0.2, np.nan, 1.0), attribute=attribute)
+    yaw = random.uniform(-4.0, 4.0, n) / 2
+    zero = np.zeros(n)
+    return real, replace(
+        predicted,
+        rotation=np.stack([np.cos(yaw), zero, zero, np.sin(yaw)], axis=-1),
+        size=predicted.size * random.uniform(0.5, 2.0, (n, 3)),
+        velocity=random.normal(0.0, 1.0, (n, 2)),
+        attribute=random.integers(-1, 2, n).astype(np.int8),
+    )
+
+
+def greedy(truth: BoxTable, found: BoxTable, label: int, threshold: float) -> list[tuple[int, int]]:
+    """(prediction, box) pairs by the rule itself, one box after the other."""
+    own = [i for i in range(len(found)) if found.label[i] == label]
+    own = [i for _, i in sorted((float(found.score[i]), i) for i in own)][::-1]
+    taken: set[int] = set()
+    pairs = []
+    for i in own:
+        best, pick = math.inf, None
+        for g in range(len(truth)):
+            if truth.label[g] == label and truth.sample[g] == found.sample[i] and g not in taken:
+                distance = float(np.linalg.norm(found.translation[i, :2] - truth.translation[g, :2]))
+                if distance < best:
+                    best, pick = distance, g
+        if best < threshold and pick is not None:
+            taken.add(pick)
+            pairs.append((i, pick))
+    return pairs
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.0, 0.5, 1.0]), st.sampled_from([0, 1, 3]))
+def test_matches_are_those_of_the_greedy_rule(key: int, grid: float, levels: int) -> None:
+    truth, found = random_tables(key, grid=grid, levels=levels)
+    matches = match(truth, found, samples=6)
+    for label in (CAR, PEDESTRIAN, BARRIER):
+        own = np.flatnonzero(found.label == label)
+        rank = own[np.argsort(found.score[own], kind="stable")[::-1]]
+        for threshold, hits in zip(CVPR_2019.dist_ths, matches.classes[label].hits, strict=True):
+            pairs = greedy(truth, found, label, threshold)
+            assert rank[hits].tolist() == [i for i, _ in pairs]
+        pairs = greedy(truth, found, label, CVPR_2019.dist_th_tp)
+        expected = [float(np.linalg.norm(found.translation[i, :2] - truth.translation[g, :2])) for i, g in pairs]
+        assert matches.classes[label].errors[0].tolist() == expected
+
+
+def repeated(table: BoxTable, weights: np.ndarray) -> BoxTable:
+    """Each sample as often as its weight says, its copies one after the other."""
+    first = np.cumsum(weights) - weights
+    rows, sample = [], []
+    for s, weight in enumerate(weights.tolist()):
+        own = np.flatnonzero(table.sample == s)
+        for copy in range(weight):
+            rows.append(own)
+            sample.append(np.full(len(own), first[s] + copy))
+    index = np.concatenate([*rows, np.zeros(0, np.int64)]).astype(np.int64)
+    return replace(table.take(index), sample=np.concatenate([*sample, np.zeros(0)]).astype(np.int32))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.lists(st.integers(0, 3), min_size=6, max_size=6),
+    st.sampled_from([(0.0, 0), (0.5, 2), (0.5, 1)]),
+)
+def test_weights_are_repeated_samples(key: int, times: list[int], ties: tuple[float, int]) -> None:
+    truth, found = random_tables(key, grid=ties[0], levels=ties[1])
+    weights = np.array(times)
+    ours = match(truth, found, samples=6).scores(weights)
+    other = score_detections(repeated(truth, weights), repeated(found, weights), samples=max(int(weights.sum()), 1))
+    np.testing.assert_allclose(ours.ap, other.ap, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(ours.errors, other.errors, rtol=0, atol=1e-12)
+    assert ours.truth.tolist() == other.truth.tolist()
+    assert ours.predictions.tolist() == other.predictions.tolist()
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=20, deadline=None)
+def test_invariants(key: int) -> None:
+    truth, found = random_tables(key)
+    scores = score_detections(truth, found, samples=6)
+    ones = match(truth, found, samples=6).scores(np.ones(6, np.int64))
+    assert np.array_equal(scores.ap, ones.ap)
+    assert np.array_equal(scores.errors, ones.errors, equal_nan=True)
+    squeezed = score_detections(truth, replace(found, score=found.score**2), samples=6)
+    np.testing.assert_allclose(scores.ap, squeezed.ap, atol=1e-12)  # only the order of scores counts
+    order = np.array([3, 1, 5, 0, 2, 4], np.int32)
+    moved = score_detections(
+        replace(truth, sample=order[truth.sample]), replace(found, sample=order[found.sample]), samples=6
+    )
+    np.testing.assert_allclose(scores.ap, moved.ap, atol=1e-12)
+    assert 0.0 <= scores.mean_ap <= 1.0
+    assert 0.0 <= scores.nd_score <= 1.0
+
+
+def test_perfect_predictions() -> None:
+    rows = [(s, label, 3.0 * label, 2.0) for s in range(3) for label in range(10)]
+    truth = boxes(rows, attribute=np.zeros(30, np.int8))
+    found = replace(truth, score=np.full(30, 0.5))
+    scores = score_detections(truth, found, samples=3)
+    assert scores.mean_ap == pytest.approx(1.0)
+    assert scores.nd_score == pytest.approx(1.0)
+    assert all(error == 0.0 for error in scores.tp_errors.values())
+    assert math.isnan(scores.label_tp_errors["traffic_cone"]["orient_err"])
+    assert scores.truth.tolist() == [3] * 10
+
+
+def test_nothing_found_and_nothing_there() -> None:
+    truth = boxes([(0, CAR, 1.0, 1.0)])
+    for real, found in ((truth, BoxTable.empty()), (BoxTable.empty(), truth), (BoxTable.empty(), BoxTable.empty())):
+        scores = score_detections(real, found, samples=1)
+        assert scores.mean_ap == 0.0
+        assert scores.nd_score == 0.0
+        assert set(scores.tp_errors.values()) == {1.0}
+
+
+def test_a_distance_at_the_threshold_is_no_match() -> None:
+    truth = boxes([(0, CAR, 0.0, 0.0)])
+    scores = score_detections(truth, boxes([(0, CAR, 1.0, 0.0, 0.9)]), samples=1)
+    assert scores.label_aps["car"] == {"0.5": 0.0, "1.0": 0.0, "2.0": pytest.approx(1.0), "4.0": pytest.approx(1.0)}
+
+
+def test_a_barrier_has_no_front() -> None:
+    turned = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
+    truth = boxes([(0, CAR, 0.0, 0.0), (0, BARRIER, 5.0, 0.0)])
+    found = boxes([(0, CAR, 0.0, 0.0, 0.9), (0, BARRIER, 5.0, 0.0, 0.9)], rotation=turned)
+    errors = score_detections(truth, found, samples=1).label_tp_errors
+    assert errors["car"]["orient_err"] == pytest.approx(math.pi)
+    assert errors["barrier"]["orient_err"] == pytest.approx(0.0)
+
+
+def test_range_is_strict_and_by_class() -> None:
+    table = boxes([(0, CAR, 50.0, 0.0), (0, CAR, 49.9, 0.0), (0, PEDESTRIAN, 45.0, 0.0), (0, CONE, 29.0, 0.0)])
+    assert keep_boxes(table).tolist() == [False, True, False, True]
+
+
+def test_empty_boxes_are_left_out() -> None:
+    table = boxes([(0, CAR, 1.0, 0.0)] * 3)
+    assert keep_boxes(table, points=np.array([0, 1, -1])).tolist() == [False, True, True]
+
+
+def test_racks_take_the_cycles_of_their_sample() -> None:
+    turn = math.radians(90.0) / 2
+    racks = BikeRacks(
+        sample=np.array([1, 0], np.int32),
+        translation=np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]),
+        size=np.array([[2.0, 6.0, 2.0], [2.0, 6.0, 2.0]]),
+        rotation=np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(turn), 0.0, 0.0, math.sin(turn)]]),
+    )
+    rows = [
+        (0, BICYCLE, 0.0, 0.0),  # the rack there is of sample 1
+        (0, BICYCLE, 10.0, 2.9),  # turned: long in y
+        (0, BICYCLE, 12.9, 0.0),
+        (0, CAR, 10.0, 0.0),
+        (1, BICYCLE, 3.0, 1.0),  # a corner, which counts as inside
+        (1, BICYCLE, 3.01, 0.0),
+    ]
+    assert keep_boxes(boxes(rows), racks=racks).tolist() == [True, False, True, True, False, True]
+    assert len(filter_boxes(boxes(rows), racks=racks)) == 4
+
+
+def test_too_many_boxes_name_the_sample() -> None:
+    table = boxes([(1, CAR, 0.0, 0.0, 0.5)] * 501)
+    with pytest.raises(FormatError, match="sample b: 501 boxes"):
+        check_counts(table, names=["a", "b"])
+    with pytest.raises(FormatError, match="sample 1: 501 boxes"):
+        match(BoxTable.empty(), table, samples=2)
+    check_counts(table.take(np.arange(500)))
+
+
+def test_a_flat_box_is_refused_where_it_matches() -> None:
+    truth = boxes([(0, CAR, 0.0, 0.0)])
+    flat = boxes([(0, CAR, 0.0, 0.0, 0.5)], size=np.array([[1.0, 0.0, 1.0]]))
+    with pytest.raises(FormatError, match="sample s: a prediction box"):
+        match(truth, flat, samples=1, names=["s"])
+    away = replace(flat, translation=flat.translation + 30.0)
+    assert match(truth, away, samples=1).scores().mean_ap == 0.0
+
+
+def test_negative_scores_are_refused() -> None:
+    truth = boxes([(0, CAR, 0.0, 0.0), (0, CAR, 9.0, 0.0)])
+    with pytest.raises(FormatError, match="class car: scores below 0"):
+        score_detections(truth, boxes([(0, CAR, 0.0, 0.0, -2.0)]), samples=1)
+
+
+def test_weights_must_fit() -> None:
+    matches = match(*random_tables(1), samples=6)
+    for wrong in (np.ones(5, np.int64), np.array([1, 1, 1, 1, 1, -1])):
+        with pytest.raises(ValueError, match="weights"):
+            matches.scores(wrong)
+
+
+def test_intervals_over_scenes() -> None:
+    truth, found = random_tables(5, samples=40)
+    matches = match(truth, found, samples=40)
+    scene = np.repeat(np.arange(10), 4)
+    limits = scene_intervals(matches, scene, generator=generator("s"), replicates=60)
+    assert limits == scene_intervals(matches, scene, generator=generator("s"), replicates=60)
+    scores = matches.scores()
+    assert limits["mean_ap"][0] < scores.mean_ap < limits["mean_ap"][1]
+    assert limits["nd_score"][0] < limits["nd_score"][1]
+    narrow = scene_intervals(matches, scene, generator=generator("s"), replicates=60, level=0.5)
+    assert narrow["mean_ap"][1] - narrow["mean_ap"][0] < limits["mean_ap"][1] - limits["mean_ap"][0]
+    single = scene_intervals(matches, np.zeros(40, np.int64), generator=generator("s"))
+    assert all(math.isnan(v) for pair in single.values() for v in pair)
+
+
+def test_the_settings_are_the_official_ones() -> None:
+    assert CVPR_2019.classes == CLASSES
+    assert CVPR_2019.serialize()["class_range"]["pedestrian"] == 40
+    assert DetectionConfig() == CVPR_2019
+    summary = score_detections(*random_tables(2), samples=6).summary()
+    keys = ["label_aps", "mean_dist_aps", "mean_ap", "label_tp_errors", "tp_errors", "tp_scores", "nd_score", "cfg"]
+    assert list(summary) == keys
+    full = score_detections(*random_tables(2), samples=6).summary(eval_time=1.0, meta={"use_lidar": True})
+    assert set(full) - set(keys) == {"eval_time", "meta"}
