@@ -115,8 +115,10 @@ def difference(theirs: dict[str, Any], ours: dict[str, Any]) -> float:
     for key, value in theirs.items():
         if isinstance(value, dict):
             worst = max(worst, difference(value, ours[key]))
-        elif isinstance(value, float) and key != "eval_time" and not (math.isnan(value) and math.isnan(ours[key])):
-            worst = max(worst, abs(value - ours[key]))
+        elif isinstance(value, float) and key != "eval_time":
+            if math.isnan(value) != math.isnan(ours[key]):
+                return math.inf
+            worst = max(worst, abs(value - ours[key]) if not math.isnan(value) else 0.0)
     return worst
 
 

@@ -19,7 +19,7 @@ from ssad.errors import FormatError
 from ssad.metrics.detection_boxes import I64, BoxTable, DetectionConfig, yaw
 from ssad.types import F64, I32, Bool
 
-PAIRS = 1 << 20  # pairs looked at together: bounds the memory
+PAIRS = 1 << 16  # pairs looked at together: bounds the memory
 
 
 @dataclass(frozen=True)

@@ -1,24 +1,30 @@
 """The manifest of a nuScenes-N root: one line a file while it is written, one page when it is done.
 
-ROOT/manifest/SCENE.jsonl has a line a file: what was applied, severity, hash of the pixels before encoding, hash and
-size of the file, what was skipped and why. ROOT/manifest.json sums it up; it is there only when the root is complete.
+ROOT/manifest/SCENE.jsonl has a line a file: its state, what was applied, severity, hash of the pixels before encoding,
+hash and size of the file, what was skipped and why. States: shifted; linked (the clean file: the shift was not asked
+for it or changed nothing in it); absent (not asked for, and not in the dataset either); failed. ROOT/manifest.json sums
+it up; it is there only when the root is complete.
 """
 
 from __future__ import annotations
 
 import hashlib
+import heapq
+import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from ssad import safeio
 from ssad.errors import FormatError, StoreError
-from ssad.seeding import generator
+from ssad.seeding import digest
 
 PAGE: Final = "manifest.json"
 FOLDER: Final = "manifest"
-STATES: Final = ("shifted", "linked", "failed")
+TABLE: Final = "sample_annotation"
+STATES: Final = ("shifted", "linked", "absent", "failed")
 
 
 def shard_path(root: Path, scene: str) -> Path:
@@ -36,9 +42,19 @@ def read_lines(path: Path) -> dict[str, dict[str, Any]]:
             record = safeio.parse_json(line.decode(), str(path)) if line else None
         except (FormatError, UnicodeDecodeError):
             continue  # torn by a kill: the file is done again
-        if isinstance(record, dict) and "file" in record:
+        if _whole(record):
             found[record["file"]] = record
     return found
+
+
+def _whole(record: Any) -> bool:
+    """Whether a line has what the rest of the toolbox asks of it."""
+    if not isinstance(record, dict) or record.get("state") not in STATES:
+        return False
+    names = ["file", "kind"] + (["hash"] if record["state"] == "shifted" else [])
+    names += ["reason"] if record["state"] == "failed" else []
+    sized = record["state"] != "shifted" or isinstance(record.get("bytes"), int)
+    return sized and all(isinstance(record.get(name), str) for name in names)
 
 
 def text(records: Iterable[Mapping[str, Any]]) -> str:
@@ -46,37 +62,70 @@ def text(records: Iterable[Mapping[str, Any]]) -> str:
     return "".join(safeio.dump_json(dict(r)) + "\n" for r in sorted(records, key=lambda r: str(r["file"])))
 
 
-def digest_bytes(data: bytes) -> str:
+def digest_bytes(data: bytes | memoryview) -> str:
     """Hash that manifests use: 32 hex digits of BLAKE2b."""
     return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 def digest_file(path: Path) -> str:
-    """The same of a file. FormatError when it cannot be read."""
-    return digest_bytes(safeio.read_bytes(path, limit=1 << 30))
+    """The same of a file of any size. FormatError when it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+    except FileNotFoundError:
+        raise FormatError(f"{path}: no such file") from None
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts over the lines of a root, added scene by scene so that memory is that of one scene."""
+
+    scenes: dict[str, str] = field(default_factory=dict)
+    files: Counter[str] = field(default_factory=Counter)
+    states: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+    images: int = 0
+    changed: int = 0
+    reasons: list[str] = field(default_factory=list)
+
+    def add(self, scene: str, records: Iterable[Mapping[str, Any]]) -> None:
+        """The lines of a scene."""
+        rows = list(records)
+        self.scenes[scene] = digest_bytes(text(rows).encode())
+        for record in rows:
+            self.files[f"{record['kind']} {record['state']}"] += 1
+            self.states[record["state"]] += 1
+            self.skipped.update(record.get("skipped") or {})
+            if record["kind"] == "camera":
+                self.images += 1
+                self.changed += bool(record.get("changed"))
+            if record["state"] == "failed":
+                self.reasons.append(record["reason"])
+            elif "reason" in record:
+                self.skipped[record["reason"]] += 1
+
+    @property
+    def applied(self) -> float:
+        """Share of the images that changed."""
+        return self.changed / max(self.images, 1)
 
 
 def page(
-    identity: Mapping[str, Any],
-    source: Mapping[str, Any],
-    records: Mapping[str, Sequence[Mapping[str, Any]]],
-    labels: str,
+    identity: Mapping[str, Any], source: Mapping[str, Any], tally: Tally, *, labels: str, transformed: str
 ) -> dict[str, Any]:
-    """manifest.json of a complete root: identity, source, counts, and the hash of each scene's lines."""
-    everything = [r for rows in records.values() for r in rows]
-    cameras = [r for r in everything if r["kind"] == "camera"]
-    skipped: Counter[str] = Counter()
-    for record in everything:
-        skipped.update(record.get("skipped", {}))
+    """manifest.json of a complete root: identity, source, counts, hashes of each scene's lines and of the new boxes."""
     return {
         "identity": dict(identity),
         "source": dict(source),
         "labels": labels,
-        "scenes": {scene: digest_bytes(text(rows).encode()) for scene, rows in sorted(records.items())},
-        "files": dict(sorted(Counter(f"{r['kind']} {r['state']}" for r in everything).items())),
-        "images": len(cameras),
-        "applied": sum(bool(r.get("changed")) for r in cameras) / max(len(cameras), 1),
-        "skipped": dict(sorted(skipped.items())),
+        "transformed": transformed,
+        "scenes": dict(sorted(tally.scenes.items())),
+        "files": dict(sorted(tally.files.items())),
+        "images": tally.images,
+        "applied": tally.applied,
+        "skipped": dict(sorted(tally.skipped.items())),
     }
 
 
@@ -88,7 +137,10 @@ def read_manifest(root: Path) -> dict[str, Any] | None:
             raise StoreError(f"{root}: nuScenes-N that is not complete (no {PAGE}); run the same ssad shift again")
         return None
     data = safeio.read_json(path)
-    if not isinstance(data, dict) or not {"identity", "source", "scenes", "images"} <= set(data):
+    kinds = {"identity": dict, "source": dict, "scenes": dict, "images": int, "labels": str, "transformed": str}
+    if not isinstance(data, dict) or any(not isinstance(data.get(name), kind) for name, kind in kinds.items()):
+        raise FormatError(f"{path}: not a manifest written by ssad shift")
+    if any(not isinstance(data["source"].get(n), k) for n, k in (("root", str), ("version", str), ("tables", dict))):
         raise FormatError(f"{path}: not a manifest written by ssad shift")
     return data
 
@@ -102,44 +154,50 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
     """The manifest of a root after a check that its data are shifted indeed; None for a clean dataset.
 
     Lines must be those that the page has hashes of; each file must be there with its size, and not be a link to the
-    clean one; `sample` of them, by a fixed draw, are hashed. scenes: names that must be covered. StoreError.
+    clean one; `sample` of them, by a fixed draw, are hashed; the boxes must be those that the page names. scenes:
+    names that must be covered, and the only ones looked at; none: all of them. StoreError.
     """
     root = Path(root)
     manifest = read_manifest(root)
     if manifest is None:
         return None
-    missing = sorted(set(scenes) - set(manifest["scenes"]))
+    wanted = sorted(set(scenes))
+    missing = [scene for scene in wanted if scene not in manifest["scenes"]]
     if missing:
         more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise StoreError(
             f"{root}: these scenes are not shifted: {', '.join(missing[:3])}{more}; run ssad shift for them"
         )
-    shifted = []
-    for scene, expected in manifest["scenes"].items():
+    for problem in _wrong_boxes(root, manifest):
+        raise StoreError(f"{problem}; run the same ssad shift again")
+    draw: list[tuple[str, str, str]] = []
+    for scene in wanted or manifest["scenes"]:
         lines = read_lines(shard_path(root, scene))
-        if digest_bytes(text(lines.values()).encode()) != expected:
+        if digest_bytes(text(lines.values()).encode()) != manifest["scenes"][scene]:
             raise StoreError(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of; run ssad shift again")
         for record in lines.values():
-            problem = _wrong(root, record)
+            problem = _wrong(root, record, manifest)
             if problem:
                 raise StoreError(f"{root / record['file']}: {problem}; run the same ssad shift again")
-            if record["state"] == "shifted":
-                shifted.append(record)
-    draw = generator("manifest check", str(manifest["identity"]))
-    for index in draw.permutation(len(shifted))[:sample]:
-        record = shifted[int(index)]
-        if digest_file(root / record["file"]) != record["hash"]:
-            raise StoreError(f"{root / record['file']}: not the bytes in the manifest; run ssad shift again")
+        shifted = ((r["file"], r["hash"]) for r in lines.values() if r["state"] == "shifted")
+        draw = heapq.nsmallest(sample, [*draw, *((digest("manifest check", *pair), *pair) for pair in shifted)])
+    for _, name, expected in draw:
+        if digest_file(root / name) != expected:
+            raise StoreError(f"{root / name}: not the bytes in the manifest; run the same ssad shift again")
     return manifest
 
 
-def _wrong(root: Path, record: Mapping[str, Any]) -> str | None:
-    """What is wrong with a file, going by its name and size alone."""
+def _wrong(root: Path, record: Mapping[str, Any], manifest: Mapping[str, Any]) -> str | None:
+    """What is wrong with a file, going by its name, size and link alone."""
     path = root / record["file"]
     if record["state"] == "failed":
         return f"failed: {record['reason']}"
+    if record["state"] == "absent":
+        return "there, where the dataset has none" if path.is_symlink() or path.exists() else None
     if record["state"] == "linked":
-        return None if path.is_symlink() and path.exists() else "the link to the unchanged file is gone or broken"
+        return (
+            None if leads_to(path, Path(manifest["source"]["root"]) / record["file"]) else "no link to the clean file"
+        )
     if path.is_symlink():
         return "a link, where the manifest says that it was shifted"
     if not path.is_file():
@@ -148,26 +206,57 @@ def _wrong(root: Path, record: Mapping[str, Any]) -> str | None:
     return None if size == record["bytes"] else f"{size} bytes, {record['bytes']} in the manifest"
 
 
+def leads_to(link: Path, source: Path) -> bool:
+    """Whether `link` is a symbolic link to `source`, which is there."""
+    try:
+        return link.is_symlink() and os.path.samefile(link, source)
+    except OSError:
+        return False
+
+
+def _wrong_boxes(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
+    """Whether sample_annotation.json is the set of boxes that the page names."""
+    version = manifest["source"]["version"]
+    path = root / version / f"{TABLE}.json"
+    new = manifest["labels"] == "transformed"
+    expected = root / version / f"{TABLE}.transformed.json"
+    if not leads_to(path, expected if new else Path(manifest["source"]["root"]) / version / f"{TABLE}.json"):
+        yield f"{path}: no link to the {manifest['labels']} boxes, which {PAGE} names"
+
+
 def verify(root: Path) -> tuple[int, list[str]]:
-    """Hashes every file of a root: their number, and one line for each that is not as the manifest says."""
+    """Hashes every file and table of a root: the number of files, and a line for each that is not as in the manifest.
+
+    StoreError for a root without a manifest; FormatError when that is broken.
+    """
     root = Path(root)
     manifest = read_manifest(root)
     if manifest is None:
         raise StoreError(f"{root}: not written by ssad shift (no {PAGE})")
-    count, problems = 0, []
-    for scene, expected in manifest["scenes"].items():
+    count, problems = 0, list(_wrong_boxes(root, manifest))
+    version = manifest["source"]["version"]
+    expected = {name: text for name, text in manifest["source"]["tables"].items() if name != TABLE}
+    expected |= {f"{TABLE}.original": manifest["source"]["tables"].get(TABLE)}
+    expected |= {f"{TABLE}.transformed": manifest["transformed"]}
+    for name, hashed in sorted(expected.items()):
+        problems += _wrong_bytes(root / version / f"{name}.json", hashed)
+    for scene, hashed in manifest["scenes"].items():
         lines = read_lines(shard_path(root, scene))
-        if digest_bytes(text(lines.values()).encode()) != expected:
+        if digest_bytes(text(lines.values()).encode()) != hashed:
             problems.append(f"{shard_path(root, scene)}: not the lines that {PAGE} was made of")
         for record in lines.values():
             count += 1
-            problem = _wrong(root, record)
-            if (
-                problem is None
-                and record["state"] == "shifted"
-                and digest_file(root / record["file"]) != record["hash"]
-            ):
-                problem = "not the bytes in the manifest"
+            problem = _wrong(root, record, manifest)
             if problem:
                 problems.append(f"{root / record['file']}: {problem}")
+            elif record["state"] == "shifted":
+                problems += _wrong_bytes(root / record["file"], record["hash"])
     return count, problems
+
+
+def _wrong_bytes(path: Path, expected: str) -> list[str]:
+    """A line when a file has another hash or cannot be read."""
+    try:
+        return [] if digest_file(path) == expected else [f"{path}: not the bytes in the manifest"]
+    except FormatError as error:
+        return [str(error)]

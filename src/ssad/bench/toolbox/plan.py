@@ -40,6 +40,8 @@ class Options:
     subsampling: str = "auto"
 
     def __post_init__(self) -> None:
+        for name in ("shifts", "severities", "scenes"):  # asked for twice: written once
+            object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
         if not self.shifts or not self.severities:
             raise ConfigError("no shift or no severity to apply")
         if self.labels not in ("original", "transformed"):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from ssad.datasets.nuscenes.files import read_image, read_points
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
@@ -61,9 +62,14 @@ class SceneShifter:
             return self.base
         return self.base.at(random_severity(self.base, frame.scene_token, frame.sample_token))
 
-    @cached_property
+    @property
     def context(self) -> SceneContext:
         """Brightness of the sky and viewing directions, from the first sample whose images can be read."""
+        return self._opening[1]
+
+    @cached_property
+    def _opening(self) -> tuple[str, SceneContext]:
+        """The context, and the token of the sample it was measured on ("" when none can be read)."""
         start = self.scene.frames[0].timestamp_us / 1e6 if self.scene.frames else 0.0
         token = self.scene.record.token
         for sample in self.scene.samples:
@@ -78,8 +84,30 @@ class SceneShifter:
                 continue
             if images:
                 views = tuple(viewing_direction(self._frame(f, Boxes3D.empty(), None)) for f in cameras)
-                return SceneContext(token, sky_light(images), views, start)
-        return SceneContext(token, start=start)
+                return sample.token, SceneContext(token, sky_light(images), views, start)
+        return "", SceneContext(token, start=start)
+
+    def basis(self, frame: SensorFrame) -> dict[str, str]:
+        """What else of the dataset decides about a frame under weather: plain data for the manifest.
+
+        context: token of the sample that gave the brightness of the sky; sweep: name of the LiDAR file that gave
+        depth, "" when it could not be read. A better basis, after the dataset was mended, means another picture.
+        """
+        found = {}
+        if self.base.family == "environment":
+            found["context"] = self._opening[0]
+        if frame.modality == "camera" and self._uses_depth and self._sweeps:
+            sweep = self._nearest(frame)
+            found["sweep"] = sweep.filename if self._read(sweep) is not None else ""
+        return found
+
+    def outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
+        """Whether a frame made on this basis would now have a better one."""
+        order = {sample.token: n for n, sample in enumerate(self.scene.samples)}
+        made = order.get(str(basis["context"]), len(order)) if "context" in basis else 0
+        if made and order.get(self._opening[0], len(order)) < made:
+            return True
+        return basis.get("sweep") == "" and self.basis(frame).get("sweep") != ""
 
     def velocity(self, frame: SensorFrame) -> F64:
         """Velocity [3] of the ego, m/s, world: from the poses of the channel before and after."""
@@ -89,22 +117,38 @@ class SceneShifter:
         span = times[after] - times[before]
         return np.asarray((places[after] - places[before]) / span) if span > 0 else np.zeros(3)
 
-    def _cloud(self, frame: SensorFrame) -> F32:
-        """Points of the sweep, the last few kept."""
+    def cloud(self, frame: SensorFrame) -> F32:
+        """The clean points [P, 5] of a sweep, the last few kept. FormatError."""
         if frame.token not in self._clouds:
             self._clouds[frame.token] = read_points(self.root / frame.filename)
+            self._clouds[frame.token].setflags(write=False)
             while len(self._clouds) > 4:
                 self._clouds.popitem(last=False)
         return self._clouds[frame.token]
 
+    @property
+    def _uses_depth(self) -> bool:
+        """Whether images take depth from the LiDAR."""
+        return self.base.calibration == "physical" and self.base.name in ("fog", "rain", "snow", "sunlight")
+
+    def _nearest(self, frame: SensorFrame) -> SensorFrame:
+        """The nearest sweep in time."""
+        return self._sweeps[int(np.abs(self._sweep_times - frame.timestamp_us).argmin())]
+
+    def _read(self, sweep: SensorFrame) -> F32 | None:
+        """Points of the sweep; None when they cannot be read."""
+        try:
+            return self.cloud(sweep)
+        except FormatError:
+            return None
+
     def _points(self, frame: SensorFrame) -> F32 | None:
-        """The nearest sweep in time, in the frame of a camera; None without LiDAR or when it cannot be read."""
+        """The nearest sweep in the frame of a camera; None without LiDAR or when it cannot be read."""
         if not self._sweeps:
             return None
-        sweep = self._sweeps[int(np.abs(self._sweep_times - frame.timestamp_us).argmin())]
-        try:
-            cloud = self._cloud(sweep)
-        except FormatError:
+        sweep = self._nearest(frame)
+        cloud = self._read(sweep)
+        if cloud is None:
             return None
         to_camera = np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego) @ sweep.ego_to_world @ sweep.sensor_to_ego
         return np.asarray(cloud[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3], np.float32)
@@ -126,11 +170,9 @@ class SceneShifter:
 
     def camera_frame(self, frame: SensorFrame) -> Frame:
         """What the shift is told about an image."""
-        family, name = self.base.family, self.base.name
-        boxes = boxes_of(self.scene.annotations_of(frame)) if family == "object" else Boxes3D.empty()
-        depth = family == "environment" and self.base.calibration == "physical"
-        points = self._points(frame) if depth and name in ("fog", "rain", "snow", "sunlight") else None
-        return self._frame(frame, boxes, points)
+        objects = self.base.family == "object"
+        boxes = boxes_of(self.scene.annotations_of(frame)) if objects else Boxes3D.empty()
+        return self._frame(frame, boxes, self._points(frame) if self._uses_depth else None)
 
     def read(self, frame: SensorFrame) -> U8:
         """The clean image. FormatError, also when its size is not what the tables say."""
@@ -142,19 +184,32 @@ class SceneShifter:
             )
         return image
 
-    def images(self, frames: Sequence[SensorFrame], *, device: str | None = None) -> tuple[list[U8], list[Applied]]:
-        """Shifted images [H, W, 3] of camera frames of one size, and what was done. FormatError."""
-        clean = np.stack([self.read(f) for f in frames])
+    def images(
+        self, frames: Sequence[SensorFrame], *, clean: Sequence[U8] | None = None, device: str | None = None
+    ) -> tuple[list[U8], list[Applied]]:
+        """Shifted images [H, W, 3] of camera frames of one size, and what was done. FormatError.
+
+        clean: the images from `read`, where they are at hand.
+        """
+        pixels = [self.read(f) for f in frames] if clean is None else clean
         specs = [self.spec(f) for f in frames]
-        views = [self.camera_frame(f) for f in frames]
-        contexts = {self.context.scene: self.context} if self.base.family == "environment" else None
-        out, done = shift_images(clean, views, specs, contexts=contexts, device=device)
+        # tables without sizes: that of the image
+        sized = [
+            f if f.width and f.height else replace(f, width=p.shape[1], height=p.shape[0])
+            for f, p in zip(frames, pixels, strict=True)
+        ]
+        views = [self.camera_frame(f) for f in sized]
+        out, done = shift_images(np.stack(pixels), views, specs, contexts=self._contexts, device=device)
         return list(out), done
 
-    def image(self, frame: SensorFrame) -> tuple[U8, Applied]:
+    def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, Applied]:
         """One shifted image. FormatError."""
-        images, done = self.images([frame])
+        images, done = self.images([frame], clean=None if clean is None else [clean])
         return images[0], done[0]
+
+    @property
+    def _contexts(self) -> dict[str, SceneContext] | None:
+        return {self.context.scene: self.context} if self.base.family == "environment" else None
 
     def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
         """The shifted points [P, 5] of a LiDAR frame. FormatError."""
@@ -168,22 +223,30 @@ class SceneShifter:
             self.velocity(frame),
             boxes,
         )
-        contexts = {self.context.scene: self.context} if self.base.family == "environment" else None
-        return shift_points(self._cloud(frame), sweep, self.spec(frame), contexts=contexts)
+        return shift_points(self.cloud(frame), sweep, self.spec(frame), contexts=self._contexts)
 
-    def labels(self, sample_token: str) -> Annotations:
-        """The boxes of a sample as they stand after the shift, with the points that are left in each."""
+    def key_sweep(self, sample_token: str) -> SensorFrame | None:
+        """The LiDAR frame of a sample, if it has one."""
+        return next((f for f in self._sweeps if f.key_frame and f.sample_token == sample_token), None)
+
+    def labels(self, sample_token: str, *, lidar: bool | None = True) -> Annotations:
+        """The boxes of a sample as they stand after the shift, with the points that are in each. FormatError.
+
+        lidar: count the points in the shifted sweep (True), in the clean one (False), or leave the counts (None).
+        Severity 0 changes nothing, counts included.
+        """
         found = self.scene.annotations(sample_token)
-        sweep = next((f for f in self._sweeps if f.key_frame and f.sample_token == sample_token), None)
-        frame = sweep or next(f for f in self.scene.frames if f.sample_token == sample_token)
+        frame = next((f for f in self.scene.frames if f.sample_token == sample_token), None)
+        if frame is None or self.spec(frame).severity == 0:
+            return found
         boxes = transformed_boxes(self.spec(frame), boxes_of(found), scene=frame.scene_token, sample=sample_token)
-        points = found.lidar_points
-        if sweep is not None and len(boxes):
-            points = _count(self.points(sweep)[0], sweep, boxes)
+        points, sweep = found.lidar_points, self.key_sweep(sample_token)
+        if sweep is not None and lidar is not None:
+            points = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
         return replace(found, centre=boxes.centre, size=boxes.size, rotation=boxes.rotation, lidar_points=points)
 
 
-def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> np.ndarray[tuple[int], np.dtype[np.int32]]:
+def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> npt.NDArray[np.int32]:
     """Points in each box."""
     from ssad.scenarios.static.shifts.lidar import inside
     from ssad.scenarios.static.shifts.objects import affine

@@ -23,7 +23,7 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 
 @lru_cache(maxsize=1)
-def _normal() -> npt.NDArray[np.float64]:
+def unit_normal() -> npt.NDArray[np.float64]:
     """Inverse distribution function of the unit normal at 65,536 midpoints, symmetric, of unit deviation."""
     inverse = NormalDist().inv_cdf
     upper = np.array([inverse(0.5 + (i + 0.5) / 65536) for i in range(32768)])
@@ -35,7 +35,7 @@ def _normal() -> npt.NDArray[np.float64]:
 def noise_table(name: str, severity: int, calibration: str) -> npt.NDArray[np.int16]:
     """int16 [65536]: grey levels to add for a uniform 16-bit number."""
     level = 255.0 * (GAUSSIAN if name == "gaussian" else UNIFORM)[severity - 1]
-    values = level * (_normal() if name == "gaussian" else (np.arange(65536) + 0.5) / 32768 - 1)
+    values = level * (unit_normal() if name == "gaussian" else (np.arange(65536) + 0.5) / 32768 - 1)
     rounded = np.floor(values) if calibration == "paper" else np.rint(values)
     return rounded.astype(np.int16)
 

@@ -327,7 +327,7 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
                 device=device,
             )
         return out, done
-    nodes = wp.zeros(plan.node_count, dtype=wp.vec3, device=device)
+    nodes = wp.zeros(plan.node_count, dtype=wp.vec4, device=device)
     tallest = max(row[16] for row in plan.items)
     wp.launch(
         kernels.displace,

@@ -8,6 +8,7 @@ scale nothing, lengths in pixels hold at a width of 1600 and scale with the widt
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
 from ssad.scenarios.static.shifts.depth import grid_size
 from ssad.scenarios.static.shifts.kernels import layers, veil
+from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
@@ -60,7 +62,8 @@ def _falling(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) 
             size = draws.uniform(0.4, 0.6)
             speed = draws.uniform(0.04, 0.20)
             # a share `density` of the cells is wet; a drop is as large as size says, its streak as long as speed says
-            mean, deviation, threshold, keep = 0.55, 0.25, 1.1 - density, 1.0
+            mean, deviation, keep = 0.4, 0.2, 1.0
+            threshold = NormalDist(mean, deviation).inv_cdf(1 - density)
             zoom, angle = 2.0 + 4.0 * (1.0 - size), np.radians(-90 + draws.uniform(-15, 15))
             taps = max(4.0, speed * batch.height / 4)
             sigma = taps / 2
@@ -83,14 +86,19 @@ def _falling(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) 
     device = batch.device
     noise, field, layer = (wp.empty(shape, dtype=float, device=device) for shape in (small, half, half))
     numbers = [_key(s, f) for s, f in zip(specs, frames, strict=True)]
-    everything = on(batch, np.full(batch.count, -9.0, np.float32), wp.float32)
-    inputs = [keys_on(batch, numbers), column("mean"), column("deviation"), everything]
-    wp.launch(layers.specks, dim=small, inputs=inputs, outputs=[noise], device=device)
+    normal = on(batch, unit_normal().astype(np.float32), wp.float32)
+    inputs = [keys_on(batch, numbers), column("mean"), column("deviation"), normal]
+    wp.launch(layers.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=device)
     inputs = [noise, column("zoom"), column("threshold")]
     wp.launch(layers.enlarge, dim=half[:2], inputs=inputs, outputs=[field], device=device)
-    steps = np.array([[row["dx"], row["dy"]] for row in rows], np.float32)
-    taps = on(batch, [int(row["taps"]) for row in rows], wp.int32)
-    inputs = [field, on(batch, steps, wp.vec2), taps, column("sigma")]
+    # at most 12 cells a streak: it is smooth along itself
+    taps = np.arange(max(int(row["taps"]) for row in rows)).astype(float)
+    taps = taps[:: -(-len(taps) // 12)]
+    steps = np.array([[row["dx"], row["dy"]] for row in rows])
+    offsets = np.rint(steps[:, None] * taps[None, :, None]).astype(np.int32)
+    weights = np.stack([np.where(taps < row["taps"], np.exp(-(taps**2) / (2 * row["sigma"] ** 2)), 0) for row in rows])
+    weights /= weights.sum(1, keepdims=True)
+    inputs = [field, on(batch, offsets, wp.vec2i), on(batch, weights.astype(np.float32), wp.float32)]
     wp.launch(layers.streaks, dim=half[:2], inputs=inputs, outputs=[layer], device=device)
     out = batch.like()
     highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
@@ -132,8 +140,11 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     )
     values = clouds.numpy().reshape(batch.count, -1)
     low, span = values.min(1), np.maximum(np.ptp(values, axis=1), 1e-6)
-    size = batch.height * batch.width * 3
-    most = batch.data.numpy().reshape(batch.count, batch.stride)[:, :size].max(1) / 255
+    highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
+    dim = (batch.count, batch.height)
+    inputs = [batch.data, batch.width, batch.stride]
+    wp.launch(layers.brightest, dim=dim, inputs=inputs, outputs=[highest], device=batch.device)
+    most = highest.numpy().max(1) / 255
     out = batch.like()
     numbers = [on(batch, np.asarray(v, np.float32), wp.float32) for v in (low, span, amount, most, grey)]
     wp.launch(

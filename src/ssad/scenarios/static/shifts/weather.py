@@ -145,7 +145,8 @@ def _air(spec: ShiftSpec, frame: Frame, weather: Weather) -> tuple[Any, ...]:
     count = int(in_air * TILE[0] * TILE[1] * TILE[2])
     growth = SNOW_GROWTH if snow else 1.0
     wind = tuple(weather.wind)
-    return (spec.key("air", frame.scene), TILE, wind, slope, least, largest, growth, int(snow), count)
+    reach, drag = 1 - np.exp(-slope * (largest - least)), 10.3 * np.exp(-0.6 * least)
+    return (spec.key("air", frame.scene), TILE, wind, slope, least, reach, drag, growth, int(snow), count)
 
 
 def add_precipitation(

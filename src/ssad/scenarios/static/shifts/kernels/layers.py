@@ -5,27 +5,27 @@ import warp as wp
 from ssad.scenarios.static.shifts.kernels.shared import byte, cell, draw, unit
 
 
-@wp.func
-def normal(bits: wp.uint64) -> float:
-    """A draw of the unit normal (Box and Muller)."""
-    r = wp.sqrt(-2.0 * wp.log(unit(bits, 0)))
-    return r * wp.cos(6.2831853 * unit(bits, 16))
-
-
 @wp.kernel
 def specks(
     keys: wp.array(dtype=wp.uint64),
     mean: wp.array(dtype=float),
     deviation: wp.array(dtype=float),
-    threshold: wp.array(dtype=float),
+    normal: wp.array(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Normal noise, 0 under the threshold, at most 1: flakes or drops before they are enlarged and blurred."""
-    b, y, x = wp.tid()
-    value = mean[b] + deviation[b] * normal(draw(keys[b], y * out.shape[2] + x))
-    if value < threshold[b]:
-        value = 0.0
-    out[b, y, x] = wp.clamp(value, 0.0, 1.0)
+    """Normal noise in [0, 1]: flakes or drops before they are enlarged, cut off and blurred.
+
+    normal: inverse distribution function at 65,536 midpoints; four cells a hash.
+    """
+    b, y = wp.tid()
+    columns = out.shape[2]
+    for q in range((columns + 3) / 4):
+        bits = draw(keys[b], y * 4096 + q)
+        for k in range(4):
+            x = 4 * q + k
+            if x < columns:
+                u = int((bits >> wp.uint64(16 * k)) & wp.uint64(65535))
+                out[b, y, x] = wp.clamp(mean[b] + deviation[b] * normal[u], 0.0, 1.0)
 
 
 @wp.func
@@ -58,25 +58,23 @@ def enlarge(
 @wp.kernel
 def streaks(
     grid: wp.array3d(dtype=float),
-    step: wp.array(dtype=wp.vec2),
-    taps: wp.array(dtype=int),
-    sigma: wp.array(dtype=float),
+    offsets: wp.array2d(dtype=wp.vec2i),
+    weights: wp.array2d(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Blurs along one direction: one-sided gaussian weights, as ImageMagick's motion blur."""
+    """Blurs along one direction: the weighted mean of cells at some offsets (x, y), held at the border."""
     b, y = wp.tid()
     rows = grid.shape[1]
     columns = grid.shape[2]
     for x in range(columns):
-        total = float(0.0)
-        weight = float(0.0)
-        for k in range(taps[b]):
-            px = wp.clamp(x + int(wp.floor(step[b][0] * float(k) + 0.5)), 0, columns - 1)
-            py = wp.clamp(y + int(wp.floor(step[b][1] * float(k) + 0.5)), 0, rows - 1)
-            w = wp.exp(-float(k * k) / (2.0 * sigma[b] * sigma[b]))
-            total += w * grid[b, py, px]
-            weight += w
-        out[b, y, x] = total / weight
+        out[b, y, x] = 0.0
+    for k in range(weights.shape[1]):
+        w = weights[b, k]
+        if w > 0.0:
+            py = wp.clamp(y + offsets[b, k][1], 0, rows - 1)
+            dx = offsets[b, k][0]
+            for x in range(columns):
+                out[b, y, x] = out[b, y, x] + w * grid[b, py, wp.clamp(x + dx, 0, columns - 1)]
 
 
 @wp.kernel
@@ -97,24 +95,33 @@ def blend_layer(
     """
     b, y = wp.tid()
     start = b * stride + y * width * 3
-    part = keep[b]
-    most = float(0.0)
-    for x in range(width):
-        i = start + x * 3
-        red = float(image[i])
-        green = float(image[i + 1])
-        blue = float(image[i + 2])
-        white = (0.299 * red + 0.587 * green + 0.114 * blue) * 1.5 + 127.5
-        flake = layer[b, y / 2, x / 2] + layer[b, (height - 1 - y) / 2, (width - 1 - x) / 2]
-        add = flake * 255.0
-        red = wp.min(part * red + (1.0 - part) * wp.max(red, white) + add, 255.0) * (1.0 - grey) + 128.0 * grey
-        green = wp.min(part * green + (1.0 - part) * wp.max(green, white) + add, 255.0) * (1.0 - grey) + 128.0 * grey
-        blue = wp.min(part * blue + (1.0 - part) * wp.max(blue, white) + add, 255.0) * (1.0 - grey) + 128.0 * grey
-        most = wp.max(most, wp.max(red, wp.max(green, blue)))
-        out[i] = wp.uint8(red + 0.5)
-        out[i + 1] = wp.uint8(green + 0.5)
-        out[i + 2] = wp.uint8(blue + 0.5)
-    highest[b, y] = int(most + 0.5)
+    part = int(keep[b] * 256.0 + 0.5)
+    most = int(0)
+    last = layer.shape[2] - 1
+    rest = int((1.0 - grey) * 1024.0)
+    base = int(128.0 * grey * 1024.0) + 512
+    for q in range(layer.shape[2]):
+        add = int((layer[b, y / 2, q] + layer[b, (height - 1 - y) / 2, last - q]) * 255.0)
+        for k in range(2):
+            x = 2 * q + k
+            if x < width:
+                i = start + x * 3
+                r = int(image[i])
+                g = int(image[i + 1])
+                w = int(image[i + 2])
+                if part < 256:
+                    white = (((77 * r + 150 * g + 29 * w) * 3) >> 9) + 127
+                    r = (part * r + (256 - part) * wp.max(r, white)) >> 8
+                    g = (part * g + (256 - part) * wp.max(g, white)) >> 8
+                    w = (part * w + (256 - part) * wp.max(w, white)) >> 8
+                r = (wp.min(r + add, 255) * rest + base) >> 10
+                g = (wp.min(g + add, 255) * rest + base) >> 10
+                w = (wp.min(w + add, 255) * rest + base) >> 10
+                most = wp.max(most, wp.max(r, wp.max(g, w)))
+                out[i] = wp.uint8(r)
+                out[i + 1] = wp.uint8(g)
+                out[i + 2] = wp.uint8(w)
+    highest[b, y] = most
 
 
 @wp.kernel
@@ -132,6 +139,17 @@ def darken(gain: wp.array(dtype=int), words: int, chunk: int, data: wp.array(dty
         third = wp.min((((word >> wp.uint32(16)) & limit) * factor) >> wp.uint32(8), limit)
         high = wp.min(((word >> wp.uint32(24)) * factor) >> wp.uint32(8), limit)
         data[i] = low | (second << wp.uint32(8)) | (third << wp.uint32(16)) | (high << wp.uint32(24))
+
+
+@wp.kernel
+def brightest(image: wp.array(dtype=wp.uint8), width: int, stride: int, highest: wp.array2d(dtype=int)):
+    """The largest value of each row."""
+    b, y = wp.tid()
+    most = int(0)
+    start = b * stride + y * width * 3
+    for i in range(start, start + width * 3):
+        most = wp.max(most, int(image[i]))
+    highest[b, y] = most
 
 
 @wp.kernel

@@ -103,12 +103,13 @@ def displace(
     items: wp.array(dtype=Item),
     points: wp.array(dtype=wp.vec2),
     lens: wp.array(dtype=wp.vec4),
-    nodes: wp.array(dtype=wp.vec3),
+    nodes: wp.array(dtype=wp.vec4),
 ):
-    """Where each node of an item's grid takes its colour from: (dx, dy), and 1 inside the new box.
+    """Where each node of an item's grid takes its colour from.
 
-    Inside, the viewing ray meets the surface of the new box, and the same point of the old box is looked up. Around it
-    the surroundings stretch or shrink radially up to a margin, so that no hole opens.
+    (dx, dy, pixels inside the new outline, 1 where the surroundings must stretch). Inside, the viewing ray meets the
+    surface of the new box, and the same point of the old box is looked up. Where the new outline lies inside the old
+    one, the surroundings stretch radially to fill the gap; elsewhere they stay.
     """
     k, row = wp.tid()
     item = items[k]
@@ -130,23 +131,41 @@ def displace(
             t1 = (0.5 - o[axis]) / speed
             enter = wp.max(enter, wp.min(t0, t1))
             leave = wp.min(leave, wp.max(t0, t1))
-        result = wp.vec3(0.0, 0.0, 0.0)
+        result = wp.vec4(0.0, 0.0, -1.0e3, 0.0)
+        away = p - item.middle
+        r = wp.length(away)
+        u = wp.vec2(1.0, 0.0)
+        if r > 1.0e-3:
+            u = away / r
+        new = outline_reach(points, item.new_first, item.new_count, item.middle, u)
         if enter <= leave and enter > 0.0:
             q = item.back * (o + d * enter) + item.back_origin
             z = wp.max(q[2], 0.2)
-            result = wp.vec3(focal[0] * q[0] / z + focal[2] - p[0], focal[1] * q[1] / z + focal[3] - p[1], 1.0)
+            dx = focal[0] * q[0] / z + focal[2] - p[0]
+            dy = focal[1] * q[1] / z + focal[3] - p[1]
+            result = wp.vec4(dx, dy, wp.max(new - r, 0.0), 0.0)
         else:
-            away = p - item.middle
-            r = wp.length(away)
-            if r > 1.0e-3:
-                u = away / r
-                new = outline_reach(points, item.new_first, item.new_count, item.middle, u)
-                old = outline_reach(points, item.old_first, item.old_count, item.middle, u)
-                edge = wp.max(new, old) * 1.25 + 8.0
+            old = outline_reach(points, item.old_first, item.old_count, item.middle, u)
+            if old > new:
+                edge = old * 1.25 + 8.0
                 if r < edge:
                     source = old + (wp.max(r, new) - new) * (edge - old) / (edge - new)
-                    result = wp.vec3(u[0] * (source - r), u[1] * (source - r), 0.0)
+                    result = wp.vec4(u[0] * (source - r), u[1] * (source - r), new - r, 1.0)
+            elif r < new + 8.0:
+                # goes on smoothly past the outline, for the pixels just inside
+                source = r * old / new
+                result = wp.vec4(u[0] * (source - r), u[1] * (source - r), new - r, 0.0)
         nodes[item.node_first + row * item.node_wide + column] = result
+
+
+# half of 4096 in each of three fields of 21 bits
+HALF = wp.constant(wp.uint64(2048 + (2048 << 21) + (2048 << 42)))
+
+
+@wp.func
+def colour(image: wp.array(dtype=wp.uint8), i: int) -> wp.uint64:
+    """Three bytes in fields of 21 bits: a weighted sum of colours is one multiplication each."""
+    return wp.uint64(image[i]) | (wp.uint64(image[i + 1]) << wp.uint64(21)) | (wp.uint64(image[i + 2]) << wp.uint64(42))
 
 
 @wp.kernel
@@ -155,7 +174,7 @@ def paint(
     items: wp.array(dtype=Item),
     item_first: wp.array(dtype=int),
     owner: wp.array3d(dtype=wp.int16),
-    nodes: wp.array(dtype=wp.vec3),
+    nodes: wp.array(dtype=wp.vec4),
     respect: int,
     stride: int,
     out: wp.array(dtype=wp.uint8),
@@ -181,16 +200,15 @@ def paint(
             for nx in range(wide - 1):
                 j = first + nx + 1
                 right = nodes[j] * (1.0 - ty) + nodes[j + wide] * ty
-                still = wp.abs(left[0]) + wp.abs(left[1]) + wp.abs(right[0]) + wp.abs(right[1])
-                if still > 0.05 or left[2] + right[2] > 0.0:
+                if left[2] > 0.0 or right[2] > 0.0 or left[3] + right[3] > 0.0:
                     for m in range(STEP):
                         x = low + nx * STEP + m
                         if x < end:
                             hidden = int(owner[b, y, x])
                             if respect == 0 or hidden <= rank:
                                 n = left + (right - left) * (float(m) * 0.25)
-                                inside = n[2] > 0.5
-                                if inside or wp.abs(n[0]) + wp.abs(n[1]) > 0.05:
+                                inside = n[2] > 0.0
+                                if inside or (n[3] > 0.5 and wp.abs(n[0]) + wp.abs(n[1]) > 0.2):
                                     sx = wp.clamp(float(x) + n[0], 0.0, float(width) - 2.0)
                                     sy = wp.clamp(float(y) + n[1], 0.0, float(height) - 2.0)
                                     x0 = int(sx)
@@ -204,17 +222,19 @@ def paint(
                                     if fine:
                                         ax = int((sx - float(x0)) * 64.0)
                                         ay = int((sy - float(y0)) * 64.0)
-                                        w00 = (64 - ax) * (64 - ay)
-                                        w01 = ax * (64 - ay)
-                                        w10 = (64 - ax) * ay
-                                        w11 = ax * ay
                                         i = start + (y0 * width + x0) * 3
                                         d = i + width * 3
+                                        w01 = wp.uint64(ax * (64 - ay))
+                                        w10 = wp.uint64((64 - ax) * ay)
+                                        w11 = wp.uint64(ax * ay)
+                                        w00 = wp.uint64(4096) - w01 - w10 - w11
+                                        total = colour(image, i) * w00 + colour(image, i + 3) * w01
+                                        total += colour(image, d) * w10 + colour(image, d + 3) * w11
+                                        total += HALF
                                         o = start + (y * width + x) * 3
-                                        for c in range(3):
-                                            total = int(image[i + c]) * w00 + int(image[i + 3 + c]) * w01
-                                            total += int(image[d + c]) * w10 + int(image[d + 3 + c]) * w11
-                                            out[o + c] = wp.uint8((total + 2048) >> 12)
+                                        out[o] = wp.uint8(total >> wp.uint64(12))
+                                        out[o + 1] = wp.uint8((total >> wp.uint64(33)) & wp.uint64(255))
+                                        out[o + 2] = wp.uint8((total >> wp.uint64(54)) & wp.uint64(255))
                 left = right
 
 

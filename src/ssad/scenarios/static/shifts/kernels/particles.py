@@ -9,8 +9,8 @@ from ssad.scenarios.static.shifts.kernels.shared import draw, unit
 class Air:
     """What falls, the same for all cameras of a scene. Lengths in metres, diameters in millimetres.
 
-    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low, high: least
-    and largest diameter; snow: 1 for flakes, 0 for drops; growth: visible over melted diameter.
+    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low: least
+    diameter; reach: share of sizes up to the largest; drag: 10.3 exp(-0.6 low) of the speed of fall; snow: 1 for flakes, 0 for drops; growth: visible over melted diameter.
     """
 
     key: wp.uint64
@@ -18,7 +18,8 @@ class Air:
     wind: wp.vec3
     slope: float
     low: float
-    high: float
+    reach: float
+    drag: float
     growth: float
     snow: int
     count: int
@@ -61,24 +62,30 @@ def splat(
     first = draw(air.key, i * 2)
     second = draw(air.key, i * 2 + 1)
     # diameter: exponential between low and high (Marshall-Palmer, Sekhon-Srivastava)
-    reach = 1.0 - wp.exp(-air.slope * (air.high - air.low))
-    melted = air.low - wp.log(1.0 - unit(second, 0) * reach) / air.slope
-    fall = 9.65 - 10.3 * wp.exp(-0.6 * melted)  # Atlas, Srivastava and Sekhon 1973
-    wobble = wp.vec3(0.0, 0.0, 0.0)
+    rest = 1.0 - unit(second, 0) * air.reach
     t = time[b]
+    fall = 0.9 + 0.8 * unit(second, 48)
+    if air.snow == 0:
+        # Atlas, Srivastava and Sekhon 1973: 9.65 - 10.3 exp(-0.6 D)
+        fall = 9.65 - air.drag * wp.pow(rest, 0.6 / air.slope)
+    drift = air.wind + wp.vec3(0.0, 0.0, -fall)
+    base = wp.vec3(unit(first, 0) * air.tile[0], unit(first, 16) * air.tile[1], unit(first, 32) * air.tile[2])
+    p = base + drift * t - position[b]
+    p = wp.vec3(wrapped(p[0], air.tile[0]), wrapped(p[1], air.tile[1]), wrapped(p[2], air.tile[2]))
+    # far outside of the picture: most are
+    focal = lens[b]
+    rough = to_camera[b] * p
+    if rough[2] < 0.1:
+        return
+    u = focal[0] * rough[0] / rough[2] + focal[2]
+    v = focal[1] * rough[1] / rough[2] + focal[3]
+    if u < -400.0 or u > 2.0 * float(layer.shape[2]) + 400.0 or v < -400.0 or v > 2.0 * float(layer.shape[1]) + 400.0:
+        return
+    melted = air.low - wp.log(rest) / air.slope
     if air.snow == 1:
-        fall = 0.8 + 0.2 * melted
         phase = unit(second, 16) * 6.2831853
         pace = 1.0 + 2.0 * unit(second, 32)
-        wobble = wp.vec3(wp.sin(pace * t + phase), wp.cos(pace * t * 0.8 + phase), 0.0) * 0.08
-    drift = air.wind + wp.vec3(0.0, 0.0, -fall)
-    base = wp.vec3(
-        unit(first, 0) * air.tile[0] + unit(first, 48) * 0.0002,
-        unit(first, 16) * air.tile[1],
-        unit(first, 32) * air.tile[2],
-    )
-    p = base + drift * t + wobble - position[b]
-    p = wp.vec3(wrapped(p[0], air.tile[0]), wrapped(p[1], air.tile[1]), wrapped(p[2], air.tile[2]))
+        p = p + wp.vec3(wp.sin(pace * t + phase), wp.cos(pace * t * 0.8 + phase), 0.0) * 0.08
     # fades out towards the border of the tile, so that nothing pops up there
     away = wp.length(wp.cw_div(p, air.tile)) * 2.0
     if away >= 1.0:
@@ -90,7 +97,6 @@ def splat(
     z = 0.5 * (a[2] + c[2])
     if a[2] < 0.25 or c[2] < 0.25:
         return
-    focal = lens[b]
     # half-resolution cells: pixel u lies in cell (u + 0.5) / 2 - 0.5
     ax = (focal[0] * a[0] / a[2] + focal[2] + 0.5) * 0.5 - 0.5
     ay = (focal[1] * a[1] / a[2] + focal[3] + 0.5) * 0.5 - 0.5
