@@ -47,6 +47,7 @@ def run(
     """
     from rich.console import Console
 
+    from ssad.bench.pictures import make_pictures
     from ssad.bench.run import pick_device, plan
     from ssad.bench.run import run as run_plan
     from ssad.bench.suite import load_suite
@@ -60,6 +61,7 @@ def run(
     except KeyboardInterrupt:
         print(f"stopped; what is done is kept in {folder}: the same command goes on from there", file=sys.stderr)
         raise typer.Exit(130) from None
+    make_pictures(list(chosen.pictures), folder)
     console = Console()
     console.print(table(chosen.title or chosen.name, records))
     failed = [r for r in records if r["status"] != "ok"]
@@ -108,6 +110,110 @@ def replay(
     raise typer.Exit(1 if found.difference else 0)
 
 
+@app.command()
+def shift(
+    source: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, or a picture of your own.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT", help="Folder for one nuScenes root a shift and severity; FILE.png: a contact sheet."
+        ),
+    ],
+    shifts: Annotated[
+        str, typer.Option(help="Names with commas between them (see: ssad list shifts), or all.")
+    ] = "all",
+    severity: Annotated[str, typer.Option(help="1 to 5, with commas between them, or random.")] = "random",
+    seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    calibration: Annotated[
+        str, typer.Option(help="physical, or paper: the published figures, image by image.")
+    ] = "physical",
+    labels: Annotated[
+        str, typer.Option(help="Boxes in the tables: original, or transformed with the objects.")
+    ] = "original",
+    version: Annotated[str | None, typer.Option(help="Such as v1.0-mini.  [default: the only one]")] = None,
+    split: Annotated[str | None, typer.Option(help="Only the scenes of a split, such as mini_val.")] = None,
+    scenes: Annotated[str, typer.Option(help="Only these scenes, with commas between them.")] = "",
+    sweeps: Annotated[bool, typer.Option(help="Shift the files between key frames too.")] = True,
+    lidar: Annotated[bool, typer.Option(help="Shift the LiDAR too.")] = True,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG files.")] = 95,
+    subsampling: Annotated[str, typer.Option(help="auto (444 for sensor noise, else 420), 444, 422 or 420.")] = "auto",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
+    ] = None,
+    channel: Annotated[str, typer.Option(help="Camera of a contact sheet.")] = "CAM_FRONT",
+    box: Annotated[list[str] | None, typer.Option(metavar="X0,Y0,X1,Y1", help="An object in your picture.")] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Only compare OUT with its manifests, file by file.")
+    ] = False,
+) -> None:
+    """Distribution shifts: a nuScenes folder into nuScenes-N, or a contact sheet of one picture.
+
+    Run the same command again to go on after a stop. Exit code 1: some files failed, or are not as the manifest says.
+    """
+    from ssad.bench.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
+
+    if verify:
+        raise typer.Exit(verify_folder(out))
+    names = [name.strip() for name in shifts.split(",") if name.strip()]
+    if source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        write_contact_sheets(
+            source,
+            out,
+            version=version,
+            channel=channel,
+            boxes=box or [],
+            severity=severity,
+            seed=seed,
+            calibration=calibration,
+        )
+        return
+    code = shift_folder(
+        source,
+        out,
+        shifts=names,
+        severity=severity,
+        version=version,
+        split=split,
+        scenes=[name.strip() for name in scenes.split(",") if name.strip()],
+        workers=workers,
+        ray=ray,
+        settings={
+            "seed": seed, "calibration": calibration, "labels": labels, "sweeps": sweeps, "lidar": lidar,
+            "quality": quality, "subsampling": subsampling,
+        },
+    )  # fmt: skip
+    raise typer.Exit(code)
+
+
+@app.command()
+def score(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.json", help="Detections in the official format.")],
+    dataroot: Annotated[Path, typer.Option(help="nuScenes or nuScenes-N folder.")],
+    version: Annotated[str, typer.Option(help="Such as v1.0-trainval.")],
+    split: Annotated[str, typer.Option(help="Such as val, mini_val, or one of the folder's splits.json.")],
+    file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers there.")] = None,
+    intervals: Annotated[int, typer.Option(min=0, help="Bootstrap replicates over scenes for 95 % intervals.")] = 0,
+) -> None:
+    """mAP, NDS and the TP errors, as the official nuScenes evaluation gives them.
+
+    A shifted folder is checked against its manifest first, so that clean data are not scored as shifted.
+    """
+    from rich.console import Console
+
+    from ssad.bench.score import score_results, tables, write_summary
+    from ssad.bench.toolbox.commands import checked
+
+    found = score_results(
+        results, dataroot=dataroot, version=version, split=split, replicates=intervals, check=checked(dataroot)
+    )
+    if file is not None:
+        write_summary(file, found)
+    console = Console()
+    for table in tables(found):
+        console.print(table)
+
+
 def _scenario_list() -> dict[str, str]:
     from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
 
@@ -136,15 +242,29 @@ def _suite_list() -> dict[str, str]:
     return {name: load_suite(name).title for name in suite_files()}
 
 
-KINDS = {"suites": _suite_list, "scenarios": _scenario_list, "systems": _system_list, "towns": _town_list}
+def _shift_list() -> dict[str, str]:
+    from ssad.scenarios.static.shifts.spec import SHIFTS
+
+    return {name: f"{family}: {text}" for name, (family, text) in SHIFTS.items()}
+
+
+KINDS = {
+    "suites": _suite_list,
+    "scenarios": _scenario_list,
+    "systems": _system_list,
+    "shifts": _shift_list,
+    "towns": _town_list,
+}
 ALIASES = {"agents": "systems"}
 
 
 @app.command("list")
 def list_names(
-    kind: Annotated[str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, towns.")] = None,
+    kind: Annotated[
+        str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, shifts, towns.")
+    ] = None,
 ) -> None:
-    """List what can be named: suites, scenarios, systems (agents), towns."""
+    """List what can be named: suites, scenarios, systems (agents), shifts, towns."""
     chosen = ALIASES.get(kind or "", kind)
     if chosen is not None and chosen not in KINDS:
         raise unknown_name("kind", str(kind), [*KINDS, *ALIASES])

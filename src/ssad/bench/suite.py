@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -23,7 +23,8 @@ class Suite(BaseModel):
     systems: names, or module:object; scenarios: what `load_scenarios` understands (sets, types, names, YAML files);
     repetitions: episodes of each pair, with seeds of their own; timeout_s: seconds that one cell may take; chunk:
     cells that run as one batch of the world (results do not depend on it); reference: the published table that the
-    report shows beside this one; witness: search each collision for a way out.
+    report shows beside this one; witness: search each collision for a way out; pictures: what the report shows besides
+    (shifts: contact sheets of the distribution shifts).
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -39,6 +40,7 @@ class Suite(BaseModel):
     chunk: int = Field(default=16, ge=1, le=4096)
     reference: str | None = None
     witness: bool = True
+    pictures: list[Literal["shifts"]] = []
 
 
 def suite_folders() -> list[Path]:
@@ -103,7 +105,7 @@ def _apply(data: dict[str, Any], setting: str) -> str:
     if parts[0] not in known:
         raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], known)}")
     value = parse_yaml(text, f"--set {key}")
-    if parts[0] in ("systems", "scenarios") and isinstance(value, str):
+    if parts[0] in ("systems", "scenarios", "pictures") and isinstance(value, str):
         value = [value]  # one name alone is a list of one
     place = data
     for part in parts[:-1]:

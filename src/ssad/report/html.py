@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 import shlex
 from collections import Counter
@@ -79,7 +80,24 @@ def render(run: Run, found: list[Table]) -> str:
         # "</" would end the script element that holds the data
         replay=safeio.dump_json(replay).replace("</", "<\\/"),
         missing=replay["missing"],
+        pictures=_pictures(run),
     )
+
+
+def _pictures(run: Run) -> list[dict[str, str]]:
+    """The pictures of the run as data: URIs with their captions; those that are gone are left out."""
+    folder = run.folder / "pictures"
+    if not (folder / "pictures.json").is_file():
+        return []
+    captions = safeio.read_json(folder / "pictures.json")
+    found = []
+    for name, caption in captions.items():
+        path = folder / Path(str(name)).name
+        kind = {".jpg": "jpeg", ".png": "png"}.get(path.suffix)
+        if kind and path.is_file():
+            data = base64.b64encode(safeio.read_bytes(path)).decode()
+            found.append({"data": f"data:image/{kind};base64,{data}", "caption": str(caption)})
+    return found
 
 
 def _command(run: Run) -> str:

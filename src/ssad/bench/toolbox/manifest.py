@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 from ssad import safeio
 from ssad.errors import FormatError, StoreError
@@ -47,7 +47,7 @@ def read_lines(path: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _whole(record: Any) -> bool:
+def _whole(record: Any) -> TypeGuard[dict[str, Any]]:
     """Whether a line has what the rest of the toolbox asks of it."""
     if not isinstance(record, dict) or record.get("state") not in STATES:
         return False
@@ -168,8 +168,8 @@ def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) 
         raise StoreError(
             f"{root}: these scenes are not shifted: {', '.join(missing[:3])}{more}; run ssad shift for them"
         )
-    for problem in _wrong_boxes(root, manifest):
-        raise StoreError(f"{problem}; run the same ssad shift again")
+    for found in _wrong_boxes(root, manifest):
+        raise StoreError(f"{found}; run the same ssad shift again")
     draw: list[tuple[str, str, str]] = []
     for scene in wanted or manifest["scenes"]:
         lines = read_lines(shard_path(root, scene))

@@ -22,7 +22,8 @@ class Options:
     source: a nuScenes root; out: folder that gets one root a shift and severity; shifts and severities: all pairs of
     them; scenes: names, empty for all; sweeps, lidar: whether files between key frames and LiDAR files are shifted
     too (else they are linked); labels: which boxes sample_annotation.json holds (the other set lies beside it);
-    quality, subsampling: of JPEG files ("auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420).
+    a file in which nothing changes is linked, so that severity 0 gives the dataset itself; quality, subsampling: of
+    JPEG files ("auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420).
     """
 
     source: Path

@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import re
+import shutil
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ssad import safeio
-from ssad.bench.toolbox.manifest import FOLDER, PAGE, digest_file, page, read_lines, shard_path
+from ssad.bench.toolbox.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
 from ssad.bench.toolbox.plan import Options, Shard, Strength
-from ssad.bench.toolbox.work import labels_path, link, make_shard
+from ssad.bench.toolbox.work import UNFINISHED, check_folders, finished, link, make_shard
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
-from ssad.errors import ConfigError, SSADError, StoreError
+from ssad.errors import ConfigError, FormatError, SSADError, StoreError
 
 Progress = Callable[[int, int], None]
-TABLE = "sample_annotation"
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A finished root: how many files were shifted, linked, failed; the share of images that changed; problems."""
+    """A root as it stands: how many files were shifted, linked, failed; share of the images that changed; why files
+    failed. With a failed file it has no manifest.json and is not complete."""
 
     root: Path
     shifted: int
@@ -46,6 +51,10 @@ def materialise(
     workers: processes (None: one a core); ray: address of a cluster that sees the same folders. The bytes do not
     depend on either. ConfigError, FormatError, StoreError; StoreError also when a shift changed no image at all.
     """
+    if workers is not None and workers < 1:
+        raise ConfigError(f"{workers} workers: expected 1 or more")
+    if (options.source / FOLDER / "identity.json").exists():
+        raise ConfigError(f"{options.source}: shifted already; give the clean dataset")
     data = NuScenes(options.source, options.version)
     names = tuple(record.name for record in data.scenes())
     unknown = sorted(set(options.scenes) - set(names))
@@ -62,11 +71,19 @@ def materialise(
     with _locked(options.out):
         for shift, severity in roots:
             _begin(options, shift, severity, source)
-        shards = options.shards(tuple(chosen))
+        shards = options.shards(chosen)
         for count, _ in enumerate(_work(shards, workers=workers, ray=ray), 1):
             if progress is not None:
                 progress(count, len(shards))
-        return [_finish(options, shift, severity, source, chosen) for shift, severity in roots]
+        written, problems = [], []
+        for shift, severity in roots:
+            try:
+                written.append(_finish(options, shift, severity, source=source, scenes=chosen, known=names))
+            except StoreError as error:  # the other roots are finished nevertheless
+                problems.append(error)
+        if problems:
+            raise StoreError(" | ".join(map(str, problems)))
+        return written
 
 
 def _tables(options: Options) -> dict[str, str]:
@@ -83,12 +100,18 @@ class _locked:
     def __enter__(self) -> None:
         import fcntl
 
-        self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
         try:
             fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             os.close(self.descriptor)
-            raise StoreError(f"{self.path.parent}: another ssad shift is writing there") from None
+            raise StoreError(f"{self.path.parent}: another ssad shift is writing there; wait for its end") from None
+        except OSError as error:
+            os.close(self.descriptor)
+            raise StoreError(f"{self.path}: cannot be locked: {error.strerror or error}") from None
 
     def __exit__(self, *_: object) -> None:
         os.close(self.descriptor)
@@ -97,25 +120,46 @@ class _locked:
 def _begin(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
     """A new root, or one of the same identity to go on with. StoreError for another's."""
     root = options.root(shift, severity)
+    check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
     safeio.make_folder(root / FOLDER)
     identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
     path = root / FOLDER / "identity.json"
     if path.exists():
-        if safeio.read_json(path) != identity:
+        if _read_identity(path) != identity:
             raise StoreError(f"{root}: holds a shift of other data or options; choose another folder")
     else:
         safeio.write_atomic(path, safeio.dump_json(identity, indent=1) + "\n")
-    (root / PAGE).unlink(missing_ok=True)  # not complete until it is again
+    try:
+        (root / PAGE).unlink(missing_ok=True)  # not complete until it is again
+        _clear(root, options.version)
+    except OSError as error:
+        raise StoreError(f"{root}: cannot be written: {error.strerror or error}") from None
     for entry in sorted(options.source.iterdir()):
         if entry.name in ("samples", "sweeps", PAGE, FOLDER) or entry.name.startswith(("v1.0-", ".")):
             continue
-        link(entry.resolve(), root / entry.name)
-    for name in TABLES:
-        if name != TABLE:
-            link(table_path(options.source, options.version, name).resolve(), table_path(root, options.version, name))
-    extra = options.source / options.version / "splits.json"
-    if extra.is_file():
-        link(extra.resolve(), root / options.version / "splits.json")
+        link(root, entry, root / entry.name)
+    own = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
+    for table in sorted((options.source / options.version).glob("*.json")):
+        if table.name not in own:
+            link(root, table, root / options.version / table.name)
+
+
+def _read_identity(path: Path) -> Any:
+    """What a root says that it holds; None when that is damaged."""
+    try:
+        return safeio.read_json(path)
+    except FormatError:
+        return None
+
+
+def _clear(root: Path, version: str) -> None:
+    """Removes what a killed run left half written."""
+    if (root / UNFINISHED).exists():
+        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+    for folder in (root.parent, root, root / FOLDER, root / version):
+        for path in folder.glob(".*") if folder.is_dir() else ():
+            if re.fullmatch(r"\.probe-\d+|\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?", path.name):
+                path.unlink(missing_ok=True)
 
 
 def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> Iterator[dict[str, int]]:
@@ -124,10 +168,11 @@ def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> I
         yield from _on_ray(shards, ray)
         return
     count = min(workers or os.cpu_count() or 1, len(shards))
-    if count <= 1:
+    if count == 1:
         yield from map(make_shard, shards)
         return
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
         futures = [pool.submit(make_shard, shard) for shard in shards]
         try:
             for future in as_completed(futures):
@@ -140,51 +185,99 @@ def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> I
             raise
 
 
+def _end_with_parent() -> None:
+    """Ends this worker when the process that started it is gone, even by kill -9."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _on_ray(shards: Sequence[Shard], address: str) -> Iterator[dict[str, int]]:
-    """Runs the shards on a Ray cluster."""
+    """Runs the shards on a Ray cluster; "local" starts one for as long as it takes."""
     try:
         import ray
     except ImportError:
         raise ConfigError("--ray needs the extra `ray`: pip install 'ssad-testbed[ray]'") from None
+    own = not ray.is_initialized()
     try:
-        ray.init(address=None if address == "local" else address, log_to_driver=False, ignore_reinit_error=True)
+        if own:
+            ray.init(address="local" if address == "local" else address, log_to_driver=False)
     except Exception as error:
         raise ConfigError(f"no Ray cluster at '{address}': {error}") from None
     task = ray.remote(make_shard)
-    waiting = [task.remote(shard) for shard in shards]
-    while waiting:
-        ready, waiting = ray.wait(waiting)
-        try:
+    # workers have a folder of their own: names as seen from here
+    waiting = [
+        task.remote(
+            replace(s, options=replace(s.options, source=s.options.source.absolute(), out=s.root.parent.absolute()))
+        )
+        for s in shards
+    ]
+    try:
+        while waiting:
+            ready, waiting = ray.wait(waiting)
             yield ray.get(ready[0])
-        except ray.exceptions.RayTaskError as error:
-            cause = error.cause
-            raise cause if isinstance(cause, SSADError) else StoreError(f"a Ray task failed: {cause}") from None
+    except ray.exceptions.RayTaskError as error:
+        cause = error.cause
+        raise cause if isinstance(cause, SSADError) else StoreError(f"a Ray task failed: {cause}") from None
+    except ray.exceptions.RayError as error:
+        raise StoreError(f"a Ray worker died: {error}; run the same command again to go on") from None
+    finally:
+        for left in waiting:
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.cancel(left)
+        if own:
+            ray.shutdown()
 
 
-def _finish(options: Options, shift: str, severity: Strength, source: dict[str, Any], scenes: Iterable[str]) -> Written:
-    """Labels, the manifest's page, and the check that something changed."""
+def _finish(
+    options: Options,
+    shift: str,
+    severity: Strength,
+    *,
+    source: dict[str, Any],
+    scenes: Sequence[str],
+    known: Sequence[str],
+) -> Written:
+    """Labels, the manifest's page, and the check that something changed.
+
+    The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
+    """
     root = options.root(shift, severity)
-    shard = Shard(options, shift, severity, "")
-    records = {scene: list(read_lines(shard_path(root, scene)).values()) for scene in scenes}
-    labels: dict[str, Any] = {}
-    for scene in scenes:
-        labels |= safeio.read_json(labels_path(root, scene))
-    _write_labels(options, root, labels)
-    everything = [r for rows in records.values() for r in rows]
-    failed = [r for r in everything if r["state"] == "failed"]
-    found = page(shard.identity(), source, records, options.labels)
-    if severity != 0 and found["images"] and found["applied"] == 0 and len(failed) < found["images"]:
-        why = "; ".join(f"{reason} ({count})" for reason, count in found["skipped"].items()) or "no reason was given"
-        raise StoreError(f"{root}: {shift} changed none of {found['images']} images: {why}")
-    if not failed:
+    tally, labels = Tally(), dict[str, msgspec.Raw]()
+    for scene in known:
+        made = finished(root, scene)
+        if made is None and scene in scenes:
+            raise StoreError(f"{root}: the lines of {scene} are gone; run the same ssad shift again")
+        lines = read_lines(shard_path(root, scene)).values() if made is not None else ()
+        if made is None or (scene not in scenes and any(r["state"] == "failed" for r in lines)):
+            continue
+        tally.add(scene, lines)
+        labels |= made.boxes
+    transformed = _write_labels(options, root, labels)
+    if not tally.reasons and severity != 0 and not (tally.changed if tally.images else tally.states["shifted"]):
+        why = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
+        raise StoreError(f"{root}: {shift} changed none of {tally.images} images: {why or 'no reason was given'}")
+    shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+    if not tally.reasons:
+        identity = Shard(options, shift, severity, "").identity()
+        found = page(identity, source, tally, labels=options.labels, transformed=transformed)
         safeio.write_atomic(root / PAGE, safeio.dump_json(found, indent=1) + "\n")
-    reasons = tuple(str(r["reason"]) for r in failed)
-    count = {state: sum(r["state"] == state for r in everything) for state in ("shifted", "linked")}
-    return Written(root, count["shifted"], count["linked"], len(failed), float(found["applied"]), reasons)
+    states = tally.states
+    return Written(
+        root, states["shifted"], states["linked"], states["failed"], tally.applied, tuple(sorted(tally.reasons))
+    )
 
 
-def _write_labels(options: Options, root: Path, labels: dict[str, Any]) -> None:
-    """sample_annotation.json as asked for; both sets of boxes beside it. One pass, a block at a time."""
+def _write_labels(options: Options, root: Path, labels: dict[str, msgspec.Raw]) -> str:
+    """sample_annotation.json as asked for; both sets of boxes beside it. One pass, a block at a time.
+
+    The hash of the transformed ones.
+    """
     original = table_path(options.source, options.version, TABLE)
     folder = table_path(root, options.version, TABLE).parent
     moved = folder / f"{TABLE}.transformed.json"
@@ -193,9 +286,10 @@ def _write_labels(options: Options, root: Path, labels: dict[str, Any]) -> None:
         separator = b"[\n"
         for block in stream(original, dict[str, Any]):
             for row in block:
-                file.write(separator + encoder.encode(row | labels.get(row.get("token", ""), {})))
+                new = labels.get(row.get("token", ""))
+                file.write(separator + encoder.encode(row if new is None else row | msgspec.json.decode(new)))
                 separator = b",\n"
         file.write(b"\n]\n" if separator == b",\n" else b"[\n]\n")
-    link(original.resolve(), folder / f"{TABLE}.original.json")
-    chosen = original.resolve() if options.labels == "original" else Path(moved.name)
-    link(chosen, folder / f"{TABLE}.json")
+    link(root, original, folder / f"{TABLE}.original.json")
+    link(root, original if options.labels == "original" else moved, folder / f"{TABLE}.json")
+    return digest_file(moved)

@@ -32,10 +32,16 @@ VISIBLE: Final = {"1": 0.0, "2": 0.4, "3": 0.6, "4": 0.8}
 LIDAR: Final = "LIDAR_TOP"
 
 
-def boxes_of(found: Annotations) -> Boxes3D:
-    """Annotations as boxes; an unknown visibility counts as visible."""
-    visible = np.array([VISIBLE.get(token, 1.0) for token in found.visibility])
-    return Boxes3D(found.instance, found.centre, found.size, found.rotation, found.velocity, visible)
+def boxes_of(found: Annotations) -> tuple[Boxes3D, npt.NDArray[np.intp]]:
+    """Annotations as boxes, and their rows [N]; an unknown visibility counts as visible.
+
+    Boxes without a volume are left out: no shift of an object can be made of them.
+    """
+    rows = np.flatnonzero((found.size > 0).all(axis=1))
+    visible = np.array([VISIBLE.get(found.visibility[n], 1.0) for n in rows])
+    instance = tuple(found.instance[n] for n in rows)
+    boxes = Boxes3D(instance, found.centre[rows], found.size[rows], found.rotation[rows], found.velocity[rows], visible)
+    return boxes, rows
 
 
 class SceneShifter:
@@ -79,11 +85,11 @@ class SceneShifter:
                 if f.key_frame and f.modality == "camera" and f.sample_token == sample.token
             ]
             try:
-                images = [read_image(self.root / f.filename) for f in cameras]
+                images = [self.read(f) for f in cameras]
+                views = tuple(viewing_direction(self._frame(f, Boxes3D.empty(), None)) for f in cameras)
             except FormatError:
                 continue
             if images:
-                views = tuple(viewing_direction(self._frame(f, Boxes3D.empty(), None)) for f in cameras)
                 return sample.token, SceneContext(token, sky_light(images), views, start)
         return "", SceneContext(token, start=start)
 
@@ -154,8 +160,8 @@ class SceneShifter:
         return np.asarray(cloud[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3], np.float32)
 
     def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None) -> Frame:
-        if frame.intrinsic is None:
-            raise FormatError(f"{frame.filename}: the camera {frame.channel} has no intrinsic matrix")
+        if frame.intrinsic is None or not min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0:
+            raise FormatError(f"{frame.filename}: the camera {frame.channel} has no focal length")
         camera = Camera(frame.width, frame.height, frame.intrinsic, frame.sensor_to_ego, frame.channel)
         return Frame(
             camera,
@@ -170,8 +176,8 @@ class SceneShifter:
 
     def camera_frame(self, frame: SensorFrame) -> Frame:
         """What the shift is told about an image."""
-        objects = self.base.family == "object"
-        boxes = boxes_of(self.scene.annotations_of(frame)) if objects else Boxes3D.empty()
+        objects = self.base.family == "object" or self._uses_depth
+        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
         return self._frame(frame, boxes, self._points(frame) if self._uses_depth else None)
 
     def read(self, frame: SensorFrame) -> U8:
@@ -213,7 +219,8 @@ class SceneShifter:
 
     def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
         """The shifted points [P, 5] of a LiDAR frame. FormatError."""
-        boxes = boxes_of(self.scene.annotations_of(frame)) if self.base.family == "object" else Boxes3D.empty()
+        objects = self.base.family == "object"
+        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
         sweep = SweepFrame(
             frame.scene_token,
             frame.sample_token if self.base.family == "object" else frame.token,
@@ -239,11 +246,14 @@ class SceneShifter:
         frame = next((f for f in self.scene.frames if f.sample_token == sample_token), None)
         if frame is None or self.spec(frame).severity == 0:
             return found
-        boxes = transformed_boxes(self.spec(frame), boxes_of(found), scene=frame.scene_token, sample=sample_token)
-        points, sweep = found.lidar_points, self.key_sweep(sample_token)
+        old, rows = boxes_of(found)
+        boxes = transformed_boxes(self.spec(frame), old, scene=frame.scene_token, sample=sample_token)
+        centre, size, rotation = found.centre.copy(), found.size.copy(), found.rotation.copy()
+        centre[rows], size[rows], rotation[rows] = boxes.centre, boxes.size, boxes.rotation
+        points, sweep = found.lidar_points.copy(), self.key_sweep(sample_token)
         if sweep is not None and lidar is not None:
-            points = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
-        return replace(found, centre=boxes.centre, size=boxes.size, rotation=boxes.rotation, lidar_points=points)
+            points[rows] = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
+        return replace(found, centre=centre, size=size, rotation=rotation, lidar_points=points)
 
 
 def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> npt.NDArray[np.int32]:

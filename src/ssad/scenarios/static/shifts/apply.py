@@ -40,7 +40,7 @@ def shift_images(
     """
     batch = to_batch(images, device)
     if frames is None:
-        cameras = Camera.typical(batch.width, batch.height)
+        cameras = Camera.typical(batch.seen, batch.height)
         frames = [Frame(cameras, sample=str(b)) for b in range(batch.count)]
     elif isinstance(frames, Frame):
         frames = [frames]
@@ -69,7 +69,7 @@ def _some(
     contexts: Mapping[str, SceneContext] | None,
 ) -> tuple[Any, list[Applied]]:
     """Severity 0 among others: only the others are computed."""
-    pixels = batch.numpy()
+    pixels = batch.numpy().copy()
     part, records = shift_images(
         pixels[chosen], [frames[b] for b in chosen], [specs[b] for b in chosen], contexts=contexts, device=batch.device
     )
@@ -107,9 +107,8 @@ def _dispatch(
 def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
-    size = batch.height * batch.width * 3
-    row = batch.data[b * batch.stride : b * batch.stride + size].numpy()
-    light = sky_light([row.reshape(batch.height, batch.width, 3)])
+    row = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
+    light = sky_light([row.reshape(batch.height, batch.width, 3)[:, : batch.seen]])
     return SceneContext(frame.scene, light, (viewing_direction(frame),), 0.0)
 
 

@@ -18,23 +18,32 @@ wp.config.log_level = wp.LOG_ERROR
 
 @dataclass(slots=True)
 class Batch:
-    """B images of `height` x `width`, RGB interleaved, one byte a value, each `stride` bytes (a multiple of four)."""
+    """B images of `height` x `width`, RGB interleaved, one byte a value, each `stride` bytes.
+
+    The width is a multiple of four, so that four pixels are three words; images of another width are continued to the
+    right by their last column, and cut to `seen` columns again at the end.
+    """
 
     data: Any
     count: int
     height: int
     width: int
-    stride: int
+    seen: int
     device: str
+
+    @property
+    def stride(self) -> int:
+        """Bytes of an image."""
+        return self.height * self.width * 3
 
     def like(self) -> Batch:
         """Another batch of the same shape, its values not set."""
         data = wp.empty(self.count * self.stride, dtype=wp.uint8, device=self.device)
-        return Batch(data, self.count, self.height, self.width, self.stride, self.device)
+        return Batch(data, self.count, self.height, self.width, self.seen, self.device)
 
     def copy(self) -> Batch:
         """A copy on the same device."""
-        return Batch(wp.clone(self.data), self.count, self.height, self.width, self.stride, self.device)
+        return Batch(wp.clone(self.data), self.count, self.height, self.width, self.seen, self.device)
 
     def words(self) -> Any:
         """The same memory, four bytes at a time."""
@@ -45,9 +54,8 @@ class Batch:
 
     def numpy(self) -> U8:
         """The images [B, H, W, 3] in main memory."""
-        size = self.height * self.width * 3
-        rows = self.data.numpy().reshape(self.count, self.stride)[:, :size]
-        return np.ascontiguousarray(rows).reshape(self.count, self.height, self.width, 3)
+        rows = self.data.numpy().reshape(self.count, self.height, self.width, 3)
+        return np.ascontiguousarray(rows[:, :, : self.seen])
 
 
 def to_batch(images: Any, device: str | None = None) -> Batch:
@@ -68,21 +76,21 @@ def to_batch(images: Any, device: str | None = None) -> Batch:
         if values.device.type == "cpu":
             return to_batch(values.numpy(), where)
         count, height, width = _shape(tuple(values.shape))
-        stride = (height * width * 3 + 3) // 4 * 4
-        flat = torch.zeros(count, stride, dtype=torch.uint8, device=values.device)
-        flat[:, : height * width * 3] = values.reshape(count, -1)
-        return Batch(wp.from_torch(flat.reshape(-1)), count, height, width, stride, where)
+        rows = values.reshape(count, height, width, 3)
+        extra = -width % 4
+        if extra:
+            rows = torch.cat([rows, rows[:, :, -1:].expand(-1, -1, extra, -1)], 2)
+        return Batch(wp.from_torch(rows.reshape(-1).clone()), count, height, width + extra, width, where)
     array = np.asarray(images)
     if array.dtype != np.uint8:
         raise ConfigError(f"images must be uint8 [H, W, 3] or [B, H, W, 3], not {array.dtype} {list(array.shape)}")
     count, height, width = _shape(array.shape)
-    size = height * width * 3
-    stride = (size + 3) // 4 * 4
-    rows = np.ascontiguousarray(array).reshape(count, size)
-    if stride != size:
-        rows = np.pad(rows, ((0, 0), (0, stride - size)))
-    flat_bytes = wp.array(rows.reshape(-1), dtype=wp.uint8, device=device or "cpu", copy=False)
-    return Batch(flat_bytes, count, height, width, stride, device or "cpu")
+    pixels = np.ascontiguousarray(array).reshape(count, height, width, 3)
+    extra = -width % 4
+    if extra:
+        pixels = np.pad(pixels, ((0, 0), (0, 0), (0, extra), (0, 0)), mode="edge")
+    flat = wp.array(pixels.reshape(-1), dtype=wp.uint8, device=device or "cpu", copy=False)
+    return Batch(flat, count, height, width + extra, width, device or "cpu")
 
 
 def _shape(shape: tuple[int, ...]) -> tuple[int, int, int]:
@@ -101,9 +109,8 @@ def like_input(batch: Batch, images: Any) -> Any:
         return batch
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(images, torch.Tensor):
-        size = batch.height * batch.width * 3
-        flat = wp.to_torch(batch.data).reshape(batch.count, batch.stride)[:, :size].to(images.device)
-        values = flat.reshape(batch.count, batch.height, batch.width, 3)
+        flat = wp.to_torch(batch.data).to(images.device)
+        values = flat.reshape(batch.count, batch.height, batch.width, 3)[:, :, : batch.seen]
         if images.is_floating_point():
             return values.permute(0, 3, 1, 2).to(images.dtype) / 255
         return values.reshape(images.shape).clone()
@@ -126,9 +133,9 @@ def check_batch(batch: Batch, frames: Sequence[Any]) -> None:
         raise ConfigError(f"{batch.count} images, but {len(frames)} frames")
     for frame in frames:
         camera = frame.camera
-        if (camera.height, camera.width) != (batch.height, batch.width):
+        if (camera.height, camera.width) != (batch.height, batch.seen):
             raise ConfigError(
-                f"camera {camera.channel} is {camera.width} x {camera.height}, its image {batch.width} x {batch.height}"
+                f"camera {camera.channel} is {camera.width} x {camera.height}, its image {batch.seen} x {batch.height}"
             )
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.frames import Frame
+from ssad.frames import Frame, camera_to_world, rotation_matrix
 from ssad.scenarios.static.shifts.batch import Batch
 from ssad.types import F32
 
@@ -80,15 +80,24 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
     inverse = np.maximum(-down / max(float(place[2]), 0.3), 0).astype(np.float32)
     weight = np.where(inverse > 1 / 80, np.float32(_ROAD_WEIGHT), np.float32(0))
 
-    # the sky: above the horizon, bright for this image, smooth, not red
+    # the sky: above the horizon, smooth, and bright for this image and not red, or blue
     slope = np.abs(cv2.Laplacian(grey, cv2.CV_32F, ksize=3))
     bright = grey > 0.7 * float(np.quantile(grey[::4, ::4], 0.95))
-    sky = (down > 0.02) & bright & (cv2.blur(slope, (5, 5)) < 0.04) & (small[..., 2] >= small[..., 0] * 0.92)
+    red, tinge = small[..., 0].astype(np.float32), small[..., 2].astype(np.float32)
+    blue = (tinge - red > 40) & (tinge > 130)
+    sky = (down > 0.02) & (blue | (bright & (tinge >= red * 0.92))) & (cv2.blur(slope, (5, 5)) < 0.08)
+    # clouds leave holes
+    sky = (cv2.morphologyEx(sky.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)) > 0) & (down > 0.02)
     weight[down > 0] = _SKY_WEIGHT
     weight[sky] = 0.5
     inverse[down > 0] = 0
 
+    _boxes(frame, inverse, weight, (fx, fy, cx, cy))
     points = frame.points
+    if points is None or not len(points):
+        # nothing is known of what stands upright: as far as houses along a street
+        upright = (down > 0) & ~sky & (weight < 0.1)
+        inverse[upright], weight[upright] = 1 / 45, 0.05
     if points is not None and len(points):
         p = np.asarray(points, np.float32)[:, :3]
         p = p[p[:, 2] > 1.0]
@@ -102,6 +111,27 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
         _upwards(inverse, weight, (y, x), small, sky)
     filled = _guided(grey, _pull_push(inverse, weight))
     return np.asarray(1 / np.maximum(filled, 1 / FARTHEST), np.float32)
+
+
+def _boxes(frame: Frame, inverse: F32, weight: F32, lens: tuple[float, float, float, float]) -> None:
+    """Annotated objects are as far away as their boxes, the nearest in front. Changes both grids."""
+    boxes = frame.boxes
+    if not len(boxes):
+        return
+    fx, fy, cx, cy = lens
+    pose = camera_to_world(frame)
+    half = boxes.size[:, [1, 0, 2]] / 2
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    corners = np.einsum("nij,nkj->nki", rotation_matrix(boxes.rotation), half[:, None] * signs) + boxes.centre[:, None]
+    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    nearest = local[..., 2].min(1)
+    for n in np.argsort(-nearest, kind="stable"):
+        if nearest[n] < 1.0 or nearest[n] > 80:
+            continue
+        pixels = local[n, :, :2] / local[n, :, 2:] * [fx, fy] + [cx, cy]
+        hull = np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32)
+        cv2.fillConvexPoly(inverse, hull, 1 / (0.5 * (nearest[n] + float(local[n, :, 2].mean()))))
+        cv2.fillConvexPoly(weight, hull, 0.2)
 
 
 def _upwards(inverse: F32, weight: F32, hits: tuple[Any, Any], image: Any, sky: Any) -> None:

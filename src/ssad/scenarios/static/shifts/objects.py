@@ -322,7 +322,7 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
             wp.launch(
                 kernels.smear,
                 dim=(len(chosen), max(lines for _, lines in chosen) * 2),
-                inputs=[batch.data, items, on(batch, [c[0] for c in chosen], wp.int32), owner, respect, batch.stride],
+                inputs=[batch.data, items, on(batch, [c[0] for c in chosen], wp.int32), owner, batch.stride],
                 outputs=[out.data],
                 device=device,
             )

@@ -92,11 +92,13 @@ def _falling(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) 
     inputs = [noise, column("zoom"), column("threshold")]
     wp.launch(layers.enlarge, dim=half[:2], inputs=inputs, outputs=[field], device=device)
     # at most 12 cells a streak: it is smooth along itself
-    taps = np.arange(max(int(row["taps"]) for row in rows)).astype(float)
-    taps = taps[:: -(-len(taps) // 12)]
+    every = np.arange(max(int(row["taps"]) for row in rows)).astype(float)
+    cells = every[:: -(-len(every) // 12)]
     steps = np.array([[row["dx"], row["dy"]] for row in rows])
-    offsets = np.rint(steps[:, None] * taps[None, :, None]).astype(np.int32)
-    weights = np.stack([np.where(taps < row["taps"], np.exp(-(taps**2) / (2 * row["sigma"] ** 2)), 0) for row in rows])
+    offsets = np.rint(steps[:, None] * cells[None, :, None]).astype(np.int32)
+    weights = np.stack(
+        [np.where(cells < row["taps"], np.exp(-(cells**2) / (2 * row["sigma"] ** 2)), 0) for row in rows]
+    )
     weights /= weights.sum(1, keepdims=True)
     inputs = [field, on(batch, offsets, wp.vec2i), on(batch, weights.astype(np.float32), wp.float32)]
     wp.launch(layers.streaks, dim=half[:2], inputs=inputs, outputs=[layer], device=device)
@@ -182,15 +184,14 @@ def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
         veil.blend_glare,
         dim=(batch.count, batch.height),
         inputs=[
-            batch.data,
+            batch.words(),
             light,
             on(batch, np.ones((batch.count, 3), np.float32), wp.vec3),
             on(batch, np.ones(batch.count, np.float32), wp.float32),
-            batch.height,
             batch.width,
-            batch.stride,
+            batch.stride // 4,
         ],
-        outputs=[out.data],
+        outputs=[out.words()],
         device=batch.device,
     )
     return out, done

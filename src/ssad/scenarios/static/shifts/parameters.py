@@ -25,9 +25,11 @@ FOG_RANGE: Final[Five] = (600.0, 300.0, 150.0, 100.0, 50.0)
 RAIN_RATE: Final[Five] = (2.5, 10.0, 25.0, 50.0, 100.0)
 # snow: mm/h of water; visual range about 1 km / rate
 SNOW_RATE: Final[Five] = (0.5, 1.5, 3.5, 7.0, 14.0)
+# drops on the lens, from as many as a wiped lens has between two wipes
+LENS_DROPS: Final = (4, 9, 16, 26, 40)
 # sun: glare one degree from the sun, grey levels at full scale 255
 SUN_STRENGTH: Final[Five] = (90.0, 180.0, 360.0, 700.0, 1400.0)
-EXPOSURE: Final = 0.008  # s
+EXPOSURE: Final = 0.004  # s, by day
 APERTURE: Final = 0.0025  # m
 
 # ---- objects, physical: change of size, shear, turn (degrees), each of a random sign an instance; the figures of 3DC

@@ -88,15 +88,14 @@ def add_sun(
         veil.blend_glare,
         dim=(batch.count, batch.height),
         inputs=[
-            batch.data,
+            batch.words(),
             light,
             on(batch, np.tile(np.array([1.0, 0.97, 0.9], np.float32), (batch.count, 1)), wp.vec3),
             on(batch, gain, wp.float32),
-            batch.height,
             batch.width,
-            batch.stride,
+            batch.stride // 4,
         ],
-        outputs=[out.data],
+        outputs=[out.words()],
         device=batch.device,
     )
     return out, done

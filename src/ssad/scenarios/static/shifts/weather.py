@@ -22,8 +22,8 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.types import F64
 
 # period of the particle fields, metres; drops per m^3 follow from the size distributions
-TILE = (8.0, 8.0, 6.0)
-RAIN_LEAST, RAIN_LARGEST = 2.3, 6.0  # mm; smaller drops are part of the veil
+RAIN_TILE, SNOW_TILE = (6.0, 6.0, 5.0), (8.0, 8.0, 6.0)
+RAIN_LEAST, RAIN_LARGEST = 2.0, 6.0  # mm; smaller drops are part of the veil
 SNOW_LEAST, SNOW_LARGEST = 1.0, 6.0  # mm of water
 SNOW_GROWTH = 3.0  # diameter of a flake over that of its water: a density of 40 kg / m^3
 _CLOCK = 4096.0  # s after which the air repeats
@@ -123,8 +123,8 @@ def add_fog(
     wp.launch(
         veil.blend_air,
         dim=(batch.count, batch.height),
-        inputs=[batch.data, clear, on(batch, air.astype(np.float32), wp.vec3), batch.height, batch.width, batch.stride],
-        outputs=[out.data],
+        inputs=[batch.words(), clear, on(batch, air.astype(np.float32), wp.vec3), batch.width, batch.stride // 4],
+        outputs=[out.words()],
         device=batch.device,
     )
     done = [
@@ -137,16 +137,38 @@ def add_fog(
 def _air(spec: ShiftSpec, frame: Frame, weather: Weather) -> tuple[Any, ...]:
     """What falls, as a row of the kernel's `Air`."""
     snow = spec.name == "snow"
-    least, largest = (SNOW_LEAST, SNOW_LARGEST) if snow else (RAIN_LEAST, RAIN_LARGEST)
+    tile, least, largest = (SNOW_TILE, SNOW_LEAST, SNOW_LARGEST) if snow else (RAIN_TILE, RAIN_LEAST, RAIN_LARGEST)
     rate = (table.SNOW_RATE if snow else table.RAIN_RATE)[spec.severity - 1]
     slope = table.snow_slope(rate) if snow else table.rain_slope(rate)
     density = 2500 * rate**-0.94 if snow else 8000.0
     in_air = density / slope * (np.exp(-slope * least) - np.exp(-slope * largest))
-    count = int(in_air * TILE[0] * TILE[1] * TILE[2])
+    count = int(in_air * tile[0] * tile[1] * tile[2])
     growth = SNOW_GROWTH if snow else 1.0
     wind = tuple(weather.wind)
     reach, drag = 1 - np.exp(-slope * (largest - least)), 10.3 * np.exp(-0.6 * least)
-    return (spec.key("air", frame.scene), TILE, wind, slope, least, reach, drag, growth, int(snow), count)
+    return (spec.key("air", frame.scene), tile, wind, slope, least, reach, drag, growth, int(snow), count)
+
+
+def _count(spec: ShiftSpec) -> int:
+    """Drops on the lens."""
+    return table.LENS_DROPS[spec.severity - 1] if spec.name == "rain" else 0
+
+
+def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> list[tuple[Any, ...]]:
+    """Drops of rain that sit on the lens: where, how large; the same for a camera throughout a scene."""
+    found = []
+    for b, (spec, frame) in enumerate(zip(specs, frames, strict=True)):
+        if spec.name != "rain":
+            continue
+        draws = spec.generator("lens", frame.scene, frame.camera.channel)
+        most = table.LENS_DROPS[-1]
+        # all are drawn, the first few are used: a heavier rain adds drops and moves none
+        place = draws.uniform(0, 1, (most, 2)) * [batch.width, batch.height]
+        radius = np.minimum(np.exp(draws.normal(2.3, 0.55, most)), 40) * batch.width / 1600
+        oval = draws.uniform(1.0, 1.4, most)
+        for n in range(_count(spec)):
+            found.append((b, float(place[n, 0]), float(place[n, 1]), max(float(radius[n]), 1.5), float(oval[n])))
+    return found
 
 
 def add_precipitation(
@@ -167,7 +189,7 @@ def add_precipitation(
             structs(batch, airs, particles.Air),
             on(batch, ages, wp.float32),
             on(batch, np.swapaxes(poses[:, :3, :3], 1, 2).astype(np.float32), wp.mat33),
-            on(batch, (poses[:, :3, 3] % np.array(TILE)).astype(np.float32), wp.vec3),
+            on(batch, (poses[:, :3, 3] % np.array([a[1] for a in airs])).astype(np.float32), wp.vec3),
             on(batch, np.stack([f.ego_velocity for f in frames]).astype(np.float32), wp.vec3),
             lens(batch, frames),
             table.EXPOSURE,
@@ -183,21 +205,25 @@ def add_precipitation(
         veil.blend_particles,
         dim=(batch.count, batch.height),
         inputs=[
-            batch.data,
+            batch.words(),
             clear,
             on(batch, (sky * 235).astype(np.float32), wp.vec3),
             layer,
             on(batch, (sky * bright).astype(np.float32), wp.vec3),
-            batch.height,
             batch.width,
-            batch.stride,
+            batch.stride // 4,
         ],
-        outputs=[out.data],
+        outputs=[out.words()],
         device=batch.device,
     )
+    drops = _lens_drops(batch, frames, specs)
+    if len(drops):
+        rows = structs(batch, drops, particles.LensDrop)
+        inputs = [batch.data, rows, batch.height, batch.width, batch.stride]
+        wp.launch(particles.refract, dim=len(drops), inputs=inputs, outputs=[out.data], device=batch.device)
     rates = [(table.SNOW_RATE if s.name == "snow" else table.RAIN_RATE)[s.severity - 1] for s in specs]
     done = [
-        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "depth": source})
-        for rate, air, source in zip(rates, airs, sources, strict=True)
+        Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _count(s), "depth": source})
+        for rate, air, source, s in zip(rates, airs, sources, specs, strict=True)
     ]
     return out, done

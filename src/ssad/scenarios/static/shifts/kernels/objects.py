@@ -149,7 +149,9 @@ def displace(
             if old > new:
                 edge = old * 1.25 + 8.0
                 if r < edge:
-                    source = old + (wp.max(r, new) - new) * (edge - old) / (edge - new)
+                    # from a little outside the old outline: boxes are not drawn to the pixel
+                    rim = old * 1.02 + 1.5
+                    source = rim + (wp.max(r, new) - new) * (edge - rim) / (edge - new)
                     result = wp.vec4(u[0] * (source - r), u[1] * (source - r), new - r, 1.0)
             elif r < new + 8.0:
                 # goes on smoothly past the outline, for the pixels just inside
@@ -244,12 +246,13 @@ def smear(
     items: wp.array(dtype=Item),
     chosen: wp.array(dtype=int),
     owner: wp.array3d(dtype=wp.int16),
-    respect: int,
     stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """Blurs items along their streak: a box filter over the pixels of the item, one thread a line of pixels.
+    """Blurs items along their streak: a box filter, one thread a line of pixels.
 
+    Within the item all pixels of the window count, as the background shows through at its ends; beside it, the item's
+    own pixels are laid over the sharp background.
     A line steps one pixel along the longer side of the streak; lines of one slope cover every pixel once. The sum
     over the window is carried along, so that the cost does not depend on the length of the streak.
     """
@@ -285,7 +288,9 @@ def smear(
         first = across + line - extra
     half = int(reach * 0.5 + 0.5)
     total = wp.vec3i(0, 0, 0)
+    beside = wp.vec3i(0, 0, 0)
     weight = int(0)
+    count = int(0)
     start = b * stride
     window = float(2 * half + 1)
     for s in range(-half, steps + half):
@@ -299,10 +304,14 @@ def smear(
                 x = low + ahead
                 y = side
             if x >= 0 and x < width and y >= 0 and y < height:
-                if int(owner[b, y, x]) == item.rank:
-                    i = start + (y * width + x) * 3
+                i = start + (y * width + x) * 3
+                rank = int(owner[b, y, x])
+                if rank == item.rank:
                     total = total + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
                     weight += 1
+                elif rank < item.rank:
+                    beside = beside + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
+                    count += 1
         if s >= 0 and s < steps and weight > 0:
             side = first + int(wp.floor(slope * float(s) + 0.5))
             x = side
@@ -311,7 +320,14 @@ def smear(
                 x = low + s
                 y = side
             if x >= 0 and x < width and y >= 0 and y < height:
-                if respect == 0 or int(owner[b, y, x]) <= item.rank:
+                rank = int(owner[b, y, x])
+                if rank == item.rank:
+                    i = start + (y * width + x) * 3
+                    scale = 1.0 / float(weight + count)
+                    out[i] = wp.uint8(float(total[0] + beside[0]) * scale + 0.5)
+                    out[i + 1] = wp.uint8(float(total[1] + beside[1]) * scale + 0.5)
+                    out[i + 2] = wp.uint8(float(total[2] + beside[2]) * scale + 0.5)
+                elif rank < item.rank:
                     i = start + (y * width + x) * 3
                     alpha = float(weight) / window
                     scale = alpha / float(weight)
@@ -327,7 +343,11 @@ def smear(
                 x = low + behind
                 y = side
             if x >= 0 and x < width and y >= 0 and y < height:
-                if int(owner[b, y, x]) == item.rank:
-                    i = start + (y * width + x) * 3
+                i = start + (y * width + x) * 3
+                rank = int(owner[b, y, x])
+                if rank == item.rank:
                     total = total - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
                     weight -= 1
+                elif rank < item.rank:
+                    beside = beside - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
+                    count -= 1

@@ -9,8 +9,9 @@ from ssad.scenarios.static.shifts.kernels.shared import draw, unit
 class Air:
     """What falls, the same for all cameras of a scene. Lengths in metres, diameters in millimetres.
 
-    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low: least
-    diameter; reach: share of sizes up to the largest; drag: 10.3 exp(-0.6 low) of the speed of fall; snow: 1 for flakes, 0 for drops; growth: visible over melted diameter.
+    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low: least diameter;
+    reach: share of sizes up to the largest; drag: 10.3 exp(-0.6 low) of the speed of fall; growth: visible over melted
+    diameter; snow: 1 for flakes, 0 for drops.
     """
 
     key: wp.uint64
@@ -23,6 +24,58 @@ class Air:
     growth: float
     snow: int
     count: int
+
+
+@wp.struct
+class LensDrop:
+    """A drop on the lens of one image: centre and radius in pixels, height over width."""
+
+    image: int
+    x: float
+    y: float
+    radius: float
+    oval: float
+
+
+@wp.kernel
+def refract(
+    image: wp.array(dtype=wp.uint8),
+    drops: wp.array(dtype=LensDrop),
+    height: int,
+    width: int,
+    stride: int,
+    out: wp.array(dtype=wp.uint8),
+):
+    """A drop is a small lens out of focus: it shows what is around, upside down, small and blurred, dark at its rim."""
+    drop = drops[wp.tid()]
+    start = drop.image * stride
+    wide = int(drop.radius) + 1
+    tall = int(drop.radius * drop.oval) + 1
+    for j in range(-tall, tall + 1):
+        for i in range(-wide, wide + 1):
+            x = int(drop.x) + i
+            y = int(drop.y) + j
+            u = float(i) / drop.radius
+            v = float(j) / (drop.radius * drop.oval)
+            r = wp.sqrt(u * u + v * v)
+            if r < 1.0 and x >= 0 and x < width and y >= 0 and y < height:
+                red = float(0.0)
+                green = float(0.0)
+                blue = float(0.0)
+                for k in range(9):
+                    # a wide view: the rim looks past the picture's border, where it is held
+                    sx = drop.x - (u + float(k % 3 - 1) * 0.12) * float(height) * 0.55
+                    sy = drop.y - (v + float(k / 3 - 1) * 0.12) * float(height) * 0.55
+                    at = start + (wp.clamp(int(sy), 0, height - 1) * width + wp.clamp(int(sx), 0, width - 1)) * 3
+                    red += float(image[at])
+                    green += float(image[at + 1])
+                    blue += float(image[at + 2])
+                cover = 0.8 * wp.clamp((1.0 - r) * 3.0, 0.0, 1.0)
+                shade = (1.0 - 0.35 * r * r) * cover / 9.0
+                o = start + (y * width + x) * 3
+                out[o] = wp.uint8(wp.min(float(out[o]) * (1.0 - cover) + red * shade + 0.5, 255.0))
+                out[o + 1] = wp.uint8(wp.min(float(out[o + 1]) * (1.0 - cover) + green * shade + 0.5, 255.0))
+                out[o + 2] = wp.uint8(wp.min(float(out[o + 2]) * (1.0 - cover) + blue * shade + 0.5, 255.0))
 
 
 @wp.func

@@ -71,3 +71,54 @@ def value_noise(key: wp.uint64, p: wp.vec3) -> float:
     c = wp.lerp(lattice(key, x, y, z + 1), lattice(key, x + 1, y, z + 1), u)
     d = wp.lerp(lattice(key, x, y + 1, z + 1), lattice(key, x + 1, y + 1, z + 1), u)
     return wp.lerp(wp.lerp(a, b, v), wp.lerp(c, d, v), w)
+
+
+# three bytes of a pixel in fields of 21 bits of one word: one multiplication serves all three
+FIELDS = wp.constant(wp.uint64(255 + (255 << 21) + (255 << 42)))
+HALF = wp.constant(wp.uint64(512 + (512 << 21) + (512 << 42)))
+ONES = wp.constant(wp.uint64(1 + (1 << 21) + (1 << 42)))
+
+
+@wp.func
+def spread(pixel: wp.uint32) -> wp.uint64:
+    """The lower 24 bits of a word as three fields."""
+    p = wp.uint64(pixel)
+    return (
+        (p & wp.uint64(255)) | ((p & wp.uint64(65280)) << wp.uint64(13)) | ((p & wp.uint64(16711680)) << wp.uint64(26))
+    )
+
+
+@wp.func
+def gather(fields: wp.uint64) -> wp.uint32:
+    """Three fields of 8 bits as the lower 24 bits of a word."""
+    middle = (fields >> wp.uint64(13)) & wp.uint64(65280)
+    last = (fields >> wp.uint64(26)) & wp.uint64(16711680)
+    return wp.uint32((fields & wp.uint64(255)) | middle | last)
+
+
+@wp.func
+def fields_of(colour: wp.vec3) -> wp.uint64:
+    """A colour, rounded and clipped to 0..1023, as fields."""
+    r = wp.uint64(wp.clamp(int(colour[0] + 0.5), 0, 1023))
+    g = wp.uint64(wp.clamp(int(colour[1] + 0.5), 0, 1023))
+    b = wp.uint64(wp.clamp(int(colour[2] + 0.5), 0, 1023))
+    return r | (g << wp.uint64(21)) | (b << wp.uint64(42))
+
+
+@wp.func
+def blend(a: wp.uint64, b: wp.uint64, share: int) -> wp.uint64:
+    """a * share / 1024 + b * (1 - share / 1024), rounded, field by field (values up to 255)."""
+    total = a * wp.uint64(share) + b * wp.uint64(1024 - share) + HALF
+    return (total >> wp.uint64(10)) & FIELDS
+
+
+@wp.func
+def pixel_of(first: wp.uint32, second: wp.uint32, third: wp.uint32, k: int) -> wp.uint32:
+    """Pixel k of the four in three words."""
+    if k == 0:
+        return first & wp.uint32(16777215)
+    if k == 1:
+        return (first >> wp.uint32(24)) | ((second & wp.uint32(65535)) << wp.uint32(8))
+    if k == 2:
+        return (second >> wp.uint32(16)) | ((third & wp.uint32(255)) << wp.uint32(16))
+    return third >> wp.uint32(8)

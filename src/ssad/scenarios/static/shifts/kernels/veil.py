@@ -2,7 +2,18 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import byte, cell, value_noise
+from ssad.scenarios.static.shifts.kernels.shared import (
+    FIELDS,
+    HALF,
+    ONES,
+    blend,
+    cell,
+    fields_of,
+    gather,
+    pixel_of,
+    spread,
+    value_noise,
+)
 
 
 @wp.kernel
@@ -66,36 +77,37 @@ def transmittance(
 
 @wp.kernel
 def blend_air(
-    image: wp.array(dtype=wp.uint8),
+    image: wp.array(dtype=wp.uint32),
     grid: wp.array3d(dtype=float),
     air: wp.array(dtype=wp.vec3),
-    height: int,
     width: int,
-    stride: int,
-    out: wp.array(dtype=wp.uint8),
+    words: int,
+    out: wp.array(dtype=wp.uint32),
 ):
-    """image * t + air * (1 - t), with t from a quarter grid; `air` in grey levels."""
+    """image * t + air * (1 - t), with t from a quarter grid; `air` in grey levels. Four pixels are three words."""
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     fraction = fy - float(row)
-    start = b * stride + y * width * 3
-    red = int(air[b][0] * 1024.0)
-    green = int(air[b][1] * 1024.0)
-    blue = int(air[b][2] * 1024.0)
-    left = cell(grid, b, row, fraction, -1)
-    for q in range(-1, grid.shape[2]):
-        right = cell(grid, b, row, fraction, q + 1)
-        for k in range(4):
-            x = q * 4 + 2 + k
-            if x >= 0 and x < width:
-                t = int((left + (right - left) * (float(k) + 0.5) * 0.25) * 1024.0)
-                i = start + x * 3
-                rest = 1024 - t
-                out[i] = wp.uint8((int(image[i]) * t * 1024 + red * rest + 524288) >> 20)
-                out[i + 1] = wp.uint8((int(image[i + 1]) * t * 1024 + green * rest + 524288) >> 20)
-                out[i + 2] = wp.uint8((int(image[i + 2]) * t * 1024 + blue * rest + 524288) >> 20)
-        left = right
+    i = b * words + y * width * 3 / 4
+    haze = fields_of(air[b])
+    before = cell(grid, b, row, fraction, -1) * 1024.0
+    here = cell(grid, b, row, fraction, 0) * 1024.0
+    for q in range(width / 4):
+        after = cell(grid, b, row, fraction, q + 1) * 1024.0
+        w0 = image[i]
+        w1 = image[i + 1]
+        w2 = image[i + 2]
+        p0 = gather(blend(spread(pixel_of(w0, w1, w2, 0)), haze, int(before + (here - before) * 0.625)))
+        p1 = gather(blend(spread(pixel_of(w0, w1, w2, 1)), haze, int(before + (here - before) * 0.875)))
+        p2 = gather(blend(spread(pixel_of(w0, w1, w2, 2)), haze, int(here + (after - here) * 0.125)))
+        p3 = gather(blend(spread(pixel_of(w0, w1, w2, 3)), haze, int(here + (after - here) * 0.375)))
+        out[i] = p0 | (p1 << wp.uint32(24))
+        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        i += 3
+        before = here
+        here = after
 
 
 @wp.func
@@ -105,67 +117,59 @@ def opacity(layer: wp.array3d(dtype=int), b: int, near: int, other: int, column:
     return 3 * layer[b, near, x] + layer[b, other, x]
 
 
+@wp.func
+def behind(pixel: wp.uint32, haze: wp.uint64, clear: float, white: wp.uint64, cover: int) -> wp.uint32:
+    """A pixel through the veil, then under particles that hide cover / 1,048,576 of it."""
+    seen = blend(spread(pixel), haze, int(clear))
+    if cover > 0:
+        seen = blend(white, seen, wp.min(cover >> 10, 1024))
+    return gather(seen)
+
+
 @wp.kernel
 def blend_particles(
-    image: wp.array(dtype=wp.uint8),
+    image: wp.array(dtype=wp.uint32),
     grid: wp.array3d(dtype=float),
     air: wp.array(dtype=wp.vec3),
     layer: wp.array3d(dtype=int),
     white: wp.array(dtype=wp.vec3),
-    height: int,
     width: int,
-    stride: int,
-    out: wp.array(dtype=wp.uint8),
+    words: int,
+    out: wp.array(dtype=wp.uint32),
 ):
     """The veil of `blend_air`, then particles over it: layer is their opacity (of 65536) at half resolution."""
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     fraction = fy - float(row)
-    start = b * stride + y * width * 3
-    red = int(air[b][0] * 1024.0)
-    green = int(air[b][1] * 1024.0)
-    blue = int(air[b][2] * 1024.0)
-    r = int(white[b][0] * 1024.0)
-    g = int(white[b][1] * 1024.0)
-    w = int(white[b][2] * 1024.0)
+    i = b * words + y * width * 3 / 4
+    haze = fields_of(air[b])
+    light = fields_of(white[b])
     # rows of the half-resolution layer around this row: weights 3/4 and 1/4
     near = y / 2
     other = wp.clamp(near + (y & 1) * 2 - 1, 0, layer.shape[1] - 1)
-    left = cell(grid, b, row, fraction, -1)
-    o0 = opacity(layer, b, near, other, -2)
-    o1 = opacity(layer, b, near, other, -1)
-    for q in range(-1, grid.shape[2]):
-        right = cell(grid, b, row, fraction, q + 1)
-        # pixels 4q+2 to 4q+5 lie in the half-resolution columns 2q+1 and 2q+2
-        o2 = opacity(layer, b, near, other, 2 * q + 2)
-        o3 = opacity(layer, b, near, other, 2 * q + 3)
-        any_drop = o0 + o1 + o2 + o3
-        for k in range(4):
-            x = q * 4 + 2 + k
-            if x >= 0 and x < width:
-                t = int((left + (right - left) * (float(k) + 0.5) * 0.25) * 1024.0)
-                i = start + x * 3
-                rest = 1024 - t
-                c0 = (int(image[i]) * t * 1024 + red * rest) >> 10
-                c1 = (int(image[i + 1]) * t * 1024 + green * rest) >> 10
-                c2 = (int(image[i + 2]) * t * 1024 + blue * rest) >> 10
-                if any_drop > 0:
-                    a = 3 * o1 + o0
-                    if k == 1:
-                        a = 3 * o1 + o2
-                    elif k == 2:
-                        a = 3 * o2 + o1
-                    elif k == 3:
-                        a = 3 * o2 + o3
-                    a = wp.min(a >> 10, 1024)
-                    c0 = c0 + (((r - c0) * a) >> 10)
-                    c1 = c1 + (((g - c1) * a) >> 10)
-                    c2 = c2 + (((w - c2) * a) >> 10)
-                out[i] = wp.uint8((c0 + 512) >> 10)
-                out[i + 1] = wp.uint8((c1 + 512) >> 10)
-                out[i + 2] = wp.uint8((c2 + 512) >> 10)
-        left = right
+    before = cell(grid, b, row, fraction, -1) * 1024.0
+    here = cell(grid, b, row, fraction, 0) * 1024.0
+    o0 = opacity(layer, b, near, other, -1)
+    o1 = opacity(layer, b, near, other, 0)
+    for q in range(width / 4):
+        after = cell(grid, b, row, fraction, q + 1) * 1024.0
+        # pixels 4q to 4q+3 lie in the half-resolution columns 2q and 2q+1
+        o2 = opacity(layer, b, near, other, 2 * q + 1)
+        o3 = opacity(layer, b, near, other, 2 * q + 2)
+        w0 = image[i]
+        w1 = image[i + 1]
+        w2 = image[i + 2]
+        p0 = behind(pixel_of(w0, w1, w2, 0), haze, before + (here - before) * 0.625, light, 3 * o1 + o0)
+        p1 = behind(pixel_of(w0, w1, w2, 1), haze, before + (here - before) * 0.875, light, 3 * o1 + o2)
+        p2 = behind(pixel_of(w0, w1, w2, 2), haze, here + (after - here) * 0.125, light, 3 * o2 + o1)
+        p3 = behind(pixel_of(w0, w1, w2, 3), haze, here + (after - here) * 0.375, light, 3 * o2 + o3)
+        out[i] = p0 | (p1 << wp.uint32(24))
+        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        i += 3
+        before = here
+        here = after
         o0 = o2
         o1 = o3
 
@@ -218,34 +222,51 @@ def glare(
         out[b, y, x] = strength[b] * light
 
 
+@wp.func
+def lit(pixel: wp.uint32, gain: wp.uint64, tint: wp.uint64, light: float) -> wp.uint32:
+    """pixel * gain + tint * light (of 1024 both), clipped: what overflows a field is white."""
+    bright = wp.uint64(wp.clamp(int(light + 0.5), 0, 320))
+    total = ((spread(pixel) * gain + tint * bright + HALF) >> wp.uint64(10)) & TENS
+    over = ((total >> wp.uint64(8)) | (total >> wp.uint64(9))) & ONES
+    return gather((total | (over * wp.uint64(255))) & FIELDS)
+
+
+# fields of ten bits
+TENS = wp.constant(wp.uint64(1023 + (1023 << 21) + (1023 << 42)))
+
+
 @wp.kernel
 def blend_glare(
-    image: wp.array(dtype=wp.uint8),
+    image: wp.array(dtype=wp.uint32),
     grid: wp.array3d(dtype=float),
     tint: wp.array(dtype=wp.vec3),
     gain: wp.array(dtype=float),
-    height: int,
     width: int,
-    stride: int,
-    out: wp.array(dtype=wp.uint8),
+    words: int,
+    out: wp.array(dtype=wp.uint32),
 ):
-    """image * gain + tint * grid, clipped: the exposure goes down, the glare comes on top."""
+    """image * gain + tint * grid, clipped: the exposure goes down, the glare comes on top. tint, gain: 0 to 1."""
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     fraction = fy - float(row)
-    start = b * stride + y * width * 3
-    factor = gain[b]
-    colour = tint[b]
-    left = cell(grid, b, row, fraction, -1)
-    for q in range(-1, grid.shape[2]):
-        right = cell(grid, b, row, fraction, q + 1)
-        for k in range(4):
-            x = q * 4 + 2 + k
-            if x >= 0 and x < width:
-                light = left + (right - left) * (float(k) + 0.5) * 0.25
-                i = start + x * 3
-                out[i] = byte(float(image[i]) * factor + colour[0] * light)
-                out[i + 1] = byte(float(image[i + 1]) * factor + colour[1] * light)
-                out[i + 2] = byte(float(image[i + 2]) * factor + colour[2] * light)
-        left = right
+    i = b * words + y * width * 3 / 4
+    factor = wp.uint64(wp.clamp(int(gain[b] * 1024.0), 0, 1024))
+    colour = fields_of(tint[b] * 1023.0)
+    before = cell(grid, b, row, fraction, -1)
+    here = cell(grid, b, row, fraction, 0)
+    for q in range(width / 4):
+        after = cell(grid, b, row, fraction, q + 1)
+        w0 = image[i]
+        w1 = image[i + 1]
+        w2 = image[i + 2]
+        p0 = lit(pixel_of(w0, w1, w2, 0), factor, colour, before + (here - before) * 0.625)
+        p1 = lit(pixel_of(w0, w1, w2, 1), factor, colour, before + (here - before) * 0.875)
+        p2 = lit(pixel_of(w0, w1, w2, 2), factor, colour, here + (after - here) * 0.125)
+        p3 = lit(pixel_of(w0, w1, w2, 3), factor, colour, here + (after - here) * 0.375)
+        out[i] = p0 | (p1 << wp.uint32(24))
+        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        i += 3
+        before = here
+        here = after

@@ -1,0 +1,166 @@
+"""ssad shift and ssad score on the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ssad import cli
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
+from ssad.datasets.nuscenes.tiny import make_tiny
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of the command in this process."""
+    monkeypatch.setattr("sys.argv", ["ssad", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_tiny(tmp_path_factory.mktemp("data") / "tiny", scenes=2, samples=2, sweeps=0, size=(320, 180))
+
+
+def perfect(root: Path, file: Path, **meta: str) -> Path:
+    """A results file that says exactly what the tables say."""
+    data = NuScenes(root)
+    results = {}
+    for record in data.scenes():
+        scene = data.scene(record.name)
+        for sample in scene.samples:
+            found = scene.annotations(sample.token)
+            results[sample.token] = [
+                {
+                    "sample_token": sample.token,
+                    "translation": found.centre[n].tolist(),
+                    "size": found.size[n].tolist(),
+                    "rotation": found.rotation[n].tolist(),
+                    "velocity": found.velocity[n, :2].tolist(),
+                    "detection_name": CATEGORY_TO_CLASS[found.category[n]],
+                    "detection_score": 0.5,
+                    "attribute_name": (found.attributes[n] or ("",))[0],
+                }
+                for n in range(len(found))
+                if found.category[n] in CATEGORY_TO_CLASS
+            ]
+    kinds = {f"use_{k}": k == "camera" for k in ("camera", "lidar", "radar", "map", "external")}
+    file.write_text(json.dumps({"meta": kinds | meta, "results": results}))
+    return file
+
+
+def test_a_folder_is_shifted_scored_and_verified(
+    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go = lambda *a: run(capsys, monkeypatch, *map(str, a))  # noqa: E731
+    out = tmp_path / "n"
+    code, text, _ = go(
+        "shift", tiny, out, "--shifts", "gaussian,scale", "--severity", "2", "--workers", "1", "--labels", "transformed"
+    )
+    assert code == 0
+    assert text.count("files shifted") == 2
+    assert go("shift", out, out, "--verify")[0] == 0
+    results = perfect(tiny, tmp_path / "results.json")
+    score = ("--version", "v1.0-mini", "--split", "mini_val", "--json", tmp_path / "score.json")
+    code, text, _ = go("score", results, "--dataroot", tiny, *score)
+    assert code == 0
+    assert "data: clean" in text
+    clean = json.loads((tmp_path / "score.json").read_text())
+    assert {"mean_ap", "nd_score", "tp_errors", "mean_dist_aps", "label_aps", "label_tp_errors"} <= set(clean)
+    assert clean["mean_dist_aps"]["car"] == pytest.approx(1.0)
+    code, text, _ = go("score", results, "--dataroot", out / "scale-2", *score)
+    assert code == 0
+    assert "scale, severity 2" in text
+    scaled = json.loads((tmp_path / "score.json").read_text())
+    assert scaled["label_tp_errors"]["car"]["scale_err"] > 0.2, "the truth grew, the boxes did not"
+    assert scaled["ssad"]["data"] == "shifted"
+
+    # a results file that says which data it saw is believed only for those
+    named = perfect(tiny, tmp_path / "named.json", ssad_manifest=scaled["ssad"]["manifest"])
+    assert go("score", named, "--dataroot", out / "scale-2", *score)[0] == 0
+    for root in (out / "gaussian-2", tiny):
+        code, _, err = go("score", named, "--dataroot", root, *score)
+        assert code == 2
+        assert "the results were made on" in err
+
+    # clean files in the place of shifted ones
+    victim = next((out / "gaussian-2" / "samples" / "CAM_FRONT").iterdir())
+    shutil.copy(tiny / "samples" / "CAM_FRONT" / victim.name, victim)
+    code, _, err = go("score", results, "--dataroot", out / "gaussian-2", *score)
+    assert code == 2
+    assert victim.name in err
+    code, text, _ = go("shift", out, out, "--verify")
+    assert code == 1
+    assert victim.name in text
+
+
+def test_contact_sheets(
+    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, text, _ = run(capsys, monkeypatch, "shift", str(tiny), str(tmp_path / "sheet.png"))
+    assert code == 0
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    rows, columns = 4, 3
+    tall, wide = sheet.shape[0] // rows, sheet.shape[1] // columns
+    panels = [
+        sheet[r * tall : (r + 1) * tall - 30, c * wide : (c + 1) * wide] for r in range(rows) for c in range(columns)
+    ]
+    for panel in panels[1:]:
+        assert np.abs(panel.astype(int) - panels[0]).mean() > 0.05, "every panel differs from the clean one"
+    assert (tmp_path / "sheet-severities.png").is_file()
+    picture = next((tiny / "samples" / "CAM_BACK").iterdir())
+    own = tmp_path / "own.jpg"
+    code, text, _ = run(
+        capsys, monkeypatch, "shift", str(picture), str(own), "--box", "120,80,200,130", "--severity", "5"
+    )
+    assert code == 0
+    assert str(own) in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parts"),
+    [
+        (("shift", "nowhere", "out"), ("nowhere", "no such folder")),
+        (("shift", "{tiny}", "{tmp}/o", "--shifts", "fgo"), ("unknown shift 'fgo'", "closest: fog")),
+        (("shift", "{tiny}", "{tmp}/o", "--severity", "6"), ("expected 1 to 5",)),
+        (("shift", "{tiny}", "{tmp}/o", "--calibration", "real"), ("calibration",)),
+        (("shift", "{tiny}", "{tmp}/o", "--labels", "moved"), ("labels 'moved'",)),
+        (("shift", "{tiny}", "{tmp}/o", "--version", "v1.0-test"), ("v1.0-test", "v1.0-mini")),
+        (("shift", "{tiny}", "{tmp}/o", "--scenes", "scene-9"), ("scene-9",)),
+        (("shift", "{tiny}", "{tmp}/o", "--split", "vall"), ("vall",)),
+        (("shift", "{tiny}", "{tiny}/o"), ("outside of the dataset",)),
+        (("shift", "{tmp}", "{tmp}/x", "--verify"), ("not written by ssad shift",)),
+        (("shift", "{picture}", "{tmp}/x.png", "--box", "1,2,3"), ("--box 1,2,3", "x0,y0,x1,y1")),
+        (("shift", "{picture}", "{tmp}/x.png", "--box", "1,2,90,20"), ("horizon",)),
+        (("shift", "{picture}", "{tmp}/x.gif"), ("x.gif",)),
+        (
+            ("score", "none.json", "--dataroot", "{tiny}", "--version", "v1.0-mini", "--split", "mini_val"),
+            ("none.json",),
+        ),
+        (("score", "none.json", "--dataroot", "{tiny}", "--version", "v1.0-x", "--split", "mini_val"), ("v1.0-x",)),
+    ],
+)
+def test_wrong_use_ends_in_one_line(
+    arguments: tuple[str, ...],
+    parts: tuple[str, ...],
+    tiny: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = {"tiny": str(tiny), "tmp": str(tmp_path), "picture": str(next((tiny / "samples" / "CAM_BACK").iterdir()))}
+    code, out, err = run(capsys, monkeypatch, *(a.format(**names) for a in arguments))
+    assert code == 2
+    assert out == ""
+    assert err.startswith("error: ")
+    assert len(err.strip().splitlines()) == 1
+    for part in parts:
+        assert part in err
