@@ -339,7 +339,7 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
     wp.launch(
         kernels.paint,
         dim=(batch.count, batch.height),
-        inputs=[batch.data, items, first, owner, nodes, respect, batch.stride],
+        inputs=[batch.words(), items, first, owner, nodes, respect, batch.stride],
         outputs=[out.data],
         device=device,
     )

@@ -219,8 +219,10 @@ def add_precipitation(
     drops = _lens_drops(batch, frames, specs)
     if len(drops):
         rows = structs(batch, drops, particles.LensDrop)
-        inputs = [batch.data, rows, batch.height, batch.width, batch.stride]
-        wp.launch(particles.refract, dim=len(drops), inputs=inputs, outputs=[out.data], device=batch.device)
+        first = on(batch, np.searchsorted([d[0] for d in drops], np.arange(batch.count + 1)), wp.int32)
+        inputs = [batch.data, rows, first, batch.height, batch.width]
+        dim = (batch.count, batch.height)
+        wp.launch(particles.refract, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
     rates = [(table.SNOW_RATE if s.name == "snow" else table.RAIN_RATE)[s.severity - 1] for s in specs]
     done = [
         Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _count(s), "depth": source})

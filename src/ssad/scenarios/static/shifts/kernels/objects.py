@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from ssad.scenarios.static.shifts.kernels.shared import spread
+
 
 @wp.struct
 class Item:
@@ -36,6 +38,7 @@ class Item:
 
 
 STEP = wp.constant(4)
+DONE = wp.constant(16384)
 
 
 @wp.func
@@ -146,7 +149,7 @@ def displace(
             result = wp.vec4(dx, dy, wp.max(new - r, 0.0), 0.0)
         else:
             old = outline_reach(points, item.old_first, item.old_count, item.middle, u)
-            if old > new:
+            if old > new + 0.5:
                 edge = old * 1.25 + 8.0
                 if r < edge:
                     # from a little outside the old outline: boxes are not drawn to the pixel
@@ -161,18 +164,23 @@ def displace(
 
 
 # half of 4096 in each of three fields of 21 bits
-HALF = wp.constant(wp.uint64(2048 + (2048 << 21) + (2048 << 42)))
+MIDDLE = wp.constant(wp.uint64(2048 + (2048 << 21) + (2048 << 42)))
 
 
 @wp.func
-def colour(image: wp.array(dtype=wp.uint8), i: int) -> wp.uint64:
-    """Three bytes in fields of 21 bits: a weighted sum of colours is one multiplication each."""
-    return wp.uint64(image[i]) | (wp.uint64(image[i + 1]) << wp.uint64(21)) | (wp.uint64(image[i + 2]) << wp.uint64(42))
+def between(words: wp.array(dtype=wp.uint32), i: int, right: wp.uint64, left: wp.uint64) -> wp.uint64:
+    """The pixel at byte i and its right neighbour, weighted, as fields: two or three words hold both."""
+    w = i >> 2
+    shift = wp.uint64((i & 3) * 8)
+    both = (wp.uint64(words[w]) | (wp.uint64(words[w + 1]) << wp.uint64(32))) >> shift
+    if shift > wp.uint64(16):
+        both = both | (wp.uint64(words[w + 2]) << wp.uint64(40))
+    return spread(wp.uint32(both)) * left + spread(wp.uint32(both >> wp.uint64(24))) * right
 
 
 @wp.kernel
 def paint(
-    image: wp.array(dtype=wp.uint8),
+    image: wp.array(dtype=wp.uint32),
     items: wp.array(dtype=Item),
     item_first: wp.array(dtype=int),
     owner: wp.array3d(dtype=wp.int16),
@@ -181,15 +189,18 @@ def paint(
     stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """Draws the items of an image row by row, the farthest first, always from the unchanged image.
+    """Draws the items of an image row by row, the nearest first, always from the unchanged image.
 
-    respect = 1: an item is not drawn over a nearer box nor with a nearer box's pixels.
+    A pixel is drawn once: then it is marked as done in `owner`. respect = 1: an item is not drawn over a nearer box nor
+    with a nearer box's pixels.
     """
     b, y = wp.tid()
     height = owner.shape[1]
     width = owner.shape[2]
     start = b * stride
-    for k in range(item_first[b], item_first[b + 1]):
+    last = item_first[b + 1] - 1
+    for back in range(last - item_first[b] + 1):
+        k = last - back
         if items[k].skip == 0 and y >= items[k].low_y and y < items[k].high_y:
             rank = items[k].rank
             low = items[k].low_x
@@ -207,7 +218,7 @@ def paint(
                         x = low + nx * STEP + m
                         if x < end:
                             hidden = int(owner[b, y, x])
-                            if respect == 0 or hidden <= rank:
+                            if hidden < DONE and (respect == 0 or hidden <= rank):
                                 n = left + (right - left) * (float(m) * 0.25)
                                 inside = n[2] > 0.0
                                 if inside or (n[3] > 0.5 and wp.abs(n[0]) + wp.abs(n[1]) > 0.2):
@@ -217,7 +228,7 @@ def paint(
                                     y0 = int(sy)
                                     fine = respect == 0
                                     if respect == 1:
-                                        seen = int(owner[b, y0, x0])
+                                        seen = int(owner[b, y0, x0]) & (DONE - 1)
                                         fine = seen <= rank
                                         if not inside:
                                             fine = (seen == 0 or seen == rank) and (hidden == 0 or hidden == rank)
@@ -230,9 +241,9 @@ def paint(
                                         w10 = wp.uint64((64 - ax) * ay)
                                         w11 = wp.uint64(ax * ay)
                                         w00 = wp.uint64(4096) - w01 - w10 - w11
-                                        total = colour(image, i) * w00 + colour(image, i + 3) * w01
-                                        total += colour(image, d) * w10 + colour(image, d + 3) * w11
-                                        total += HALF
+                                        total = between(image, i, w01, w00) + between(image, d, w11, w10)
+                                        total += MIDDLE
+                                        owner[b, y, x] = wp.int16(hidden | DONE)
                                         o = start + (y * width + x) * 3
                                         out[o] = wp.uint8(total >> wp.uint64(12))
                                         out[o + 1] = wp.uint8((total >> wp.uint64(33)) & wp.uint64(255))

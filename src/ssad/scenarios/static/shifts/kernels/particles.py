@@ -41,41 +41,45 @@ class LensDrop:
 def refract(
     image: wp.array(dtype=wp.uint8),
     drops: wp.array(dtype=LensDrop),
+    first: wp.array(dtype=int),
     height: int,
     width: int,
-    stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """A drop is a small lens out of focus: it shows what is around, upside down, small and blurred, dark at its rim."""
-    drop = drops[wp.tid()]
-    start = drop.image * stride
-    wide = int(drop.radius) + 1
-    tall = int(drop.radius * drop.oval) + 1
-    for j in range(-tall, tall + 1):
-        for i in range(-wide, wide + 1):
-            x = int(drop.x) + i
-            y = int(drop.y) + j
-            u = float(i) / drop.radius
-            v = float(j) / (drop.radius * drop.oval)
-            r = wp.sqrt(u * u + v * v)
-            if r < 1.0 and x >= 0 and x < width and y >= 0 and y < height:
-                red = float(0.0)
-                green = float(0.0)
-                blue = float(0.0)
-                for k in range(9):
-                    # a wide view: the rim looks past the picture's border, where it is held
-                    sx = drop.x - (u + float(k % 3 - 1) * 0.12) * float(height) * 0.55
-                    sy = drop.y - (v + float(k / 3 - 1) * 0.12) * float(height) * 0.55
-                    at = start + (wp.clamp(int(sy), 0, height - 1) * width + wp.clamp(int(sx), 0, width - 1)) * 3
-                    red += float(image[at])
-                    green += float(image[at + 1])
-                    blue += float(image[at + 2])
-                cover = 0.8 * wp.clamp((1.0 - r) * 3.0, 0.0, 1.0)
-                shade = (1.0 - 0.35 * r * r) * cover / 9.0
-                o = start + (y * width + x) * 3
-                out[o] = wp.uint8(wp.min(float(out[o]) * (1.0 - cover) + red * shade + 0.5, 255.0))
-                out[o + 1] = wp.uint8(wp.min(float(out[o + 1]) * (1.0 - cover) + green * shade + 0.5, 255.0))
-                out[o + 2] = wp.uint8(wp.min(float(out[o + 2]) * (1.0 - cover) + blue * shade + 0.5, 255.0))
+    """A drop is a small lens out of focus: it shows what is around, upside down, small and blurred, dark at its rim.
+
+    One thread a row, the drops of an image one after the other, so that drops that overlap do so in one order.
+    """
+    b, y = wp.tid()
+    start = b * height * width * 3
+    for n in range(first[b], first[b + 1]):
+        drop = drops[n]
+        v = float(y - int(drop.y)) / (drop.radius * drop.oval)
+        if wp.abs(v) < 1.0:
+            wide = int(drop.radius) + 1
+            for i in range(-wide, wide + 1):
+                x = int(drop.x) + i
+                u = float(i) / drop.radius
+                r = wp.sqrt(u * u + v * v)
+                if r < 1.0 and x >= 0 and x < width:
+                    red = float(0.0)
+                    green = float(0.0)
+                    blue = float(0.0)
+                    for k in range(9):
+                        # a wide view: the rim looks past the picture's border, where it is held
+                        sx = drop.x - (u + float(k % 3 - 1) * 0.12) * float(height) * 0.55
+                        sy = drop.y - (v + float(k / 3 - 1) * 0.12) * float(height) * 0.55
+                        row = wp.clamp(int(sy), 0, height - 1)
+                        at = start + (row * width + wp.clamp(int(sx), 0, width - 1)) * 3
+                        red += float(image[at])
+                        green += float(image[at + 1])
+                        blue += float(image[at + 2])
+                    cover = 0.8 * wp.clamp((1.0 - r) * 3.0, 0.0, 1.0)
+                    shade = (1.0 - 0.35 * r * r) * cover / 9.0
+                    o = start + (y * width + x) * 3
+                    out[o] = wp.uint8(wp.min(float(out[o]) * (1.0 - cover) + red * shade + 0.5, 255.0))
+                    out[o + 1] = wp.uint8(wp.min(float(out[o + 1]) * (1.0 - cover) + green * shade + 0.5, 255.0))
+                    out[o + 2] = wp.uint8(wp.min(float(out[o + 2]) * (1.0 - cover) + blue * shade + 0.5, 255.0))
 
 
 @wp.func
