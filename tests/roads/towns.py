@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ssad.roads import LaneGraph, bake, load_town
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround")
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
 IMPORTED = ("Town_Safebench_Light", "Town02", "Town05")
 
 

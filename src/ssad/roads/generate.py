@@ -10,6 +10,7 @@ from pathlib import Path
 from ssad.errors import unknown_name
 from ssad.roads.bake import bake
 from ssad.roads.graph import save_graph
+from ssad.roads.library import BUILT_IN
 from ssad.roads.writer import Point, Street, Town, write_town
 from ssad.safeio import write_atomic
 
@@ -102,23 +103,127 @@ def proving_ground() -> Town:
     return Town("ProvingGround", tuple(streets), signalled=(*inner, (a, low), (b, high), (high, a), (low, b)))
 
 
-TOWNS: dict[str, Callable[[], Town]] = {
+def _shift(a: Point, b: Point, *, lead: float) -> tuple[Point, ...]:
+    """Points of a street from a to b that leaves and arrives along one axis and crosses over between.
+
+    lead: m from each end to where it turns. The axis is that of the longer side.
+    """
+    along = (1.0, 0.0) if abs(b[0] - a[0]) > abs(b[1] - a[1]) else (0.0, 1.0)
+    step = along[0] * (b[0] - a[0]) + along[1] * (b[1] - a[1])
+    if abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9:
+        return a, b
+    sign = lead if step > 0.0 else -lead
+    one = (a[0] + sign * along[0], a[1] + sign * along[1])
+    two = (b[0] - sign * along[0], b[1] - sign * along[1])
+    return a, one, two, b
+
+
+def oldmarket() -> Town:
+    """Narrow two-lane streets of an old town: short crooked blocks inside a crescent, about 280 x 260 m.
+
+    Junctions lie off the grid by some metres, so that no street is straight for long. The market is the large block.
+    """
+
+    def street(points: tuple[Point, ...]) -> Street:
+        return Street(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=22.0)
+
+    def crescent(points: tuple[Point, ...]) -> Street:
+        return Street(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=48.0)
+
+    # rows from south to north, junctions from west to east
+    south: list[Point] = [(80.0, 0.0), (146.0, -6.0), (212.0, 2.0)]
+    lower: list[Point] = [(0.0, 66.0), (74.0, 76.0), (144.0, 68.0), (206.0, 78.0), (280.0, 70.0)]
+    middle: list[Point] = [(8.0, 128.0), (84.0, 136.0)]
+    upper: list[Point] = [(0.0, 192.0), (78.0, 198.0), (196.0, 190.0), (294.0, 198.0)]
+    north: list[Point] = [(86.0, 256.0), (214.0, 260.0)]
+    pairs = [
+        *pairwise(south),
+        *pairwise(lower),
+        *pairwise(middle),
+        *pairwise(upper),
+        *pairwise(north),
+        *pairwise([south[0], lower[1], middle[1], upper[1], north[0]]),
+        *pairwise([south[2], lower[3], upper[2], north[1]]),
+        *pairwise([lower[0], middle[0], upper[0]]),
+        (south[1], lower[2]),
+        (lower[4], upper[3]),
+    ]
+    streets = [street(_shift(a, b, lead=19.0)) for a, b in pairs]
+    streets += [
+        crescent((south[0], (lower[0][0], south[0][1]), lower[0])),
+        crescent((south[2], (lower[4][0], south[2][1]), lower[4])),
+        crescent((north[0], (upper[0][0], north[0][1]), upper[0])),
+        crescent((north[1], (upper[3][0], north[1][1]), upper[3])),
+    ]
+    return Town("Oldmarket", tuple(streets), signalled=(lower[1], lower[3], upper[1], upper[2]))
+
+
+def larkhill() -> Town:
+    """A suburb of two-lane roads that wind, with T-junctions and cul-de-sacs that end in a loop; 470 x 450 m."""
+
+    def road(*points: Point) -> Street:
+        return Street(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=25.0, radius=34.0)
+
+    def close(*points: Point) -> Street:
+        return Street(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=20.0, radius=13.0)
+
+    def loop(head: Point, ahead: Point, aside: float) -> Street:
+        """A street that leaves `head` sideways, runs round and comes back; ahead: m east and north to its far side."""
+        (x, y), (u, v) = head, ahead
+        a, b = (0.0, aside) if u else (aside, 0.0)
+        return close(head, (x + a, y + b), (x + a + u, y + b + v), (x - a + u, y - b + v), (x - a, y - b), head)
+
+    south, lane, east = (120.0, 20.0), (245.0, 0.0), (335.0, 12.0)
+    west, centre, fork, gate = (20.0, 180.0), (200.0, 160.0), (335.0, 176.0), (450.0, 190.0)
+    north, birch, elm = (225.0, 335.0), (110.0, 322.0), (440.0, 290.0)
+    heads = ((120.0, -48.0), (245.0, 62.0), (110.0, 262.0), (372.0, 290.0))
+    streets = [
+        road(south, (60.0, 20.0), (20.0, 80.0), west),
+        road(south, (155.0, 20.0), (190.0, 0.0), lane),
+        road(lane, (275.0, 0.0), (300.0, 12.0), east),
+        road(east, (400.0, 12.0), (450.0, 70.0), (438.0, 115.0), (450.0, 150.0), gate),
+        road(gate, (450.0, 225.0), (440.0, 255.0), elm),
+        road(elm, (440.0, 372.0), (330.0, 372.0), (280.0, 335.0), north),
+        road(north, (190.0, 335.0), (150.0, 322.0), birch),
+        road(birch, (50.0, 322.0), (20.0, 260.0), west),
+        road(west, (70.0, 180.0), (105.0, 200.0), (135.0, 190.0), (158.0, 160.0), centre),
+        road(centre, (240.0, 160.0), (290.0, 176.0), fork),
+        road(fork, (385.0, 176.0), (405.0, 190.0), gate),
+        road(south, (120.0, 58.0), (150.0, 92.0), (200.0, 112.0), centre),
+        road(centre, (200.0, 205.0), (240.0, 250.0), (225.0, 295.0), north),
+        road(east, (335.0, 55.0), (310.0, 95.0), (335.0, 135.0), fork),
+        close(south, heads[0]),
+        close(lane, heads[1]),
+        close(birch, heads[2]),
+        close(elm, heads[3]),
+        loop(heads[0], (0.0, -44.0), 30.0),
+        loop(heads[1], (0.0, 40.0), 29.0),
+        loop(heads[2], (0.0, -42.0), 30.0),
+        loop(heads[3], (-46.0, 0.0), 30.0),
+    ]
+    return Town("Larkhill", tuple(streets), signalled=(south, centre, fork))
+
+
+_MAKERS: dict[str, Callable[[], Town]] = {
     "Twinford": twinford,
     "Crossgate": crossgate,
     "ProvingGround": proving_ground,
+    "Oldmarket": oldmarket,
+    "Larkhill": larkhill,
 }
+TOWNS = {name: _MAKERS[name] for name in BUILT_IN}  # those that load by name
 
 
 def generate_town(name: str) -> str:
     """OpenDRIVE 1.4 text of a built-in town. UnknownNameError."""
-    if name not in TOWNS:
-        raise unknown_name("town", name, TOWNS)
-    return write_town(TOWNS[name]())
+    if name not in _MAKERS:
+        raise unknown_name("town", name, _MAKERS)
+    return write_town(_MAKERS[name]())
 
 
 def main(folder: str) -> None:
     """Write every built-in town as NAME.xodr and NAME.npz."""
-    for name in TOWNS:
+    for name in _MAKERS:
         path = Path(folder) / f"{name}.xodr"
         write_atomic(path, generate_town(name))
         save_graph(bake(path, name), path.with_suffix(".npz"))

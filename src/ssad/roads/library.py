@@ -11,7 +11,7 @@ from ssad.roads.bake import bake
 from ssad.roads.graph import LaneGraph, load_graph
 from ssad.safeio import home
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround")
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
 
 
 def town_names() -> dict[str, str]:

@@ -1,0 +1,111 @@
+"""Frames a second of the camera: python benchmarks/camera_speed.py [--device cpu|cuda] [--batch N] [--out FILE]
+
+A street of Twinford, 640 x 640, 30 vehicles, 2 x 2 samples a pixel, shadows; medians. Re-texturing: a car 20 m ahead
+wears a texture of 256 x 256; picture and gradient, once the frame has been seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+import warp as wp
+
+from ssad.camera.bodies import draw_paint, make_body
+from ssad.camera.render import View, Weather, render
+from ssad.camera.stage import Stage, Thing
+from ssad.camera.street import build_street
+from ssad.camera.texture import apply_taps, taps_of, texture_gradient
+from ssad.frames import FORWARD, Camera
+from ssad.roads import load_town
+from ssad.seeding import generator
+
+
+def place(x: float, y: float, yaw: float) -> Any:
+    """Pose of something on the ground."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:2, 3] = x, y
+    return pose
+
+
+def scene(size: int, device: str) -> tuple[Stage, View]:
+    """A stage and a view with 30 vehicles on the lanes before the camera."""
+    graph = load_town("Twinford")
+    kinds = ["car"] * 7 + ["truck", "bus", "motorcycle"]
+    meshes = [make_body(kind, generator=generator("camera speed", k)) for k, kind in enumerate(kinds)]
+    stage = Stage(build_street(graph, seed=0), meshes, device=device)
+    lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == 1 and graph.junction[k] < 0]
+    start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
+    first = graph.offset[start] + 6
+    ego = place(*graph.xy[first], graph.yaw[first])
+    spots = np.concatenate([np.arange(graph.offset[k] + 3, graph.offset[k + 1], 9) for k in lanes])
+    local = (graph.xy[spots] - graph.xy[first]) @ ego[:2, :2]
+    ahead = (local[:, 0] > 9) & (np.abs(local[:, 1]) < local[:, 0])
+    spots = spots[ahead][np.argsort(local[ahead, 0])][:30]
+    draws = generator("camera speed")
+    things = [
+        Thing(k % len(meshes), place(*graph.xy[i], graph.yaw[i]), draw_paint(draws), k + 1) for k, i in enumerate(spots)
+    ]
+    things[0] = Thing(0, ego @ place(21.7, 0, 0), tag=1, texture=0)
+    focal = 0.79 * size
+    camera = Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]))
+    return stage, View(camera, ego @ FORWARD, tuple(things), Weather(0.8, 0.9))
+
+
+def median(run: Callable[[], object], device: str, repeats: int) -> float:
+    """Median seconds of a call, after one to warm up."""
+    times = []
+    for number in range(repeats + 1):
+        wp.synchronize_device(device)
+        begin = time.perf_counter()
+        run()
+        wp.synchronize_device(device)
+        if number:
+            times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def main() -> None:
+    """Measures, prints, writes JSON."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--batch", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    device = "cuda:0" if options.device == "cuda" else "cpu"
+    stage, view = scene(640, device)
+    seconds = median(lambda: render(stage, [view] * options.batch, download=False), device, options.repeats)
+    result: dict[str, Any] = {
+        "device": wp.get_device(device).name if device != "cpu" else platform.machine(),
+        "batch": options.batch,
+        "things": len(view.things),
+        "ms_per_frame": 1e3 * seconds / options.batch,
+        "frames_per_s": options.batch / seconds,
+    }
+    print(f"{result['ms_per_frame']:.2f} ms a frame, {result['frames_per_s']:.0f} frames/s")
+    if device == "cpu":
+        picture = render(stage, [view])
+        taps = taps_of(picture, 256)
+        texture, pull = np.full((256, 256, 3), 0.4), np.ones_like(picture.radiance)
+        both = median(lambda: (apply_taps(taps, texture, picture.radiance), texture_gradient(taps, pull)), device, 15)
+        result["retexture_ms"] = 1e3 * both
+        result["pieces"] = len(taps.pixel)
+        print(f"{1e3 * both:.2f} ms to re-texture {len(taps.pixel)} pieces, with gradient")
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The camera: meshes, visibility, shading, weather and sensors."""

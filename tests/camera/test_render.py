@@ -1,0 +1,288 @@
+"""Visibility, shading and textures of the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssad.camera import mesh as meshes
+from ssad.camera.kernels import raster
+from ssad.camera.mesh import Material, build
+from ssad.camera.render import View, Weather, light_of, render, response
+from ssad.camera.stage import Stage, Thing
+from ssad.camera.texture import apply_taps, levels_of, pyramid, pyramid_transpose, taps_of, texture_gradient
+from ssad.errors import ConfigError
+from ssad.frames import FORWARD, Camera
+
+GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
+PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
+CAMERA = Camera(64, 48, np.array([[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]))
+NOON = Weather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
+
+
+def visible(vertices: Any, faces: Any, *, width: int = 128, height: int = 96, scale: int = 2) -> tuple[Any, Any]:
+    """Face [height, width] (-1 none) and inverse depth of the visibility pass for a camera at the origin."""
+    count = len(faces)
+    samples = wp.zeros((1, height, width), dtype=wp.uint64, device="cpu")
+    triangles = wp.empty(2 * count, dtype=raster.Triangle, device="cpu")
+
+    def on(values: Any, dtype: Any) -> Any:
+        return wp.array(values, dtype=dtype, device="cpu")
+
+    inputs = [
+        on(vertices, wp.vec3), on(faces, wp.int32), on(np.arange(count), wp.int32), on([0, count], wp.int32),
+        on([0], wp.int32), on([0], wp.int32), on(np.eye(4)[None], wp.mat44), on([[60, 60, 31.5, 23.5]], wp.vec4),
+        0.2, float(scale), 0, float(width), float(height),
+    ]  # fmt: skip
+    wp.launch(raster.setup, dim=count, inputs=inputs, outputs=[triangles], device="cpu")
+    spare = [wp.zeros(1, dtype=int, device="cpu") for _ in range(2)]
+    wp.launch(raster.fill, dim=2 * count, inputs=[triangles, 1e30], outputs=[samples, *spare], device="cpu")
+    keys = samples.numpy()[0]
+    slot = 0xFFFFFFFF - (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+    near = (keys >> np.uint64(32)).astype(np.uint32).view(np.float32)
+    return np.where(keys > 0, slot // 2, -1), np.where(keys > 0, near, 0)
+
+
+def cast(vertices: Any, faces: Any, *, width: int = 128, height: int = 96, scale: int = 2) -> tuple[Any, Any]:
+    """The same by casting a ray through each sample, in double precision."""
+    y, x = np.mgrid[0:height, 0:width]
+    ray = np.stack([((x + 0.5) / scale - 0.5 - 31.5) / 60, ((y + 0.5) / scale - 0.5 - 23.5) / 60, np.ones_like(x)], -1)
+    best, owner = np.zeros((height, width)), np.full((height, width), -1)
+    for f, face in enumerate(faces):
+        a, b, c = vertices[face].astype(float)
+        normal = np.cross(b - a, c - a)
+        slope = ray @ normal
+        with np.errstate(all="ignore"):
+            z = (a @ normal) / slope
+            p = z[..., None] * ray - a
+            sb = np.cross(p, c - a) @ normal / (normal @ normal)
+            sc = np.cross(b - a, p) @ normal / (normal @ normal)
+            hit = (slope < 0) & (z > 0.2) & (sb >= 0) & (sc >= 0) & (sb + sc <= 1) & (1 / z > best)
+        owner[hit], best[hit] = f, 1 / z[hit]
+    return owner, best
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_visibility_equals_ray_casting(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vertices = rng.uniform(-4, 4, (90, 3)).astype(np.float32)
+    vertices[:, 2] += 3  # some lie behind the camera, some across the near plane
+    faces = np.arange(90).reshape(30, 3).astype(np.int32)
+    owner, near = visible(vertices, faces)
+    expected, depth = cast(vertices, faces)
+    same = owner == expected
+    assert same.mean() > 0.998, "but for samples on an edge"
+    both = same & (owner >= 0)
+    assert np.abs(near - depth)[both].max(initial=0) < 1e-4
+
+
+def test_neighbouring_triangles_leave_no_gap_and_do_not_overlap() -> None:
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.linspace(-6, 6, 9), np.linspace(-5, 5, 9)), -1).astype(np.float32)
+    grid[1:-1, 1:-1] += rng.uniform(-0.4, 0.4, (7, 7, 2)).astype(np.float32)
+    vertices = np.concatenate([grid.reshape(-1, 2), 4 + rng.uniform(-0.2, 0.2, (81, 1))], 1).astype(np.float32)
+    faces = meshes.grid_faces(9, 9)
+    owner, _ = visible(vertices, faces)
+    turned, _ = visible(vertices, faces[:, [0, 2, 1]])
+    full = owner if (owner >= 0).mean() > 0.5 else turned
+    assert (full >= 0).all()
+    assert np.minimum((owner >= 0).mean(), (turned >= 0).mean()) == 0, "the other side is turned away"
+
+
+def ground(size: float = 60.0) -> Any:
+    """A square on the ground."""
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * size
+    return build(vertices, np.array([[0, 1, 2], [0, 2, 3]]), materials=(GREY,))
+
+
+def cube(size: tuple[float, float, float] = (4.0, 2.0, 1.5)) -> Any:
+    """A painted box on the ground with one panel."""
+    return meshes.box(size, material=PAINT, centre=(0.0, 0.0, size[2] / 2), panel="body")
+
+
+def place(x: float, y: float, z: float = 0.0) -> Any:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+@pytest.fixture(scope="module")
+def stage() -> Stage:
+    return Stage(None, [ground(), cube()])
+
+
+def scene(*things: Thing, weather: Weather = NOON) -> View:
+    return View(CAMERA, FORWARD, (Thing(0, np.eye(4)), *things), weather)
+
+
+def test_depth_tags_and_the_nuscenes_camera_model(stage: Stage) -> None:
+    picture = render(stage, [scene(Thing(1, place(12.0, 0.5), tag=7))], shadows=False)
+    tag, depth = picture.tag[0], picture.depth[0]
+    assert (tag[:10] == -1).all()
+    assert np.isinf(depth[:10]).all()
+    rows = np.arange(36, 48)
+    expected = 1.5 * 50.0 / (rows - 23.5)  # the ground under a level camera 1.5 m up
+    assert depth[rows, 2] == pytest.approx(expected, rel=1e-4)
+    assert (tag[rows, 2] == 0).all()
+    # the near face of the box: depth and extent by the pinhole model of nuScenes (u = fx X / Z + cx)
+    z = 10.0 - FORWARD[0, 3]
+    left, right = 31.5 - 50 * 1.5 / z, 31.5 + 50 * 0.5 / z
+    columns = np.flatnonzero((tag == 7).any(0))
+    assert columns[0] == pytest.approx(left, abs=1.0)
+    assert columns[-1] == pytest.approx(right, abs=1.0)
+    assert np.median(depth[tag == 7]) == pytest.approx(z, rel=1e-4)
+
+
+def test_a_view_does_not_depend_on_its_batch(stage: Stage) -> None:
+    views = [
+        scene(
+            Thing(1, place(9.0 + k, k - 1.0), (0.1 * k, 0.3, 0.2), tag=k + 1),
+            weather=replace(NOON, sun_heading=float(k)),
+        )
+        for k in range(3)
+    ]
+    together = render(stage, views)
+    for k in range(3):
+        alone = render(stage, [views[k]])
+        assert (alone.image[0] == together.image[k]).all()
+        assert (alone.tag[0] == together.tag[k]).all()
+
+
+def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Stage) -> None:
+    weather = Weather(sun_height=0.6, sun_heading=np.pi / 2, clouds=0.0)  # from the left: the shadow falls to the right
+    with_box = render(stage, [scene(Thing(1, place(12.0, 0.0), tag=1), weather=weather)])
+    without = render(stage, [scene(weather=weather)])
+    same = with_box.tag[0] == without.tag[0]
+    ratio = with_box.radiance[0].mean(-1) / np.maximum(without.radiance[0].mean(-1), 1e-6)
+    dark = same & (without.tag[0] == 0) & (ratio < 0.7)
+    assert dark.sum() > 10
+    _, columns = np.nonzero(dark)
+    assert columns.mean() > 33, "to the right of the box"
+    light, _ = light_of(weather)
+    assert ratio[dark].min() > 0.1, "the sky still lights it"
+    assert light[0][1] > 0.8
+
+
+def test_coverage_is_averaged_over_samples(stage: Stage) -> None:
+    """The mean radiance hardly changes with the number of samples; edges get between values."""
+    view = scene(Thing(1, place(9.0, 0.3), (0.9, 0.1, 0.1), tag=1))
+    one, two, four = (render(stage, [view], scale=s, shadows=False).radiance[0] for s in (1, 2, 4))
+    assert two.mean() == pytest.approx(four.mean(), rel=0.01)
+    assert np.abs(two - four).mean() < np.abs(one - four).mean()
+
+
+def test_weather_and_hour_change_the_picture_as_they_should(stage: Stage) -> None:
+    view = scene(Thing(1, place(12.0, 0.0), (0.6, 0.1, 0.1), tag=1))
+    clear = render(stage, [view])
+    foggy = render(stage, [replace(view, weather=replace(NOON, fog=0.05))])
+    night = render(stage, [replace(view, weather=replace(NOON, sun_height=-0.3))])
+    red = clear.tag[0] == 1
+    contrast = lambda p: float(np.ptp(p.image[0][red].astype(float).mean(0)))  # noqa: E731
+    assert contrast(foggy) < 0.7 * contrast(clear)
+    assert night.radiance.mean() < 0.2 * clear.radiance.mean()
+    far, near = night.radiance[0][26, 2].mean(), night.radiance[0][46, 2].mean()
+    assert near > 2 * far, "head lamps light what is near"
+    assert (np.diff(response().astype(int)) >= 0).all()
+
+
+# ---------------------------------------------------------------- textures
+
+
+def test_a_texture_of_one_colour_is_a_paint(stage: Stage) -> None:
+    colour = (0.7, 0.2, 0.4)
+    painted = render(stage, [scene(Thing(1, place(8.0, 0.4), colour, tag=1))])
+    textured = render(stage, [scene(Thing(1, place(8.0, 0.4), tag=1, texture=0))])
+    taps = taps_of(textured, 32)
+    assert len(taps.pixel) > 50
+    assert taps.weight.sum(1) == pytest.approx(1.0)
+    out = apply_taps(taps, np.broadcast_to(colour, (32, 32, 3)), textured.radiance)
+    assert out == pytest.approx(painted.radiance, rel=1e-4, abs=1e-5)
+
+
+def test_the_gradient_equals_finite_differences(stage: Stage) -> None:
+    rng = np.random.default_rng(0)
+    picture = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
+    for size in (16, 64, 256):
+        taps = taps_of(picture, size)
+        texture, step = rng.uniform(0, 1, (size, size, 3)), rng.normal(size=(size, size, 3))
+        pull = rng.normal(size=picture.radiance.shape)
+        gradient = texture_gradient(taps, pull)
+        ahead, behind = (apply_taps(taps, texture + h * step, picture.radiance) for h in (1e-3, -1e-3))
+        expected = ((ahead - behind) * pull).sum() / 2e-3
+        assert (gradient * step).sum() == pytest.approx(expected, rel=1e-5)
+
+
+def test_small_textures_and_far_things_still_get_gradient(stage: Stage) -> None:
+    """Far away a pixel spans many texels: through the pyramid each of those that are seen gets its share."""
+    shares = []
+    for distance in (8.0, 40.0):
+        picture = render(stage, [scene(Thing(1, place(distance, 0.0), tag=1, texture=0))])
+        gradient = texture_gradient(taps_of(picture, 128), np.ones_like(picture.radiance))
+        shares.append(float((np.abs(gradient).sum(-1) > 0).mean()))
+    assert shares[1] > 0.5 * shares[0]
+
+
+@given(st.integers(0, 7), st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_the_pyramid_keeps_the_mean_and_its_transpose_is_one(power: int, seed: int) -> None:
+    size = 2**power
+    rng = np.random.default_rng(seed)
+    texture = rng.uniform(0, 1, (size, size, 3))
+    rows = pyramid(texture)
+    start = 0
+    for edge in levels_of(size):
+        assert rows[start : start + edge * edge].mean(0) == pytest.approx(texture.mean((0, 1)))
+        start += edge * edge
+    assert start == len(rows)
+    other = rng.normal(size=rows.shape)
+    assert (rows * other).sum() == pytest.approx((texture * pyramid_transpose(other, size)).sum())
+
+
+def test_a_patch_stays_in_its_rectangle(stage: Stage) -> None:
+    whole = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
+    u0, v0, u1, v1 = cube().panel_rectangle("body")
+    part = (u0, v0, u0 + 0.4 * (u1 - u0), v0 + 0.4 * (v1 - v0))
+    patch = render(stage, [scene(Thing(1, place(7.0, 0.4), (0.3, 0.3, 0.3), tag=1, texture=0, rectangle=part))])
+    assert 0 < len(patch.fragments) < len(whole.fragments)
+    assert patch.fragments["u"].min() >= 0
+    assert patch.fragments["u"].max() <= 1
+
+
+# ---------------------------------------------------------------- bad input
+
+
+def test_wrong_use_is_refused_in_one_line(stage: Stage) -> None:
+    view = scene()
+    nan = FORWARD.copy()
+    nan[0, 3] = np.nan
+    flat = replace(CAMERA, intrinsic=np.diag([0.0, 50.0, 1.0]))
+    for views in (
+        [],
+        [view, replace(view, camera=Camera.typical(32, 24))],
+        [replace(view, pose=nan)],
+        [replace(view, camera=flat)],
+    ):
+        with pytest.raises(ConfigError) as error:
+            render(stage, views)
+        assert "\n" not in str(error.value)
+    with pytest.raises(ConfigError):
+        Stage(None, [])
+    picture = render(stage, [view])
+    with pytest.raises(ConfigError, match="power of two"):
+        taps_of(picture, 100)
+    with pytest.raises(ConfigError, match="square"):
+        pyramid(np.zeros((8, 4, 3)))
+
+
+def test_an_empty_scene_is_sky(stage: Stage) -> None:
+    picture = render(stage, [View(CAMERA, FORWARD)])
+    assert (picture.tag == -1).all()
+    assert np.isinf(picture.depth).all()
+    assert picture.image.std() > 0
