@@ -19,6 +19,10 @@ def make_pictures(names: list[str], folder: str | Path) -> None:
         captions["shifts-severities.jpg"] = "Each shift at severities 1 to 5."
         if not all((target / name).is_file() for name in captions):
             _shifts(safeio.make_folder(target) / "shifts.jpg")
+    if "camera" in names:
+        from ssad.bench.gallery import write_gallery
+
+        captions |= write_gallery(safeio.make_folder(target))
     if captions:
         safeio.write_atomic(target / PAGE, safeio.dump_json(captions, indent=1) + "\n")
 

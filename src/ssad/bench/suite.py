@@ -24,7 +24,7 @@ class Suite(BaseModel):
     repetitions: episodes of each pair, with seeds of their own; timeout_s: seconds that one cell may take; chunk:
     cells that run as one batch of the world (results do not depend on it); reference: the published table that the
     report shows beside this one; witness: search each collision for a way out; pictures: what the report shows besides
-    (shifts: contact sheets of the distribution shifts).
+    (shifts: contact sheets of the distribution shifts; camera: what the camera sees).
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -40,7 +40,7 @@ class Suite(BaseModel):
     chunk: int = Field(default=16, ge=1, le=4096)
     reference: str | None = None
     witness: bool = True
-    pictures: list[Literal["shifts"]] = []
+    pictures: list[Literal["shifts", "camera"]] = []
 
 
 def suite_folders() -> list[Path]:

@@ -90,7 +90,7 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
         sun, tuple(sun_colour), tuple(zenith), tuple(horizon), tuple(ground), weather.fog, weather.clouds, weather.wet,
         lamps, weather.turn,
     )  # fmt: skip
-    return light, 0.30 / max(bright, 0.004) * 2.0**weather.exposure
+    return light, 0.40 / max(bright, 0.004) * 2.0**weather.exposure
 
 
 @lru_cache(maxsize=1)

@@ -84,20 +84,35 @@ def render(run: Run, found: list[Table]) -> str:
     )
 
 
-def _pictures(run: Run) -> list[dict[str, str]]:
-    """The pictures of the run as data: URIs with their captions; those that are gone are left out."""
+GROUPS = {
+    "shifts": (
+        "Distribution shifts",
+        "The same for a picture of yours:",
+        "ssad shift PICTURE.jpg OUT.png --box X0,Y0,X1,Y1",
+    ),
+    "camera": ("Camera", "", ""),
+}
+
+
+def _pictures(run: Run) -> list[dict[str, Any]]:
+    """The pictures of the run as data: URIs with captions, grouped by the start of their names; what is gone is left
+    out."""
     folder = run.folder / "pictures"
     if not (folder / "pictures.json").is_file():
         return []
     captions = safeio.read_json(folder / "pictures.json")
-    found = []
-    for name, caption in captions.items():
-        path = folder / Path(str(name)).name
-        kind = {".jpg": "jpeg", ".png": "png"}.get(path.suffix)
-        if kind and path.is_file():
-            data = base64.b64encode(safeio.read_bytes(path)).decode()
-            found.append({"data": f"data:image/{kind};base64,{data}", "caption": str(caption)})
-    return found
+    groups = []
+    for name, (title, note, command) in GROUPS.items():
+        found = []
+        for file, caption in sorted(captions.items()):
+            path = folder / Path(str(file)).name
+            kind = {".jpg": "jpeg", ".png": "png"}.get(path.suffix)
+            if kind and path.name.startswith(name) and path.is_file():
+                data = base64.b64encode(safeio.read_bytes(path)).decode()
+                found.append({"data": f"data:image/{kind};base64,{data}", "caption": str(caption)})
+        if found:
+            groups.append({"name": name, "title": title, "note": note, "command": command, "pictures": found})
+    return groups
 
 
 def _command(run: Run) -> str:

@@ -97,10 +97,10 @@ def contact_sheet(
     width: int = 480,
 ) -> U8:
     """The clean picture and the 11 shifts, 12 panels in three columns as in the paper's figure: [rows, columns, 3]."""
-    panels = [_panel(image, "clean", width)]
+    panels = [captioned(image, "clean", width)]
     for name in SHIFTS:
         spec = ShiftSpec(name, severity, seed, calibration)
-        panels.append(_panel(*_shifted(image, frame, spec, context), width))
+        panels.append(captioned(*_shifted(image, frame, spec, context), width))
     return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])
 
 
@@ -121,7 +121,7 @@ def severity_sheet(
         named = [
             (picture, text or f"{name} {spec.severity}") for (picture, text), spec in zip(cells, specs, strict=True)
         ]
-        rows.append(np.hstack([_panel(picture, text, width) for picture, text in named]))
+        rows.append(np.hstack([captioned(picture, text, width) for picture, text in named]))
     return np.vstack(rows)
 
 
@@ -136,7 +136,7 @@ def _shifted(image: U8, frame: Frame, spec: ShiftSpec, context: SceneContext | N
     return out, caption
 
 
-def _panel(image: U8, caption: str, width: int) -> U8:
+def captioned(image: U8, caption: str, width: int) -> U8:
     """A picture of that width with its caption under it."""
     height = round(image.shape[0] * width / image.shape[1])
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from ssad.camera.kernels.raster import LAST, NONE
+
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 
@@ -24,15 +26,13 @@ def cover(
     sky = int(0)
     best = int(0)
     for s in range(count):
-        key = samples[b, y * scale + s / scale, x * scale + s % scale]
-        if key == wp.uint64(0):
+        key = samples[b, y * scale + s / scale, x * scale + s % scale] & LAST
+        if key == NONE:
             sky += 1
         else:
             same = int(1)
             for e in range(s + 1, count):
-                if samples[b, y * scale + e / scale, x * scale + e % scale] & wp.uint64(4294967295) == key & wp.uint64(
-                    4294967295
-                ):
+                if (samples[b, y * scale + e / scale, x * scale + e % scale] & LAST) == key:
                     same += 1
             best = wp.max(best, same)
     if sky < count:
