@@ -104,7 +104,7 @@ def _pictures(run: Run) -> list[dict[str, Any]]:
     groups = []
     for name, (title, note, command) in GROUPS.items():
         found = []
-        for file, caption in sorted(captions.items()):
+        for file, caption in sorted(captions.items(), key=lambda item: (len(item[0]), item[0])):
             path = folder / Path(str(file)).name
             kind = {".jpg": "jpeg", ".png": "png"}.get(path.suffix)
             if kind and path.name.startswith(name) and path.is_file():
