@@ -49,15 +49,17 @@ def scene(size: int, device: str) -> tuple[Stage, View]:
     start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
     first = graph.offset[start] + 6
     ego = place(*graph.xy[first], graph.yaw[first])
-    spots = np.concatenate([np.arange(graph.offset[k] + 3, graph.offset[k + 1], 9) for k in lanes])
+    spots = np.concatenate([np.arange(graph.offset[k] + 3, graph.offset[k + 1], 6) for k in lanes])
     local = (graph.xy[spots] - graph.xy[first]) @ ego[:2, :2]
+    # before the camera, and not between it and the car that wears the texture
     ahead = (local[:, 0] > 9) & (np.abs(local[:, 1]) < local[:, 0])
-    spots = spots[ahead][np.argsort(local[ahead, 0])][:30]
+    ahead &= (np.abs(local[:, 1]) > 2) | (local[:, 0] > 30)
+    spots = spots[ahead][np.argsort(local[ahead, 0])][:29]
     draws = generator("camera speed")
     things = [
         Thing(k % len(meshes), place(*graph.xy[i], graph.yaw[i]), draw_paint(draws), k + 1) for k, i in enumerate(spots)
     ]
-    things[0] = Thing(0, ego @ place(21.7, 0, 0), tag=1, texture=0)
+    things.append(Thing(0, ego @ place(21.7, 0, 0), tag=100, texture=0))
     focal = 0.79 * size
     camera = Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]))
     return stage, View(camera, ego @ FORWARD, tuple(things), Weather(0.8, 0.9))

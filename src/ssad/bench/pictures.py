@@ -23,8 +23,28 @@ def make_pictures(names: list[str], folder: str | Path) -> None:
         from ssad.bench.gallery import write_gallery
 
         captions |= write_gallery(safeio.make_folder(target))
+        captions |= _onboard(Path(folder), target)
     if captions:
         safeio.write_atomic(target / PAGE, safeio.dump_json(captions, indent=1) + "\n")
+
+
+def _onboard(folder: Path, target: Path) -> dict[str, str]:
+    """An episode of the run from the ego's camera and from above, if a recording is there."""
+    from ssad.bench.onboard import onboard_sheet, pick_trace
+    from ssad.bench.toolbox.sheet import save_picture
+    from ssad.roads import load_town
+    from ssad.roads.graph import load_graph
+    from ssad.traces import load_trace
+
+    chosen = pick_trace(folder)
+    if chosen is None:
+        return {}
+    trace = load_trace(chosen)
+    path = target / "camera.jpg"
+    if not path.is_file():
+        own = folder / "towns" / f"{trace.town}.npz"
+        save_picture(path, onboard_sheet(trace, load_graph(own) if own.is_file() else load_town(trace.town)))
+    return {path.name: f"An episode of this run ({chosen.stem}) from the ego's camera and from above."}
 
 
 def _shifts(path: Path) -> None:

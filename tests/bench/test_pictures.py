@@ -1,0 +1,69 @@
+"""Pictures of the camera that a run shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssad.bench.gallery import CLASSES, RIG, class_sheet, rig_camera
+from ssad.bench.onboard import BODY, above, body_of, moments, onboard_sheet, pick_trace, things_at
+from ssad.bench.pictures import make_pictures
+from ssad.camera.bodies import BODIES
+from ssad.datasets.nuscenes.schema import CLASSES as NUSCENES
+from ssad.roads import load_town
+from ssad.world.models import MODELS
+from ssad.world.rollout import rollout
+
+pytest.importorskip("cv2")
+
+
+def test_every_class_and_every_model_has_a_body() -> None:
+    assert {name.replace(" ", "_") for name in CLASSES} == set(NUSCENES)
+    for kind, styles in CLASSES.values():
+        assert set(styles) <= set(BODIES[kind].styles)
+    for name, model in MODELS.items():
+        low, high = body_of(name, 0).bounds()
+        assert high - low == pytest.approx([model.length, model.width, model.height], rel=0.1)
+    assert set(BODY) < set(MODELS)
+    sheet = class_sheet(60)
+    assert sheet.std() > 20
+
+
+def test_the_rig_is_that_of_nuscenes() -> None:
+    for channel, (at, heading, focal) in RIG.items():
+        camera = rig_camera(channel, 1600)
+        assert camera.intrinsic[0, 0] == pytest.approx(focal)
+        assert camera.intrinsic[:2, 2] == pytest.approx([816.3, 491.5])
+        axis = camera.to_ego[:3, 2]
+        turned = np.degrees(np.arctan2(axis[1], axis[0])) - heading
+        assert (turned + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
+        assert camera.to_ego[:3, 3] == pytest.approx(at)
+        assert np.linalg.det(camera.to_ego[:3, :3]) == pytest.approx(1)
+
+
+def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
+    from ssad.agents import make_system
+    from ssad.scenarios.dynamic import build_episode, load_scenarios
+
+    scenario = next(s for s in load_scenarios("precrash") if s.name == "StraightObstacle/00")
+    graph = load_town(scenario.town)
+    episode = build_episode(scenario, graph, seed=0)
+    trace = rollout([episode], {graph.name: graph}, make_system("blind"))[0]
+    assert len(moments(trace)) == 3
+    people = things_at(trace, 0, ego=False)
+    assert {t.tag for t in people} == {a + 1 for a in range(1, len(trace.models)) if trace.active[0, a]}
+    camera, pose = above(np.eye(4), 40.0, 64, 36)
+    assert pose[:3, 2] == pytest.approx([0, 0, -1])
+    assert camera.width == 64
+    sheet = onboard_sheet(trace, graph, width=160)
+    assert sheet.shape[1] == pytest.approx(2 * 164, abs=2)
+    assert sheet.std() > 20
+
+
+def test_a_run_without_recordings_has_no_such_picture(tmp_path: Path) -> None:
+    (tmp_path / "results.jsonl").write_text("")
+    assert pick_trace(tmp_path) is None
+    make_pictures([], tmp_path)
+    assert not (tmp_path / "pictures").exists()
