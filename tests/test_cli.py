@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-COMMANDS = ("run", "report", "replay", "shift", "score", "list", "import", "doctor")
+COMMANDS = ("run", "report", "replay", "shift", "score", "record", "list", "import", "doctor")
 
 
 def ssad(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:

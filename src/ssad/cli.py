@@ -214,6 +214,41 @@ def score(
         console.print(table)
 
 
+@app.command()
+def record(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set.")],
+    towns: Annotated[
+        str, typer.Option(help="Towns with commas between them.")
+    ] = "Twinford,Crossgate,Oldmarket,Larkhill",
+    held_out: Annotated[str, typer.Option(help="Towns of the split val; the others are train.")] = "Oldmarket,Larkhill",
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of each town.")] = 2,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a scene.")] = 20.0,
+    width: Annotated[int, typer.Option(min=64, help="Width of the pictures (16:9).")] = 1600,
+    sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between key frames.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+) -> None:
+    """Drives in the world, seen by the nuScenes rig: a data set in the nuScenes schema. Run again to go on."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from ssad.bench.record import Recording, record_nuscenes
+
+    def names(text: str) -> tuple[str, ...]:
+        return tuple(name.strip() for name in text.split(",") if name.strip())
+
+    todo = Recording(
+        out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps, seed=seed
+    )
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("record", total=None)
+        root = record_nuscenes(
+            todo, workers=workers, progress=lambda done, of: bar.update(task, completed=done, total=of)
+        )
+    print(f"{root}: {len(todo.towns) * scenes} scenes, version {todo.version}, splits train and val")
+
+
 def _scenario_list() -> dict[str, str]:
     from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
 

@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -16,6 +17,7 @@ from ssad.datasets.nuscenes.files import read_image, read_points
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
 from ssad.errors import FormatError
 from ssad.frames import Applied, Boxes3D, Camera, Frame, SceneContext, SweepFrame
+from ssad.safeio import read_bytes
 from ssad.scenarios.static.shifts import (
     ShiftSpec,
     random_severity,
@@ -159,6 +161,16 @@ class SceneShifter:
         to_camera = np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego) @ sweep.ego_to_world @ sweep.sensor_to_ego
         return np.asarray(cloud[:, :3] @ to_camera[:3, :3].T + to_camera[:3, 3], np.float32)
 
+    def _depth(self, frame: SensorFrame) -> F32 | None:
+        """The depth map that `ssad record` wrote beside the picture; None where there is none. FormatError."""
+        path = self.root / "depth" / frame.channel / f"{frame.token}.png"
+        if not path.is_file():
+            return None
+        values = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+        if values is None or values.dtype != np.uint16 or values.ndim != 2:
+            raise FormatError(f"{path}: not a depth map of 16 bits")
+        return np.where(values == 65535, np.inf, values / 64).astype(np.float32)
+
     def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None) -> Frame:
         if frame.intrinsic is None or not min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0:
             raise FormatError(f"{frame.filename}: the camera {frame.channel} has no focal length")
@@ -171,6 +183,7 @@ class SceneShifter:
             frame.ego_to_world,
             self.velocity(frame),
             boxes,
+            depth=self._depth(frame) if points is not None or self._uses_depth else None,
             points=points,
         )
 
