@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
+from ssad.detections import Assignment, Dense, Detections, Truth
 from ssad.types import F32, I32, Bool, Controller, Episode
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -97,3 +101,35 @@ class World(Protocol):
 
     def hashes(self) -> list[str]:
         """One hash a scene over all that changes."""
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds objects in camera images; `ssad.detectors.check.check_detector` holds an implementation to it.
+
+    images [B, 3, H, W] float32 (or float64) in [0, 1], RGB, any H and W; intrinsic [B, 3, 3] is needed where `task` is
+    "3d". Everything that the detector's source does to a picture (order of channels, mean, padding, resizing) happens
+    inside, differentiably. A result does not depend on the other images of the batch. No call changes the detector's
+    state or mode; parameters are frozen (`requires_grad` False) unless it is being trained.
+    """
+
+    name: str
+    task: Literal["2d", "3d"]
+    classes: tuple[str, ...]
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Detections of each image, best first, without gradient; threshold: least score, default the detector's."""
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        """Raw outputs, differentiable to the images."""
+
+    def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
+        """Which place answers for which object, as in training; no gradient flows through it."""
+
+    def losses(
+        self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
+    ) -> dict[str, Tensor]:
+        """The training losses by name, weighted so that their sum is the source's loss. "batch": scalars, normalised
+        over the batch as in training; "image": [B], each image as if it were alone."""

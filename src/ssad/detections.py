@@ -1,0 +1,93 @@
+"""What detectors are told and what they answer, in tensors. Importing this does not import torch.
+
+Shape letters: B images, P places (all cells, anchors and levels of a detector, one after the other), C classes,
+N objects, Q true objects. 2D boxes are x1, y1, x2, y2 in pixels of the picture that was handed in, at pixel edges
+(pixel 0 spans 0 to 1). 3D boxes stand in the camera frame (x right, y down, z forward), metres and radians:
+size is length, height, width (along x, y, z at yaw 0), yaw turns about the y axis as in mmdetection3d and KITTI
+(yaw 0: the length along x; positive from z towards x).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+CLASSES_3D = (
+    "car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian", "traffic_cone",
+    "barrier",
+)  # fmt: skip
+ATTRIBUTES = (
+    "cycle.with_rider", "cycle.without_rider", "pedestrian.moving", "pedestrian.standing",
+    "pedestrian.sitting_lying_down", "vehicle.moving", "vehicle.parked", "vehicle.stopped", "none",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Solids:
+    """3D boxes in the camera frame: centre [N, 3] (of gravity), size [N, 3] (length, height, width), yaw [N],
+    velocity [N, 2] (x, z; NaN where unknown), attribute [N] index into `ATTRIBUTES`."""
+
+    centre: Tensor
+    size: Tensor
+    yaw: Tensor
+    velocity: Tensor
+    attribute: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is in one image: label [Q] index into the detector's classes, box [Q, 4], solid for 3D; intrinsic [3, 3] of
+    the camera for 3D; crowd [Q] bool: objects that count neither as found nor as missed (too small, too hidden)."""
+
+    label: Tensor
+    box: Tensor
+    solid: Solids | None = None
+    intrinsic: Tensor | None = None
+    crowd: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """What was found in one image, best first: score [N] in 0..1, label [N], box [N, 4] (for 3D: the hull of the
+    projected corners, unless the detector predicts it), solid for 3D."""
+
+    score: Tensor
+    label: Tensor
+    box: Tensor
+    solid: Solids | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Dense:
+    """Raw outputs before any threshold or suppression, differentiable to the image.
+
+    logit [B, P, C]: class logits; quality [B, P]: the logit that multiplies them (objectness, centreness), None for a
+    detector without; box [B, P, 4]: 2D boxes; place [P, 2]: x, y of the cell's middle in pixels; stride [P];
+    level [P]: index of the map it comes from; maps: the detector's own maps by name, as its source returns them;
+    features: trunk or neck maps [B, K, h, w], finest first, for attention-based attacks.
+    """
+
+    logit: Tensor
+    quality: Tensor | None
+    box: Tensor
+    place: Tensor
+    stride: Tensor
+    level: Tensor
+    maps: Mapping[str, list[Tensor]]
+    features: tuple[Tensor, ...] = ()
+    size: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Which place answers for which object, fixed before an attack or a step. label [B, P]: class, -1 background, -2
+    ignored; owner [B, P]: index into that image's objects, -1 none; extra: what the detector's loss needs besides."""
+
+    label: Tensor
+    owner: Tensor
+    truth: tuple[Truth, ...]
+    extra: Mapping[str, Tensor] = field(default_factory=dict)
