@@ -226,6 +226,7 @@ def record(
     width: Annotated[int, typer.Option(min=64, help="Width of the pictures (16:9).")] = 1600,
     sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between key frames.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    device: Annotated[str, typer.Option(help="Where pictures are rendered: cpu or cuda.")] = "cpu",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
 ) -> None:
     """Drives in the world, seen by the nuScenes rig: a data set in the nuScenes schema. Run again to go on."""
@@ -238,8 +239,9 @@ def record(
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
     todo = Recording(
-        out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps, seed=seed
-    )
+        out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps, seed=seed,
+        device=device,
+    )  # fmt: skip
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("record", total=None)

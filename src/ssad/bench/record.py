@@ -21,15 +21,14 @@ import cv2
 import numpy as np
 
 from ssad import safeio
+from ssad.bench.cast import Standing, make_cast
+from ssad.bench.drives import make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.gallery import RIG, place, rig_camera
-from ssad.bench.onboard import BODY, body_of
-from ssad.camera.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.camera.labels import visibility_token, visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
-from ssad.camera.mesh import Mesh
 from ssad.camera.render import View, Weather, render
-from ssad.camera.stage import Stage, Thing
+from ssad.camera.stage import Stage
 from ssad.camera.street import cached_street
 from ssad.datasets.nuscenes.files import encode_jpeg, points_bytes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
@@ -37,12 +36,8 @@ from ssad.errors import ConfigError, StoreError
 from ssad.frames import Boxes3D, Camera
 from ssad.roads import load_town, town_names
 from ssad.roads.graph import LaneGraph
-from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.make_sets import natural
-from ssad.scenarios.dynamic.yamlio import scenario_text
 from ssad.seeding import digest, generator
-from ssad.types import F64, U8, EpisodeTrace, LaneType
-from ssad.world.models import MODELS
+from ssad.types import F64, U8, Episode, EpisodeTrace
 
 TOWNS: Final = ("Twinford", "Crossgate", "Oldmarket", "Larkhill")
 HELD_OUT: Final = ("Oldmarket", "Larkhill")
@@ -56,14 +51,19 @@ CATEGORY: Final = {
     "pedestrian": "human.pedestrian.adult", "traffic_cone": "movable_object.trafficcone",
     "barrier": "movable_object.barrier",
 }  # fmt: skip
-# what stands on parking places, and how often
-PARKED: Final = {"car": 12.0, "truck": 1.2, "trailer": 1.5, "construction": 1.5, "motorcycle": 1.5, "bicycle": 1.5}
+# s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
+AHEAD: Final = {
+    "CAM_FRONT_LEFT": 0.0431, "CAM_FRONT": 0.0355, "CAM_FRONT_RIGHT": 0.0276, "CAM_BACK_RIGHT": 0.0201,
+    "CAM_BACK": 0.0104, "CAM_BACK_LEFT": 0.0005,
+}  # fmt: skip
+NOISE: Final = 0.012  # of the sensor
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
     """What to record. scenes: of each town; seconds: of each scene; width: of the pictures (16:9); sweeps: frames
-    between key frames that are written too (0 to 4); quality: of JPEG files. ConfigError for what cannot be."""
+    between key frames that are written too (0 to 4); quality: of JPEG files; device: where pictures are rendered (it
+    decides bits, though few: see docs/camera.md). ConfigError for what cannot be."""
 
     out: Path
     towns: tuple[str, ...] = TOWNS
@@ -75,6 +75,7 @@ class Recording:
     seed: int = 0
     quality: int = 90
     version: str = "v1.0-ssad"
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         for town in self.towns:
@@ -90,30 +91,11 @@ class Recording:
         return {
             "towns": list(self.towns), "held_out": list(self.held_out), "scenes": self.scenes, "seconds": self.seconds,
             "width": self.width, "sweeps": self.sweeps, "seed": self.seed, "quality": self.quality,
-            "version": self.version,
+            "version": self.version, "device": self.device,
         }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Prop:
-    """Something that stands still: kind, mesh number, pose, size (length, width, height), attributes."""
-
-    kind: str
-    mesh: int
-    pose: F64
-    size: tuple[float, float, float]
-    attributes: tuple[str, ...]
-
-
-@dataclass(slots=True)
-class _Cast:
-    """Bodies of a scene: those of the agents first, then the props."""
-
-    meshes: list[Mesh] = field(default_factory=list)
-    props: list[Prop] = field(default_factory=list)
-
-
-def _weather(key: tuple[object, ...]) -> Weather:
+def draw_weather(key: tuple[object, ...]) -> Weather:
     """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads."""
     draws = generator("record weather", *key)
     kind = draws.choice(["day", "overcast", "low", "fog", "wet", "night"], p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
@@ -128,75 +110,6 @@ def _weather(key: tuple[object, ...]) -> Weather:
         "night": Weather(float(draws.uniform(-0.3, -0.05)), heading, float(draws.uniform(0, 0.9)), turn=turn),
     }
     return found[str(kind)]
-
-
-def _props(cast: _Cast, graph: LaneGraph, street: Any, trace: EpisodeTrace, key: tuple[object, ...]) -> None:
-    """Parked vehicles, people on sidewalks, cones and barriers along the route; none on a road."""
-    draws = generator("record props", *key)
-    route = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::10]
-
-    def near(x: float, y: float, reach: float) -> bool:
-        return bool(np.hypot(route[:, 0] - x, route[:, 1] - y).min() < reach)
-
-    def add(kind: str, pose: F64, style: str | None, attributes: tuple[str, ...]) -> None:
-        number = len(cast.meshes)
-        own = generator("record prop", *key, number)
-        chosen = style or draw_style(kind, generator=own)
-        size = draw_size(kind, chosen, generator=own)
-        if kind == "car" and size[0] > 5.3:
-            size = (5.3, size[1], size[2])
-        cast.meshes.append(make_body(kind, style=chosen, size=size, generator=own, detail=1))
-        cast.props.append(Prop(kind, number, pose, size, attributes))
-
-    kinds, share = list(PARKED), np.array(list(PARKED.values()))
-    last: list[F64] = []
-    for x, y, yaw in np.asarray(street.parking, float):
-        if not near(x, y, 45.0) or draws.random() > 0.45:
-            continue
-        kind = str(draws.choice(kinds, p=share / share.sum()))
-        reach = {"car": 5.6, "truck": 10.0, "trailer": 14.5, "construction": 9.0}.get(kind, 3.0)
-        if last and min(float(np.hypot(*(q - [x, y]))) for q in last) < reach:
-            continue
-        last.append(np.array([x, y]))
-        parked = ("cycle.without_rider",) if kind in ("motorcycle", "bicycle") else ("vehicle.parked",)
-        add(kind, place(x, y, yaw), "parked" if kind in ("motorcycle", "bicycle") else None, parked)
-        if kind == "construction":  # fenced off
-            for dx in (-5.5, 5.5):
-                add("traffic_cone", place(x, y, yaw) @ place(dx, 0.6, 0.0), None, ())
-    walks = np.flatnonzero(graph.kind == LaneType.SIDEWALK)
-    spots = [int(i) for k in walks for i in range(int(graph.offset[k]) + 1, int(graph.offset[k + 1]), 7)]
-    for i in spots:
-        x, y, yaw = float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])
-        if not near(x, y, 35.0):
-            continue
-        pick = draws.random()
-        if pick < 0.14:
-            add("pedestrian", place(x, y, yaw + draws.uniform(-3, 3), 0.12), "standing", ("pedestrian.standing",))
-        elif pick < 0.18:
-            add("traffic_cone", place(x, y, yaw, 0.12), None, ())
-        elif pick < 0.23:
-            add("barrier", place(x, y, yaw + np.pi / 2, 0.12), None, ())
-
-
-def _agent_boxes(
-    trace: EpisodeTrace, step: int
-) -> list[tuple[int, F64, tuple[float, float, float], str, tuple[str, ...]]]:
-    """Agents but the ego at a step: number, pose, size (length, width, height), category, attributes."""
-    found: list[tuple[int, F64, tuple[float, float, float], str, tuple[str, ...]]] = []
-    for a in range(1, len(trace.models)):
-        model = MODELS[trace.models[a]]
-        if not trace.active[step, a] or (trace.models[a] not in BODY and trace.models[a] != "barrier"):
-            continue
-        kind = BODY.get(trace.models[a], ("barrier", ""))[0]
-        moving = abs(float(trace.speed[step, a])) > 0.3
-        attribute = {
-            "pedestrian": "pedestrian.moving" if moving else "pedestrian.standing",
-            "motorcycle": "cycle.with_rider", "bicycle": "cycle.with_rider",
-        }.get(kind, "vehicle.moving" if moving else "vehicle.stopped")  # fmt: skip
-        pose = place(float(trace.x[step, a]), float(trace.y[step, a]), float(trace.yaw[step, a]))
-        attributes = () if kind in ("traffic_cone", "barrier") else (attribute,)
-        found.append((a, pose, (model.length, model.width, model.height), CATEGORY[kind], attributes))
-    return found
 
 
 def _quaternion(matrix: F64) -> tuple[float, float, float, float]:
@@ -216,6 +129,28 @@ def depth_bytes(depth: Any) -> bytes:
     return bytes(cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
 
 
+def attributes_of(who: Standing) -> tuple[str, ...]:
+    """The nuScenes attributes of a body at a moment."""
+    body, moving = who.body, who.speed > 0.3
+    if body.kind == "pedestrian":
+        return ("pedestrian.moving",) if moving else ("pedestrian.standing",)
+    if body.kind in ("motorcycle", "bicycle"):
+        return ("cycle.with_rider",) if body.style == "ridden" else ("cycle.without_rider",)
+    if body.kind in ("traffic_cone", "barrier"):
+        return ()
+    return ("vehicle.parked",) if body.parked else ("vehicle.moving",) if moving else ("vehicle.stopped",)
+
+
+def ego_at(trace: EpisodeTrace, time: float) -> F64:
+    """Pose [4, 4] of the ego at a time, s, between steps in between."""
+    exact = min(max(time / trace.dt, 0.0), len(trace.x) - 1.0)
+    low = min(int(exact), max(len(trace.x) - 2, 0))
+    high, part = min(low + 1, len(trace.x) - 1), exact - low
+    turn = (float(trace.yaw[high, 0] - trace.yaw[low, 0]) + np.pi) % (2 * np.pi) - np.pi
+    x, y = (float(v[low, 0]) + part * float(v[high, 0] - v[low, 0]) for v in (trace.x, trace.y))
+    return place(x, y, float(trace.yaw[low, 0]) + part * turn)
+
+
 def _scene(task: tuple[Recording, str, int, str]) -> str:
     """Records one scene into its part; its name. What is there already is left alone."""
     recording, town, number, name = task
@@ -227,60 +162,69 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph, street = load_town(town), cached_street(town)
-    drives = natural(graph, max(recording.scenes, 1), 1)
-    scenario = drives[number % len(drives)]
-    trace = _drive(scenario, graph, int(digest("record", *key)[:6], 16))
-    steps = min(int(recording.seconds / trace.dt), len(trace.x) - 1)
-    cast = _Cast([body_of(m, int(digest("agent", *key, a)[:6], 16)) for a, m in enumerate(trace.models)])
-    _props(cast, graph, street, trace, key)
-    stage = Stage(street, cast.meshes)
-    weather = _weather(key)
+    episode = make_drive(graph, key=(recording.seed, number), seconds=recording.seconds + 0.2)
+    trace = drive(episode, graph)
+    cast = make_cast(trace, graph, street, key=key)
+    stage = Stage(street, cast.meshes, device=recording.device)
+    weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
     samples: list[dict[str, Any]] = []
     files = _Files(folder, recording.quality)
     spacing = max(1, KEY // (recording.sweeps + 1))
-    for step in range(steps + 1):
+    # the first sweep ends when every camera has fired
+    first = 0.1
+    for step in range(min(int(recording.seconds / trace.dt), len(trace.x) - 2) + 1):
         on_key = step % KEY == 0
         if not on_key and (step % spacing or step % KEY > spacing * recording.sweeps):
             continue
-        ego = place(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
-        agents = _agent_boxes(trace, step)
-        things = [Thing(a, pose, draw_paint(generator("paint", *key, a)), a) for a, pose, _, _, _ in agents]
-        first = len(trace.models)
-        for p, prop in enumerate(cast.props):
-            if np.hypot(*(prop.pose[:2, 3] - ego[:2, 3])) < 140:
-                things.append(Thing(prop.mesh, prop.pose, draw_paint(generator("paint", *key, -1, p)), first + p))
-        moment = START + number * 100_000_000 + round(step * trace.dt * 1e6)
+        now = first + step * trace.dt
+        views, times, egos = [], [], []
+        for c, camera in enumerate(cameras):
+            fired = now - AHEAD[camera.channel]
+            ego = ego_at(trace, fired)
+            things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], 140.0))
+            noise = int(digest("noise", *key, step, c)[:7], 16)
+            views.append(View(camera, ego @ camera.to_ego, things, weather, NOISE, noise))
+            times.append(moment_of(number, fired))
+            egos.append(ego)
         shares: dict[int, float] = {}
-        for camera in cameras:
-            view = View(camera, ego @ camera.to_ego, tuple(things), weather)
-            picture = render(stage, [view])
-            if on_key:
-                for tag, share in visible_share(stage, view, picture).items():
-                    shares[tag] = max(shares.get(tag, 0.0), share)
-            files.picture(camera, picture.image[0], picture.depth[0], moment=moment, on_key=on_key, ego=ego)
-        points, _ = sweep(stage, HDL32E, ego, things, key=("lidar", *key, step))
-        files.cloud(points, moment=moment, on_key=on_key, ego=ego)
+        at_once = len(views) if recording.device != "cpu" else 1
+        for k in range(0, len(views), at_once):
+            picture = render(stage, views[k : k + at_once], linear=False)
+            for n in range(at_once):
+                if on_key:
+                    for tag, share in visible_share(stage, views[k + n], picture, n).items():
+                        shares[tag] = max(shares.get(tag, 0.0), share)
+                files.picture(
+                    cameras[k + n], picture.image[n], picture.depth[n], sweep=step, moment=times[k + n], on_key=on_key,
+                    ego=egos[k + n],
+                )  # fmt: skip
+        ego = ego_at(trace, now)
+        around = cast.at(now, ego[:2, 3], 140.0)
+        points, _ = sweep(stage, HDL32E, ego, [s.thing for s in around], key=("lidar", *key, step))
+        files.cloud(points, sweep=step, moment=moment_of(number, now), on_key=on_key, ego=ego)
         if on_key:
-            everything = [
-                *agents,
-                *((first + p, q.pose, q.size, CATEGORY[q.kind], q.attributes) for p, q in enumerate(cast.props)),
-            ]
-            samples.append({"time": moment, "boxes": _annotate(everything, ego, points, shares)})
+            boxes = _annotate([s for s in around if s.body.kind], ego, points, shares)
+            samples.append({"time": moment_of(number, now), "sweep": step, "boxes": boxes})
     part = {
-        "name": name, "town": town, "scenario": scenario_text([scenario]), "samples": samples, "frames": files.rows,
+        "name": name, "town": town, "drive": episode.key, "samples": samples, "frames": files.rows,
         "weather": repr(weather), "sensors": _sensors(cameras),
     }  # fmt: skip
     safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
     return name
 
 
-def _drive(scenario: Any, graph: LaneGraph, seed: int) -> EpisodeTrace:
-    """The Autopilot drives a scenario."""
+def moment_of(number: int, time: float) -> int:
+    """Time stamp in us of a moment of scene `number`."""
+    return START + number * 100_000_000 + round(time * 1e6)
+
+
+def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
+    """The Autopilot drives an episode."""
     from ssad.agents import make_system
     from ssad.world.rollout import rollout
 
-    return rollout([build_episode(scenario, graph, seed=seed)], {graph.name: graph}, make_system("autopilot"))[0]
+    return rollout([episode], {graph.name: graph}, make_system("autopilot"))[0]
 
 
 @dataclass(slots=True)
@@ -291,43 +235,48 @@ class _Files:
     quality: int
     rows: list[dict[str, Any]] = field(default_factory=list)
 
-    def picture(self, camera: Camera, image: U8, depth: Any, *, moment: int, on_key: bool, ego: F64) -> None:
+    def picture(
+        self, camera: Camera, image: U8, depth: Any, *, sweep: int, moment: int, on_key: bool, ego: F64
+    ) -> None:
         """One picture and its depth map."""
         name = f"{camera.channel}_{moment}"
         safeio.write_atomic(self.folder / f"{name}.jpg", encode_jpeg(image, self.quality, "420"))
         safeio.write_atomic(self.folder / f"{name}.depth.png", depth_bytes(depth))
         size = [camera.width, camera.height]
-        row = {"channel": camera.channel, "time": moment, "key": on_key, "file": f"{name}.jpg", "size": size}
+        row = {"channel": camera.channel, "time": moment, "key": on_key, "file": f"{name}.jpg", "size": size,
+               "sweep": sweep}  # fmt: skip
         self.rows.append(row | {"ego": ego.tolist()})
 
-    def cloud(self, points: Any, *, moment: int, on_key: bool, ego: F64) -> None:
+    def cloud(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
         """One sweep."""
         name = f"LIDAR_TOP_{moment}.pcd.bin"
         safeio.write_atomic(self.folder / name, points_bytes(points))
-        row = {"channel": "LIDAR_TOP", "time": moment, "key": on_key, "file": name, "size": [0, 0]}
+        row = {"channel": "LIDAR_TOP", "time": moment, "key": on_key, "file": name, "size": [0, 0],
+               "sweep": sweep}  # fmt: skip
         self.rows.append(row | {"ego": ego.tolist()})
 
 
-def _annotate(everything: list[Any], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
+def _annotate(around: list[Standing], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
     """Boxes within reach that are seen by a camera or hit by the LiDAR."""
-    near = [e for e in everything if np.hypot(*(e[1][:2, 3] - ego[:2, 3])) < REACH]
+    near = [s for s in around if np.hypot(*(s.pose[:2, 3] - ego[:2, 3])) < REACH]
     if not near:
         return []
-    centre = np.array([e[1][:3, 3] + [0, 0, e[2][2] / 2] for e in near])
-    size = np.array([[e[2][1], e[2][0], e[2][2]] for e in near])
-    rotation = np.array([_quaternion(e[1][:3, :3]) for e in near])
-    boxes = Boxes3D(tuple(str(e[0]) for e in near), centre, size, rotation, np.zeros_like(centre), np.ones(len(near)))
+    centre = np.array([s.pose[:3, 3] + [0, 0, s.body.size[2] / 2] for s in near])
+    size = np.array([[s.body.size[1], s.body.size[0], s.body.size[2]] for s in near])
+    rotation = np.array([_quaternion(s.pose[:3, :3]) for s in near])
+    boxes = Boxes3D(tuple(str(s.body.tag) for s in near), centre, size, rotation, np.zeros_like(centre),
+                    np.ones(len(near)))  # fmt: skip
     pose = ego @ HDL32E.to_ego
     world = np.asarray(points[:, :3], np.float64) @ pose[:3, :3].T + pose[:3, 3]
     counts = points_in_boxes(world, boxes)
     found = []
-    for n, (tag, _, _, category, attributes) in enumerate(near):
-        share = shares.get(tag, 0.0)
+    for n, who in enumerate(near):
+        share = shares.get(who.body.tag, 0.0)
         if counts[n] or share > 0:
             found.append(
-                {"tag": tag, "category": category, "attributes": list(attributes), "centre": centre[n].tolist(),
-                 "size": size[n].tolist(), "rotation": list(rotation[n]), "points": int(counts[n]),
-                 "visibility": visibility_token(share)}
+                {"tag": who.body.tag, "category": CATEGORY[who.body.kind], "attributes": list(attributes_of(who)),
+                 "centre": centre[n].tolist(), "size": size[n].tolist(), "rotation": list(rotation[n]),
+                 "points": int(counts[n]), "visibility": visibility_token(share)}
             )  # fmt: skip
     return found
 
@@ -402,13 +351,13 @@ def _merge(recording: Recording, names: list[str]) -> None:
                 )  # fmt: skip
             times = {}
             for sample in part["samples"]:
-                times[sample["time"]] = writer.add_sample(scene, sample["time"])
+                times[sample["sweep"]] = writer.add_sample(scene, sample["time"])
             for frame in part["frames"]:
                 ego = np.array(frame["ego"])
                 token = writer.add_sensor_frame(
                     scene, frame["channel"], timestamp_us=frame["time"], data=folder / frame["file"],
                     ego_translation=tuple(ego[:3, 3]), ego_rotation=_quaternion(ego[:3, :3]),
-                    sample=times[frame["time"]] if frame["key"] else None, size=tuple(frame["size"]),
+                    sample=times[frame["sweep"]] if frame["key"] else None, size=tuple(frame["size"]),
                 )  # fmt: skip
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"
                 if depth.is_file():
@@ -419,7 +368,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     if box["tag"] not in known:
                         known[box["tag"]] = writer.add_instance(scene, f"thing-{box['tag']}", category=box["category"])
                     writer.add_annotation(
-                        times[sample["time"]], known[box["tag"]], translation=box["centre"], size=box["size"],
+                        times[sample["sweep"]], known[box["tag"]], translation=box["centre"], size=box["size"],
                         rotation=box["rotation"], visibility=box["visibility"], attributes=box["attributes"],
                         lidar_points=box["points"],
                     )  # fmt: skip

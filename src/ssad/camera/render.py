@@ -19,6 +19,7 @@ from ssad.types import F32, F64, I32, U8
 NEAR = 0.15  # m
 FAR = 500.0
 LARGE, LANES = 4096, 32  # large triangles that a view may list, threads for each
+DAY = 0.5  # exposure on a clear day
 SHADOW_SIZE, SHADOW_REACH = 1024, 60.0  # texels, m from the middle to the border
 
 
@@ -38,12 +39,18 @@ class Weather:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera at a place: `pose` (camera to world) [4, 4], what stands there, the weather."""
+    """A camera at a place: `pose` (camera to world) [4, 4], what stands there, the weather.
+
+    noise: of the sensor by day, as the deviation at full light (0.01 is a good camera's); it grows where the exposure
+    must, by night. seed: of the noise; equal seeds give equal noise.
+    """
 
     camera: Camera
     pose: F64
     things: tuple[Thing, ...] = ()
     weather: Weather = Weather()
+    noise: float = 0.0
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,12 +151,18 @@ class _Pass:
 
 
 def render(
-    stage: Stage, views: Sequence[View], *, scale: int = 2, shadows: bool = True, download: bool = True
+    stage: Stage,
+    views: Sequence[View],
+    *,
+    scale: int = 2,
+    shadows: bool = True,
+    download: bool = True,
+    linear: bool = True,
 ) -> Picture:
     """Pictures of views of one size. ConfigError for views that do not fit.
 
     scale: samples a pixel along each side; download: numpy arrays; else the picture's image, radiance, tag and depth
-    stay on the stage's device as Warp arrays.
+    stay on the stage's device as Warp arrays; linear: download the radiance too.
     """
     if not views:
         raise ConfigError("no view to render")
@@ -215,11 +228,24 @@ def render(
     image = wp.empty((*shape, 3), dtype=wp.uint8, device=device)
     bright = wp.array(np.array(exposures, np.float32), dtype=float, device=device)
     curve = wp.array(response(), dtype=wp.uint8, device=device)
-    wp.launch(shade.develop, dim=shape, inputs=[radiance, bright, curve], outputs=[image], device=device)
+    amount = wp.array(_noise(views, exposures), dtype=wp.vec2, device=device)
+    seeds = wp.array(np.array([v.seed for v in views], np.int32), dtype=int, device=device)
+    inputs = [radiance, bright, amount, seeds, curve]
+    wp.launch(shade.develop, dim=shape, inputs=inputs, outputs=[image], device=device)
     arrays = (image, radiance, tag, depth)
     if download:
-        arrays = tuple(a.numpy() for a in arrays)
+        arrays = tuple(a.numpy() if linear or a is not radiance else a for a in arrays)
     return Picture(*arrays, np.array(exposures), fragments)
+
+
+def _noise(views: Sequence[View], exposures: Sequence[float]) -> F32:
+    """Variance for each unit of light and deviation in the dark, [B, 2]. Beyond the exposure of a clear day half of
+    the rest (in stops) is a longer shutter, which costs no noise, half is gain."""
+    rows = []
+    for view, exposure in zip(views, exposures, strict=True):
+        gain = max(exposure / DAY, 1.0) ** 0.5
+        rows.append([view.noise**2 * gain, 0.2 * view.noise * gain])
+    return np.array(rows, np.float32)
 
 
 def _light_camera(sun: F64, middle: F64) -> F64:

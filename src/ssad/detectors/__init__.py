@@ -1,0 +1,1 @@
+"""Detectors: the AI components under test."""
