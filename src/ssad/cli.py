@@ -234,13 +234,14 @@ def record(
     from rich.progress import Progress
 
     from ssad.bench.record import Recording, record_nuscenes
+    from ssad.bench.run import pick_device
 
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
     todo = Recording(
         out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps, seed=seed,
-        device=device,
+        device=pick_device(device),
     )  # fmt: skip
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:

@@ -1,0 +1,1 @@
+"""Training of detectors: recipes, batches, the loop."""

@@ -1,0 +1,215 @@
+"""Pictures and truth for training: held decoded in memory, changed at random on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import affine_grid, grid_sample
+
+from ssad.detections import Solids, Truth
+from ssad.detectors.training.recipe import Recipe
+from ssad.errors import ConfigError
+from ssad.types import U8
+
+GREY = 0.447
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One picture: how to read it (uint8 RGB [H, W, 3]), and what is in it."""
+
+    read: Callable[[], U8]
+    truth: Truth
+
+
+@dataclass(frozen=True, slots=True)
+class Bank:
+    """All pictures of a set, uint8 [N, H, W, 3], and their truth (on the CPU)."""
+
+    pictures: Tensor
+    truth: tuple[Truth, ...]
+
+    def __len__(self) -> int:
+        return len(self.truth)
+
+
+def fill(items: Sequence[Item], *, device: str = "cpu", threads: int = 8) -> Bank:
+    """Reads all pictures, in parallel, to the device. ConfigError: no picture, or pictures of different sizes."""
+    if not items:
+        raise ConfigError("no picture to train on")
+    first = items[0].read()
+    pictures = torch.empty((len(items), *first.shape), dtype=torch.uint8, device=device)
+
+    def load(start: int) -> None:
+        block = []
+        for k in range(start, min(start + 32, len(items))):
+            picture = items[k].read()
+            if picture.shape != first.shape:
+                raise ConfigError(f"picture {k} has the size {picture.shape[:2]}, the first {first.shape[:2]}")
+            block.append(torch.from_numpy(np.ascontiguousarray(picture)))
+        pictures[start : start + len(block)] = torch.stack(block).to(device)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(load, range(0, len(items), 32)))
+    return Bank(pictures, tuple(item.truth for item in items))
+
+
+def order(count: int, batch: int, *, seed: int, epoch: int) -> list[list[int]]:
+    """Indices of each batch of an epoch; the last one is dropped if it is short, unless it is the only one."""
+    shuffled = np.random.default_rng([seed, epoch]).permutation(count).tolist()
+    full = max(count // batch, 1)
+    return [shuffled[k * batch : (k + 1) * batch] for k in range(full)]
+
+
+def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
+    """Truth on a device, in one transfer for each kind of value."""
+    truths = list(truths)
+    counts = [len(t.label) for t in truths]
+
+    def together(values: list[Tensor | None]) -> list[Tensor | None]:
+        if any(v is None for v in values):
+            return [None if v is None else v.to(device) for v in values]
+        given = [v for v in values if v is not None]
+        return list(torch.split(torch.cat(given).to(device, non_blocking=True), counts))
+
+    columns = {name: together([getattr(t, name) for t in truths]) for name in ("label", "box", "crowd")}
+    lens = [t.intrinsic for t in truths]
+    if lens and all(k is not None for k in lens):
+        stacked = torch.stack([k for k in lens if k is not None]).to(device, non_blocking=True)
+        columns["intrinsic"] = list(stacked.unbind())
+    else:
+        columns["intrinsic"] = [None] * len(truths)
+    solids: list[Solids | None] = [None] * len(truths)
+    if truths and all(t.solid is not None for t in truths):
+        parts = {f.name: together([getattr(t.solid, f.name) for t in truths]) for f in fields(Solids)}
+        solids = [Solids(**{name: values[k] for name, values in parts.items()}) for k in range(len(truths))]  # type: ignore[arg-type]
+    return [
+        Truth(solid=solids[k], **{name: values[k] for name, values in columns.items()})  # type: ignore[arg-type]
+        for k in range(len(truths))
+    ]
+
+
+def take(truth: Truth, rows: Tensor) -> Truth:
+    """Some of the objects."""
+
+    def pick(value: Any) -> Any:
+        return None if value is None else value[rows]
+
+    solid = truth.solid
+    if solid is not None:
+        solid = Solids(**{f.name: pick(getattr(solid, f.name)) for f in fields(Solids)})
+    return replace(truth, label=pick(truth.label), box=pick(truth.box), crowd=pick(truth.crowd), solid=solid)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What happens to one picture: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
+
+    mirror: bool
+    zoom: float
+    shift: tuple[float, float]
+
+
+def draw_change(recipe: Recipe, size: tuple[int, int], rng: np.random.Generator) -> Change:
+    """A random change of a picture of `size` (height, width)."""
+    zoom = float(np.exp(rng.uniform(np.log(recipe.zoom[0]), np.log(recipe.zoom[1]))))
+    free = [length * (1.0 - zoom) for length in (size[1], size[0])]
+    return Change(bool(rng.random() < recipe.flip), zoom, (rng.random() * free[0], rng.random() * free[1]))
+
+
+def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
+    """Truth of a changed picture. Objects go whose visible share falls under `keep` (2D) or whose middle leaves the
+    picture (3D); those that go in 2D become crowd while a part of them is in sight."""
+    height, width = size
+    box, solid, lens = truth.box, truth.solid, truth.intrinsic
+    if change.mirror:
+        box = torch.stack([width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]], -1)
+        if solid is not None:
+            side = solid.centre.new_tensor([-1.0, 1.0, 1.0])
+            solid = replace(
+                solid, centre=solid.centre * side, yaw=torch.pi - solid.yaw, velocity=solid.velocity * side[[0, 2]]
+            )
+        if lens is not None:
+            lens = lens.clone()
+            lens[0, 2] = width - 1 - lens[0, 2]
+    move_by = box.new_tensor([*change.shift, *change.shift])
+    box = box * change.zoom + move_by
+    if lens is not None:
+        lens = lens.clone()
+        lens[:2, :2] *= change.zoom
+        for axis in (0, 1):
+            lens[axis, 2] = change.zoom * (lens[axis, 2] + 0.5) + change.shift[axis] - 0.5
+    limit = box.new_tensor([width, height, width, height])
+    cut = box.clamp_min(0.0).minimum(limit)
+    area = (box[:, 2:] - box[:, :2]).prod(-1).clamp_min(1e-6)
+    share = (cut[:, 2:] - cut[:, :2]).prod(-1) / area
+    changed = replace(truth, box=cut, solid=solid, intrinsic=lens)
+    if solid is not None and lens is not None:
+        flat = solid.centre @ lens.T
+        middle = flat[:, :2] / flat[:, 2:].clamp_min(1e-3)
+        inside = (middle >= 0).all(-1) & (middle[:, 0] < width) & (middle[:, 1] < height)
+        return take(changed, inside & (solid.centre[:, 2] > 0) & (share > 0))
+    crowd = torch.zeros(len(box), dtype=torch.bool) if truth.crowd is None else truth.crowd
+    return take(replace(changed, crowd=crowd | (share < keep)), share > 0.02)
+
+
+def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
+    """Pictures float [B, 3, H, W] after their changes; grey where there is nothing."""
+    if all(not c.mirror and c.zoom == 1.0 for c in changes):
+        return pictures
+    height, width = pictures.shape[2:]
+    rows = []
+    for c in changes:
+        side = -1.0 if c.mirror else 1.0
+        x = side * (1 / c.zoom - 2 * c.shift[0] / (c.zoom * width) - 1)
+        y = 1 / c.zoom - 2 * c.shift[1] / (c.zoom * height) - 1
+        rows.append([[side / c.zoom, 0.0, x], [0.0, 1 / c.zoom, y]])
+    theta = torch.tensor(rows, dtype=pictures.dtype, device=pictures.device)
+    grid = affine_grid(theta, list(pictures.shape), align_corners=False)
+    return grid_sample(pictures - GREY, grid, align_corners=False) + GREY
+
+
+def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> Tensor:
+    """Brightness, contrast, saturation and gamma of each picture moved at random; noise added; in [0, 1]."""
+    if recipe.jitter <= 0 and recipe.noise <= 0:
+        return pictures
+    device = pictures.device
+
+    def about(spread: float) -> Tensor:
+        value = torch.rand((len(pictures), 1, 1, 1), generator=draws)
+        return (1.0 + spread * (2 * value - 1)).to(device)
+
+    grey = pictures.mean(1, keepdim=True)
+    pictures = grey + (pictures - grey) * about(1.5 * recipe.jitter)
+    middle = pictures.mean((1, 2, 3), keepdim=True)
+    pictures = (middle + (pictures - middle) * about(recipe.jitter)) * about(recipe.jitter)
+    pictures = pictures * (
+        1.0 + recipe.jitter * 0.15 * (torch.rand((len(pictures), 3, 1, 1), generator=draws) * 2 - 1)
+    ).to(device)
+    pictures = pictures.clamp(1e-4, 1.0) ** about(recipe.jitter)
+    if recipe.noise > 0:
+        level = torch.rand((len(pictures), 1, 1, 1), generator=draws).to(device) ** 2 * recipe.noise
+        pictures = pictures + torch.randn_like(pictures) * level
+    return pictures.clamp(0.0, 1.0)
+
+
+def make_batch(
+    bank: Bank, indices: Sequence[int], recipe: Recipe, *, key: tuple[int, ...], device: torch.device
+) -> tuple[Tensor, list[Truth]]:
+    """Pictures float [B, 3, H, W] and their truth on the device, changed at random as the key says."""
+    rng = np.random.default_rng(key)
+    draws = torch.Generator().manual_seed(int(rng.integers(2**62)))
+    chosen = torch.as_tensor(indices, device=bank.pictures.device)
+    pictures = bank.pictures[chosen].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
+    size = (pictures.shape[2], pictures.shape[3])
+    changes = [draw_change(recipe, size, rng) for _ in indices]
+    truths = [
+        change_truth(bank.truth[i], change, size, keep=recipe.keep) for i, change in zip(indices, changes, strict=True)
+    ]
+    return change_colours(change_pictures(pictures, changes), recipe, draws), move(truths, device)

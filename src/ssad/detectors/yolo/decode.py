@@ -1,0 +1,114 @@
+"""From raw maps to boxes and back, and from scores to detections.
+
+Here boxes are in pixels of the network's own input unless said otherwise. A place is a cell with one of its anchors;
+places run over levels (finest first), anchors, rows, columns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+from torchvision.ops import batched_nms
+
+from ssad.detections import Detections
+
+MAX_LOG_SIZE = math.log(1000.0)
+MAX_CANDIDATES = 30_000
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The places of a picture. cell [P, 2]: column, row; anchor [P, 2]: width, height in pixels; stride [P]; level [P];
+    shapes: rows, columns a level; start: first place of each level; anchors [L, A, 2]; strides of the levels."""
+
+    cell: Tensor
+    anchor: Tensor
+    stride: Tensor
+    level: Tensor
+    shapes: tuple[tuple[int, int], ...]
+    start: tuple[int, ...]
+    anchors: Tensor
+    strides: tuple[int, ...]
+
+
+def make_grid(shapes: Sequence[tuple[int, int]], strides: Sequence[int], anchors: Tensor) -> Grid:
+    """Places of maps with these rows and columns; anchors [L, A, 2] give device and dtype."""
+    count = anchors.shape[1]
+    device, dtype = anchors.device, anchors.dtype
+    cells, sizes, start = [], [], [0]
+    for (rows, columns), level in zip(shapes, anchors, strict=True):
+        y = torch.arange(rows, device=device, dtype=dtype)[:, None].expand(rows, columns)
+        x = torch.arange(columns, device=device, dtype=dtype).expand(rows, columns)
+        cells.append(torch.stack((x, y), -1).reshape(1, -1, 2).expand(count, -1, 2).reshape(-1, 2))
+        sizes.append(level[:, None].expand(-1, rows * columns, 2).reshape(-1, 2))
+        start.append(start[-1] + count * rows * columns)
+    many = torch.tensor([end - first for first, end in pairwise(start)], device=device)
+    level = torch.arange(len(strides), device=device).repeat_interleave(many, output_size=start[-1])
+    stride = torch.tensor(strides, device=device, dtype=dtype)[level]
+    return Grid(
+        torch.cat(cells), torch.cat(sizes), stride, level, tuple(shapes), tuple(start[:-1]), anchors, tuple(strides)
+    )
+
+
+def flatten(maps: Sequence[Tensor], anchors: int) -> Tensor:
+    """Raw maps [B, A * K, h, w] as [B, P, K], in float32 at least."""
+    parts = []
+    for part in maps:
+        full = part.float() if part.dtype in {torch.float16, torch.bfloat16} else part
+        batch, channels, rows, columns = full.shape
+        split = full.reshape(batch, anchors, channels // anchors, rows * columns)
+        parts.append(split.transpose(2, 3).reshape(batch, anchors * rows * columns, channels // anchors))
+    return torch.cat(parts, 1)
+
+
+def to_corners(middle: Tensor, size: Tensor) -> Tensor:
+    """Boxes [..., 4] x1, y1, x2, y2 from middle and size [..., 2]."""
+    return torch.cat((middle - size / 2, middle + size / 2), -1)
+
+
+def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
+    """Boxes [..., P, 4] from the first four raw numbers [..., P, 4].
+
+    v3 (paper, section 2.1): middle (sigmoid(t) + cell) * stride, size anchor * exp(t), with t at most ln 1000.
+    v5 (published formulas): middle (2 sigmoid(t) - 0.5 + cell) * stride, size anchor * (2 sigmoid(t))^2.
+    """
+    stride = grid.stride[:, None]
+    if rule == "v3":
+        middle = (raw[..., :2].sigmoid() + grid.cell) * stride
+        return to_corners(middle, grid.anchor * raw[..., 2:].clamp(max=MAX_LOG_SIZE).exp())
+    share = 2 * raw.sigmoid()
+    return to_corners((share[..., :2] - 0.5 + grid.cell) * stride, grid.anchor * share[..., 2:] ** 2)
+
+
+def encode(rule: str, box: Tensor, grid: Grid) -> Tensor:
+    """The raw numbers [..., P, 4] that `decode` turns into the boxes [..., P, 4]; infinite or NaN where none do."""
+    cell = (box[..., :2] + box[..., 2:]) / 2 / grid.stride[:, None] - grid.cell
+    ratio = (box[..., 2:] - box[..., :2]) / grid.anchor
+    if rule == "v3":
+        return torch.cat((cell.logit(), ratio.log()), -1)
+    return torch.cat((((cell + 0.5) / 2).logit(), (ratio.sqrt() / 2).logit()), -1)
+
+
+def select(
+    score: Tensor, box: Tensor, *, threshold: float, iou: float, limit: int, size: tuple[int, int]
+) -> Detections:
+    """Detections of one image from score [P, C] and box [P, 4]: every class of every place above the threshold, the
+    30,000 best of them, suppression within a class at more than `iou`, at most `limit`; boxes are cut to the picture
+    of `size` (height, width)."""
+    # NaN is above nothing, so broken weights give no detections instead of boxes that are none
+    usable = (score > threshold) & box.isfinite().all(-1, keepdim=True)
+    place, label = usable.nonzero(as_tuple=True)
+    value = score[place, label]
+    order = value.argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+    place, label, value = place[order], label[order], value[order]
+    found = box[place]
+    # float64: suppression by class shifts boxes far apart, and float32 would round them there
+    keep = batched_nms(found.double(), value.double(), label, iou)[:limit]
+    height, width = size
+    edge = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
+    return Detections(value[keep], label[keep], found[keep].clamp(min=0).minimum(edge))

@@ -1,0 +1,88 @@
+"""Layers of YOLOv3 (Redmon and Farhadi 2018) and of YOLOv5 6.0 (published layer table)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class ConvUnit(nn.Module):
+    """Convolution without bias, batch norm, activation. [B, i, h, w] -> [B, o, ceil(h / stride), ceil(w / stride)].
+
+    smooth: SiLU and the batch norm of YOLOv5 (eps 1e-3), else leaky ReLU with slope 0.1 and that of darknet (eps 1e-5).
+    """
+
+    def __init__(
+        self, inputs: int, outputs: int, *, kernel: int = 1, stride: int = 1, padding: int | None = None, smooth: bool
+    ) -> None:
+        super().__init__()
+        padding = kernel // 2 if padding is None else padding
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False)
+        self.norm = nn.BatchNorm2d(outputs, eps=1e-3 if smooth else 1e-5, momentum=0.03)
+        self.activation: nn.Module = nn.SiLU() if smooth else nn.LeakyReLU(0.1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The activated map."""
+        result: Tensor = self.activation(self.norm(self.conv(x)))
+        return result
+
+
+class Residual(nn.Module):
+    """1x1 to `hidden` channels, 3x3 back to as many as came in; the input is added when `add`."""
+
+    def __init__(self, channels: int, hidden: int, *, smooth: bool, add: bool = True) -> None:
+        super().__init__()
+        self.reduce = ConvUnit(channels, hidden, smooth=smooth)
+        self.expand = ConvUnit(hidden, channels, kernel=3, smooth=smooth)
+        self.add = add
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, c, h, w] -> [B, c, h, w]."""
+        y: Tensor = self.expand(self.reduce(x))
+        return x + y if self.add else y
+
+
+class C3(nn.Module):
+    """Cross-stage partial block of three convolutions: half the channels pass the residual blocks, half go round."""
+
+    def __init__(self, inputs: int, outputs: int, *, repeats: int, add: bool = True) -> None:
+        super().__init__()
+        half = outputs // 2
+        self.through = ConvUnit(inputs, half, smooth=True)
+        self.past = ConvUnit(inputs, half, smooth=True)
+        self.merge = ConvUnit(2 * half, outputs, smooth=True)
+        self.blocks = nn.Sequential(*(Residual(half, half, smooth=True, add=add) for _ in range(repeats)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, i, h, w] -> [B, o, h, w]."""
+        result: Tensor = self.merge(torch.cat((self.blocks(self.through(x)), self.past(x)), 1))
+        return result
+
+
+class SPPF(nn.Module):
+    """Spatial pyramid pooling as three 5x5 poolings in a row (fields of 5, 9 and 13), joined with their input."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        half = inputs // 2
+        self.reduce = ConvUnit(inputs, half, smooth=True)
+        self.merge = ConvUnit(4 * half, outputs, smooth=True)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, i, h, w] -> [B, o, h, w]."""
+        maps = [self.reduce(x)]
+        for _ in range(3):
+            maps.append(functional.max_pool2d(maps[-1], 5, stride=1, padding=2))
+        result: Tensor = self.merge(torch.cat(maps, 1))
+        return result
+
+
+def pool_same(x: Tensor) -> Tensor:
+    """2x2 pooling of stride 1 that keeps the size, as darknet does: one row and column more at the right and bottom."""
+    return functional.max_pool2d(functional.pad(x, (0, 1, 0, 1), value=-torch.inf), 2, stride=1)
+
+
+def upsample(x: Tensor) -> Tensor:
+    """Twice the size, nearest neighbour."""
+    return functional.interpolate(x, scale_factor=2.0, mode="nearest")

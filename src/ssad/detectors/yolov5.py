@@ -1,0 +1,97 @@
+"""YOLOv5 6.0 n and s (published layer table and multiples): presets, builders, and the names of other people's weights.
+
+Weights come as a state dict of tensors, e.g. from a converted safetensors file; `.pt` files of the source are pickles
+of its own classes and are not read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ssad.detectors.yolo.classes import COCO
+from ssad.detectors.yolo.detector import Yolo
+from ssad.detectors.yolo.models import YoloSpec
+from ssad.errors import FormatError
+
+YOLOV5N = YoloSpec(
+    name="yolov5n",
+    rule="v5",
+    network="csp",
+    anchors=(((10, 13), (16, 30), (33, 23)), ((30, 61), (62, 45), (59, 119)), ((116, 90), (156, 198), (373, 326))),
+    width=0.25,
+    depth=0.33,
+)
+YOLOV5S = replace(YOLOV5N, name="yolov5s", width=0.5)
+
+# the layers of the published table that have weights
+LAYERS = {
+    0: "stem", 1: "down2", 2: "stage2", 3: "down3", 4: "stage3", 5: "down4", 6: "stage4", 7: "down5", 8: "stage5",
+    9: "pool", 10: "lateral5", 13: "top4", 14: "lateral4", 17: "neck3", 18: "up4", 20: "neck4", 21: "up5", 23: "neck5",
+}  # fmt: skip
+HEADS = 24
+_PARTS = {"cv1": "through", "cv2": "past", "cv3": "merge"}
+_POOL_PARTS = {"cv1": "reduce", "cv2": "merge"}
+_BLOCK_PARTS = {"cv1": "reduce", "cv2": "expand"}
+
+
+def yolov5n(classes: Sequence[str] = COCO, *, input_width: int | None = None, seed: int = 0) -> Yolo:
+    """YOLOv5n with fresh weights."""
+    return Yolo(YOLOV5N, classes, input_width=input_width, seed=seed)
+
+
+def yolov5s(classes: Sequence[str] = COCO, *, input_width: int | None = None, seed: int = 0) -> Yolo:
+    """YOLOv5s with fresh weights."""
+    return Yolo(YOLOV5S, classes, input_width=input_width, seed=seed)
+
+
+def from_yolov5_keys(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The state dict of `Yolo` from one with YOLOv5's names (model.0.conv.weight, model.2.cv1.conv.weight,
+    model.24.m.0.weight), in float32. The anchors come along, in pixels. FormatError: a name that is not of 6.0 n or s.
+
+    Also takes names with `model.model.` before the number. Shapes and missing names are `load_state_dict`'s to check.
+    """
+    result: dict[str, Tensor] = {}
+    for key, value in state.items():
+        match = re.fullmatch(r"(?:model\.){1,2}(\d+)\.(.+)", key)
+        name = _rename(int(match[1]), match[2]) if match else None
+        if name is None:
+            raise FormatError(f"weights: '{key}' is no name of YOLOv5 6.0 n or s; convert a model of that version")
+        full = value.float() if value.is_floating_point() else value
+        if name == "anchors":
+            if full.shape != (3, 3, 2):
+                raise FormatError(f"weights: '{key}' has the shape {list(full.shape)}; it takes [3, 3, 2]")
+            full = full * torch.tensor(YOLOV5N.strides, dtype=full.dtype, device=full.device)[:, None, None]
+        if name:
+            result[name] = full
+    return result
+
+
+def _rename(layer: int, rest: str) -> str | None:
+    """The own name of a tensor, "" for one that is not needed, None for one that is not known."""
+    if layer == HEADS:
+        if rest == "anchors":
+            return "anchors"
+        if rest in {"anchor_grid", "stride"}:
+            return ""
+        head = re.fullmatch(r"m\.([012])\.(weight|bias)", rest)
+        return f"network.heads.{head[1]}.{head[2]}" if head else None
+    if layer not in LAYERS:
+        return None
+    own = LAYERS[layer]
+    match = re.fullmatch(r"(?:m\.(\d+)\.)?(?:(cv[123])\.)?(conv\.weight|bn\.\w+)", rest)
+    if match is None:
+        return None
+    block, part, tensor = match[1], match[2], match[3].replace("bn.", "norm.")
+    kinds = {} if own.startswith(("stem", "down", "up", "lateral")) else _POOL_PARTS if own == "pool" else _PARTS
+    if block is not None:
+        if kinds is not _PARTS or part not in _BLOCK_PARTS:
+            return None
+        return f"network.{own}.blocks.{block}.{_BLOCK_PARTS[part]}.{tensor}"
+    if part is None:
+        return None if kinds else f"network.{own}.{tensor}"
+    return f"network.{own}.{kinds[part]}.{tensor}" if part in kinds else None
