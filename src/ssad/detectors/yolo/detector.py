@@ -110,8 +110,10 @@ class Yolo(nn.Module):
 
         ConfigError: truth that does not belong to the images, or is none (labels out of range, empty boxes).
         """
-        if len(truth) != len(dense.box):
-            raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.box)}")
+        if not truth or len(truth) != len(dense.box):
+            raise ConfigError(
+                f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.box)}; it takes one each"
+            )
         grid = self._grid_of(dense)
         scale = self._scale(dense.size, dense.box)
         targets = pad_truth(truth, scale, classes=len(self.classes))

@@ -1,0 +1,80 @@
+"""Everything that makes a monocular 3D detector, and the presets.
+
+Sources: Wang et al., FCOS3D (ICCVW 2021); Wang et al., PGD (CoRL 2021); mmdetection3d 1.4, nuScenes configurations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ssad.errors import ConfigError
+
+# mean and deviation of depth (m), and mean length, height, width (m), in the order of CLASSES_3D. The sizes from
+# bicycle on are one row late: the published weights were trained with these numbers.
+BASE_DEPTHS = (
+    (31.99, 21.12), (37.15, 24.63), (39.69, 23.97), (40.91, 26.34), (34.16, 20.11), (22.35, 13.70), (24.28, 16.05),
+    (27.26, 15.50), (20.61, 13.68), (22.74, 15.01),
+)  # fmt: skip
+BASE_DIMS = (
+    (4.62, 1.73, 1.96), (6.93, 2.83, 2.51), (12.56, 3.89, 2.94), (11.22, 3.50, 2.95), (6.68, 3.21, 2.85),
+    (6.68, 3.21, 2.85), (2.11, 1.46, 0.78), (0.73, 1.77, 0.67), (0.41, 1.08, 0.41), (0.50, 0.99, 2.52),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Mono3DConfig:
+    """A detector. trunk: ResNet depth (101 or 50, caffe style, deformable in its last two stages), or 18 for the light
+    one of basic blocks with `width` channels in its first stage; channels: of neck and heads; strides: one a level;
+    ranges: largest side distance (pixels) that a level answers for; deformable: in the heads' second convolutions;
+    pgd: 2D boxes, depth bins and their fusion with the regressed depth.
+
+    code_weights: of offset, depth, size, yaw, velocity (and 2D box) in the loss; threshold, nms, before, most: least
+    score, IoU, places kept of each level, detections kept of an image. input_width: pictures are resized to it inside;
+    virtual_focal: depth is predicted as for a camera of this focal length (pixels, after resizing) and scaled.
+    mean, std: of B, G, R in 0..255.
+    """
+
+    name: str
+    trunk: int = 101
+    width: int = 64
+    channels: int = 256
+    strides: tuple[int, ...] = (8, 16, 32, 64, 128)
+    ranges: tuple[float, ...] = (48.0, 96.0, 192.0, 384.0, 1e8)
+    deformable: bool = True
+    pgd: bool = False
+    code_weights: tuple[float, ...] = (1, 1, 0.2, 1, 1, 1, 1, 0.05, 0.05)
+    threshold: float = 0.05
+    nms: float = 0.8
+    before: int = 1000
+    most: int = 200
+    input_width: int | None = None
+    virtual_focal: float | None = None
+    mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
+    std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    radius: float = 1.5
+    dir_offset: float = 0.7854
+
+    def __post_init__(self) -> None:
+        if self.trunk not in (18, 50, 101):
+            raise ConfigError(f"{self.name}: trunk {self.trunk}; choose 18 (light), 50 or 101")
+        if self.channels % 32 or len(self.ranges) != len(self.strides):
+            raise ConfigError(f"{self.name}: channels must be a multiple of 32, and each stride needs a range")
+        if any(s != 8 << k for k, s in enumerate(self.strides)) or not 3 <= len(self.strides) <= 5:
+            raise ConfigError(f"{self.name}: strides are 8, 16, 32 and may go on to 64 and 128, not {self.strides}")
+        if self.input_width is not None and self.input_width < 64:
+            raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """Channels of each part of the regression: offset, depth, size, yaw, velocity (, 2D box)."""
+        return (2, 1, 3, 1, 2, 4) if self.pgd else (2, 1, 3, 1, 2)
+
+
+_PGD_WEIGHTS = (1, 1, 0.2, 1, 1, 1, 1, 0.05, 0.05, 0.2, 0.2, 0.2, 0.2)
+FCOS3D = Mono3DConfig("fcos3d")
+PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)
+FCOS3D_LIGHT = Mono3DConfig(
+    "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
+    deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
+)  # fmt: skip
+PGD_DET_LIGHT = replace(FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)

@@ -1,0 +1,147 @@
+"""The dense head that all levels share: towers, branches, and the decoding that happens inside it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ssad.detections import ATTRIBUTES, CLASSES_3D
+from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
+from ssad.detectors.mono3d.trunk import DeformConv
+
+BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
+
+
+class Unit(nn.Module):
+    """Convolution, group norm, ReLU."""
+
+    def __init__(self, inside: int, outside: int, *, deformable: bool = False) -> None:
+        super().__init__()
+        self.conv: nn.Module
+        if deformable:
+            self.conv = DeformConv(inside, outside, bias=True)
+            nn.init.normal_(self.conv.weight, std=0.01)
+        else:
+            self.conv = nn.Conv2d(inside, outside, 3, padding=1)
+            nn.init.normal_(self.conv.weight, std=0.01)
+            nn.init.zeros_(self.conv.bias)  # type: ignore[arg-type]
+        self.gn = nn.GroupNorm(32, outside)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, O, H, W]."""
+        return functional.relu(self.gn(self.conv(x)))
+
+
+class Scale(nn.Module):
+    """A learned factor."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.tensor(1.0))
+
+
+def _last(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
+    conv = nn.Conv2d(inside, outside, 1)
+    nn.init.normal_(conv.weight, std=0.01)
+    nn.init.constant_(conv.bias, -math.log(99.0) if rare else 0.0)  # type: ignore[arg-type]
+    return conv
+
+
+class Head(nn.Module):
+    """Class, attribute, direction, centreness and regression maps of each level."""
+
+    base_depths: Tensor
+    base_dims: Tensor
+
+    def __init__(self, config: Mono3DConfig) -> None:
+        super().__init__()
+        self.config = config
+        c = config.channels
+        for name in ("cls_convs", "reg_convs"):
+            self.add_module(name, nn.ModuleList([Unit(c, c), Unit(c, c, deformable=config.deformable)]))
+        self.conv_cls_prev = nn.ModuleList([Unit(c, c)])
+        self.conv_cls = _last(c, len(CLASSES_3D), rare=True)
+        self.conv_reg_prevs = nn.ModuleList(
+            nn.ModuleList([] if k == 4 else [Unit(c, c)]) for k in range(len(config.groups))
+        )
+        self.conv_regs = nn.ModuleList(_last(c, size) for size in config.groups)
+        self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
+        self.conv_dir_cls = _last(c, 2, rare=True)
+        self.conv_attr_prev = nn.ModuleList([Unit(c, c)])
+        self.conv_attr = _last(c, len(ATTRIBUTES), rare=True)
+        narrow = max(c // 4, 32)
+        self.conv_centerness_prev = nn.ModuleList([Unit(c, narrow)])
+        self.conv_centerness = _last(narrow, 1)
+        self.scales = nn.ModuleList(
+            nn.ModuleList(Scale() for _ in range(4 if config.pgd else 3)) for _ in config.strides
+        )
+        if config.pgd:
+            self.conv_depth_cls_prev = nn.ModuleList([Unit(c, c)])
+            self.conv_depth_cls = _last(c, BINS, rare=True)
+            self.fuse_lambda = nn.Parameter(torch.tensor(1e-4))
+        self.register_buffer("base_depths", torch.tensor(BASE_DEPTHS), persistent=False)
+        self.register_buffer("base_dims", torch.tensor(BASE_DIMS), persistent=False)
+
+    def forward(self, maps: list[Tensor], lens: Tensor | None) -> dict[str, list[Tensor]]:
+        """Maps by mmdetection3d's names, one a level: cls_scores [B, 10, h, w], bbox_preds [B, 9 or 13, h, w] (offset
+        in pixels, depth m, size m, yaw, velocity, 2D distances in pixels), dir_cls_preds, attr_preds, centernesses,
+        and for PGD depth_cls_preds. lens [B]: factor of the depth, None for 1."""
+        found: dict[str, list[Tensor]] = {}
+        for level, x in enumerate(maps):
+            for name, value in self._level(level, x, lens).items():
+                found.setdefault(name, []).append(value)
+        return found
+
+    def _level(self, level: int, x: Tensor, lens: Tensor | None) -> dict[str, Tensor]:
+        kinds, boxes = x, x
+        for unit in self.get_submodule("cls_convs").children():
+            kinds = unit(kinds)
+        for unit in self.get_submodule("reg_convs").children():
+            boxes = unit(boxes)
+        logit = self.conv_cls(self.conv_cls_prev[0](kinds)).float()
+        parts = []
+        for prev, last in zip(self.conv_reg_prevs, self.conv_regs, strict=True):
+            value = boxes
+            for unit in prev.children():
+                value = unit(value)
+            parts.append(last(value).float())
+        found = {
+            "cls_scores": logit,
+            "bbox_preds": self._decode(level, parts, logit, lens),
+            "dir_cls_preds": self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes)).float(),
+            "attr_preds": self.conv_attr(self.conv_attr_prev[0](kinds)).float(),
+            "centernesses": self.conv_centerness(self.conv_centerness_prev[0](boxes)).float(),
+        }
+        if self.config.pgd:
+            found["depth_cls_preds"] = self.conv_depth_cls(self.conv_depth_cls_prev[0](boxes)).float()
+        return found
+
+    def _decode(self, level: int, parts: list[Tensor], logit: Tensor, lens: Tensor | None) -> Tensor:
+        """Offsets times stride, depth and size in metres."""
+        factor = list(self.scales[level].parameters())
+        stride = self.config.strides[level]
+        offset = parts[0] * factor[0] * stride
+        depth, size = parts[1] * factor[1], (parts[2] * factor[2]).exp()
+        if self.config.pgd:
+            kind = logit.argmax(1)
+            prior = self.base_depths.to(depth)[kind]
+            depth = prior[..., 0][:, None] + depth * prior[..., 1][:, None]
+            size = self.base_dims.to(size)[kind].permute(0, 3, 1, 2) * size
+        else:
+            depth = depth.exp()
+        if lens is not None:
+            depth = depth * lens[:, None, None, None]
+        if self.config.pgd:
+            parts = [*parts[:5], (parts[5] * factor[3]).relu() * stride]
+        return torch.cat([offset, depth, size, *parts[3:]], 1)
+
+    def fuse(self, depth: Tensor, bins: Tensor, lens: Tensor | None = None) -> Tensor:
+        """PGD's depth [...] from the regressed one and the logits of the bins [..., 6]; lens [...] as in `forward`."""
+        likely = bins.softmax(-1) @ (BIN * torch.arange(BINS, dtype=bins.dtype, device=bins.device))
+        if lens is not None:
+            likely = likely * lens
+        share = self.fuse_lambda.sigmoid()
+        return share * depth + (1 - share) * likely
