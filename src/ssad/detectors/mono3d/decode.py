@@ -1,0 +1,104 @@
+"""From dense maps to boxes: places, projection, yaw, corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+NEAR = 0.1  # m in front of the camera at which corners are held
+
+
+@dataclass(frozen=True, slots=True)
+class Flat:
+    """Maps of all levels as rows, levels one after the other, each row by row: logit [B, P, 10], reg [B, P, 9 or 13]
+    (see `Head.forward`), direction [B, P, 2], attribute [B, P, 9], centreness [B, P], bins [B, P, 6] or None."""
+
+    logit: Tensor
+    reg: Tensor
+    direction: Tensor
+    attribute: Tensor
+    centreness: Tensor
+    bins: Tensor | None
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """P places: x, y of each in pixels [P, 2] (stride times index plus half the stride), stride [P], level [P]."""
+
+    xy: Tensor
+    stride: Tensor
+    level: Tensor
+
+
+def flatten(maps: dict[str, list[Tensor]]) -> Flat:
+    """Rows of all levels."""
+
+    def rows(name: str) -> Tensor:
+        return torch.cat([m.flatten(2).transpose(1, 2) for m in maps[name]], 1)
+
+    return Flat(
+        rows("cls_scores"), rows("bbox_preds"), rows("dir_cls_preds"), rows("attr_preds"), rows("centernesses")[..., 0],
+        rows("depth_cls_preds") if "depth_cls_preds" in maps else None,
+    )  # fmt: skip
+
+
+def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
+    """Places of maps [B, C, h, w]."""
+    xy, size, level = [], [], []
+    for k, (m, stride) in enumerate(zip(maps, strides, strict=True)):
+        y, x = torch.meshgrid(
+            torch.arange(m.shape[2], device=m.device), torch.arange(m.shape[3], device=m.device), indexing="ij"
+        )
+        one = torch.stack([x, y], -1).reshape(-1, 2).to(m.dtype) * stride + stride // 2
+        xy.append(one)
+        size.append(torch.full((len(one),), stride, dtype=m.dtype, device=m.device))
+        level.append(torch.full((len(one),), k, dtype=torch.int64, device=m.device))
+    return Places(torch.cat(xy), torch.cat(size), torch.cat(level))
+
+
+def unproject(points: Tensor, lens: Tensor) -> Tensor:
+    """Camera frame [..., 3] of u, v (pixels), depth (m) [..., 3]; lens [..., 3, 3] (broadcast)."""
+    u, v, d = points.unbind(-1)
+    full = torch.stack([u * d, v * d, d], -1)
+    inverse: Tensor = torch.linalg.inv(lens.double()).to(points.dtype)
+    return (inverse @ full[..., None])[..., 0]
+
+
+def project(points: Tensor, lens: Tensor) -> Tensor:
+    """u, v [..., 2] of points [..., 3] in the camera frame; the depth is held above `NEAR`."""
+    flat = (lens @ points[..., None])[..., 0]
+    return flat[..., :2] / flat[..., 2:].clamp_min(NEAR)
+
+
+def global_yaw(local: Tensor, direction: Tensor, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
+    """Yaw from the regressed one (mod pi), the direction bin [...] and the column u of the centre; lens [..., 3, 3].
+
+    The viewing angle is taken from the focal length along x, as in the source.
+    """
+    turned = local - offset
+    turned = turned - (turned / torch.pi).floor() * torch.pi
+    return turned + offset + torch.pi * direction + ray_angle(u, lens)
+
+
+def ray_angle(u: Tensor, lens: Tensor) -> Tensor:
+    """Angle between the ray of column u and the optical axis."""
+    return torch.atan2(u - lens[..., 0, 2], lens[..., 0, 0])
+
+
+def corners(centre: Tensor, size: Tensor, yaw: Tensor) -> Tensor:
+    """Corners [..., 8, 3] of boxes in the camera frame: centre of gravity, (length, height, width), yaw."""
+    signs = torch.tensor(
+        [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)], dtype=size.dtype, device=size.device
+    )
+    local = signs * size[..., None, :]
+    cos, sin = yaw.cos()[..., None], yaw.sin()[..., None]
+    x = cos * local[..., 0] + sin * local[..., 2]
+    z = -sin * local[..., 0] + cos * local[..., 2]
+    return torch.stack([x, local[..., 1], z], -1) + centre[..., None, :]
+
+
+def hull(points: Tensor) -> Tensor:
+    """x0, y0, x1, y1 [..., 4] of points [..., K, 2]."""
+    return torch.cat([points.amin(-2), points.amax(-2)], -1)

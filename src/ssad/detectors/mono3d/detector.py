@@ -1,0 +1,267 @@
+"""FCOS3D and PGD-Det behind the `Detector` protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ssad.detections import CLASSES_3D, Assignment, Dense, Detections, Solids, Truth
+from ssad.detectors.mono3d.config import Mono3DConfig
+from ssad.detectors.mono3d.decode import (
+    Flat,
+    Places,
+    corners,
+    flatten,
+    global_yaw,
+    hull,
+    places_of,
+    project,
+    unproject,
+)
+from ssad.detectors.mono3d.head import Head
+from ssad.detectors.mono3d.losses import losses
+from ssad.detectors.mono3d.nms import rotated_nms
+from ssad.detectors.mono3d.targets import assign
+from ssad.detectors.mono3d.trunk import Neck, Trunk
+from ssad.errors import ConfigError
+
+MULTIPLE = 32
+
+
+class Mono3D(nn.Module):
+    """A monocular 3D detector; parts and weights carry mmdetection3d's names (backbone, neck, bbox_head).
+
+    Starts frozen and in eval mode with fresh weights from `seed`. Truth and detections are in the camera frame of the
+    intrinsic that is handed in; it is used as given (a place is column and row times stride plus half the stride).
+    `Dense`: maps are mmdetection3d's in eval mode, in pixels of the network's input; quality: centreness; box: hull of
+    the projected corners, or PGD's own 2D box, cut at the border; while training there are none ([B, 0, 4]).
+    """
+
+    task: Literal["2d", "3d"] = "3d"
+
+    def __init__(self, config: Mono3DConfig, *, seed: int = 0) -> None:
+        super().__init__()
+        self.config = config
+        self.name = config.name
+        self.classes = CLASSES_3D
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.backbone = Trunk(config.trunk, width=config.width)
+            self.neck = Neck(self.backbone.out_channels, config.channels, len(config.strides))
+            self.bbox_head = Head(config)
+        self.register_buffer("mean", torch.tensor(config.mean)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(config.std)[:, None, None], persistent=False)
+        self.requires_grad_(False).eval()
+
+    def forward(self, images: Tensor, intrinsic: Tensor) -> Dense:
+        """As `dense`."""
+        return self.dense(images, intrinsic)
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        """Raw outputs for images [B, 3, H, W] in [0, 1] and intrinsic [B, 3, 3], differentiable to the images.
+
+        ConfigError: another shape or type, or no intrinsic.
+        """
+        size, lens = self._check(images, intrinsic)
+        scale = self._scale(size, lens)
+        lens = self._scaled(lens, scale)
+        maps = self.bbox_head(self.neck(self.backbone(self._prepare(images))), self._factor(lens))
+        flat = flatten(maps)
+        places = places_of(maps["cls_scores"], self.config.strides)
+        if self.training:
+            box = flat.reg.new_zeros((len(images), 0, 4))
+        elif self.config.pgd:
+            box = torch.cat([places.xy - flat.reg[..., 9:11], places.xy + flat.reg[..., 11:13]], -1)
+        else:
+            box = self._boxes(flat, places, lens)
+        limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
+        return Dense(
+            logit=flat.logit, quality=flat.centreness, box=(box / scale.repeat(2)).clamp_min(0.0).minimum(limit),
+            place=places.xy / scale, stride=places.stride / scale[0], level=places.level, size=size,
+            maps={**maps, "intrinsic": [lens]},
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Detections of each image, best first: score class times centreness (times PGD's confidence of depth)."""
+        least = self.config.threshold if threshold is None else threshold
+        if not 0 <= least < 1:
+            raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
+        with _evaluating(self):
+            dense = self.dense(images, intrinsic)
+        found = self.select(dense, least)
+        return [_best_first(one) for one in found]
+
+    def select(self, dense: Dense, threshold: float) -> list[Detections]:
+        """Detections of each image in mmdetection3d's order: by class and falling score, or by score if some had to
+        go. Boxes that the source suppresses are gone."""
+        flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
+        places = places_of(dense.maps["cls_scores"], self.config.strides)
+        share = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
+        if flat.bins is not None:
+            share = share * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True)
+        best = share.amax(-1)
+        rows: list[Tensor] = []
+        start = 0
+        for m in dense.maps["cls_scores"]:  # the best of each level
+            count = m.shape[2] * m.shape[3]
+            part = best[:, start : start + count]
+            if count > self.config.before:
+                rows.append(part.topk(self.config.before, 1)[1] + start)
+            else:
+                rows.append(torch.arange(start, start + count, device=part.device).expand(len(part), -1))
+            start += count
+        kept = torch.cat(rows, 1)
+        return [self._one(dense, flat, places, lens[k], share[k], kept[k], k, threshold) for k in range(len(kept))]
+
+    @torch.no_grad()
+    def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
+        """The source's assignment; extra: see `ssad.detectors.mono3d.targets`. ConfigError: truth does not fit."""
+        if len(truth) != len(dense.logit):
+            raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.logit)}")
+        lens = dense.maps["intrinsic"][0]
+        places = places_of(dense.maps["cls_scores"], self.config.strides)
+        return assign(self.config, places, truth, lens, self._scale(dense.size, lens))
+
+    def losses(
+        self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
+    ) -> dict[str, Tensor]:
+        """See `ssad.detectors.mono3d.losses`. ConfigError: the assignment was made for other pictures."""
+        if assignment.label.shape != dense.logit.shape[:2]:
+            raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
+        lens = dense.maps["intrinsic"][0]
+        places = places_of(dense.maps["cls_scores"], self.config.strides)
+        fuse = self.bbox_head.fuse
+        return losses(
+            self.config, flatten(_head_maps(dense)), places, assignment, lens, factor=self._factor(lens), fuse=fuse,
+            reduction=reduction,
+        )  # fmt: skip
+
+    def _one(  # noqa: PLR0917
+        self, dense: Dense, flat: Flat, places: Places, lens: Tensor, share: Tensor, kept: Tensor, k: int,
+        threshold: float,
+    ) -> Detections:  # fmt: skip
+        """Detections of one image."""
+        share = share[kept]
+        place, label = (share > threshold).nonzero(as_tuple=True)
+        rows, score = kept[place], share[place, label]
+        centre, size, yaw, reg = self._solids(flat, places, lens, k, rows)
+        flat_box = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1)
+        stay = rotated_nms(flat_box, score, label, threshold=self.config.nms)
+        if len(stay) > self.config.most:
+            stay = stay[score[stay].argsort(descending=True, stable=True)[: self.config.most]]
+        rows = rows[stay]
+        solid = Solids(centre[stay], size[stay], yaw[stay], reg[stay, 7:9], flat.attribute[k, rows].argmax(-1))
+        scale = self._scale(dense.size, lens)
+        if self.config.pgd:
+            box = torch.cat([places.xy[rows] - reg[stay, 9:11], places.xy[rows] + reg[stay, 11:13]], -1)
+        else:
+            box = hull(project(corners(solid.centre, solid.size, solid.yaw), lens))
+        limit = torch.tensor([dense.size[1], dense.size[0]] * 2, dtype=box.dtype, device=box.device)
+        return Detections(score[stay], label[stay], (box / scale.repeat(2)).clamp_min(0.0).minimum(limit), solid)
+
+    def _solids(
+        self, flat: Flat, places: Places, lens: Tensor, k: int, rows: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Centre, size, yaw and raw regression of some places of image k."""
+        reg = flat.reg[k, rows]
+        centre2d, depth = places.xy[rows] - reg[:, :2], reg[:, 2]
+        if flat.bins is not None:
+            factor = self._factor(lens[None])
+            unit = None if factor is None else factor.expand(len(rows))
+            depth = self.bbox_head.fuse(depth, flat.bins[k, rows], unit)
+        centre = unproject(torch.cat([centre2d, depth[:, None]], -1), lens)
+        direction = flat.direction[k, rows].argmax(-1)
+        yaw = global_yaw(reg[:, 6], direction, centre2d[:, 0], lens, offset=self.config.dir_offset)
+        return centre, reg[:, 3:6], yaw, reg
+
+    def _boxes(self, flat: Flat, places: Places, lens: Tensor) -> Tensor:
+        """Hulls [B, P, 4] of all places, in the network's input."""
+        reg, wide = flat.reg, lens[:, None]
+        centre2d = places.xy - reg[..., :2]
+        centre = unproject(torch.cat([centre2d, reg[..., 2:3]], -1), wide)
+        yaw = global_yaw(reg[..., 6], flat.direction.argmax(-1), centre2d[..., 0], wide, offset=self.config.dir_offset)
+        return hull(project(corners(centre, reg[..., 3:6], yaw), wide[:, :, None]))
+
+    def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
+        if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
+            kind = str(images.dtype).removeprefix("torch.")
+            wanted = "[B, 3, H, W] of floats in [0, 1] (RGB)"
+            raise ConfigError(f"{self.name}: images must be {wanted}; got {list(images.shape)} of {kind}")
+        if intrinsic is None or intrinsic.shape != (len(images), 3, 3):
+            got = "none" if intrinsic is None else str(list(intrinsic.shape))
+            raise ConfigError(f"{self.name}: a 3D detector needs the cameras' intrinsic [B, 3, 3]; got {got}")
+        return (images.shape[2], images.shape[3]), intrinsic.to(self._dtype())
+
+    def _dtype(self) -> torch.dtype:
+        return next(self.parameters()).dtype
+
+    def _resized(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Height and width inside the network, before padding."""
+        if self.config.input_width is None:
+            return size
+        return max(1, round(size[0] * self.config.input_width / size[1])), self.config.input_width
+
+    def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
+        height, width = self._resized(size)
+        return torch.tensor([width / size[1], height / size[0]], device=like.device, dtype=like.dtype)
+
+    def _scaled(self, lens: Tensor, scale: Tensor) -> Tensor:
+        """Intrinsics of the resized picture; pixel edges are what is scaled."""
+        if self.config.input_width is None:
+            return lens
+        lens = lens.clone()
+        lens[:, :2, :2] *= scale[:, None]
+        lens[:, :2, 2] = (lens[:, :2, 2] + 0.5) * scale - 0.5
+        return lens
+
+    def _factor(self, lens: Tensor) -> Tensor | None:
+        if self.config.virtual_focal is None:
+            return None
+        return lens[:, 0, 0] / self.config.virtual_focal
+
+    def _prepare(self, images: Tensor) -> Tensor:
+        """BGR in 0..255, less the mean, padded with 0 at the right and bottom."""
+        images = images.to(self._dtype())
+        size = (images.shape[2], images.shape[3])
+        resized = self._resized(size)
+        if resized != size:
+            small = resized[0] < size[0]
+            images = functional.interpolate(images, resized, mode="bilinear", align_corners=False, antialias=small)
+        mean, std = self.get_buffer("mean"), self.get_buffer("std")
+        images = (images.flip(1) * 255 - mean) / std
+        return functional.pad(images, (0, -resized[1] % MULTIPLE, 0, -resized[0] % MULTIPLE))
+
+
+def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:
+    return {name: value for name, value in dense.maps.items() if name != "intrinsic"}
+
+
+def _best_first(found: Detections) -> Detections:
+    order = found.score.argsort(descending=True, stable=True)
+    solid = found.solid
+    assert solid is not None
+    turned = Solids(
+        solid.centre[order], solid.size[order], solid.yaw[order], solid.velocity[order], solid.attribute[order]
+    )
+    return Detections(found.score[order], found.label[order], found.box[order], turned)
+
+
+@contextmanager
+def _evaluating(module: nn.Module) -> Iterator[None]:
+    """Every part in eval mode within the block, then each in the mode it had."""
+    training = [part for part in module.modules() if part.training]
+    for part in training:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True
