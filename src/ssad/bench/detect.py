@@ -1,0 +1,157 @@
+"""Detectors on data sets: from pictures to boxes in the world and their scores; 2D boxes and their AP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ssad.datasets.nuscenes.reader import NuScenes, read_image
+from ssad.datasets.nuscenes.results import with_ego
+from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
+from ssad.datasets.nuscenes.schema import ATTRIBUTES, CLASSES
+from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
+from ssad.detections import CLASSES_3D, Detections
+from ssad.detectors.mono3d.merge import WorldBoxes, merge_cameras
+from ssad.detectors.training.batches import Bank
+from ssad.metrics.detection import Matches, filter_boxes, match
+from ssad.metrics.detection2d import Boxes2D, average_precision
+from ssad.metrics.detection_boxes import BoxTable
+from ssad.protocols import Detector
+from ssad.types import F64, U8
+
+Picture = Callable[[SensorFrame], U8]
+LABEL = np.array([CLASSES.index(name) for name in CLASSES_3D])
+_ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
+FLOOR = 0.001  # least score that counts for AP of 2D boxes
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBoxes:
+    """What was found in one sample."""
+
+    token: str
+    boxes: WorldBoxes
+
+
+def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tensor:
+    """uint8 RGB [H, W, 3] of one size as float [B, 3, H, W] in [0, 1] on the device."""
+    stacked = torch.from_numpy(np.stack(pictures)).to(device)
+    return stacked.permute(0, 3, 1, 2).float() / 255
+
+
+def detect_scene(
+    detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", picture: Picture | None = None
+) -> list[SampleBoxes]:
+    """Boxes in the world for each sample of a scene. picture: gives a camera frame's picture (default: reads it)."""
+
+    def read(frame: SensorFrame) -> U8:
+        return read_image(root / frame.filename)
+
+    look = picture or read
+    by_sample: dict[str, list[SensorFrame]] = {}
+    for frame in scene.frames:
+        if frame.modality == "camera" and frame.key_frame:
+            by_sample.setdefault(frame.sample_token, []).append(frame)
+    found = []
+    with ThreadPoolExecutor(4) as pool:
+        ahead = {s.token: [pool.submit(look, f) for f in by_sample.get(s.token, [])] for s in scene.samples[:2]}
+        for number, sample in enumerate(scene.samples):
+            for later in scene.samples[number + 1 : number + 3]:
+                if later.token not in ahead:
+                    ahead[later.token] = [pool.submit(look, f) for f in by_sample.get(later.token, [])]
+            frames = by_sample.get(sample.token, [])
+            pictures = [p.result() for p in ahead.pop(sample.token)]
+            detections: list[Detections] = []
+            sizes = sorted({p.shape[:2] for p in pictures})
+            order: list[int] = []
+            for size in sizes:  # pictures of one size in one call
+                rows = [k for k, p in enumerate(pictures) if p.shape[:2] == size]
+                lens = np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])
+                images = to_images([pictures[k] for k in rows], device)
+                detections += detector.predict(images, torch.from_numpy(lens).to(device))
+                order += rows
+            boxes = merge_cameras(
+                detections, [frames[k].sensor_to_ego for k in order], [frames[k].ego_to_world for k in order]
+            )
+            found.append(SampleBoxes(sample.token, boxes))
+    return found
+
+
+def detect(
+    detector: Detector, root: Path, version: str, scenes: Sequence[str], *, device: str = "cpu"
+) -> list[SampleBoxes]:
+    """Boxes for each sample of the scenes."""
+    with NuScenes(root, version) as data:
+        return [one for name in scenes for one in detect_scene(detector, root, data.scene(name), device=device)]
+
+
+def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
+    """Found boxes as rows in the order of the truth's samples."""
+    place = {token: k for k, token in enumerate(truth.samples)}
+    chosen = sorted((one for one in found if one.token in place), key=lambda one: place[one.token])
+    parts = [one.boxes for one in chosen]
+    if not parts:
+        return BoxTable.empty()
+
+    def column(name: str) -> F64:
+        return np.concatenate([np.asarray(getattr(p, name), np.float64) for p in parts])
+
+    attributes = [_ATTRIBUTE[name] for p in parts for name in p.attribute]
+    table = BoxTable(
+        sample=np.repeat([place[one.token] for one in chosen], [len(p) for p in parts]).astype(np.int32),
+        label=LABEL[column("label").astype(int)].astype(np.int8), translation=column("translation"),
+        size=column("size"), rotation=column("rotation"), velocity=column("velocity"),
+        attribute=np.array(attributes, np.int8), score=column("score"), ego_distance=np.full(len(attributes), np.nan),
+    )  # fmt: skip
+    return with_ego(table, truth.ego)
+
+
+def match_boxes(found: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:
+    """Found boxes against the truth, as the official evaluation matches them."""
+    return match(
+        filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
+        filter_boxes(box_table(found, truth), racks=truth.racks),
+        samples=len(truth.samples),
+    )
+
+
+def score_3d(
+    detector: Detector, root: Path, version: str, scenes: Sequence[str], *, device: str = "cpu"
+) -> dict[str, float]:
+    """mAP, NDS and the AP of each class over some scenes."""
+    truth = read_truth(root, version, scenes=frozenset(scenes))
+    scores = match_boxes(detect(detector, root, version, scenes, device=device), truth).scores()
+    return {"mAP": scores.mean_ap, "NDS": scores.nd_score} | {f"AP_{k}": v for k, v in scores.mean_dist_aps.items()}
+
+
+def score_2d(detector: Detector, bank: Bank, *, device: str = "cpu", batch: int = 32) -> dict[str, float]:
+    """AP50 of each class that there is in a bank of pictures, and their mean."""
+    names = detector.classes
+    found: list[tuple[int, Detections]] = []
+    for start in range(0, len(bank), batch):
+        images = bank.pictures[start : start + batch].to(device).permute(0, 3, 1, 2).float() / 255
+        found += [(start + k, one) for k, one in enumerate(detector.predict(images, threshold=FLOOR))]
+
+    def rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
+        empty = np.zeros((0,) if width is None else (0, width))
+        return np.concatenate([empty, *(v.detach().cpu().double().numpy() for v in values)])
+
+    predicted = Boxes2D(
+        np.repeat([k for k, _ in found], [len(one.score) for _, one in found]).astype(np.int32),
+        rows([one.label for _, one in found]).astype(np.int32), rows([one.box for _, one in found], 4),
+        rows([one.score for _, one in found]),
+    )  # fmt: skip
+    crowd = [torch.zeros(len(t.label), dtype=torch.bool) if t.crowd is None else t.crowd for t in bank.truth]
+    real = Boxes2D(
+        np.repeat(np.arange(len(bank)), [len(t.label) for t in bank.truth]).astype(np.int32),
+        rows([t.label for t in bank.truth]).astype(np.int32), rows([t.box for t in bank.truth], 4),
+        ignore=rows(crowd).astype(bool),
+    )  # fmt: skip
+    ap = average_precision(real, predicted, labels=len(names))
+    known = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}
+    return {"AP50": float(np.mean(list(known.values()))) if known else 0.0} | known

@@ -1,0 +1,77 @@
+"""From a camera's truth through the merging of cameras to the official scores: what goes in must come out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.bench.detect import detect_scene, match_boxes, score_2d
+from ssad.bench.record import Recording, record_nuscenes
+from ssad.bench.training_data import camera_truth, nuscenes_items
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.truth import read_truth
+from ssad.detections import Detections, Truth
+from ssad.detectors.training.batches import Bank
+from ssad.metrics.detection_boxes import TP_METRICS
+
+
+class Oracle:
+    """Says what is true, camera by camera in the order of the frames."""
+
+    name, task, classes = "oracle", "3d", ()
+
+    def __init__(self, truths: Iterator[Truth]) -> None:
+        self.truths = truths
+
+    def predict(self, images: torch.Tensor, intrinsic: torch.Tensor | None = None, **_: object) -> list[Detections]:
+        assert intrinsic is None or len(intrinsic) == len(images)
+        found = [next(self.truths) for _ in images]
+        return [Detections(torch.linspace(1, 0.5, len(t.label)), t.label, t.box, t.solid) for t in found]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("detect") / "set"
+    todo = Recording(out, towns=("Larkhill",), held_out=("Larkhill",), scenes=1, seconds=1.5, width=160)
+    return record_nuscenes(todo, workers=1)
+
+
+def test_perfect_cameras_score_one(root: Path) -> None:
+    """All that the cameras see, six of them merged, is found again: AP 1 but for what only the LiDAR hits."""
+    with NuScenes(root) as data:
+        scene = data.scene("scene-larkhill-000")
+        truths = [
+            camera_truth(f, scene.annotations(f.sample_token))
+            for f in scene.frames
+            if f.modality == "camera" and f.key_frame
+        ]
+        # frames come by time: put those of a sample together, as the detector is shown them
+        keys = [f.sample_token for f in scene.frames if f.modality == "camera" and f.key_frame]
+        ordered = [t for s in scene.samples for t, k in zip(truths, keys, strict=True) if k == s.token]
+        found = detect_scene(Oracle(iter(ordered)), root, scene)  # type: ignore[arg-type]
+    scores = match_boxes(found, read_truth(root, "v1.0-ssad")).scores()
+    there = scores.truth > 0
+    assert there.sum() >= 3
+    assert scores.ap[there].mean() > 0.9
+    errors = dict(zip(TP_METRICS, np.nanmean(scores.errors[there], axis=0), strict=True))
+    assert errors["trans_err"] < 0.4, "cameras fire up to 43 ms before the sweep"
+    assert errors["scale_err"] < 1e-3
+    assert errors["orient_err"] < 0.02
+    assert errors["vel_err"] < 0.1
+    assert errors["attr_err"] < 0.01
+
+
+def test_2d_truth_scores_one_and_noise_does_not(root: Path) -> None:
+    truths = tuple(item.truth for item in nuscenes_items(root, None, "all"))
+    bank = Bank(torch.zeros(len(truths), 90, 160, 3, dtype=torch.uint8), truths)
+    perfect = Oracle(iter(truths))
+    perfect.classes = tuple(str(k) for k in range(10))  # type: ignore[assignment]
+    assert score_2d(perfect, bank)["AP50"] == pytest.approx(1.0)  # type: ignore[arg-type]
+    moved = [Truth(t.label, t.box + 40, t.solid) for t in truths]
+    wrong = Oracle(iter(moved))
+    wrong.classes = perfect.classes
+    assert score_2d(wrong, bank)["AP50"] < 0.3  # type: ignore[arg-type]
