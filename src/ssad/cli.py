@@ -226,6 +226,11 @@ def record(
     width: Annotated[int, typer.Option(min=64, help="Width of the pictures (16:9).")] = 1600,
     sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between key frames.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    clips: Annotated[
+        str | None, typer.Option(help="Instead of it pictures of one car for 2D detection, COCO: drive or orbit.")
+    ] = None,
+    images: Annotated[str, typer.Option(help="With --clips: pictures of each of the towns.")] = "600,400,400,400",
+    style: Annotated[str | None, typer.Option(help="With --clips: body of the target car (default: any).")] = None,
     device: Annotated[str, typer.Option(help="Where pictures are rendered: cpu or cuda.")] = "cpu",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
 ) -> None:
@@ -239,17 +244,62 @@ def record(
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
-    todo = Recording(
-        out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps, seed=seed,
-        device=pick_device(device),
-    )  # fmt: skip
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("record", total=None)
-        root = record_nuscenes(
-            todo, workers=workers, progress=lambda done, of: bar.update(task, completed=done, total=of)
-        )
-    print(f"{root}: {len(todo.towns) * scenes} scenes, version {todo.version}, splits train and val")
+
+        def progress(done: int, of: int) -> None:
+            bar.update(task, completed=done, total=of)
+
+        if clips is not None:
+            from ssad.bench.clips import Clips, pair_images, record_clips
+
+            pairs = pair_images(names(towns), names(images))
+            todo = Clips(out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device))  # type: ignore[arg-type]
+            record_clips(todo, workers=workers, progress=progress)
+            text = f"{out}: {sum(count for _, count in pairs)} pictures, annotations train, test and all"
+        else:
+            drives = Recording(
+                out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
+                seed=seed, device=pick_device(device),
+            )  # fmt: skip
+            record_nuscenes(drives, workers=workers, progress=progress)
+            text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
+    print(text)
+
+
+train_app = typer.Typer(no_args_is_help=True, help="Train a detector (more to come).")
+app.add_typer(train_app, name="train")
+
+
+@train_app.command("detector")
+def train_detector(
+    recipe: Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a recipe (see: ssad list recipes).")],
+    data: Annotated[
+        Path,
+        typer.Option(help="Root of a data set in the nuScenes schema (3D), or a folder of `ssad record --clips` (2D)."),
+    ],
+    more: Annotated[list[Path] | None, typer.Option(help="2D: more folders of clips.")] = None,
+    out: Annotated[Path, typer.Option(help="Checkpoint, log, curves, weights; run again to go on.")] = Path("training"),
+    split: Annotated[str, typer.Option(help="Split to learn from.")] = "train",
+    val: Annotated[str, typer.Option(help="Split to validate on.")] = "val",
+    change: Annotated[
+        list[str] | None, typer.Option("--set", help="A value of the recipe: --set epochs=3 --set lr=0.001.")
+    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="Start from these weights.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
+    gpus: Annotated[int, typer.Option(min=1, help="GPUs to share the work, one process each.")] = 1,
+    seconds: Annotated[float | None, typer.Option(help="Stop after the epoch in which this time is over.")] = None,
+) -> None:
+    """Train a detector; validates on towns that it does not learn from."""
+    from ssad.bench.train import Plan, parse_changes, run_training
+
+    plan = Plan(
+        recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
+        gpus=gpus, seconds=seconds,
+    )  # fmt: skip
+    for line in run_training(plan, say=lambda text: print(text, flush=True)):
+        print(line)
 
 
 def _scenario_list() -> dict[str, str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -294,42 +294,56 @@ def record_nuscenes(
 ) -> Path:
     """Records all scenes and writes the tables; the root of the data set. Run again to go on. StoreError."""
     out = recording.out
-    safeio.make_folder(out / ".parts")
-    page = out / ".parts" / "recording.json"
-    if page.is_file():
-        if safeio.read_json(page) != recording.identity():
-            raise StoreError(f"{out}: holds another recording; choose another folder")
-    else:
-        safeio.write_atomic(page, safeio.dump_json(recording.identity(), indent=1) + "\n")
-    if (out / recording.version / "sample.json").is_file():
-        return out
     tasks = [
         (recording, town, number, f"scene-{town.lower()}-{number:03d}")
         for town in recording.towns
         for number in range(recording.scenes)
     ]
+    if (out / recording.version / "sample.json").is_file():
+        _check_page(out, recording.identity())
+        return out
+    run_parts(out, recording.identity(), _scene, tasks, workers=workers, progress=progress)
+    _merge(recording, [task[3] for task in tasks])
+    return out
+
+
+def _check_page(out: Path, identity: dict[str, Any]) -> None:
+    """Writes what is recorded here, or compares. StoreError: something else."""
+    page = out / ".parts" / "recording.json"
+    if page.is_file():
+        if safeio.read_json(page) != identity:
+            raise StoreError(f"{out}: holds another recording; choose another folder")
+    else:
+        safeio.write_atomic(page, safeio.dump_json(identity, indent=1) + "\n")
+
+
+def run_parts(
+    out: Path, identity: dict[str, Any], record: Callable[[Any], str], tasks: Sequence[Any], *,
+    workers: int | None = None, progress: Callable[[int, int], None] | None = None,
+) -> None:  # fmt: skip
+    """Records every part that is not there yet, in processes. StoreError: another recording, or a worker died."""
+    safeio.make_folder(out / ".parts")
+    _check_page(out, identity)
     count = min(workers or os.cpu_count() or 1, len(tasks))
     if count <= 1:
         for done, task in enumerate(tasks, 1):
-            _scene(task)
+            record(task)
             if progress:
                 progress(done, len(tasks))
-    else:
-        with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-            futures = [pool.submit(_scene, task) for task in tasks]
-            try:
-                for done, future in enumerate(as_completed(futures), 1):
-                    future.result()
-                    if progress:
-                        progress(done, len(tasks))
-            except BrokenProcessPool:
-                raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-            except BaseException:
-                for future in futures:
-                    future.cancel()
-                raise
-    _merge(recording, [task[3] for task in tasks])
-    return out
+        return
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(record, task) for task in tasks]
+        try:
+            for done, future in enumerate(as_completed(futures), 1):
+                future.result()
+                if progress:
+                    progress(done, len(tasks))
+        except BrokenProcessPool:
+            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
 
 
 def _merge(recording: Recording, names: list[str]) -> None:
@@ -361,7 +375,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
                 )  # fmt: skip
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"
                 if depth.is_file():
-                    _link(depth, out / "depth" / frame["channel"] / f"{token}.png")
+                    link(depth, out / "depth" / frame["channel"] / f"{token}.png")
             known: dict[int, str] = {}
             for sample in part["samples"]:
                 for box in sample["boxes"]:
@@ -376,7 +390,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
             writer.set_split(split, members)
 
 
-def _link(source: Path, target: Path) -> None:
+def link(source: Path, target: Path) -> None:
     """A hard link, or a copy where that cannot be. StoreError."""
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

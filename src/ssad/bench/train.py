@@ -1,0 +1,226 @@
+"""`ssad train detector`: from a recipe and a data set to weights with a card, on the CPU or on GPUs of this machine."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import distributed
+from torch.multiprocessing.spawn import spawn
+
+from ssad import safeio
+from ssad.bench.coco import CocoSet, read_coco
+from ssad.bench.detect import score_2d, score_3d
+from ssad.bench.training_data import nuscenes_items
+from ssad.datasets.nuscenes.files import read_image
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.splits import scenes_of_split
+from ssad.detections import Truth
+from ssad.detectors import make_detector
+from ssad.detectors.checkpoints import Card, fit_state, load_weights, save_weights
+from ssad.detectors.training.batches import Bank, Item, fill
+from ssad.detectors.training.loop import LOG, Share, train
+from ssad.detectors.training.recipe import Recipe, find_recipe, recipe_data
+from ssad.errors import ConfigError
+
+Say = Callable[[str], None]
+VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the end all are used
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A training: recipe by name, folders of data, where to write, splits, changed values of the recipe."""
+
+    recipe: str
+    data: tuple[Path, ...]
+    out: Path
+    split: str = "train"
+    val: str = "val"
+    changes: tuple[tuple[str, Any], ...] = ()
+    weights: Path | None = None
+    device: str = "auto"
+    gpus: int = 1
+    seconds: float | None = None
+
+
+def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+    """key=value pairs, values as YAML. ConfigError."""
+    found = []
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {text}: expected key=value")
+        parsed = safeio.parse_yaml(value, text)
+        found.append((key.strip(), tuple(parsed) if isinstance(parsed, list) else parsed))
+    return tuple(found)
+
+
+def coco_truth(data: CocoSet) -> list[Truth]:
+    """The truth of each picture."""
+    return [
+        Truth(
+            torch.from_numpy(image.label.astype(np.int64)), torch.from_numpy(image.box.astype(np.float32)),
+            crowd=torch.from_numpy(image.crowd.copy()),
+        )
+        for image in data.images
+    ]  # fmt: skip
+
+
+def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
+    """Classes and pictures of a split of clips. ConfigError: no such split."""
+    path = folder / "annotations" / f"{split}.json"
+    if not path.is_file():
+        raise ConfigError(f"{folder}: no annotations/{split}.json; record it with: ssad record {folder} --clips drive")
+    data = read_coco(path)
+    truths = coco_truth(data)
+    return data.classes, [
+        Item(partial(read_image, image.file), truth) for image, truth in zip(data.images, truths, strict=True)
+    ]
+
+
+def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
+    """Trains and writes OUT/NAME.safetensors with its card; lines about what was written. ConfigError, FormatError."""
+    recipe = find_recipe(plan.recipe, **dict(plan.changes))
+    device = _device(plan.device)
+    if plan.gpus > 1:
+        if device != "cuda" or torch.cuda.device_count() < plan.gpus:
+            raise ConfigError(f"--gpus {plan.gpus}: this machine has {torch.cuda.device_count()} usable GPUs")
+        safeio.make_folder(plan.out)
+        spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)
+    else:
+        _run(plan, recipe, device, Share(), say)
+    log = safeio.read_text(plan.out / LOG).splitlines()
+    yield f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log)} epochs; card, {LOG} and curves.png beside it"
+
+
+def _device(wanted: str) -> str:
+    if wanted not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
+    return "cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> None:
+    """One of several processes."""
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    world = plan.gpus
+    distributed.init_process_group(backend, rank=rank, world_size=world)
+    try:
+        device = f"cuda:{rank}" if backend == "nccl" else "cpu"
+        _run(plan, recipe, device, Share(rank, world), partial(print, flush=True))
+    finally:
+        distributed.destroy_process_group()
+
+
+def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
+    """Data, detector, training, weights."""
+    three = recipe.detector.startswith(("fcos3d", "pgd"))
+    options: dict[str, Any] = {}
+    if three:
+        items = list(nuscenes_items(plan.data[0], None, plan.split))
+    else:
+        items = []
+        for folder in plan.data:
+            names, found = coco_items(folder, plan.split)
+            if options and options["classes"] != names:
+                raise ConfigError(f"{folder}: other classes than {plan.data[0]}")
+            options["classes"] = names
+            items += found
+    detector = make_detector(recipe.detector, weights="random", device="cpu", **options)
+    if plan.weights is not None:
+        fit_state(detector, load_weights(plan.weights), str(plan.weights))
+    mine = items[share.rank :: share.world][: len(items) // share.world]
+    say(f"{len(items)} pictures to learn from, {sum(len(i.truth.label) for i in items)} objects")
+    bank = fill(mine, device=device)
+    validate = _validation(plan, device, three=three)
+    final = train(
+        detector, bank, recipe, out=plan.out, device=device, validate=lambda d: validate(d, quick=True), say=say,
+        share=share, seconds=plan.seconds,
+    )  # fmt: skip
+    if share.rank:
+        return
+    metrics = validate(final, quick=False)
+    say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    card = Card(
+        data=", ".join(folder.name for folder in plan.data), command=command_of(plan), seed=recipe.seed,
+        metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"detector": recipe.detector},
+    )  # fmt: skip
+    save_weights(plan.out / f"{recipe.detector}.safetensors", final.state_dict(), card=card, half=True)
+    draw_curves(plan.out)
+
+
+def command_of(plan: Plan) -> str:
+    """The command that trains this anew, with the names of the folders."""
+    parts = ["ssad train detector", plan.recipe, f"--data {plan.data[0].name}"]
+    parts += [f"--more {folder.name}" for folder in plan.data[1:]]
+    parts += [f"--set {key}={list(v) if isinstance(v, tuple) else v}" for key, v in plan.changes]
+    return " ".join(parts)
+
+
+def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
+    """Metrics of a detector on the validation split."""
+    if three:
+        root = plan.data[0]
+        with NuScenes(root) as data:
+            version = data.version
+        scenes = scenes_of_split(root, version, plan.val)
+        few = scenes[:: max(len(scenes) // VAL_SCENES, 1)][:VAL_SCENES]
+
+        def check_3d(detector: Any, *, quick: bool) -> dict[str, float]:
+            return score_3d(detector, root, version, few if quick else scenes, device=device)
+
+        return check_3d
+    split = "test" if plan.val == "val" else plan.val
+    banks: dict[str, Bank] = {}
+
+    def check_2d(detector: Any, *, quick: bool) -> dict[str, float]:
+        found: dict[str, float] = {}
+        for folder in plan.data:
+            if folder.name not in banks:
+                banks[folder.name] = fill(coco_items(folder, split)[1], device=device)
+            scores = score_2d(detector, banks[folder.name], device=device)
+            found |= {f"{folder.name}_{name}": value for name, value in scores.items()}
+        return found
+
+    return check_2d
+
+
+def draw_curves(out: Path) -> None:
+    """OUT/curves.png: losses and metrics over epochs."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot
+
+    rows = [safeio.parse_json(line) for line in safeio.read_text(out / LOG).splitlines()]
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4))
+    for name in rows[0]:
+        if name.startswith("loss_"):
+            left.plot([r["epoch"] for r in rows], [r[name] for r in rows], label=name[5:])
+    names = sorted({n for r in rows for n in r if n.split("_")[-1] in ("mAP", "NDS", "AP50", "car")})
+    for name in names:
+        points = [(r["epoch"], r[name]) for r in rows if name in r]
+        right.plot(*zip(*points, strict=True), marker="o", label=name)
+    left.set(xlabel="epoch", ylabel="loss", yscale="log")
+    right.set(xlabel="epoch", ylabel="validation", ylim=(0, 1))
+    left.legend(fontsize=7)
+    if names:
+        right.legend(fontsize=7)
+    figure.tight_layout()
+    with safeio.atomic_path(out / "curves.png") as path:
+        figure.savefig(path, dpi=110, format="png")
+    pyplot.close(figure)

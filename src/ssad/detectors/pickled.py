@@ -1,0 +1,336 @@
+"""PyTorch checkpoint files (.pth, .pt, .ckpt) read without running anything that they hold.
+
+`torch.save` writes a pickle, and a pickle can call any function. Here the pickle is walked with a table of the few
+names that describe tensors and plain containers; every other class becomes an inert record of its arguments and state.
+So weights can be taken out of a checkpoint that holds a training's configuration, or a whole model of a class that is
+not installed, and a hostile file does nothing. Formats: the zip archive of PyTorch 1.6 and later, and the older stream.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import struct
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ssad.errors import FormatError
+from ssad.safeio import MIB, read_bytes
+
+MAX_BYTES = 4096 * MIB
+MAX_PICKLE = 256 * MIB
+MAGIC = 0x1950A86A20F9469CFC6C  # the first number of the older stream
+STREAM = 1001
+DEEPEST = 60
+MOST = 200_000
+CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state_dict(), 'weights.safetensors')"
+NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
+
+_KINDS = {
+    "DoubleStorage": torch.float64, "FloatStorage": torch.float32, "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32,
+    "ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
+    "UntypedStorage": torch.uint8,
+}  # fmt: skip
+_ATTACKS = frozenset({"os", "posix", "nt", "subprocess", "sys", "shutil", "socket", "runpy", "importlib", "ctypes"})
+_ATTACK_CALLS = frozenset({"eval", "exec", "compile", "__import__", "open", "input", "breakpoint"})
+
+
+@dataclass(frozen=True, slots=True)
+class _Storage:
+    """A block of numbers in the file."""
+
+    kind: Any
+    key: Any
+    count: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Strided:
+    """A tensor to be: a window of a storage. Nothing in it is trusted before `_Numbers.tensor`."""
+
+    storage: Any
+    offset: Any
+    size: Any
+    stride: Any
+    kind: Any = None
+
+
+class _Inert:
+    """Stands for an object whose class is not built: its arguments, state and items."""
+
+    def __new__(cls, *args: Any, **options: Any) -> _Inert:
+        self = super().__new__(cls)
+        self.args, self.state, self.entries, self.list = args, None, {}, []
+        return self
+
+    args: tuple[Any, ...]
+    state: Any
+    entries: dict[Any, Any]
+    list: list[Any]
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        self.entries[key] = value
+
+    def append(self, value: Any) -> None:
+        """An item of a list."""
+        self.list.append(value)
+
+    def extend(self, values: Any) -> None:
+        """Items of a list."""
+        self.list.extend(values)
+
+
+class _Maker:
+    """A function that the file may call; it cannot be changed by the file."""
+
+    __slots__ = ("_make",)
+
+    def __init__(self, make: Callable[..., Any]) -> None:
+        self._make = make
+
+    def __call__(self, *args: Any) -> Any:
+        return self._make(*args)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("it changes a function")
+
+
+_MAKERS: dict[str, Callable[..., Any]] = {
+    "collections.OrderedDict": lambda *pairs: dict(*pairs),
+    "torch.Size": tuple,
+    "torch._utils._rebuild_tensor": _Strided,
+    "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _Strided(
+        storage, offset, size, stride
+    ),
+    "torch._utils._rebuild_tensor_v3": lambda storage, offset, size, stride, grad, hooks, kind, *_: _Strided(
+        storage, offset, size, stride, kind
+    ),
+    "torch._utils._rebuild_parameter": lambda data, *_: data,
+    "torch._utils._rebuild_parameter_with_state": lambda data, *_: data,
+    "torch._tensor._rebuild_from_type_v2": lambda function, kind, args, state: function(*args),
+}
+
+
+class _Reader(pickle.Unpickler):
+    """An unpickler that can build tensors to be, plain containers and inert records, and nothing else."""
+
+    def __init__(self, file: io.BufferedIOBase) -> None:
+        super().__init__(file, encoding="utf-8")
+        self.names: set[str] = set()
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Never an object of the running program."""
+        full = f"{module}.{name}"
+        self.names.add(full)
+        if module.split(".", maxsplit=1)[0] in _ATTACKS or (
+            module in {"builtins", "__builtin__"} and name in _ATTACK_CALLS
+        ):
+            raise _HostileError(full)
+        if module in {"torch", "torch.storage"} and name in _KINDS:
+            return _KINDS[name]
+        if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
+            return getattr(torch, name)
+        if full in _MAKERS:
+            return _Maker(_MAKERS[full])
+        return type(name, (_Inert,), {"__module__": module})
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        """The description of a storage."""
+        if not isinstance(pid, tuple) or len(pid) not in (5, 6) or pid[0] != "storage":
+            raise pickle.UnpicklingError("a reference that is no storage")
+        if len(pid) == 6 and pid[5] is not None:
+            raise pickle.UnpicklingError("a view of a storage, as PyTorch before 0.4 wrote")
+        return _Storage(pid[1], str(pid[2]), pid[4])
+
+
+class _HostileError(Exception):
+    """The file names a function that starts programs or changes the machine."""
+
+
+class _Numbers:
+    """Reads tensors once the pickle is known."""
+
+    def __init__(self, read: Callable[[str], bytes]) -> None:
+        self.read = read
+        self.held: dict[str, Tensor] = {}
+
+    def tensor(self, at: _Strided) -> Tensor:
+        """The tensor, with storage of its own. ValueError: it does not lie within its storage."""
+        storage = at.storage
+        if not isinstance(storage, _Storage) or not isinstance(storage.kind, torch.dtype):
+            raise ValueError("a tensor without storage")
+        kind = at.kind if isinstance(at.kind, torch.dtype) else storage.kind
+        if storage.key not in self.held:
+            self.held[storage.key] = torch.frombuffer(bytearray(self.read(storage.key) or b"\0"), dtype=torch.uint8)
+        data = self.held[storage.key]
+        size, stride, offset = at.size, at.stride, at.offset
+        whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride))
+        if not whole or len(size) != len(stride) or len(size) > 16:
+            raise ValueError("a tensor of no shape")
+        count = 1
+        for length in size:
+            count *= length
+        if count == 0:
+            return torch.empty(size, dtype=kind)
+        last = offset + sum((length - 1) * step for length, step in zip(size, stride, strict=True))
+        have = len(data) // kind.itemsize
+        if last >= have or count > have:
+            raise ValueError("a tensor larger than its storage")
+        return data[: have * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
+
+
+def read_pickled(path: str | Path) -> dict[str, Tensor]:
+    """The state dict in a checkpoint file, alone or nested (`NESTS`, averaged weights first), or of a pickled module.
+
+    FormatError: the file is cut short, no checkpoint, hostile, or holds no tensors by name.
+    """
+    try:
+        with open(path, "rb") as file:
+            start = file.read(4)
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
+    try:
+        tree, numbers, names = _read_zip(path) if start[:2] == b"PK" else _read_stream(path)
+        state = _state(tree, 0)
+        if state is None:
+            about = ", ".join(sorted(n for n in names if n not in _MAKERS and not n.startswith("torch."))[:3])
+            raise FormatError(
+                f"{path}: holds no state dict (tensors by name){f', but {about}' if about else ''}; {CONVERT}"
+            )
+        return {name: numbers.tensor(value) for name, value in state}
+    except FormatError:
+        raise
+    except _HostileError as error:
+        raise FormatError(f"{path}: refused: it would call {error}, which no weights need; nothing was run") from None
+    except Exception as error:  # what broken bytes raise is without number
+        text = " ".join(str(error).split())[:120] or type(error).__name__
+        raise FormatError(f"{path}: not a readable PyTorch checkpoint: {text}; {CONVERT}") from None
+
+
+def _read_zip(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
+    with zipfile.ZipFile(path) as archive:
+        members = {member.filename: member for member in archive.infolist()}
+        if any(name.endswith("/constants.pkl") for name in members):
+            raise FormatError(f"{path}: a TorchScript program, not weights; {CONVERT}")
+        main = [name for name in members if name.endswith("/data.pkl") and name.count("/") == 1]
+        if len(main) != 1:
+            raise FormatError(f"{path}: a zip file, but not one that PyTorch wrote")
+        root = main[0].removesuffix("data.pkl")
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
+            raise FormatError(f"{path}: its parts are compressed, which PyTorch never does")
+        if members[main[0]].file_size > MAX_PICKLE:
+            raise FormatError(f"{path}: its description alone is larger than {MAX_PICKLE // MIB} MiB")
+        if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
+            raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
+        reader = _Reader(io.BytesIO(archive.read(main[0])))
+        tree = reader.load()
+
+    def read(key: str) -> bytes:
+        with zipfile.ZipFile(path) as again:
+            return again.read(f"{root}data/{key}")
+
+    return tree, _Numbers(read), reader.names
+
+
+def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
+    data = read_bytes(path, limit=MAX_BYTES)
+    if data[:1] != b"\x80":
+        raise FormatError(f"{path}: no PyTorch checkpoint; {CONVERT}")
+    file = io.BytesIO(data)
+    if _Reader(file).load() != MAGIC:
+        raise FormatError(f"{path}: a Python pickle, not a PyTorch checkpoint; {CONVERT}")
+    if _Reader(file).load() != STREAM or not dict(_Reader(file).load()).get("little_endian", True):
+        raise FormatError(f"{path}: a PyTorch stream of another version or byte order; {CONVERT}")
+    reader = _Reader(file)
+    tree = reader.load()
+    keys = _Reader(file).load()
+    kinds = {storage.key: storage for storage in _storages(tree)}
+    places: dict[str, tuple[int, int]] = {}
+    for key in keys:
+        (count,) = struct.unpack("<q", file.read(8))
+        kind = kinds[key].kind if key in kinds else None
+        if not isinstance(kind, torch.dtype) or count < 0 or file.tell() + count * kind.itemsize > len(data):
+            raise ValueError(f"storage {key} is cut short or unknown")
+        places[str(key)] = (file.tell(), file.tell() + count * kind.itemsize)
+        file.seek(places[str(key)][1])
+    return tree, _Numbers(lambda key: data[slice(*places[key])]), reader.names
+
+
+def _storages(tree: Any) -> Iterator[_Storage]:
+    """All storages that a tree refers to."""
+    stack, seen = [tree], set()
+    while stack:
+        value = stack.pop()
+        if id(value) in seen or isinstance(value, (str, bytes, int, float)):
+            continue
+        seen.add(id(value))
+        if isinstance(value, _Strided):
+            if isinstance(value.storage, _Storage):
+                yield value.storage
+        elif isinstance(value, dict):
+            stack += [*value.keys(), *value.values()]
+        elif isinstance(value, (list, tuple, set)):
+            stack += value
+        elif isinstance(value, _Inert):
+            stack += [value.args, value.state, value.entries, value.list]
+
+
+def _mapping(value: Any) -> Mapping[Any, Any] | None:
+    if isinstance(value, dict):
+        return value
+    if isinstance(value, _Inert) and value.entries:
+        return value.entries
+    return None
+
+
+def _state(tree: Any, depth: int) -> list[tuple[str, _Strided]] | None:
+    """Names and tensors of the first state dict that is found, None if there is none."""
+    if depth > 4:
+        return None
+    if isinstance(tree, _Inert) and isinstance(tree.state, dict) and _mapping(tree.state.get("_modules")) is not None:
+        return _module(tree)
+    held = _mapping(tree)
+    if held is None:
+        inside = tree.state if isinstance(tree, _Inert) else None  # an object that keeps a model, such as an average
+        return _state(inside, depth + 1) if isinstance(inside, dict) else None
+    named = [(key, value) for key, value in held.items() if isinstance(key, str) and isinstance(value, _Strided)]
+    if named:
+        return named
+    for nest in NESTS:
+        found = _state(held[nest], depth + 1) if held.get(nest) is not None else None
+        if found:
+            return found
+    return None
+
+
+def _module(root: _Inert) -> list[tuple[str, _Strided]]:
+    """Parameters and buffers of a pickled module and its parts, by the names of its state dict."""
+    found: list[tuple[str, _Strided]] = []
+    stack: list[tuple[str, Any, int]] = [("", root, 0)]
+    count = 0
+    while stack:
+        prefix, module, depth = stack.pop()
+        count += 1
+        if depth > DEEPEST or count > MOST:
+            raise ValueError("a module nested without end")
+        state = module.state if isinstance(module, _Inert) and isinstance(module.state, dict) else {}
+        for part in ("_parameters", "_buffers"):
+            for name, value in (_mapping(state.get(part)) or {}).items():
+                if isinstance(value, _Strided):
+                    found.append((f"{prefix}{name}", value))
+        children = [(f"{prefix}{n}.", m, depth + 1) for n, m in (_mapping(state.get("_modules")) or {}).items()]
+        stack += reversed(children)
+    return found
