@@ -280,6 +280,9 @@ def train_detector(
         typer.Option(help="Root of a data set in the nuScenes schema (3D), or a folder of `ssad record --clips` (2D)."),
     ],
     more: Annotated[list[Path] | None, typer.Option(help="2D: more folders of clips.")] = None,
+    val_data: Annotated[
+        Path | None, typer.Option(help="3D: another data set to validate on (default: that of --data).")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Checkpoint, log, curves, weights; run again to go on.")] = Path("training"),
     split: Annotated[str, typer.Option(help="Split to learn from.")] = "train",
     val: Annotated[str, typer.Option(help="Split to validate on.")] = "val",
@@ -296,7 +299,7 @@ def train_detector(
 
     plan = Plan(
         recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
-        gpus=gpus, seconds=seconds,
+        gpus=gpus, seconds=seconds, val_data=val_data,
     )  # fmt: skip
     for line in run_training(plan, say=lambda text: print(text, flush=True)):
         print(line)

@@ -36,7 +36,8 @@ VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the e
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A training: recipe by name, folders of data, where to write, splits, changed values of the recipe."""
+    """A training: recipe by name, folders of data, where to write, splits, changed values of the recipe; val_data:
+    another data set in the nuScenes schema to validate on."""
 
     recipe: str
     data: tuple[Path, ...]
@@ -48,6 +49,7 @@ class Plan:
     device: str = "auto"
     gpus: int = 1
     seconds: float | None = None
+    val_data: Path | None = None
 
 
 def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
@@ -62,12 +64,12 @@ def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
     return tuple(found)
 
 
-def coco_truth(data: CocoSet) -> list[Truth]:
-    """The truth of each picture."""
+def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
+    """The truth of each picture; target: only the object that the set is about counts, all others are crowd."""
     return [
         Truth(
             torch.from_numpy(image.label.astype(np.int64)), torch.from_numpy(image.box.astype(np.float32)),
-            crowd=torch.from_numpy(image.crowd.copy()),
+            crowd=torch.from_numpy(~image.target if target else image.crowd.copy()),
         )
         for image in data.images
     ]  # fmt: skip
@@ -93,7 +95,7 @@ def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
         if device != "cuda" or torch.cuda.device_count() < plan.gpus:
             raise ConfigError(f"--gpus {plan.gpus}: this machine has {torch.cuda.device_count()} usable GPUs")
         safeio.make_folder(plan.out)
-        spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)
+        spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
         _run(plan, recipe, device, Share(), say)
     log = safeio.read_text(plan.out / LOG).splitlines()
@@ -167,6 +169,7 @@ def command_of(plan: Plan) -> str:
     """The command that trains this anew, with the names of the folders."""
     parts = ["ssad train detector", plan.recipe, f"--data {plan.data[0].name}"]
     parts += [f"--more {folder.name}" for folder in plan.data[1:]]
+    parts += [f"--val-data {plan.val_data.name}"] if plan.val_data else []
     parts += [f"--set {key}={list(v) if isinstance(v, tuple) else v}" for key, v in plan.changes]
     return " ".join(parts)
 
@@ -174,7 +177,7 @@ def command_of(plan: Plan) -> str:
 def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
     """Metrics of a detector on the validation split."""
     if three:
-        root = plan.data[0]
+        root = plan.val_data or plan.data[0]
         with NuScenes(root) as data:
             version = data.version
         scenes = scenes_of_split(root, version, plan.val)
@@ -192,8 +195,12 @@ def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[s
         for folder in plan.data:
             if folder.name not in banks:
                 banks[folder.name] = fill(coco_items(folder, split)[1], device=device)
-            scores = score_2d(detector, banks[folder.name], device=device)
+            bank = banks[folder.name]
+            scores = score_2d(detector, bank, device=device)
             found |= {f"{folder.name}_{name}": value for name, value in scores.items()}
+            data = read_coco(folder / "annotations" / f"{split}.json")
+            aimed = Bank(bank.pictures, tuple(coco_truth(data, target=True)))
+            found[f"{folder.name}_target_AP50"] = score_2d(detector, aimed, device=device)["AP50"]
         return found
 
     return check_2d

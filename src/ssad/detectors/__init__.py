@@ -38,28 +38,39 @@ def make_detector(
     if name not in DETECTORS:
         made = build(**options) if callable(build) else build
         return made.to(device) if hasattr(made, "to") else made
-    from ssad.detectors.checkpoints import fit_state, load_card, load_weights
+    from ssad.detectors.checkpoints import fit_state, load_weights
 
-    page = SHIPPED / f"{name}.json"
-    if weights is None and page.is_file():
-        card, state = load_card(page)
-        if name.startswith("yolo"):
-            options.setdefault("classes", card.classes)
-        made = build(seed=seed, **options)
-        fit_state(made, state, str(page))
-    elif weights is None or str(weights) == "random":
-        made = build(seed=seed, **options)
-    elif str(weights).endswith(".weights"):
+    if weights is None and (SHIPPED / f"{name}.json").is_file():
+        weights = SHIPPED / f"{name}.safetensors"
+    if weights is None or str(weights) == "random":
+        return build(seed=seed, **options).to(device)
+    path = Path(weights).expanduser()
+    if name.startswith("yolo") and "classes" not in options:
+        options |= _classes_of(path)
+    made = build(seed=seed, **options)
+    if path.suffix == ".weights":
         from ssad.detectors.yolo.darknet import read_darknet
 
-        made = build(seed=seed, **options)
-        read_darknet(made, Path(weights))
+        read_darknet(made, path)
     else:
-        beside = Path(weights).with_suffix(".json")
-        if name.startswith("yolo") and "classes" not in options and beside.is_file():
-            from ssad.detectors.checkpoints import read_card
-
-            options["classes"] = read_card(beside)[0].classes
-        made = build(seed=seed, **options)
-        fit_state(made, load_weights(weights), str(weights))
+        state = load_weights(path)
+        if path.parent == SHIPPED:
+            _check_hash(path, state)
+        fit_state(made, state, path)
     return made.to(device)
+
+
+def _classes_of(path: Path) -> dict[str, Any]:
+    """The classes that the card beside weights names, if there is one."""
+    from ssad.detectors.checkpoints import read_card
+
+    return {"classes": read_card(path).classes} if path.with_suffix(".json").is_file() else {}
+
+
+def _check_hash(path: Path, state: dict[str, Any]) -> None:
+    """FormatError: shipped weights that are not those of their card."""
+    from ssad.detectors.checkpoints import hash_state, read_card
+    from ssad.errors import FormatError
+
+    if hash_state(state) != read_card(path).hash:
+        raise FormatError(f"{path}: not the weights that their card describes (another hash); install SSAD anew")

@@ -1,241 +1,338 @@
-"""The only door for weights: read without executing anything, checked against a model, written with a card."""
+"""The only door for weights: files in, files out, and into a detector; each error is one line.
+
+Nothing in a file is ever executed: safetensors holds numbers alone, and PyTorch's pickles are read by
+`ssad.detectors.pickled`, which builds tensors and nothing else.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import hashlib
-import pickle
-import zipfile
+import math
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load as parse_safetensors
+from safetensors.torch import save as dump_safetensors
 from torch import Tensor, nn
 
-import ssad
-from ssad import safeio
-from ssad.errors import ConfigError, FormatError
+from ssad import __version__
+from ssad.detectors.pickled import MAX_BYTES, read_pickled
+from ssad.errors import ConfigError, FormatError, StoreError
+from ssad.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
 
-MIB = 2**20
-NESTS = ("state_dict", "model_state_dict", "model", "ema")
-_KNOWN = {
-    ("collections", "OrderedDict"), ("torch._utils", "_rebuild_tensor_v2"), ("torch._utils", "_rebuild_parameter"),
-    ("torch", "Size"), ("torch", "float32"), ("torch", "float16"), ("torch", "bfloat16"), ("torch", "int64"),
-}  # fmt: skip
+PICKLED = (".pth", ".pt", ".ckpt", ".bin", ".tar")
+SHARD = re.compile(r"(?P<stem>.+)-(?P<number>\d{5})-of-(?P<count>\d{5})\.safetensors")
+HALF_MAX = 65504.0
+COUNTER = "num_batches_tracked"  # of BatchNorm; it counts steps of training, and old files and frozen norms lack it
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What is to be known of weights: the data they were trained on, the command that trains them anew, seed, metrics,
-    classes, the values of the recipe, hash (SHA-256 of names and tensors as stored), version of SSAD."""
+    """What weights are. data: what they were trained on; command: that makes them again; metrics: measured where the
+    data say; classes: in the order of the logits; config: options of the builder; hash: SHA-256 of the tensors as
+    stored (`hash_state`); version: of SSAD. `save_weights` fills in hash and version."""
 
     data: str
     command: str
     seed: int
-    metrics: Mapping[str, float]
-    classes: tuple[str, ...] = ()
+    classes: tuple[str, ...]
+    metrics: Mapping[str, float] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     hash: str = ""
-    version: str = ssad.__version__
+    version: str = ""
 
 
-class _Inert:
-    """Stands for every object of a checkpoint that is no tensor or plain container; does nothing."""
-
-    def __init__(self, *_: Any, **__: Any) -> None:
-        pass
-
-    def __call__(self, *_: Any, **__: Any) -> _Inert:
-        return self
-
-    def __setstate__(self, _: Any) -> None:
-        pass
-
-    def __setitem__(self, _: Any, __: Any) -> None:
-        pass
-
-    def __hash__(self) -> int:
-        return id(self)
-
-    def append(self, _: Any) -> None:
-        """Nothing."""
-
-    def extend(self, _: Any) -> None:
-        """Nothing."""
-
-    def add(self, _: Any) -> None:
-        """Nothing."""
+def hash_state(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 over names, types, shapes and bytes of the tensors, in the order of their names."""
+    total = hashlib.sha256()
+    for name in sorted(state):
+        value = state[name].detach().cpu().contiguous()
+        total.update(f"{name}\x1f{value.dtype}\x1f{tuple(value.shape)}\x1e".encode())
+        total.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return total.hexdigest()
 
 
-class _Unpickler(pickle.Unpickler):
-    """Builds tensors and plain containers; anything else that a file names becomes inert and is never called."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """What a name of the file stands for."""
-        return super().find_class(module, name) if (module, name) in _KNOWN else _Inert
+# ---------------------------------------------------------------- reading
 
 
 def load_weights(path: str | Path) -> dict[str, Tensor]:
-    """Tensors by name from .safetensors (NAME-00001-of-00003.safetensors with its siblings, or a folder of them) or
-    from a torch checkpoint (.pth, .pt, .ckpt; what it nests under state_dict, model or ema). On the CPU.
+    """Tensors by name from a file or folder, on the CPU, in the types in which they are stored.
 
-    Nothing in a file is executed: objects that are no tensors are left out. FormatError: missing, broken, no weights.
+    .safetensors: one file, or shards (any one of them, NAME.safetensors for NAME-00001-of-00003.safetensors, an index
+    NAME.safetensors.index.json, or the folder); .pth, .pt, .ckpt, .bin: the state dict in a PyTorch checkpoint, also
+    inside "state_dict", "model" or "ema" (averaged weights win), or of a pickled module. FormatError.
     """
-    path = Path(path)
-    if path.is_dir():
-        return _together(path, sorted(path.glob("*.safetensors")))
-    if not path.is_file():
-        raise FormatError(f"{path}: no such file of weights")
-    if path.suffix == ".safetensors":
-        stem, _, rest = path.stem.rpartition("-of-")
-        shards = sorted(path.parent.glob(f"{stem[:-5]}*-of-{rest}.safetensors")) if rest.isdigit() else [path]
-        if rest.isdigit() and len(shards) != int(rest):
-            raise FormatError(f"{path}: {len(shards)} of {int(rest)} parts are there; put them into one folder")
-        return _together(path, shards)
-    return _torch_file(path)
-
-
-def _together(path: Path, files: Iterable[Path]) -> dict[str, Tensor]:
-    found: dict[str, Tensor] = {}
+    place = Path(path).expanduser()
+    if place.suffix in PICKLED and place.is_file():
+        return _unwrapped(read_pickled(place))
+    files = _parts(place)
+    state: dict[str, Tensor] = {}
     for file in files:
-        try:
-            found |= load_file(file)
-        except (SafetensorError, OSError) as error:
-            raise FormatError(f"{file}: not a safetensors file, or cut short ({error})") from None
-    if not found:
-        raise FormatError(f"{path}: holds no weights (*.safetensors)")
-    return {name: value.float() if value.dtype == torch.float16 else value for name, value in found.items()}
+        part = _read_safetensors(file)
+        twice = next((name for name in part if name in state), None)
+        if twice is not None:
+            raise FormatError(f"{file}: '{twice}' is in another part as well; the parts are of different weights")
+        state |= part
+    if not state:
+        raise FormatError(f"{place}: holds no tensors")
+    return _unwrapped(state)
 
 
-def _torch_file(path: Path) -> dict[str, Tensor]:
-    if not zipfile.is_zipfile(path):
-        raise FormatError(
-            f"{path}: not a checkpoint of torch 1.6 or later; load it where it was made and save its state_dict "
-            "with safetensors.torch.save_file"
-        )
-    safe: Any = SimpleNamespace(
-        Unpickler=_Unpickler, load=pickle.load, __name__="ssad", UnpicklingError=pickle.UnpicklingError
-    )
+def _unwrapped(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Names without what parallel training puts before all of them."""
+    while state and all(name.startswith("module.") for name in state):
+        state = {name.removeprefix("module."): value for name, value in state.items()}
+    return state
+
+
+def _read_safetensors(path: Path) -> dict[str, Tensor]:
+    data = read_bytes(path, limit=MAX_BYTES)
+    if data[:2] == b"PK" or data[:1] == b"\x80":
+        raise FormatError(f"{path}: a pickle under the name of weights; it was not opened (rename it to .pth)")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=False, pickle_module=safe)
-    except Exception as error:
-        raise FormatError(f"{path}: broken or foreign checkpoint ({type(error).__name__}); try safetensors") from None
-    for _ in range(3):
-        nest = next((k for k in NESTS if isinstance(content, Mapping) and isinstance(content.get(k), Mapping)), None)
-        if nest is None:
-            break
-        content = content[nest]
-    rows = content.items() if isinstance(content, Mapping) else ()
-    found = {str(k).removeprefix("module."): v for k, v in rows if isinstance(v, Tensor)}
-    if not found:
-        raise FormatError(f"{path}: holds no weights by name (a state_dict); save model.state_dict() as safetensors")
-    return {name: value.detach().clone() for name, value in found.items()}
+        return dict(parse_safetensors(data))
+    except (SafetensorError, ValueError, KeyError, RuntimeError, OverflowError) as error:
+        raise FormatError(f"{path}: not a readable safetensors file: {' '.join(str(error).split())[:120]}") from None
 
 
-def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str) -> None:
-    """Loads weights into a module, all of them and nothing else. FormatError (one line): names or shapes that do not
-    fit, values that are no numbers; the module is then as it was."""
-    own = module.state_dict()
-    optional = {name for name in own if name.endswith("num_batches_tracked")}
-    missing = sorted(set(own) - set(state) - optional)
-    foreign = sorted(set(state) - set(own) - {n for n in state if n.endswith("num_batches_tracked")})
-    if missing or foreign:
-        parts = []
-        for what, names in (("missing", missing), ("foreign", foreign)):
-            if names:
-                parts.append(f"{len(names)} {what} ({', '.join(names[:3])}{' ...' if len(names) > 3 else ''})")
-        close = difflib.get_close_matches(foreign[0], missing, n=1) if missing and foreign else []
-        hint = f"; is '{foreign[0]}' meant to be '{close[0]}'?" if close else "; these are weights of another detector"
-        raise FormatError(f"{where}: weights do not fit: {'; '.join(parts)}{hint}")
-    for name, value in own.items():
-        given = state.get(name)
-        if given is None:
-            continue
-        if given.shape != value.shape:
-            hint = ""
-            if "head" in name or "cls" in name:
-                hint = "; are they for another number of classes?"
-            raise FormatError(
-                f"{where}: '{name}' has the shape {list(given.shape)}, this detector needs {list(value.shape)}{hint}"
-            )
-        if given.is_floating_point() and not bool(torch.isfinite(given).all()):
-            raise FormatError(
-                f"{where}: '{name}' holds values that are NaN or infinite; the file is of a failed training"
-            )
-    module.load_state_dict({name: state.get(name, own[name]) for name in own})
+def _parts(place: Path) -> list[Path]:
+    """The files that make up weights."""
+    if place.is_dir():
+        indices = sorted(place.glob("*.index.json"))
+        wholes = sorted(p for p in place.glob("*.safetensors") if SHARD.fullmatch(p.name) is None)
+        stems = sorted({m["stem"] for p in place.glob("*.safetensors") if (m := SHARD.fullmatch(p.name))})
+        if len(indices) == 1 and not wholes:
+            return _indexed(indices[0])
+        if len(wholes) + len(stems) == 1 and not indices:
+            return wholes or _shards(place, stems[0])
+        pickles = sorted(p for p in place.iterdir() if p.suffix in PICKLED)
+        if len(pickles) == 1 and not wholes and not stems:
+            raise FormatError(f"{place}: no safetensors there; name the file: {pickles[0]}")
+        raise FormatError(f"{place}: {len(wholes) + len(stems) or 'no'} sets of weights there; name one file")
+    if place.name.endswith(".index.json"):
+        return _indexed(place)
+    shard = SHARD.fullmatch(place.name)
+    if shard:
+        return _shards(place.parent, shard["stem"])
+    if place.suffix == ".safetensors":
+        if place.is_file():
+            return [place]
+        if any(SHARD.fullmatch(p.name) for p in place.parent.glob(f"{place.stem}-*.safetensors")):
+            return _shards(place.parent, place.stem)
+    if not place.exists():
+        close = difflib.get_close_matches(place.name, _names(place.parent), n=3, cutoff=0.4)
+        raise FormatError(f"{place}: no such file{f'; closest: {chr(44).join(close)}' if close else ''}")
+    raise FormatError(f"{place}: weights are .safetensors or {', '.join(PICKLED)} files")
 
 
-def tensor_hash(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 over names, types, shapes and bytes, in the order of the names."""
-    found = hashlib.sha256()
-    for name in sorted(state):
-        value = state[name].detach().cpu().contiguous()
-        found.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
-        found.update(value.reshape(-1).view(torch.uint8).numpy().tobytes() if value.numel() else b"")
-    return found.hexdigest()
+def _names(folder: Path) -> list[str]:
+    return [p.name for p in folder.iterdir()] if folder.is_dir() else []
+
+
+def _indexed(index: Path) -> list[Path]:
+    """The files that an index (as other tools write it: weight_map) names."""
+    held = read_json(index)
+    table = held.get("weight_map") if isinstance(held, dict) else None
+    if not isinstance(table, dict) or not all(isinstance(name, str) for name in table.values()):
+        raise FormatError(f"{index}: not an index of safetensors: it needs weight_map, names to files")
+    names = sorted(set(table.values()))
+    if any(Path(name).name != name for name in names):
+        raise FormatError(f"{index}: names files outside its own folder")
+    return [index.parent / name for name in names]
+
+
+def _shards(folder: Path, stem: str) -> list[Path]:
+    """All parts of sharded weights. FormatError: some are missing, or sets of two sizes lie there."""
+    found = {p.name: m for p in folder.glob("*.safetensors") if (m := SHARD.fullmatch(p.name)) and m["stem"] == stem}
+    counts = {m["count"] for m in found.values()}
+    if len(counts) != 1:
+        raise FormatError(f"{folder / stem}: parts of {len(counts) or 'no'} sets there; remove those of older weights")
+    count = int(counts.pop())
+    wanted = _shard_names(stem, count) if count <= 10_000 else []
+    missing = [name for name in wanted if name not in found]
+    if missing or not wanted:
+        raise FormatError(f"{folder / stem}: {len(missing)} of {count} parts are missing: {', '.join(missing[:3])}")
+    return [folder / name for name in wanted]
+
+
+def _shard_names(stem: str, count: int) -> list[str]:
+    return [f"{stem}-{number:05d}-of-{count:05d}.safetensors" for number in range(1, count + 1)]
+
+
+def read_card(path: str | Path) -> Card:
+    """The card of weights: NAME.json, named itself or by NAME.safetensors (or another file beside it). FormatError."""
+    place = Path(path).expanduser()
+    shard = SHARD.fullmatch(place.name)
+    file = place if place.suffix == ".json" else place.with_name(f"{shard['stem'] if shard else place.stem}.json")
+    data = read_json(file)
+    known = {f.name for f in fields(Card)}
+    kinds = {"data": str, "command": str, "seed": int, "classes": list, "metrics": dict, "config": dict, "hash": str}
+    if not isinstance(data, dict) or not known - {"version"} <= data.keys():
+        raise FormatError(f"{file}: not the card of weights: it needs {', '.join(sorted(known))}")
+    wrong = [name for name, kind in kinds.items() if not isinstance(data[name], kind)]
+    if wrong or not all(isinstance(name, str) for name in data["classes"]):
+        raise FormatError(f"{file}: '{(wrong or ['classes'])[0]}' is of the wrong type")
+    metrics = {name: float("nan") if value is None else value for name, value in data["metrics"].items()}
+    if not all(isinstance(value, int | float) for value in metrics.values()):
+        raise FormatError(f"{file}: a metric is no number")
+    changed = {"classes": tuple(data["classes"]), "metrics": metrics}
+    return Card(**{name: data[name] for name in known & data.keys()} | changed)
+
+
+def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
+    """A card and the weights beside it, whose hash must be the card's. FormatError."""
+    card = read_card(path)
+    place = Path(path).expanduser()
+    whole = place.with_suffix(".safetensors") if place.suffix == ".json" else place
+    state = load_weights(whole)
+    if hash_state(state) != card.hash:
+        raise FormatError(f"{whole}: not the weights that their card describes (another hash); fetch both again")
+    return card, state
+
+
+# ---------------------------------------------------------------- writing
 
 
 def save_weights(
-    path: Path, state: Mapping[str, Tensor], *, card: Card, half: bool = False, shard_mb: float = 15.0
-) -> list[Path]:
-    """Writes weights as safetensors, in parts of at most shard_mb MiB, and the card as NAME.json; the files.
+    path: str | Path, state: Mapping[str, Tensor], *, card: Card, half: bool = False, shard_mb: float = 15.0
+) -> Card:
+    """Write NAME.safetensors (or its shards) and the card NAME.json; the same bytes for the same tensors.
 
-    half: floating point numbers as float16. ConfigError: a tensor that does not fit into a part.
+    half: matrices and kernels as float16, where they fit; vectors (biases, norms) and integers stay as they are.
+    shard_mb: largest file in 10^6 bytes; a single tensor that is larger gets a file of its own. Every file is written
+    whole or not at all, the card last; shards of older weights of this name are removed. Returns the card as written.
+    ConfigError: no tensors, or NaN or infinite ones; StoreError.
     """
-    stored = {
-        name: (value.detach().cpu().half() if half and value.is_floating_point() else value.detach().cpu()).contiguous()
-        for name, value in state.items()
-        if not name.endswith("num_batches_tracked")
-    }
-    parts: list[dict[str, Tensor]] = [{}]
-    room = shard_mb * MIB * 0.995
-    size = 0.0
-    for name, value in stored.items():
-        need = value.numel() * value.element_size() + 256
-        if need > room:
-            raise ConfigError(f"'{name}' has {need / MIB:.1f} MiB, more than a file may have")
-        if size + need > room:
-            parts.append({})
-            size = 0.0
-        parts[-1][name] = value
-        size += need
-    stem = path.name.removesuffix(".safetensors")
-    names = [path.name] if len(parts) == 1 else [
-        f"{stem}-{k:05d}-of-{len(parts):05d}.safetensors" for k in range(1, len(parts) + 1)
-    ]  # fmt: skip
-    safeio.make_folder(path.parent)
-    for name, part in zip(names, parts, strict=True):
-        with safeio.atomic_path(path.parent / name) as target:
-            save_file(part, target, metadata={"format": "pt"})
-    page = asdict(card) | {"hash": tensor_hash(stored), "files": names}
-    safeio.write_atomic(path.parent / f"{stem}.json", safeio.dump_json(page, indent=1) + "\n")
-    return [path.parent / name for name in names]
+    target = Path(path).expanduser()
+    if target.suffix != ".safetensors" or SHARD.fullmatch(target.name):
+        raise ConfigError(f"{target}: name the file NAME.safetensors")
+    if not state:
+        raise ConfigError(f"{target}: no tensors to write")
+    check_finite(state, str(target))
+    stored = {name: _stored(value, half=half) for name, value in sorted(state.items())}
+    card = replace(card, hash=hash_state(stored), version=card.version or __version__)
+    text = _card_text(card, str(target))
+    groups = _groups(stored, limit=int(shard_mb * 1e6))
+    names = [target.name] if len(groups) == 1 else _shard_names(target.stem, len(groups))
+    folder = make_folder(target.parent)
+    for name, group in zip(names, groups, strict=True):
+        write_atomic(folder / name, dump_safetensors(group, metadata={"ssad": card.hash}))
+    for old in folder.glob(f"{target.stem}*.safetensors"):
+        shard = SHARD.fullmatch(old.name)
+        if (old == target or (shard and shard["stem"] == target.stem)) and old.name not in names:
+            with contextlib.suppress(FileNotFoundError):
+                try:
+                    old.unlink()
+                except PermissionError as error:
+                    raise StoreError(f"{old}: cannot be removed: {error.strerror}") from None
+    write_atomic(target.with_suffix(".json"), text + "\n")
+    return card
 
 
-def read_card(path: Path) -> tuple[Card, tuple[str, ...]]:
-    """A card and the names of its files. FormatError."""
-    data = safeio.read_json(path)
+def _card_text(card: Card, where: str) -> str:
+    """The card as JSON; a metric that is no number (a class that the data lack) becomes null."""
     try:
-        files = tuple(str(name) for name in data.pop("files"))
-        return Card(**{**data, "classes": tuple(data["classes"])}), files
-    except (KeyError, TypeError, AttributeError) as error:
-        raise FormatError(f"{path}: not a card of weights ({type(error).__name__}: {error})") from None
+        metrics = {name: float(v) if math.isfinite(v) else None for name, v in card.metrics.items()}
+        return dump_json(asdict(card) | {"metrics": metrics}, indent=1)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: the card holds what JSON cannot: {error}") from None
 
 
-def load_card(path: Path) -> tuple[Card, dict[str, Tensor]]:
-    """The card NAME.json and the weights that it names, whose hash must be the card's. FormatError."""
-    card, files = read_card(path)
-    stored: dict[str, Tensor] = {}
-    for name in files:
-        try:
-            stored |= load_file(path.parent / name)
-        except (SafetensorError, OSError) as error:
-            raise FormatError(f"{path.parent / name}: missing or broken ({error})") from None
-    if tensor_hash(stored) != card.hash:
-        raise FormatError(f"{path}: the weights beside it are not those that it describes (another hash)")
-    return card, {k: v.float() if v.dtype == torch.float16 else v for k, v in stored.items()}
+def _stored(value: Tensor, *, half: bool) -> Tensor:
+    value = value.detach().cpu().contiguous()
+    if half and value.is_floating_point() and value.ndim > 1 and float(value.abs().max()) <= HALF_MAX:
+        return value.half()
+    return value.clone()  # tensors that share memory are refused by safetensors
+
+
+def _groups(state: Mapping[str, Tensor], *, limit: int) -> list[dict[str, Tensor]]:
+    """Tensors in the order of their names, cut where a file would become larger than `limit` bytes."""
+    groups: list[dict[str, Tensor]] = [{}]
+    size = 0
+    for name, value in state.items():
+        own = value.numel() * value.element_size() + len(name) + 120  # and its line in the header
+        if groups[-1] and size + own > limit:
+            groups.append({})
+            size = 0
+        groups[-1][name] = value
+        size += own
+    return groups
+
+
+# ---------------------------------------------------------------- into a detector
+
+
+def check_finite(state: Mapping[str, Tensor], where: str) -> None:
+    """FormatError: a tensor holds NaN or infinite values."""
+    for name, value in state.items():
+        if value.is_floating_point() and not bool(value.isfinite().all()):
+            wrong = int((~value.isfinite()).sum())
+            raise FormatError(f"{where}: '{name}' holds {wrong} NaN or infinite values of {value.numel()}")
+
+
+def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path) -> None:
+    """Copy weights into a module whose names and shapes they must match; on an error the module is as it was.
+
+    Values are cast to the module's types. Missing counters of BatchNorm's steps are let pass. FormatError: missing or
+    foreign names, another shape, NaN or infinite values, integers for weights.
+    """
+    own = module.state_dict(keep_vars=True)
+    name = str(getattr(module, "name", type(module).__name__))
+    missing = [key for key in own if key not in state and not key.endswith(COUNTER)]
+    foreign = [key for key in state if key not in own]
+    if missing or foreign:
+        parts = [_listed("missing", missing, foreign), _listed("foreign", foreign, missing)]
+        raise FormatError(
+            f"{where}: these are not the weights of {name}: {'; '.join(part for part in parts if part)} "
+            f"(of {len(own)} names {sum(key in state for key in own)} fit)"
+        )
+    differ = {key: (tuple(v.shape), tuple(own[key].shape)) for key, v in state.items() if v.shape != own[key].shape}
+    for key, (given, taken) in differ.items():
+        why = _other_shapes(module, differ.values())
+        raise FormatError(f"{where}: '{key}' has the shape {list(given)}, {name} takes {list(taken)}: {why}")
+    for key, value in state.items():
+        if own[key].is_floating_point() and not value.is_floating_point():
+            kind = str(value.dtype).removeprefix("torch.")
+            raise FormatError(f"{where}: '{key}' holds {kind} numbers, {name} takes floats (quantised weights?)")
+    check_finite(state, str(where))
+    with torch.no_grad():
+        for key, value in state.items():
+            own[key].copy_(value)
+
+
+def _listed(what: str, keys: list[str], others: Iterable[str]) -> str:
+    if not keys:
+        return ""
+    close = difflib.get_close_matches(keys[0], list(others)[:2000], n=1, cutoff=0.5)
+    hint = f" (closest: {close[0]})" if close else ""
+    more = ", ..." if len(keys) > 3 else ""
+    return f"{len(keys)} {what}: {', '.join(keys[:3])}{more}{hint}"
+
+
+Shape = tuple[int, ...]
+
+
+def _other_shapes(module: nn.Module, differ: Iterable[tuple[Shape, Shape]]) -> str:
+    """A guess at why shapes (given, taken) differ: another number of classes if that explains all, or another width."""
+    classes = len(getattr(module, "classes", ()))
+    guesses: set[int] | None = None
+    for given, taken in differ:
+        axes = [axis for axis, (a, b) in enumerate(zip(given, taken, strict=False)) if a != b]
+        here: set[int] = set()
+        if len(given) == len(taken) and len(axes) == 1 and classes:
+            has, needs = given[axes[0]], taken[axes[0]]
+            for extra in (0, 1, 4, 5):  # rows of a class head: anchors * (extra + classes)
+                anchors, rest = divmod(needs, classes + extra)
+                if anchors and not rest and has % anchors == 0 and has // anchors > extra:
+                    here.add(has // anchors - extra)
+        guesses = here if guesses is None else guesses & here
+    if guesses:
+        return f"made for {min(guesses)} classes, this detector has {classes}"
+    return "another width or variant of the detector"

@@ -13,6 +13,7 @@ import pickle
 import struct
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,7 +110,7 @@ class _Maker:
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "collections.OrderedDict": lambda *pairs: dict(*pairs),
+    "collections.OrderedDict": dict,
     "torch.Size": tuple,
     "torch._utils._rebuild_tensor": _Strided,
     "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _Strided(
@@ -166,6 +167,7 @@ class _Numbers:
     def __init__(self, read: Callable[[str], bytes]) -> None:
         self.read = read
         self.held: dict[str, Tensor] = {}
+        self.bytes = 0
 
     def tensor(self, at: _Strided) -> Tensor:
         """The tensor, with storage of its own. ValueError: it does not lie within its storage."""
@@ -189,6 +191,9 @@ class _Numbers:
         have = len(data) // kind.itemsize
         if last >= have or count > have:
             raise ValueError("a tensor larger than its storage")
+        self.bytes += count * kind.itemsize
+        if self.bytes > MAX_BYTES:
+            raise ValueError(f"its tensors take more than {MAX_BYTES // MIB} MiB")
         return data[: have * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
 
 
@@ -203,14 +208,15 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
     except OSError as error:
         raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
     try:
-        tree, numbers, names = _read_zip(path) if start[:2] == b"PK" else _read_stream(path)
-        state = _state(tree, 0)
-        if state is None:
-            about = ", ".join(sorted(n for n in names if n not in _MAKERS and not n.startswith("torch."))[:3])
-            raise FormatError(
-                f"{path}: holds no state dict (tensors by name){f', but {about}' if about else ''}; {CONVERT}"
-            )
-        return {name: numbers.tensor(value) for name, value in state}
+        with ExitStack() as files:
+            tree, numbers, names = _read_zip(path, files) if start[:2] == b"PK" else _read_stream(path)
+            state = _state(tree, 0)
+            if state is None:
+                about = ", ".join(sorted(n for n in names if n not in _MAKERS and not n.startswith("torch."))[:3])
+                raise FormatError(
+                    f"{path}: holds no state dict (tensors by name){f', but {about}' if about else ''}; {CONVERT}"
+                )
+            return {name: numbers.tensor(value) for name, value in state}
     except FormatError:
         raise
     except _HostileError as error:
@@ -220,29 +226,25 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
         raise FormatError(f"{path}: not a readable PyTorch checkpoint: {text}; {CONVERT}") from None
 
 
-def _read_zip(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
-    with zipfile.ZipFile(path) as archive:
-        members = {member.filename: member for member in archive.infolist()}
-        if any(name.endswith("/constants.pkl") for name in members):
-            raise FormatError(f"{path}: a TorchScript program, not weights; {CONVERT}")
-        main = [name for name in members if name.endswith("/data.pkl") and name.count("/") == 1]
-        if len(main) != 1:
-            raise FormatError(f"{path}: a zip file, but not one that PyTorch wrote")
-        root = main[0].removesuffix("data.pkl")
-        if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
-            raise FormatError(f"{path}: its parts are compressed, which PyTorch never does")
-        if members[main[0]].file_size > MAX_PICKLE:
-            raise FormatError(f"{path}: its description alone is larger than {MAX_PICKLE // MIB} MiB")
-        if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
-            raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
-        reader = _Reader(io.BytesIO(archive.read(main[0])))
-        tree = reader.load()
-
-    def read(key: str) -> bytes:
-        with zipfile.ZipFile(path) as again:
-            return again.read(f"{root}data/{key}")
-
-    return tree, _Numbers(read), reader.names
+def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[str]]:
+    archive = files.enter_context(zipfile.ZipFile(path))
+    members = {member.filename: member for member in archive.infolist()}
+    if any(name.endswith("/constants.pkl") for name in members):
+        raise FormatError(f"{path}: a TorchScript program, not weights; {CONVERT}")
+    main = [name for name in members if name.endswith("/data.pkl") and name.count("/") == 1]
+    if len(main) != 1:
+        raise FormatError(f"{path}: a zip file, but not one that PyTorch wrote")
+    root = main[0].removesuffix("data.pkl")
+    if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
+        raise FormatError(f"{path}: its parts are compressed, which PyTorch never does")
+    if sum(member.file_size for member in members.values()) > Path(path).stat().st_size:
+        raise FormatError(f"{path}: its parts overlap, which PyTorch never does")
+    if members[main[0]].file_size > MAX_PICKLE:
+        raise FormatError(f"{path}: its description alone is larger than {MAX_PICKLE // MIB} MiB")
+    if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
+        raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
+    reader = _Reader(io.BytesIO(archive.read(main[0])))
+    return reader.load(), _Numbers(lambda key: archive.read(f"{root}data/{key}")), reader.names
 
 
 def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
@@ -277,9 +279,10 @@ def _storages(tree: Any) -> Iterator[_Storage]:
         if id(value) in seen or isinstance(value, (str, bytes, int, float)):
             continue
         seen.add(id(value))
-        if isinstance(value, _Strided):
-            if isinstance(value.storage, _Storage):
-                yield value.storage
+        if isinstance(value, _Storage):
+            yield value
+        elif isinstance(value, _Strided):
+            stack.append(value.storage)
         elif isinstance(value, dict):
             stack += [*value.keys(), *value.values()]
         elif isinstance(value, (list, tuple, set)):
