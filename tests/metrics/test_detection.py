@@ -110,7 +110,7 @@ def test_matches_are_those_of_the_greedy_rule(key: int, grid: float, levels: int
             assert rank[hits].tolist() == [i for i, _ in pairs]
         pairs = greedy(truth, found, label, CVPR_2019.dist_th_tp)
         expected = [float(np.linalg.norm(found.translation[i, :2] - truth.translation[g, :2])) for i, g in pairs]
-        assert matches.classes[label].errors[0].tolist() == expected
+        np.testing.assert_allclose(matches.classes[label].errors[0], expected, rtol=1e-14, atol=0)
 
 
 def repeated(table: BoxTable, weights: np.ndarray) -> BoxTable:

@@ -1,14 +1,17 @@
 """`ssad record --clips`: pictures of a target car for 2D detection, with COCO annotations.
 
-drive: a camera follows the target on its own way, 20 m behind, as in the paper; orbit: views of a standing target over
-distance, azimuth and elevation. Recorded in parts as `ssad.bench.record` does: any number of processes, any stop.
+drive: a camera follows the driving target on its own way, 20 m behind, as in the paper; orbit: views of a target on the
+road over distance, azimuth, elevation and weather. Recorded in parts as `ssad.bench.record` does: pictures are written
+to their places, a page of each part to OUT/.parts, the annotations when all parts are there. So any number of
+processes gives the same bytes, and a run that was stopped goes on.
 """
 
 from __future__ import annotations
 
-import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -16,38 +19,45 @@ import cv2
 import numpy as np
 
 from ssad import safeio
-from ssad.bench.cast import Cast, make_cast
+from ssad.bench.cast import Body, Cast, Standing, make_cast
 from ssad.bench.coco import coco_data
 from ssad.bench.drives import make_drive
 from ssad.bench.execute import quiet_warp
-from ssad.bench.record import HELD_OUT, NOISE, draw_weather, drive, ego_at, link, run_parts
-from ssad.camera.bodies import draw_paint, draw_size, draw_style, make_body
+from ssad.bench.record import HELD_OUT, NOISE, draw_weather, drive, run_parts
+from ssad.bench.shots import Shot, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
+from ssad.camera.bodies import BODIES, draw_paint, draw_size, draw_style, make_body
 from ssad.camera.labels import label_picture
-from ssad.camera.render import View, Weather, render
+from ssad.camera.render import Picture, View, render
 from ssad.camera.stage import Stage, Thing
 from ssad.camera.street import cached_street
 from ssad.datasets.nuscenes.files import encode_jpeg
 from ssad.detections import CLASSES_3D
-from ssad.errors import ConfigError
+from ssad.errors import ConfigError, StoreError
 from ssad.frames import Camera
 from ssad.roads import load_town, town_names
 from ssad.seeding import digest, generator
-from ssad.types import F64, EpisodeTrace
+from ssad.types import U8, EpisodeTrace
 
-CLASSES: Final = CLASSES_3D
+CLASSES: Final = CLASSES_3D  # category ids are 1 and more in this order
 _LABEL = {"construction": "construction_vehicle"}
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
-EACH: Final = 25  # pictures of a part
+EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
+DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
+TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
+TARGETS: Final = 5  # bodies that an orbit shows in turn
+SECONDS: Final = 24.0  # of a drive
 TARGET: Final = 1_000_000  # its tag
+FOCAL: Final = 1.1  # focal length in widths of the picture: 49 degrees across
 SMALL, HIDDEN = 8.0, 0.25  # px of a side, visible share: below, an object is crowd
-SEEN: Final = 0.6  # least visible share of the target
-PART: Final = "part.json"
+SEEN: Final = 0.6  # least visible share of the target, and least share of it inside the picture
+NEAR: Final = 0.2  # largest share of the picture that something right before the camera may cover
 
 
 @dataclass(frozen=True, slots=True)
 class Clips:
     """What to record. images: town -> how many pictures; mode; size: pixels a side; style: of the target car (None:
-    any); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of the orbit."""
+    any); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of the orbit;
+    quality: of JPEG files; device: where pictures are rendered. ConfigError for what cannot be."""
 
     out: Path
     images: tuple[tuple[str, int], ...] = tuple(IMAGES.items())
@@ -59,43 +69,43 @@ class Clips:
     height: float = 2.0
     distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
     azimuths: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
-    elevations: tuple[float, ...] = (4.0, 15.0, 30.0)
+    elevations: tuple[float, ...] = (0.0, 15.0, 30.0)
     seed: int = 0
     quality: int = 92
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for town, count in self.images:
+        for town in (*(t for t, _ in self.images), *self.held_out):
             if town not in town_names():
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
-            if count < 1:
-                raise ConfigError(f"{town}: {count} pictures; ask for one or more")
         if not self.images or self.mode not in ("drive", "orbit"):
             raise ConfigError("name a town to record, and drive or orbit")
-        if self.size < 64 or not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0:
-            raise ConfigError("size: from 64 pixels; behind: 3 to 60 m; height: 0.5 to 30 m")
-        if not (self.distances and self.azimuths and self.elevations) or min(self.distances) < 3.0:
-            raise ConfigError("an orbit needs distances of 3 m or more, azimuths and elevations")
+        for town, count in self.images:
+            if count < 1:
+                raise ConfigError(f"{town}: {count} pictures; ask for one or more")
+            if sum(t == town for t, _ in self.images) > 1:
+                raise ConfigError(f"{town} is named twice; name each town once")
+        if self.style is not None and self.style not in BODIES["car"].styles:
+            raise ConfigError(f"no car of style '{self.style}'; choose from: {', '.join(BODIES['car'].styles)}")
+        if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
+            raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
+        if not (self.distances and self.azimuths and self.elevations):
+            raise ConfigError("an orbit needs distances, azimuths and elevations")
+        if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
+            raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
+        if not np.isfinite(self.azimuths).all():
+            raise ConfigError("azimuths: finite numbers of degrees")
+        far = self.behind if self.mode == "drive" else max(self.distances)
+        if not FOCAL * self.size * 1.35 / far >= SMALL or self.size > 4096:
+            least = int(np.ceil(SMALL * far / FOCAL / 1.35))
+            raise ConfigError(
+                f"pictures of {self.size} pixels: a car {far:g} m away needs {least}, and 4096 is the most"
+            )
 
     def identity(self) -> dict[str, Any]:
         """What decides the bytes."""
-        return {
-            "clips": self.mode, "images": [list(pair) for pair in self.images], "held_out": list(self.held_out),
-            "size": self.size, "style": self.style, "behind": self.behind, "height": self.height,
-            "distances": list(self.distances), "azimuths": list(self.azimuths), "elevations": list(self.elevations),
-            "seed": self.seed, "quality": self.quality, "device": self.device,
-        }  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """One picture to take: time s, pose of the camera and of the target [4, 4], what is known about it."""
-
-    time: float
-    camera: F64
-    target: F64
-    weather: Weather
-    about: dict[str, Any]
+        found = asdict(replace(self, out=Path())) | {"clips": self.mode, "images": [list(pair) for pair in self.images]}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in ("out", "mode")}
 
 
 def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:
@@ -110,154 +120,203 @@ def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str,
     return tuple(zip(towns, counts, strict=True))
 
 
-def look_at(eye: F64, point: F64) -> F64:
-    """Pose [4, 4] of an upright camera (x right, y down, z forward) at `eye` that looks at `point`."""
-    z = (point - eye) / np.linalg.norm(point - eye)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x = x / np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z], -1)
-    pose[:3, 3] = eye
-    return pose
+@dataclass(frozen=True, slots=True)
+class _Set:
+    """A drive to take pictures of: its trace, who is there, the bodies that play the target in turn."""
+
+    clips: Clips
+    key: tuple[object, ...]
+    trace: EpisodeTrace
+    cast: Cast
+    stage: Stage
+    targets: tuple[Body, ...]
 
 
-def _follow(clips: Clips, trace: EpisodeTrace, weather: Weather) -> Iterator[Shot]:
-    """Shots from behind the driving target, at least 1 m of way apart, spread over the drive."""
-    driven = trace.driven.astype(np.float64)
-    usable = np.flatnonzero((driven > clips.behind + 1.0) & (trace.speed[:, 0] > 1.0))
-    step = max(1.0, (driven[usable[-1]] - driven[usable[0]]) / (1.6 * EACH)) if len(usable) else 1.0
-    last = -1e9
-    for t in usable.tolist():
-        if driven[t] - last < step:
-            continue
-        last = driven[t]
-        before = float(np.interp(driven[t] - clips.behind, driven[: t + 1], np.arange(t + 1)))
-        target = ego_at(trace, t * trace.dt)
-        eye = ego_at(trace, before * trace.dt)[:3, 3] + [0.0, 0.0, clips.height]
-        away = float(np.hypot(*(eye[:2] - target[:2, 3])))
-        pose = look_at(eye, target[:3, 3] + [0.0, 0.0, 0.8])
-        yield Shot(t * trace.dt, pose, target, weather, {"distance": round(away, 2), "azimuth": 180.0})
+def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
+    graph, street = load_town(town), cached_street(town)
+    trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    cast = make_cast(trace, graph, street, key=key)
+    count = TARGETS if clips.mode == "orbit" else 1
+    targets = tuple(_target(cast, clips.style, generator("clips target", *key, n)) for n in range(count))
+    return _Set(clips, key, trace, cast, Stage(street, cast.meshes, device=clips.device), targets)
 
 
-def _orbit(clips: Clips, trace: EpisodeTrace, weather: Weather, key: tuple[object, ...]) -> Iterator[Shot]:
-    """Shots of the target from all around, at moments of the drive."""
-    draws = generator("clips orbit", *key)
-    cells = [(d, a, e) for d in clips.distances for a in clips.azimuths for e in clips.elevations]
-    for n in range(8 * EACH):
-        distance, azimuth, elevation = cells[int(draws.integers(len(cells)))]
-        time = float(draws.uniform(0.5, (len(trace.x) - 2) * trace.dt))
-        target = ego_at(trace, time)
-        up, turn = np.radians(elevation), np.radians(azimuth)
-        local = np.array([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), 0.0]) * distance
-        eye = target[:3, :3] @ local + target[:3, 3] + [0.0, 0.0, 0.8 + distance * np.sin(up)]
-        eye[2] = max(eye[2], 1.2)
-        aim = target[:3, 3] + [0.0, 0.0, 0.7] + draws.normal(0, 0.05 * distance, 3) * [1, 1, 0.4]
-        about = {"distance": distance, "azimuth": azimuth, "elevation": elevation, "cell": n}
-        yield Shot(time, look_at(eye, aim), target, weather, about)
+def _target(cast: Cast, style: str | None, draws: np.random.Generator) -> Body:
+    """A car in the place of the ego, with its mesh in the cast."""
+    style = style or draw_style("car", generator=draws)
+    drawn = draw_size("car", style, generator=draws)
+    size = min(drawn[0], 4.9), min(drawn[1], 2.06), drawn[2]
+    mesh = cast.mesh(make_body("car", style=style, size=size, generator=draws))
+    paint, nowhere = draw_paint(draws), np.zeros((1, 4))
+    return Body(TARGET, "car", style, size, paint, (mesh,), nowhere, np.ones(1, bool), np.zeros(1))
+
+
+def batch_size(device: str) -> int:
+    """Views rendered at once: on the CPU one is as fast as many."""
+    return 1 if device == "cpu" else 32
+
+
+def _rounds(
+    made: _Set, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
+) -> Iterator[list[tuple[int, Shot]]]:
+    """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
+    clips, key = made.clips, made.key
+    draws = generator("clips shots", *key)
+    if clips.mode == "drive":
+        weather = draw_weather(("clips", *key))
+        left = iter(
+            follow(made.trace, weather, behind=clips.behind, height=clips.height, count=len(slots), draws=draws)
+        )
+        while todo := list(zip(missing(), left, strict=False)):
+            yield todo
+        return
+    grid = [(d, a, e) for d in clips.distances for a in clips.azimuths for e in clips.elevations]
+    wanted = turn_of(slots, len(grid), key=(clips.seed, town))
+    if attempt >= 3:
+        wanted = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
+    for turn, tries in enumerate(TRIES):
+        proposed: list[tuple[int, Shot]] = []
+        for n in missing():
+            weather = draw_weather(("clips", *key, turn, n))
+            proposed += [(n, s) for s in islice(orbit(made.trace, weather, grid[wanted[n]], draws), tries)]
+        clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device))
+        first = dict(reversed([pair for pair, ok in zip(proposed, clear, strict=True) if ok]))
+        yield sorted(first.items())
 
 
 def _part(task: tuple[Clips, str, int, int, str]) -> str:
-    """Takes `count` pictures of one drive; the part's name."""
+    """Takes `count` pictures, of one drive if it can be; the part's name. What is there is left alone. ConfigError."""
     clips, town, number, count, name = task
-    folder = clips.out / ".parts" / name
-    if (folder / PART).is_file():
+    page = clips.out / ".parts" / name / "part.json"
+    if page.is_file():
         return name
-    shutil.rmtree(folder, ignore_errors=True)
     quiet_warp()
     cv2.setNumThreads(1)
-    rows: list[dict[str, Any]] = []
-    skipped = 0
-    for attempt in range(20):
-        key = (clips.seed, clips.mode, town, number, attempt)
-        shots, stage, cast, target = _prepare(clips, town, key)
-        for shot in shots:
-            if len(rows) == count:
-                break
-            row = _take(clips, shot, stage, cast, target, f"{name}-{len(rows):03d}", folder, seed=key)
-            skipped += row is None
-            rows += [row | {"town": town}] if row is not None else []
-        if len(rows) == count:
+    rows: dict[int, dict[str, Any]] = {}
+    skipped: Counter[str] = Counter()
+    slots = range(number * EACH, number * EACH + count)
+
+    def missing() -> list[int]:
+        return [n for n in range(count) if n not in rows]
+
+    for attempt in range(DRIVES):
+        made = _prepare(clips, town, (clips.seed, clips.mode, town, number, attempt))
+        for shots in _rounds(made, town, slots, attempt, missing):
+            for n, row, image in _take(made, shots, skipped):
+                file = f"{name}-{n:03d}.jpg"
+                safeio.write_atomic(clips.out / "images" / file, encode_jpeg(image, clips.quality, "420"))
+                rows[n] = {"file_name": file, "town": town, "drive": made.trace.key} | row
+        if not missing():
             break
-    safeio.write_atomic(folder / PART, safeio.dump_json({"name": name, "images": rows, "skipped": skipped}) + "\n")
+    else:
+        why = ", ".join(f"{v} {k}" for k, v in sorted(skipped.items())) or "the drives are too short"
+        raise ConfigError(
+            f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({why}); choose smaller distances"
+        )
+    safeio.write_atomic(page, safeio.dump_json({"images": [rows[n] for n in range(count)], "skipped": skipped}) + "\n")
     return name
 
 
-def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> tuple[list[Shot], Stage, Cast, tuple[int, Any]]:
-    """Shots of a drive, the stage, who is there, and the mesh and paint of the target."""
-    graph, street = load_town(town), cached_street(town)
-    trace = drive(make_drive(graph, key=("clips", *key), seconds=24.0), graph)
-    cast = make_cast(trace, graph, street, key=key)
-    own = generator("clips target", *key)
-    style = clips.style or draw_style("car", generator=own)
-    size = draw_size("car", style, generator=own)
-    mesh = cast.mesh(
-        make_body("car", style=style, size=(min(size[0], 4.9), min(size[1], 2.06), size[2]), generator=own)
-    )
-    weather = draw_weather(("clips", *key))
-    shots = list(_follow(clips, trace, weather) if clips.mode == "drive" else _orbit(clips, trace, weather, key))
-    return shots, Stage(street, cast.meshes, device=clips.device), cast, (mesh, draw_paint(own))
-
-
-def _take(  # noqa: PLR0917
-    clips: Clips, shot: Shot, stage: Stage, cast: Cast, target: tuple[int, Any], name: str, folder: Path, *,
-    seed: tuple[object, ...],
-) -> dict[str, Any] | None:  # fmt: skip
-    """Renders, labels and writes one picture; None if the target cannot be seen well enough in it."""
-    around = cast.at(shot.time, shot.camera[:2, 3], 150.0)
-    if any(np.hypot(*(s.pose[:2, 3] - shot.camera[:2, 3])) < 0.6 * s.body.size[0] + 0.4 for s in around):
-        return None  # the camera would stand in somebody
-    things = (Thing(target[0], shot.target, target[1], TARGET), *(s.thing for s in around))
-    focal = 1.1 * clips.size
-    middle = (clips.size - 1) / 2
+def _take(
+    made: _Set, shots: Sequence[tuple[int, Shot]], skipped: Counter[str]
+) -> Iterator[tuple[int, dict[str, Any], U8]]:
+    """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
+    clips = made.clips
+    middle, focal = (clips.size - 1) / 2, FOCAL * clips.size
     camera = Camera(clips.size, clips.size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
-    view = View(camera, shot.camera, things, shot.weather, NOISE, int(digest("clips noise", *seed, name)[:7], 16))
-    picture = render(stage, [view], linear=False)
-    labels = label_picture(stage, view, picture)
-    rows = np.flatnonzero(labels.tag == TARGET)
-    if not len(rows) or labels.share[rows[0]] < SEEN or (labels.box[rows[0], 2:] - labels.box[rows[0], :2]).min() < 12:
-        return None
-    body = {s.body.tag: s.body for s in around}
+    ready: list[tuple[int, Shot, View, list[Standing]]] = []
+    for n, shot in shots:
+        target = made.targets[n % len(made.targets)]
+        around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
+        if not has_room(target, shot, around):
+            skipped["crowded"] += 1
+            continue
+        own = Thing(target.meshes[0], shot.target, target.paint, TARGET)
+        noise = int(digest("clips noise", *made.key, n)[:7], 16)
+        things = (own, *(s.thing for s in around))
+        around.append(Standing(target, shot.target, 0.0, own))
+        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise), around))
+    size = batch_size(clips.device)
+    for k in range(0, len(ready), size):
+        picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)
+        for index, (n, shot, view, around) in enumerate(ready[k : k + size]):
+            objects, fault = _annotate(made.stage, view, picture, index, around)
+            if fault:
+                skipped[fault] += 1
+                continue
+            target = around[-1].body
+            row = {
+                "width": clips.size, "height": clips.size, "time": round(shot.time, 3),
+                "weather": weather_name(shot.weather), "light": asdict(shot.weather),
+                "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.round(5).tolist(),
+                "target_pose": shot.target.round(5).tolist(), "target_style": target.style,
+                "target_size": [round(v, 3) for v in target.size], "objects": objects,
+            }  # fmt: skip
+            yield n, row | shot.about, picture.image[index]
+
+
+def _annotate(
+    stage: Stage, view: View, picture: Picture, index: int, around: Sequence[Standing]
+) -> tuple[list[dict[str, Any]], str]:
+    """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
+    labels = label_picture(stage, view, picture, index)
+    at = {s.body.tag: s for s in around}
+    own = labels.tag == TARGET
+    side = labels.box[:, 2:] - labels.box[:, :2]
+    if not own.any() or labels.share[own][0] < SEEN:
+        return [], "hidden"
+    if labels.inside[own][0] < SEEN or side[own].min() < SMALL:
+        return [], "cut or small"
+    away = float(np.linalg.norm(at[TARGET].pose[:3, 3] - view.pose[:3, 3]))
+    if near_share(view, picture.depth[index], picture.tag[index], within=max(2.0, away / 3)) > NEAR:
+        return [], "blocked"
+    crowd = (side.min(1) < SMALL) | (labels.share < HIDDEN)
     objects = []
     for n, tag in enumerate(labels.tag.tolist()):
-        kind = "car" if tag == TARGET else body[tag].kind if tag in body else ""
-        if not kind:
-            continue
-        box = labels.box[n]
-        crowd = min(box[2] - box[0], box[3] - box[1]) < SMALL or labels.share[n] < HIDDEN
-        objects.append(
-            {"label": CLASSES.index(_LABEL.get(kind, kind)), "box": [float(v) for v in box],
-             "pixels": int(labels.pixels[n]), "crowd": bool(crowd), "visible": round(float(labels.share[n]), 3),
-             "target": tag == TARGET}
-        )  # fmt: skip
-    safeio.write_atomic(folder / f"{name}.jpg", encode_jpeg(picture.image[0], clips.quality, "420"))
-    return {
-        "file_name": f"{name}.jpg", "width": clips.size, "height": clips.size, "weather": repr(shot.weather),
-        "time": round(shot.time, 3), "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.round(4).tolist(),
-        "target_pose": shot.target.round(4).tolist(), "objects": objects, **shot.about,
-    }  # fmt: skip
+        who = at[tag]
+        if who.body.kind:
+            middle = who.pose[:3, 3] + [0.0, 0.0, who.body.size[2] / 2]
+            objects.append(
+                {"label": CLASSES.index(_LABEL.get(who.body.kind, who.body.kind)), "box": labels.box[n].tolist(),
+                 "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
+                 "visible": round(float(labels.share[n]), 3),
+                 "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}
+            )  # fmt: skip
+    return objects, ""
 
 
 def record_clips(
     clips: Clips, *, workers: int | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Path:
-    """Takes all pictures and writes annotations/{train,test,all}.json; the folder. StoreError."""
-    tasks = []
+    """Takes all pictures and writes annotations/{train,test,all}.json; the folder. Run again to go on.
+
+    Each file's `info` says what was recorded, how many objects there are of each class, and how many pictures were
+    taken elsewhere instead, and why. StoreError, ConfigError.
+    """
+    out, identity, tasks = clips.out, clips.identity(), []
+    finished = out / "annotations" / "all.json"
+    if finished.is_file() and not (out / ".parts").is_dir():
+        data = safeio.read_json(finished)
+        if not isinstance(data, dict) or data.get("info", {}).get("recording") != identity:
+            raise StoreError(f"{out}: holds another recording; choose another folder")
     for town, count in clips.images:
         for number, start in enumerate(range(0, count, EACH)):
-            name = f"{clips.mode}-{town.lower()}-{number:03d}"
-            tasks.append((clips, town, number, min(EACH, count - start), name))
-    run_parts(clips.out, clips.identity(), _part, tasks, workers=workers, progress=progress)
-    splits: dict[str, list[dict[str, Any]]] = {"train": [], "test": [], "all": []}
-    skipped = 0
-    for _, town, _, _, name in tasks:
-        part = safeio.read_json(clips.out / ".parts" / name / PART)
-        skipped += int(part["skipped"])
-        for row in part["images"]:
-            link(clips.out / ".parts" / name / row["file_name"], clips.out / "images" / row["file_name"])
-        splits["all"] += part["images"]
-        splits["test" if town in clips.held_out else "train"] += part["images"]
-    for split, rows in splits.items():
-        about = {"recording": clips.identity(), "split": split, "skipped_of_all": skipped}
+            tasks.append((clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}"))
+    run_parts(out, identity, _part, tasks, workers=workers, progress=progress)
+    splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
+              "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
+    for split, members in splits.items():
+        rows: list[dict[str, Any]] = []
+        skipped: Counter[str] = Counter()
+        for task in members:
+            part = safeio.read_json(out / ".parts" / task[4] / "part.json")
+            rows += part["images"]
+            skipped.update(part["skipped"])
+        counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
+        about = {
+            "recording": identity, "split": split, "towns": sorted({t[1] for t in members}), "images": len(rows),
+            "objects": counts, "weathers": Counter(row["weather"] for row in rows), "skipped": skipped,
+        }  # fmt: skip
         page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
-        safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
-    return clips.out
+        safeio.write_atomic(out / "annotations" / f"{split}.json", page)
+    return out

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ssad import safeio
 from ssad.errors import FormatError
 from ssad.types import F64, I32, Bool
+
+LARGEST: Final = 1 << 30  # bytes of an annotation file
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,37 +59,49 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
 
 def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
     """An annotation file; images: folder of the pictures (default: `images` beside the file's folder, else the file's
-    own folder). FormatError: something is missing, or points into nowhere."""
-    data = safeio.read_json(path)
+    own folder). FormatError: something is missing, out of order, or points into nowhere."""
+    data = safeio.read_json(path, limit=LARGEST)
     lists = ("images", "annotations", "categories")
     if not isinstance(data, dict) or any(not isinstance(data.get(k), list) for k in lists):
         raise FormatError(f"{path}: no COCO annotations (lists `images`, `annotations` and `categories`)")
     beside = path.parent.parent / "images"
     folder = images or (beside if beside.is_dir() else path.parent)
     try:
-        ids = sorted((int(c["id"]), str(c["name"])) for c in data["categories"])
-        label_of = {number: k for k, (number, _) in enumerate(ids)}
-        found: dict[Any, list[Mapping[str, Any]]] = {row["id"]: [] for row in data["images"]}
+        names = {int(c["id"]): str(c["name"]) for c in data["categories"]}
+        own: dict[int, list[Mapping[str, Any]]] = {int(row["id"]): [] for row in data["images"]}
+        if len(names) < len(data["categories"]) or len(own) < len(data["images"]):
+            raise FormatError(f"{path}: two images or two categories of one id")
         for n, row in enumerate(data["annotations"]):
-            if row["image_id"] not in found or row["category_id"] not in label_of:
+            if row["image_id"] not in own or row["category_id"] not in names:
                 raise FormatError(f"{path}: annotation {n} belongs to no image or category of the file")
-            found[row["image_id"]].append(row)
-        pictures = []
-        for row in data["images"]:
-            own = found[row["id"]]
-            corner = np.array([r["bbox"] for r in own], np.float64).reshape(-1, 4)
-            if not np.isfinite(corner).all() or (corner[:, 2:] <= 0).any():
-                raise FormatError(f"{path}: image {row['id']}: a box without width, height or number")
-            pictures.append(
-                CocoImage(
-                    folder / str(row["file_name"]), int(row["width"]), int(row["height"]),
-                    {k: v for k, v in row.items() if k not in ("id", "file_name", "width", "height")},
-                    np.concatenate([corner[:, :2], corner[:, :2] + corner[:, 2:]], 1),
-                    np.array([label_of[r["category_id"]] for r in own], np.int32),
-                    np.array([bool(r.get("iscrowd", 0)) for r in own], bool),
-                    np.array([bool(r.get("target", False)) for r in own], bool),
-                )
-            )  # fmt: skip
-    except (KeyError, TypeError, ValueError) as error:
+            own[row["image_id"]].append(row)
+        label_of = {number: k for k, number in enumerate(sorted(names))}
+        pictures = tuple(_image(row, own[int(row["id"])], label_of, folder) for row in data["images"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: broken COCO annotations ({type(error).__name__}: {error})") from None
-    return CocoSet(tuple(name for _, name in ids), tuple(pictures))
+    return CocoSet(tuple(names[number] for number in sorted(names)), pictures)
+
+
+def _image(
+    row: Mapping[str, Any], own: Sequence[Mapping[str, Any]], label_of: Mapping[int, int], folder: Path
+) -> CocoImage:
+    """One picture with its annotations. ValueError, KeyError or TypeError: broken."""
+    what, file = f"image {row['id']}", str(row["file_name"])
+    width, height = int(row["width"]), int(row["height"])
+    if width < 1 or height < 1:
+        raise ValueError(f"{what}: {width} x {height} pixels")
+    if Path(file).is_absolute() or ".." in Path(file).parts or not file:
+        raise ValueError(f"{what}: file name '{file}' points out of the folder of images")
+    box = np.zeros((len(own), 4))
+    for n, thing in enumerate(own):
+        x, y, w, h = (float(v) for v in thing["bbox"])
+        box[n] = x, y, x + w, y + h
+    if not np.isfinite(box).all() or (box[:, 2:] <= box[:, :2]).any():
+        raise ValueError(f"{what}: a box without width or height, or not finite")
+    about = {k: v for k, v in row.items() if k not in ("id", "file_name", "width", "height")}
+    return CocoImage(
+        folder / file, width, height, about, box,
+        np.array([label_of[r["category_id"]] for r in own], np.int32),
+        np.array([bool(r.get("iscrowd", 0)) for r in own], bool),
+        np.array([bool(r.get("target", False)) for r in own], bool),
+    )  # fmt: skip

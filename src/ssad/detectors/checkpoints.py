@@ -22,10 +22,10 @@ from safetensors.torch import load as parse_safetensors
 from safetensors.torch import save as dump_safetensors
 from torch import Tensor, nn
 
-from ssad import __version__
 from ssad.detectors.pickled import MAX_BYTES, read_pickled
 from ssad.errors import ConfigError, FormatError, StoreError
 from ssad.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
+from ssad.version import __version__
 
 PICKLED = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 SHARD = re.compile(r"(?P<stem>.+)-(?P<number>\d{5})-of-(?P<count>\d{5})\.safetensors")
@@ -326,8 +326,8 @@ def _other_shapes(module: nn.Module, differ: Iterable[tuple[Shape, Shape]]) -> s
     for given, taken in differ:
         axes = [axis for axis, (a, b) in enumerate(zip(given, taken, strict=False)) if a != b]
         here: set[int] = set()
-        if len(given) == len(taken) and len(axes) == 1 and classes:
-            has, needs = given[axes[0]], taken[axes[0]]
+        if len(given) == len(taken) and axes == [0] and classes:
+            has, needs = given[0], taken[0]
             for extra in (0, 1, 4, 5):  # rows of a class head: anchors * (extra + classes)
                 anchors, rest = divmod(needs, classes + extra)
                 if anchors and not rest and has % anchors == 0 and has // anchors > extra:

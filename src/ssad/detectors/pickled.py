@@ -94,6 +94,13 @@ class _Inert:
         self.list.extend(values)
 
 
+class _Table(dict[Any, Any]):
+    """An OrderedDict of the file; what hangs on it besides its items is left out."""
+
+    def __setstate__(self, state: Any) -> None:
+        pass
+
+
 class _Maker:
     """A function that the file may call; it cannot be changed by the file."""
 
@@ -110,7 +117,7 @@ class _Maker:
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "collections.OrderedDict": dict,
+    "collections.OrderedDict": _Table,
     "torch.Size": tuple,
     "torch._utils._rebuild_tensor": _Strided,
     "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _Strided(
@@ -148,8 +155,10 @@ class _Reader(pickle.Unpickler):
             return _Maker(_MAKERS[full])
         return type(name, (_Inert,), {"__module__": module})
 
-    def persistent_load(self, pid: Any) -> _Storage:
-        """The description of a storage."""
+    def persistent_load(self, pid: Any) -> Any:
+        """The description of a storage; for a class that comes with its source, the class."""
+        if isinstance(pid, tuple) and len(pid) == 4 and pid[0] == "module":
+            return pid[1]
         if not isinstance(pid, tuple) or len(pid) not in (5, 6) or pid[0] != "storage":
             raise pickle.UnpicklingError("a reference that is no storage")
         if len(pid) == 6 and pid[5] is not None:

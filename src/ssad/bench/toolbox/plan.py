@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ssad import __version__
 from ssad.errors import ConfigError
 from ssad.scenarios.static.shifts import SHIFTS, VERSION, Calibration, ShiftSpec
+from ssad.version import __version__
 
 Labels = Literal["original", "transformed"]
 Strength = int | Literal["random"]

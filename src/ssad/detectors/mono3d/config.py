@@ -31,7 +31,8 @@ class Mono3DConfig:
     code_weights: of offset, depth, size, yaw, velocity (and 2D box) in the loss; threshold, nms, before, most: least
     score, IoU, places kept of each level, detections kept of an image. input_width: pictures are resized to it inside;
     virtual_focal: depth is predicted as for a camera of this focal length (pixels, after resizing) and scaled.
-    mean, std: of B, G, R in 0..255.
+    mean, std: of B, G, R in 0..255; start: depth, length, height, width that fresh weights predict (None: 1, as the
+    source).
     """
 
     name: str
@@ -51,6 +52,7 @@ class Mono3DConfig:
     virtual_focal: float | None = None
     mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    start: tuple[float, float, float, float] | None = None
     radius: float = 1.5
     dir_offset: float = 0.7854
 
@@ -61,6 +63,8 @@ class Mono3DConfig:
             raise ConfigError(f"{self.name}: channels must be a multiple of 32, and each stride needs a range")
         if any(s != 8 << k for k, s in enumerate(self.strides)) or not 3 <= len(self.strides) <= 5:
             raise ConfigError(f"{self.name}: strides are 8, 16, 32 and may go on to 64 and 128, not {self.strides}")
+        if self.pgd and self.start is not None:
+            raise ConfigError(f"{self.name}: PGD starts from its own mean depth and sizes; leave start out")
         if self.input_width is not None and self.input_width < 64:
             raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
 
@@ -75,6 +79,8 @@ FCOS3D = Mono3DConfig("fcos3d")
 PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)
 FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
-    deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
+    deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395), start=(20.0, 4.0, 1.7, 1.8),
 )  # fmt: skip
-PGD_DET_LIGHT = replace(FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)
+PGD_DET_LIGHT = replace(
+    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS, start=None
+)

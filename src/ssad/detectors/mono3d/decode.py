@@ -44,6 +44,15 @@ def flatten(maps: dict[str, list[Tensor]]) -> Flat:
     )  # fmt: skip
 
 
+def pick(flat: Flat, image: int, rows: Tensor) -> Flat:
+    """Some places [N] of one image."""
+    bins = None if flat.bins is None else flat.bins[image, rows]
+    return Flat(
+        flat.logit[image, rows], flat.reg[image, rows], flat.direction[image, rows], flat.attribute[image, rows],
+        flat.centreness[image, rows], bins,
+    )  # fmt: skip
+
+
 def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
     """Places of maps [B, C, h, w]."""
     xy, size, level = [], [], []
@@ -62,14 +71,17 @@ def unproject(points: Tensor, lens: Tensor) -> Tensor:
     """Camera frame [..., 3] of u, v (pixels), depth (m) [..., 3]; lens [..., 3, 3] (broadcast)."""
     u, v, d = points.unbind(-1)
     full = torch.stack([u * d, v * d, d], -1)
-    inverse: Tensor = torch.linalg.inv(lens.double()).to(points.dtype)
+    inverse: Tensor = torch.linalg.inv_ex(lens.double())[0].to(points.dtype)
     return (inverse @ full[..., None])[..., 0]
 
 
-def project(points: Tensor, lens: Tensor) -> Tensor:
-    """u, v [..., 2] of points [..., 3] in the camera frame; the depth is held above `NEAR`."""
+def project(points: Tensor, lens: Tensor, *, near: float | None = NEAR) -> Tensor:
+    """u, v [..., 2] of points [..., 3] in the camera frame; the depth is held above `near` (None: anything but 0)."""
     flat = (lens @ points[..., None])[..., 0]
-    return flat[..., :2] / flat[..., 2:].clamp_min(NEAR)
+    depth = flat[..., 2:]
+    if near is None:
+        return flat[..., :2] / torch.where(depth.abs() < 1e-4, 1e-4, depth)
+    return flat[..., :2] / depth.clamp_min(near)
 
 
 def global_yaw(local: Tensor, direction: Tensor, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
@@ -79,7 +91,7 @@ def global_yaw(local: Tensor, direction: Tensor, u: Tensor, lens: Tensor, *, off
     """
     turned = local - offset
     turned = turned - (turned / torch.pi).floor() * torch.pi
-    return turned + offset + torch.pi * direction + ray_angle(u, lens)
+    return turned + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, lens)
 
 
 def ray_angle(u: Tensor, lens: Tensor) -> Tensor:

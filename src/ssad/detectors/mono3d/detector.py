@@ -19,6 +19,7 @@ from ssad.detectors.mono3d.decode import (
     flatten,
     global_yaw,
     hull,
+    pick,
     places_of,
     project,
     unproject,
@@ -50,7 +51,7 @@ class Mono3D(nn.Module):
         self.name = config.name
         self.classes = CLASSES_3D
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.default_generator.manual_seed(seed)
             self.backbone = Trunk(config.trunk, width=config.width)
             self.neck = Neck(self.backbone.out_channels, config.channels, len(config.strides))
             self.bbox_head = Head(config)
@@ -70,20 +71,20 @@ class Mono3D(nn.Module):
         size, lens = self._check(images, intrinsic)
         scale = self._scale(size, lens)
         lens = self._scaled(lens, scale)
-        maps = self.bbox_head(self.neck(self.backbone(self._prepare(images))), self._factor(lens))
+        features = self.neck(self.backbone(self._prepare(images)))
+        maps = self.bbox_head(features, self._factor(lens))
         flat = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
-        if self.training:
-            box = flat.reg.new_zeros((len(images), 0, 4))
-        elif self.config.pgd:
-            box = torch.cat([places.xy - flat.reg[..., 9:11], places.xy + flat.reg[..., 11:13]], -1)
-        else:
-            box = self._boxes(flat, places, lens)
-        limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
+        with _exact(images):
+            if self.training:
+                box = flat.reg.new_zeros((len(images), 0, 4))
+            else:
+                solids = self._solids(flat, places.xy, lens[:, None])
+                box = self._boxes(flat, places.xy, solids, lens=lens[:, None], size=size)
         return Dense(
-            logit=flat.logit, quality=flat.centreness, box=(box / scale.repeat(2)).clamp_min(0.0).minimum(limit),
-            place=places.xy / scale, stride=places.stride / scale[0], level=places.level, size=size,
-            maps={**maps, "intrinsic": [lens]},
+            logit=flat.logit, quality=flat.centreness, box=box, place=places.xy / scale,
+            stride=places.stride / scale[0], level=places.level, size=size, maps={**maps, "intrinsic": [lens]},
+            features=tuple(features),
         )  # fmt: skip
 
     @torch.no_grad()
@@ -102,6 +103,10 @@ class Mono3D(nn.Module):
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
         """Detections of each image in mmdetection3d's order: by class and falling score, or by score if some had to
         go. Boxes that the source suppresses are gone."""
+        with _exact(dense.logit):
+            return self._select(dense, threshold)
+
+    def _select(self, dense: Dense, threshold: float) -> list[Detections]:
         flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
         share = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
@@ -128,7 +133,8 @@ class Mono3D(nn.Module):
             raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.logit)}")
         lens = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        return assign(self.config, places, truth, lens, self._scale(dense.size, lens))
+        with _exact(lens):
+            return assign(self.config, places, truth, lens, self._scale(dense.size, lens))
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
@@ -138,11 +144,11 @@ class Mono3D(nn.Module):
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         lens = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
-        fuse = self.bbox_head.fuse
-        return losses(
-            self.config, flatten(_head_maps(dense)), places, assignment, lens, factor=self._factor(lens), fuse=fuse,
-            reduction=reduction,
-        )  # fmt: skip
+        with _exact(lens):
+            return losses(
+                self.config, flatten(_head_maps(dense)), places, assignment, lens, factor=self._factor(lens),
+                fuse=self.bbox_head.fuse, reduction=reduction,
+            )  # fmt: skip
 
     def _one(  # noqa: PLR0917
         self, dense: Dense, flat: Flat, places: Places, lens: Tensor, share: Tensor, kept: Tensor, k: int,
@@ -152,43 +158,37 @@ class Mono3D(nn.Module):
         share = share[kept]
         place, label = (share > threshold).nonzero(as_tuple=True)
         rows, score = kept[place], share[place, label]
-        centre, size, yaw, reg = self._solids(flat, places, lens, k, rows)
-        flat_box = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1)
-        stay = rotated_nms(flat_box, score, label, threshold=self.config.nms)
+        picked = pick(flat, k, rows)
+        centre, size, yaw = self._solids(picked, places.xy[rows], lens)
+        ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1)
+        stay = rotated_nms(ground, score, label, threshold=self.config.nms)
         if len(stay) > self.config.most:
             stay = stay[score[stay].argsort(descending=True, stable=True)[: self.config.most]]
-        rows = rows[stay]
-        solid = Solids(centre[stay], size[stay], yaw[stay], reg[stay, 7:9], flat.attribute[k, rows].argmax(-1))
-        scale = self._scale(dense.size, lens)
-        if self.config.pgd:
-            box = torch.cat([places.xy[rows] - reg[stay, 9:11], places.xy[rows] + reg[stay, 11:13]], -1)
-        else:
-            box = hull(project(corners(solid.centre, solid.size, solid.yaw), lens))
-        limit = torch.tensor([dense.size[1], dense.size[0]] * 2, dtype=box.dtype, device=box.device)
-        return Detections(score[stay], label[stay], (box / scale.repeat(2)).clamp_min(0.0).minimum(limit), solid)
+        picked, xy = pick(flat, k, rows[stay]), places.xy[rows[stay]]
+        solid = Solids(centre[stay], size[stay], yaw[stay], picked.reg[:, 7:9], picked.attribute.argmax(-1))
+        box = self._boxes(picked, xy, (solid.centre, solid.size, solid.yaw), lens=lens, size=dense.size)
+        return Detections(score[stay], label[stay], box, solid)
 
-    def _solids(
-        self, flat: Flat, places: Places, lens: Tensor, k: int, rows: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Centre, size, yaw and raw regression of some places of image k."""
-        reg = flat.reg[k, rows]
-        centre2d, depth = places.xy[rows] - reg[:, :2], reg[:, 2]
+    def _solids(self, flat: Flat, xy: Tensor, lens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast)."""
+        centre2d, depth = xy - flat.reg[..., :2], flat.reg[..., 2]
         if flat.bins is not None:
-            factor = self._factor(lens[None])
-            unit = None if factor is None else factor.expand(len(rows))
-            depth = self.bbox_head.fuse(depth, flat.bins[k, rows], unit)
-        centre = unproject(torch.cat([centre2d, depth[:, None]], -1), lens)
-        direction = flat.direction[k, rows].argmax(-1)
-        yaw = global_yaw(reg[:, 6], direction, centre2d[:, 0], lens, offset=self.config.dir_offset)
-        return centre, reg[:, 3:6], yaw, reg
+            depth = self.bbox_head.fuse(depth, flat.bins, self._factor(lens))
+        centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens)
+        direction = flat.direction.argmax(-1)
+        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], lens, offset=self.config.dir_offset)
+        return centre, flat.reg[..., 3:6], yaw
 
-    def _boxes(self, flat: Flat, places: Places, lens: Tensor) -> Tensor:
-        """Hulls [B, P, 4] of all places, in the network's input."""
-        reg, wide = flat.reg, lens[:, None]
-        centre2d = places.xy - reg[..., :2]
-        centre = unproject(torch.cat([centre2d, reg[..., 2:3]], -1), wide)
-        yaw = global_yaw(reg[..., 6], flat.direction.argmax(-1), centre2d[..., 0], wide, offset=self.config.dir_offset)
-        return hull(project(corners(centre, reg[..., 3:6], yaw), wide[:, :, None]))
+    def _boxes(
+        self, flat: Flat, xy: Tensor, solids: tuple[Tensor, Tensor, Tensor], *, lens: Tensor, size: tuple[int, int]
+    ) -> Tensor:
+        """2D boxes [..., P, 4] at the picture's pixel edges: PGD's own, else of the solids' corners."""
+        if self.config.pgd:
+            box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
+        else:  # an intrinsic counts from the middle of the first pixel
+            box = hull(project(corners(*solids), lens[..., None, :, :])) + 0.5
+        limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
+        return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)
 
     def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
@@ -198,7 +198,10 @@ class Mono3D(nn.Module):
         if intrinsic is None or intrinsic.shape != (len(images), 3, 3):
             got = "none" if intrinsic is None else str(list(intrinsic.shape))
             raise ConfigError(f"{self.name}: a 3D detector needs the cameras' intrinsic [B, 3, 3]; got {got}")
-        return (images.shape[2], images.shape[3]), intrinsic.to(self._dtype())
+        focal = intrinsic[:, [0, 1], [0, 1]]
+        if intrinsic.device.type == "cpu" and not bool(intrinsic.isfinite().all() & (focal > 0).all()):
+            raise ConfigError(f"{self.name}: an intrinsic has no focal length above 0, or holds NaN")
+        return (images.shape[2], images.shape[3]), intrinsic.to(images.device, self._dtype())
 
     def _dtype(self) -> torch.dtype:
         return next(self.parameters()).dtype
@@ -217,15 +220,13 @@ class Mono3D(nn.Module):
         """Intrinsics of the resized picture; pixel edges are what is scaled."""
         if self.config.input_width is None:
             return lens
-        lens = lens.clone()
-        lens[:, :2, :2] *= scale[:, None]
-        lens[:, :2, 2] = (lens[:, :2, 2] + 0.5) * scale - 0.5
-        return lens
+        moved = (lens[:, :2, 2:] + 0.5) * scale[:, None] - 0.5
+        return torch.cat([torch.cat([lens[:, :2, :2] * scale[:, None], moved], 2), lens[:, 2:]], 1)
 
     def _factor(self, lens: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:
             return None
-        return lens[:, 0, 0] / self.config.virtual_focal
+        return lens[..., 0, 0] / self.config.virtual_focal
 
     def _prepare(self, images: Tensor) -> Tensor:
         """BGR in 0..255, less the mean, padded with 0 at the right and bottom."""
@@ -252,6 +253,11 @@ def _best_first(found: Detections) -> Detections:
         solid.centre[order], solid.size[order], solid.yaw[order], solid.velocity[order], solid.attribute[order]
     )
     return Detections(found.score[order], found.label[order], found.box[order], turned)
+
+
+def _exact(like: Tensor) -> torch.autocast:
+    """No mixed precision within the block: boxes and losses need all their digits."""
+    return torch.autocast(like.device.type, enabled=False)
 
 
 @contextmanager

@@ -32,7 +32,9 @@ class Unit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, H, W] -> [B, O, H, W]."""
-        return functional.relu(self.gn(self.conv(x)))
+        norm = self.gn  # called by its function: the module refuses a map of one place
+        x = torch.group_norm(self.conv(x), norm.num_groups, norm.weight, norm.bias, norm.eps)
+        return functional.relu(x)
 
 
 class Scale(nn.Module):
@@ -41,6 +43,11 @@ class Scale(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.scale = nn.Parameter(torch.tensor(1.0))
+
+
+def _full(x: Tensor) -> Tensor:
+    """At least 32 bits a number: what is read off the maps must not be rounded by mixed precision."""
+    return x.float() if x.dtype in {torch.float16, torch.bfloat16} else x
 
 
 def _last(inside: int, outside: int, *, rare: bool = False) -> nn.Conv2d:
@@ -82,6 +89,10 @@ class Head(nn.Module):
             self.conv_depth_cls_prev = nn.ModuleList([Unit(c, c)])
             self.conv_depth_cls = _last(c, BINS, rare=True)
             self.fuse_lambda = nn.Parameter(torch.tensor(1e-4))
+        if config.start is not None:
+            with torch.no_grad():
+                self.conv_regs[1].get_parameter("bias").copy_(torch.tensor(config.start[:1]).log())
+                self.conv_regs[2].get_parameter("bias").copy_(torch.tensor(config.start[1:]).log())
         self.register_buffer("base_depths", torch.tensor(BASE_DEPTHS), persistent=False)
         self.register_buffer("base_dims", torch.tensor(BASE_DIMS), persistent=False)
 
@@ -101,22 +112,22 @@ class Head(nn.Module):
             kinds = unit(kinds)
         for unit in self.get_submodule("reg_convs").children():
             boxes = unit(boxes)
-        logit = self.conv_cls(self.conv_cls_prev[0](kinds)).float()
+        logit = _full(self.conv_cls(self.conv_cls_prev[0](kinds)))
         parts = []
         for prev, last in zip(self.conv_reg_prevs, self.conv_regs, strict=True):
             value = boxes
             for unit in prev.children():
                 value = unit(value)
-            parts.append(last(value).float())
+            parts.append(_full(last(value)))
         found = {
             "cls_scores": logit,
             "bbox_preds": self._decode(level, parts, logit, lens),
-            "dir_cls_preds": self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes)).float(),
-            "attr_preds": self.conv_attr(self.conv_attr_prev[0](kinds)).float(),
-            "centernesses": self.conv_centerness(self.conv_centerness_prev[0](boxes)).float(),
+            "dir_cls_preds": _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes))),
+            "attr_preds": _full(self.conv_attr(self.conv_attr_prev[0](kinds))),
+            "centernesses": _full(self.conv_centerness(self.conv_centerness_prev[0](boxes))),
         }
         if self.config.pgd:
-            found["depth_cls_preds"] = self.conv_depth_cls(self.conv_depth_cls_prev[0](boxes)).float()
+            found["depth_cls_preds"] = _full(self.conv_depth_cls(self.conv_depth_cls_prev[0](boxes)))
         return found
 
     def _decode(self, level: int, parts: list[Tensor], logit: Tensor, lens: Tensor | None) -> Tensor:

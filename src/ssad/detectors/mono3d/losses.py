@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 from torch.nn import functional
-from torchvision.ops import generalized_box_iou_loss
 
 from ssad.detections import Assignment
 from ssad.detectors.mono3d.config import Mono3DConfig
@@ -40,8 +39,7 @@ def losses(
     unit = factor[image] if factor is not None else torch.ones_like(stride)
 
     def smooth(value: Tensor, wanted: Tensor, first: int) -> Tensor:
-        known = wanted.isfinite()
-        each = functional.smooth_l1_loss(value, torch.where(known, wanted, value.detach()), beta=BETA, reduction="none")
+        each = functional.smooth_l1_loss(value, wanted, beta=BETA, reduction="none")
         return total.mean((each * weights[first : first + value.shape[1]]).sum(1))
 
     depth = reg[:, 2]
@@ -53,7 +51,8 @@ def losses(
     found["size"] = smooth(reg[:, 3:6], target[:, 3:6], 3)
     said, true = reg[:, 6], target[:, 6]
     found["rotsin"] = smooth((said.sin() * true.cos())[:, None], (said.cos() * true.sin())[:, None], 6)
-    found["velo"] = smooth(reg[:, 7:9], target[:, 7:9], 7)
+    moved, known = target[:, 7:9], target[:, 7:9].isfinite()
+    found["velo"] = smooth(torch.where(known, reg[:, 7:9], 0.0), torch.where(known, moved, 0.0), 7)
     turned = true - config.dir_offset
     turned = turned - (turned / (2 * torch.pi)).floor() * 2 * torch.pi
     side = (turned / torch.pi).floor().long().clamp(0, 1)
@@ -82,7 +81,7 @@ def _consistency(
     """1 - GIoU [M] of the 2D box with the hull of the projected corners of the 3D box.
 
     The 3D box is the predicted one, its centre unprojected with the predicted depth and then moved to the true depth
-    along z, as the source does.
+    along z, and its corners are projected even from behind the camera, as the source does.
     """
     if not len(reg):
         return reg.sum(1)
@@ -90,10 +89,17 @@ def _consistency(
     centre = unproject(torch.cat([centre2d, depth[:, None]], 1), lens)
     centre = torch.cat([centre[:, :2], target[:, 2:3]], 1)
     yaw = global_yaw(reg[:, 6], direction, centre2d[:, 0], lens, offset=config.dir_offset)
-    shown = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None]))
-    box = torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1)
-    result: Tensor = generalized_box_iou_loss(box, shown, reduction="none")
-    return result
+    shown = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
+    return 1 - _generalised_iou(shown, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
+
+
+def _generalised_iou(a: Tensor, b: Tensor) -> Tensor:
+    """GIoU [M] (Rezatofighi et al. 2019) of boxes [M, 4] in pairs."""
+    common = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
+    whole = (torch.maximum(a[:, 2:], b[:, 2:]) - torch.minimum(a[:, :2], b[:, :2])).clamp_min(0.0).prod(1)
+    union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - common
+    union, whole = union.clamp_min(1e-6), whole.clamp_min(1e-6)
+    return common / union - (whole - union) / whole
 
 
 class _Sum:

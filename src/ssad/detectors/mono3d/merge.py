@@ -10,6 +10,7 @@ import torch
 
 from ssad.detections import ATTRIBUTES, CLASSES_3D, Detections
 from ssad.detectors.mono3d.nms import rotated_nms
+from ssad.errors import ConfigError
 from ssad.types import F64, I32
 
 # m from the ego within which a class is reported, in the order of CLASSES_3D (the evaluation's ranges)
@@ -36,48 +37,64 @@ class WorldBoxes:
 
 
 def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]) -> WorldBoxes:
-    """Detections of the cameras of one moment as boxes in the world.
+    """Detections of the cameras of one moment as boxes in the world, by class and falling score.
 
-    Boxes beyond the range of their class from the ego are dropped; of those of a class that overlap by 5 % or more on
-    the ground the best stays; at most 500. The overlap is taken in the ego's plane (the source takes that of the front
-    camera, which differs by its tilt). cam_to_ego, ego_to_global [4, 4] at each camera's own time.
+    As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are taken
+    to the camera that looks ahead (upright there); of those of a class that overlap by 5 % or more on its ground the
+    best stays; at most 500, then the best. cam_to_ego, ego_to_global [4, 4] at each camera's own time; with one pose
+    for all cameras the result is mmdetection3d 1.4's. ConfigError: not one pose a camera.
     """
-    columns: list[tuple[F64, ...]] = []
+    if not len(found) == len(cam_to_ego) == len(ego_to_global):
+        raise ConfigError(f"merge_cameras: {len(found)} cameras with {len(cam_to_ego)} and {len(ego_to_global)} poses")
+    if not len(found):
+        return _empty()
+    columns = []
     for one, to_ego, to_world in zip(found, cam_to_ego, ego_to_global, strict=True):
+        if one.solid is None:
+            raise ConfigError("merge_cameras: detections without 3D boxes")
         solid = one.solid
-        if solid is None or not len(one.score):
-            continue
         centre, size, yaw, velocity = (
             v.detach().cpu().double().numpy() for v in (solid.centre, solid.size, solid.yaw, solid.velocity)
         )
-        in_ego = centre @ to_ego[:3, :3].T + to_ego[:3, 3]
-        label = one.label.cpu().numpy().astype(np.float64)
-        near = np.hypot(in_ego[:, 0], in_ego[:, 1]) <= RANGES[label.astype(int)]
-        turn = (to_world @ to_ego)[:3, :3]
-        moved = np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1) @ turn.T
-        axes = turn @ _upright(yaw)
-        world = in_ego @ to_world[:3, :3].T + to_world[:3, 3]
-        rows = (world, size[:, [2, 0, 1]], _quaternions(axes), moved[:, :2], one.score.cpu().double().numpy()[:, None],
-                label[:, None], solid.attribute.cpu().double().numpy()[:, None])  # fmt: skip
+        score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
+        near = (score > LEAST) & (_distance(centre, to_ego) <= RANGES[label])
+        pose = to_world @ to_ego
+        rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ _upright(yaw),
+                _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
         columns.append(tuple(r[near] for r in rows))
-    if not columns:
-        none = np.zeros((0, 1))
-        columns = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), none, none, none)]
-    world, size, rotation, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
-    turned = 2 * np.arctan2(rotation[:, 3], rotation[:, 0])
-    flat = torch.from_numpy(np.column_stack([world[:, :2] - (world[:1, :2] if len(world) else 0.0),
-                                             size[:, [1, 0]], turned]))  # fmt: skip
-    enough = np.flatnonzero(score[:, 0] > LEAST)
-    kept = rotated_nms(
-        flat[enough], torch.from_numpy(score[enough, 0]), torch.from_numpy(label[enough, 0]), threshold=OVERLAP
-    )
-    rows = enough[kept.numpy()]
+    world, size, axes, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
+    ahead = int(np.argmax([pose[0, 2] for pose in cam_to_ego]))  # its optical axis points along the ego's x
+    pose = ego_to_global[ahead] @ cam_to_ego[ahead]
+    centre = (world - pose[:3, 3]) @ pose[:3, :3]
+    turned = pose[:3, :3].T @ axes
+    yaw = np.arctan2(turned[:, 0, 1], turned[:, 0, 0])
+    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= RANGES[label])
+    ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[near])
+    kept = rotated_nms(ground, torch.from_numpy(score[near]), torch.from_numpy(label[near]), threshold=OVERLAP)
+    rows = near[kept.numpy()]
     if len(rows) > MOST:
-        rows = rows[np.argsort(-score[rows, 0], kind="stable")[:MOST]]
-    names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows, 0], attribute[rows, 0], strict=True))
+        rows = rows[np.argsort(-score[rows], kind="stable")[:MOST]]
+    moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
+    names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
     return WorldBoxes(
-        world[rows], size[rows], rotation[rows], velocity[rows], score[rows, 0], label[rows, 0].astype(np.int32), names
-    )
+        world[rows], size[rows][:, [2, 0, 1]], _quaternions(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
+        score[rows], label[rows].astype(np.int32), names,
+    )  # fmt: skip
+
+
+def _empty() -> WorldBoxes:
+    none = np.zeros((0, 3))
+    return WorldBoxes(none, none, np.zeros((0, 4)), none[:, :2], none[:, 0], np.zeros(0, np.int32), ())
+
+
+def _distance(centre: F64, to_ego: F64) -> F64:
+    """Distances [N] on the ground from the ego to points [N, 3] of a camera's frame."""
+    return np.asarray(np.linalg.norm((centre @ to_ego[:3, :3].T + to_ego[:3, 3])[:, :2], axis=1))
+
+
+def _flat(velocity: F64) -> F64:
+    """Velocities [N, 3] of x and z [N, 2] in a camera's frame."""
+    return np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1)
 
 
 def _upright(yaw: F64) -> F64:
@@ -90,12 +107,18 @@ def _upright(yaw: F64) -> F64:
 
 
 def _quaternions(m: F64) -> F64:
-    """Unit quaternions [N, 4] (w, x, y, z) of rotation matrices [N, 3, 3] that hardly tilt."""
-    xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    half = [0.5 * np.sqrt(np.maximum(0.0, 1 + s)) for s in (xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy)]
-    signs = (m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1])
-    q = np.stack([half[0], *(np.copysign(h, s) for h, s in zip(half[1:], signs, strict=True))], -1)
-    return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True), np.float64)
+    """Unit quaternions [N, 4] (w, x, y, z; w at least 0) of rotation matrices [N, 3, 3]."""
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    four = np.empty((len(m), 4, 4))  # 4 q q^T: its largest column is q times its largest part
+    four[:, 0, 0] = 1 + trace
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        four[:, i + 1, i + 1] = 1 + 2 * m[:, i, i] - trace
+        four[:, 0, i + 1] = four[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
+        four[:, j + 1, k + 1] = four[:, k + 1, j + 1] = m[:, j, k] + m[:, k, j]
+    largest = np.einsum("nii->ni", four).argmax(1)
+    q = four[np.arange(len(m)), largest]
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(np.where(q[:, :1] < 0, -q, q), np.float64)
 
 
 def _attribute(label: int, attribute: int) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
 _UNIT = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+BLOCK = 64  # rectangles whose overlaps with all worse ones are found at once
+PAIRS = 1 << 16  # pairs that are clipped at once
 
 
 def rectangle_corners(boxes: Tensor) -> Tensor:
@@ -24,44 +25,39 @@ def _cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def intersection_area(a: Tensor, b: Tensor) -> Tensor:
-    """Area [N] of the intersection of rectangles a and b [N, 5], in pairs.
+    """Area [N] of the intersection of rectangles a and b [N, 5] (sides not negative), in pairs.
 
-    The corners of each inside the other and the crossings of their sides, in order round their middle.
+    Green's theorem over the parts of the sides of each that lie in the other.
     """
     a, b = a.double(), b.double()
-    shift = 0.5 * (a[:, :2] + b[:, :2])
-    a = torch.cat([a[:, :2] - shift, a[:, 2:]], 1)
-    b = torch.cat([b[:, :2] - shift, b[:, 2:]], 1)
-    pa, pb = rectangle_corners(a), rectangle_corners(b)
-    ea, eb = pa.roll(-1, 1) - pa, pb.roll(-1, 1) - pb
-    scale = torch.maximum(a[:, 2:4].amax(1), b[:, 2:4].amax(1)).clamp_min(1e-9)[:, None, None]
-    slack = -1e-9 * scale**2
-    inside_b = (_cross(eb[:, None, :], pa[:, :, None] - pb[:, None, :]) >= slack).all(2)
-    inside_a = (_cross(ea[:, None, :], pb[:, :, None] - pa[:, None, :]) >= slack).all(2)
-    between = pb[:, None, :] - pa[:, :, None]
-    base = _cross(ea[:, :, None], eb[:, None, :])
-    safe = torch.where(base.abs() < 1e-12 * scale**2, torch.ones_like(base), base)
-    t = _cross(between, eb[:, None, :].expand_as(between)) / safe
-    u = _cross(between, ea[:, :, None].expand_as(between)) / safe
-    crossing = (base.abs() >= 1e-12 * scale**2) & (t >= 0) & (t <= 1) & (u >= 0) & (u <= 1)
-    meet = pa[:, :, None] + t[..., None] * ea[:, :, None]
-    points = torch.cat([pa, pb, meet.flatten(1, 2)], 1)
-    valid = torch.cat([inside_b, inside_a, crossing.flatten(1)], 1)
-    count = valid.sum(1)
-    middle = (points * valid[..., None]).sum(1) / count.clamp_min(1)[:, None]
-    away = points - middle[:, None]
-    # those that do not count stand at the first one that does, and add nothing
-    angle = torch.where(valid, torch.atan2(away[..., 1], away[..., 0]), 9.0)
-    order = angle.argsort(1)
-    ring = away.gather(1, order[..., None].expand_as(away))
-    kept = valid.gather(1, order)
-    ring = torch.where(kept[..., None], ring, ring[:, :1])
-    area = 0.5 * _cross(ring, ring.roll(-1, 1)).sum(1)
-    return torch.where(count >= 3, area.clamp_min(0.0), torch.zeros_like(area))
+    middle = 0.5 * (a[:, :2] + b[:, :2])
+    a = rectangle_corners(torch.cat([a[:, :2] - middle, a[:, 2:]], 1))
+    b = rectangle_corners(torch.cat([b[:, :2] - middle, b[:, 2:]], 1))
+    return (0.5 * (_inside(a, b, shared=True) + _inside(b, a, shared=False))).clamp_min(0.0)
+
+
+def _inside(a: Tensor, b: Tensor, *, shared: bool) -> Tensor:
+    """Twice the area [N] swept from the origin along those parts of the sides of a [N, 4, 2] that lie in b.
+
+    shared: whether parts that run along a side of b, the same way, count.
+    """
+    along, side = a.roll(-1, 1) - a, b.roll(-1, 1) - b
+    height = _cross(side[:, None], a[:, :, None] - b[:, None])  # [N, 4, 4]: of the starts of a's sides, over b's
+    rise = _cross(side[:, None], along[:, :, None])
+    unit = (along.abs().amax((1, 2)) * side.abs().amax((1, 2)))[:, None, None]
+    level = rise.abs() <= 1e-12 * unit
+    least = torch.full_like(rise, 1e-9) * unit
+    if shared:
+        least = torch.where((along[:, :, None] * side[:, None]).sum(-1) > 0, -least, least)
+    at = -height / torch.where(level, torch.ones_like(rise), rise)
+    first = torch.where(~level & (rise > 0), at, 0.0).amax(2).clamp_min(0.0)
+    last = torch.where(~level & (rise < 0), at, 1.0).amin(2).clamp_max(1.0)
+    part = (last - first).clamp_min(0.0) * (~level | (height > least)).all(2)
+    return (part * _cross(a, along)).sum(1)
 
 
 def rotated_iou(a: Tensor, b: Tensor) -> Tensor:
-    """IoU [N] of rectangles a and b [N, 5], in pairs."""
+    """IoU [N] of rectangles a and b [N, 5], in pairs; 0 where both have no area."""
     common = intersection_area(a, b)
     both = (a[:, 2] * a[:, 3]).double() + (b[:, 2] * b[:, 3]).double()
     return common / (both - common).clamp_min(1e-12)
@@ -70,20 +66,56 @@ def rotated_iou(a: Tensor, b: Tensor) -> Tensor:
 def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float) -> Tensor:
     """Indices of the rectangles [N, 5] that stay, groups in rising order and scores falling in each.
 
-    Greedy within a group: one goes if its IoU with a better one that stays is at least the threshold.
+    Greedy within a group: one goes if its IoU with a better one that stays is at least the threshold (above 0). Of two
+    that score the same, the earlier one is the better.
     """
-    rank = torch.from_numpy(np.lexsort((-score.detach().cpu().double().numpy(), group.cpu().numpy())))
-    rank = rank.to(boxes.device)
-    boxes, group = boxes[rank], group[rank]
-    reach = 0.5 * torch.hypot(boxes[:, 2], boxes[:, 3])
-    apart = torch.cdist(boxes[:, :2].double(), boxes[:, :2].double(), compute_mode="donot_use_mm_for_euclid_dist")
-    near = (group[:, None] == group) & (apart <= (reach[:, None] + reach))
-    first, second = near.triu(1).nonzero(as_tuple=True)
-    over = rotated_iou(boxes[first], boxes[second]) >= threshold
-    first, second = first[over].cpu(), second[over].cpu()
-    keep = np.ones(len(boxes), bool)
-    starts = np.searchsorted(first.numpy(), np.arange(len(boxes) + 1))
-    for i in np.unique(first.numpy()).tolist():
-        if keep[i]:
-            keep[second[starts[i] : starts[i + 1]].numpy()] = False
-    return rank[torch.from_numpy(keep).to(rank.device)]
+    rank = score.argsort(descending=True, stable=True)
+    rank = rank[group[rank].argsort(stable=True)]
+    boxes, group = boxes[rank].double(), group[rank].contiguous()
+    area, corner = boxes[:, 2] * boxes[:, 3], rectangle_corners(boxes)
+    limits = torch.cat([corner.amin(1), corner.amax(1)], 1)
+    alive = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+    ends = torch.searchsorted(group, group, right=True)
+    start = 0
+    while start < len(boxes):
+        rest = start + alive[start:].nonzero()[:, 0]
+        rows = rest[:BLOCK]
+        if not len(rows):
+            break
+        stop = int(rows[-1]) + 1
+        columns = rest[: torch.searchsorted(rest, ends[stop - 1])]
+        first, second = _candidates(rows, columns, limits, area, group, threshold)
+        pairs = torch.stack([first, second])
+        parts = [pairs[:, k : k + PAIRS] for k in range(0, max(len(first), 1), PAIRS)]
+        over = torch.cat([rotated_iou(boxes[i], boxes[j]) >= threshold for i, j in parts])
+        first, second = first[over], second[over]
+        inside = second < stop
+        _settle(alive, first[inside], second[inside])
+        alive[second[alive[first]]] = False
+        start = stop
+    return rank[alive]
+
+
+def _candidates(  # noqa: PLR0917
+    rows: Tensor, columns: Tensor, limits: Tensor, area: Tensor, group: Tensor, threshold: float
+) -> tuple[Tensor, Tensor]:
+    """Pairs (better, worse) that may overlap enough: by their upright frames and their areas."""
+    a, b = limits[rows][:, None], limits[columns]
+    sides = (torch.minimum(a[..., 2:], b[:, 2:]) - torch.maximum(a[..., :2], b[:, :2])).clamp_min(0.0)
+    most = torch.minimum(torch.minimum(sides[..., 0] * sides[..., 1], area[rows][:, None]), area[columns])
+    # IoU is at most `most` / (both - most); a little slack for rounding
+    enough = most * (1 + threshold) >= threshold * (area[rows][:, None] + area[columns]) * (1 - 1e-9)
+    pair = enough & (group[rows][:, None] == group[columns]) & (rows[:, None] < columns)
+    first, second = pair.nonzero(as_tuple=True)
+    return rows[first], columns[second]
+
+
+def _settle(alive: Tensor, first: Tensor, second: Tensor) -> None:
+    """Suppress within pairs (better, worse): the one set in which each stays unless a better one that stays hits it."""
+    start = alive.clone()
+    while len(first):
+        after = start.clone()
+        after[second[alive[first]]] = False
+        if torch.equal(after, alive):
+            return
+        alive.copy_(after)

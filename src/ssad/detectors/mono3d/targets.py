@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ssad.detections import ATTRIBUTES, CLASSES_3D, Assignment, Truth
 from ssad.detectors.mono3d.config import Mono3DConfig
-from ssad.detectors.mono3d.decode import Places, project, ray_angle
+from ssad.detectors.mono3d.decode import Places, project
 from ssad.errors import ConfigError
 
 FAR = 1e8
@@ -63,7 +63,7 @@ def _one(
     label = torch.where(found, truth.label[nearest], label)
     stride = places.stride[:, None]
     picked = away[torch.arange(count, device=device), nearest]
-    local = solid.yaw.to(dtype) - ray_angle(centre[:, 0], lens)
+    local = solid.yaw.to(dtype) - torch.atan2(solid.centre[:, 0], solid.centre[:, 2]).to(dtype)
     reg = torch.cat(
         [picked / stride, solid.centre[nearest, 2:].to(dtype), solid.size[nearest].to(dtype), local[nearest, None],
          solid.velocity[nearest].to(dtype), sides[torch.arange(count, device=device), nearest] / stride], 1,

@@ -1,0 +1,1 @@
+"""Other people's detectors behind the `Detector` protocol."""

@@ -1,0 +1,80 @@
+"""What the adapters share: input, truth, choice of detections, sums."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+from torchvision.ops import batched_nms
+
+from ssad.detections import Detections, Truth
+from ssad.detectors.yolo.assign import Targets, pad_truth
+from ssad.errors import ConfigError
+
+
+def check_images(name: str, images: Tensor) -> tuple[int, int]:
+    """Height and width of images [B, 3, H, W]. ConfigError: another shape or type."""
+    if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
+        kind = str(images.dtype).removeprefix("torch.")
+        raise ConfigError(
+            f"{name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); got {list(images.shape)} of {kind}"
+        )
+    return images.shape[2], images.shape[3]
+
+
+def check_threshold(name: str, threshold: float) -> float:
+    """The threshold. ConfigError: not in [0, 1)."""
+    if not 0 <= threshold < 1:
+        raise ConfigError(f"{name}: threshold {threshold} is not in [0, 1)")
+    return threshold
+
+
+def check_truth(name: str, truth: Sequence[Truth], images: int, *, scale: Tensor, classes: int) -> Targets:
+    """Truth of all images in one, boxes times scale [4]. ConfigError: of another number of images, or broken."""
+    if len(truth) != images or not truth:
+        raise ConfigError(f"{name}: truth of {len(truth)} images for a batch of {images}; it takes one each")
+    return pad_truth(truth, scale, classes=classes)
+
+
+def log_odds(logit: Tensor) -> Tensor:
+    """The logits whose sigmoid is the softmax of `logit` [..., C]: each class against all others together."""
+    index = logit.argmax(-1, keepdim=True)
+    largest = torch.zeros_like(logit, dtype=torch.bool).scatter_(-1, index, True)
+    # all but the largest have a share of at most one half, so nothing cancels
+    share = logit.softmax(-1).masked_fill(largest, 0.0)
+    rest = logit.logsumexp(-1, keepdim=True) + torch.log1p(-share)
+    beside = logit.masked_fill(largest, -torch.inf).logsumexp(-1, keepdim=True)
+    return logit - torch.where(largest, beside, rest)
+
+
+def suppress(score: Tensor, label: Tensor, box: Tensor, *, iou: float, limit: int, size: tuple[int, int]) -> Detections:
+    """Detections from candidates [N] of one image, best first: boxes cut to the picture of `size`, suppression within
+    a class at more than `iou`, at most `limit`."""
+    height, width = size
+    edge = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
+    cut = box.clamp(min=0).minimum(edge)
+    order = score.argsort(descending=True, stable=True)
+    score, label, cut = score[order], label[order], cut[order]
+    keep = batched_nms(cut.double(), score.double(), label, iou)[:limit]
+    return Detections(score[keep], label[keep], cut[keep])
+
+
+def sums(value: Tensor, image: Tensor, images: int) -> Tensor:
+    """Sums [B] of value [N] by image [N]; no atomic additions, hence the same bits in every run."""
+    member = torch.arange(images, device=image.device)[:, None] == image
+    return torch.where(member, value, torch.zeros_like(value)).sum(1)
+
+
+@contextmanager
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Every part in eval mode within the block, then each in the mode it had."""
+    training = [part for part in module.modules() if part.training]
+    for part in training:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True

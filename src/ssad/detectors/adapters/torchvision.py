@@ -1,0 +1,267 @@
+"""Detection models of torchvision (BSD): FCOS, RetinaNet and SSD here, Faster R-CNN in `two_stage`.
+
+Places are the anchors of all levels in torchvision's order; a place lies at its anchor's middle. Losses are the ones
+of the source (torchvision.models.detection), over a batch or image by image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+import torchvision.models.detection as zoo
+from torch import Tensor, nn
+from torch.nn import functional
+from torchvision.ops import box_iou, generalized_box_iou_loss, sigmoid_focal_loss
+
+from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.detectors.adapters.common import (
+    check_images,
+    check_threshold,
+    check_truth,
+    evaluating,
+    log_odds,
+    sums,
+    suppress,
+)
+from ssad.detectors.yolo.assign import Targets
+from ssad.errors import ConfigError
+
+
+class OneStage(nn.Module):
+    """An FCOS, RetinaNet or SSD model of torchvision as a detector. Starts frozen and in eval mode.
+
+    model: the network; classes: their names in the order of the head's columns `columns`, which leave out background
+    and columns without a name; threshold: default of `predict`, default the model's.
+
+    `Dense`: logit is the head's, for SSD (softmax with background) the log-odds of each class, so that its sigmoid is
+    the source's score; quality is FCOS's centreness (whose score is the root of the product), else None. maps hold
+    cls_logits [B, P, columns], bbox_regression [B, P, 4], FCOS's bbox_ctrness, anchors [P, 4] in the network's input,
+    and scale [4] from the picture to it. The model's own resizing happens inside.
+    """
+
+    task: Literal["2d", "3d"] = "2d"
+    columns: Tensor
+
+    def __init__(
+        self, model: Any, classes: Sequence[str], columns: Sequence[int], *, name: str, threshold: float | None = None
+    ) -> None:
+        super().__init__()
+        kinds = {zoo.FCOS: "fcos", zoo.RetinaNet: "retinanet", zoo.ssd.SSD: "ssd"}
+        kind = next((kinds[own] for own in kinds if isinstance(model, own)), None)
+        if kind is None:
+            raise ConfigError(f"{name}: a {type(model).__name__} is no FCOS, RetinaNet or SSD of torchvision")
+        self.model = model
+        self.kind = kind
+        self.name = name
+        self.classes = tuple(classes)
+        self.threshold = check_threshold(name, model.score_thresh if threshold is None else threshold)
+        self.register_buffer("columns", torch.tensor(list(columns)), persistent=False)
+        self.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> OneStage:
+        """As any module; the model's resizing stays that of evaluation, which is not random."""
+        super().train(mode)
+        self.model.transform.training = False
+        return self
+
+    def forward(self, images: Tensor) -> Dense:
+        """As `dense`."""
+        return self.dense(images)
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
+        size = check_images(self.name, images)
+        batch, _ = self.model.transform(list(images.to(next(self.model.parameters()).dtype)))
+        features = list(self.model.backbone(batch.tensors).values())
+        heads = {name: full(value) for name, value in self.model.head(features).items()}
+        anchors = full(self.model.anchor_generator(batch, features)[0])
+        scale = scale_of(batch.image_sizes[0], size, anchors)
+        level, stride = self._levels(features, batch.tensors.shape[2], anchors.device)
+        logit = log_odds(heads["cls_logits"]) if self.kind == "ssd" else heads["cls_logits"]
+        return Dense(
+            logit=logit[..., self.columns],
+            quality=heads["bbox_ctrness"][..., 0] if self.kind == "fcos" else None,
+            box=self._decode(heads["bbox_regression"], anchors) / scale,
+            place=(anchors[:, :2] + anchors[:, 2:]) / 2 / scale[:2],
+            stride=stride / scale[1],
+            level=level,
+            maps={name: [value] for name, value in heads.items()} | {"anchors": [anchors], "scale": [scale]},
+            features=tuple(features),
+            size=size,
+        )
+
+    @torch.no_grad()
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Detections of each image, best first, chosen as the source does: FCOS and RetinaNet the 1,000 best of each
+        level, SSD the 400 best of each class; then suppression within a class."""
+        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
+        with evaluating(self):
+            dense = self.dense(images)
+        score = dense.logit.sigmoid()
+        if dense.quality is not None:
+            score = (score * dense.quality.sigmoid()[..., None]).sqrt()
+        return [self._choose(one, box, dense, least) for one, box in zip(score, dense.box, strict=True)]
+
+    def _choose(self, score: Tensor, box: Tensor, dense: Dense, least: float) -> Detections:
+        limit = int(self.model.topk_candidates)
+        if self.kind == "ssd":
+            value, place = score.topk(min(limit, len(score)), 0)
+            label = torch.arange(score.shape[1], device=score.device).expand_as(place)
+            kept = value > least
+            value, place, label = value[kept], place[kept], label[kept]
+        else:
+            values, places, labels = [], [], []
+            for start, count in _runs(dense.level):
+                part = score[start : start + count].flatten()
+                best, at = part.topk(min(limit, len(part)))
+                at = at[best > least]
+                values.append(part[at])
+                places.append(at // score.shape[1] + start)
+                labels.append(at % score.shape[1])
+            value, place, label = torch.cat(values), torch.cat(places), torch.cat(labels)
+        usable = box[place].isfinite().all(-1)
+        value, place, label = value[usable], place[usable], label[usable]
+        most = int(self.model.detections_per_img)
+        return suppress(value, label, box[place], iou=self.model.nms_thresh, limit=most, size=dense.size)
+
+    @torch.no_grad()
+    def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
+        """The source's: FCOS by centre sampling and size, the others by overlap with the anchors. Places that would
+        answer for a crowd object are ignored. extra: box [B, P, 4], the target in pixels of the picture."""
+        scale = dense.maps["scale"][0]
+        targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
+        owner = torch.stack([self._match(targets, k, dense) for k in range(len(truth))])
+        if targets.label.shape[1] == 0:
+            return Assignment(owner, owner.clamp(max=-1), tuple(truth), {"box": torch.zeros_like(dense.box)})
+        index = owner.clamp(min=0)
+        label = torch.where(owner >= 0, targets.label.gather(1, index), owner)
+        label = torch.where((owner >= 0) & targets.crowd.gather(1, index), -2, label)
+        owner = torch.where(label >= 0, owner, -1)
+        box = targets.box.gather(1, index[..., None].expand(-1, -1, 4)) / scale
+        box = torch.where((label >= 0)[..., None], box, torch.zeros_like(box))
+        return Assignment(label, owner, tuple(truth), {"box": box})
+
+    def losses(
+        self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
+    ) -> dict[str, Tensor]:
+        """classification, bbox_regression and FCOS's bbox_ctrness, as the source names and weights them."""
+        if assignment.label.shape != dense.box.shape[:2]:
+            raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
+        images = len(dense.box)
+        anchors, scale = dense.maps["anchors"][0], dense.maps["scale"][0]
+        image, place = (assignment.label >= 0).nonzero(as_tuple=True)
+        target = assignment.extra["box"].to(scale)[image, place] * scale
+        regression = dense.maps["bbox_regression"][0][image, place]
+        found = sums(torch.ones_like(target[:, 0]), image, images)
+        parts = {
+            "classification": self._class_loss(dense.maps["cls_logits"][0], assignment.label),
+            "bbox_regression": sums(self._box_loss(regression, target, anchors[place]), image, images),
+        }
+        if self.kind == "fcos":
+            quality = dense.maps["bbox_ctrness"][0][image, place, 0]
+            wanted = _centreness(target, anchors[place])
+            each = functional.binary_cross_entropy_with_logits(quality, wanted, reduction="none")
+            parts["bbox_ctrness"] = sums(each, image, images)
+        if reduction == "image" or self.kind == "retinanet":  # RetinaNet takes the mean over images of their own losses
+            own = {name: part / found.clamp(min=1) for name, part in parts.items()}
+            return own if reduction == "image" else {name: part.mean() for name, part in own.items()}
+        return {name: part.sum() / found.sum().clamp(min=1) for name, part in parts.items()}
+
+    def _class_loss(self, logit: Tensor, label: Tensor) -> Tensor:
+        """Sums [B] over places."""
+        column = self.columns[label.clamp(min=0)]
+        if self.kind == "ssd":
+            wanted = torch.where(label >= 0, column, 0)
+            each = functional.cross_entropy(logit.transpose(1, 2), wanted, reduction="none")
+            found = label >= 0
+            hard = each.detach().masked_fill(label != -1, -torch.inf)
+            rank = hard.argsort(1, descending=True).argsort(1)
+            chosen = (rank < self.model.neg_to_pos_ratio * found.sum(1, keepdim=True)) & (label == -1)
+            return torch.where(found | chosen, each, 0.0).sum(1)
+        wanted = functional.one_hot(column, logit.shape[-1]).to(logit) * (label >= 0)[..., None]
+        each = sigmoid_focal_loss(logit, wanted, reduction="none").sum(-1)
+        return torch.where(label != -2, each, 0.0).sum(1)
+
+    def _box_loss(self, regression: Tensor, target: Tensor, anchors: Tensor) -> Tensor:
+        """Loss [M] of the places that answer for an object."""
+        if self.kind == "ssd":
+            wanted = self.model.box_coder.encode_single(target, anchors)
+            return functional.smooth_l1_loss(regression, wanted, reduction="none").sum(-1)
+        head = self.model.head.regression_head
+        if self.kind == "fcos" or getattr(head, "_loss_type", "l1") == "giou":
+            box = self._decode(regression[None], anchors)[0]
+            result: Tensor = generalized_box_iou_loss(box, target, reduction="none")
+            return result
+        wanted = head.box_coder.encode_single(target, anchors)
+        return functional.l1_loss(regression, wanted, reduction="none").sum(-1)
+
+    def _decode(self, regression: Tensor, anchors: Tensor) -> Tensor:
+        """Boxes [B, P, 4] in the network's input."""
+        if self.kind == "fcos":
+            middle, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2:] - anchors[:, :2]
+            sides = regression * extent.repeat(1, 2)
+            return torch.cat((middle - sides[..., :2], middle + sides[..., 2:]), -1)
+        coder = self.model.box_coder if self.kind == "ssd" else self.model.head.regression_head.box_coder
+        many = anchors.expand(len(regression), -1, -1).reshape(-1, 4)
+        box: Tensor = coder.decode_single(regression.reshape(-1, 4), many)
+        return box.view_as(regression)
+
+    def _match(self, targets: Targets, k: int, dense: Dense) -> Tensor:
+        """Owner [P] of each place of image k, -1 none, -2 in between."""
+        anchors = dense.maps["anchors"][0]
+        box = targets.box[k, targets.real[k]]
+        if not len(box):
+            return torch.full((len(anchors),), -1, dtype=torch.int64, device=anchors.device)
+        if self.kind != "fcos":
+            owner: Tensor = self.model.proposal_matcher(box_iou(box, anchors))
+            return owner
+        middle, extent = (anchors[:, :2] + anchors[:, 2:]) / 2, anchors[:, 2] - anchors[:, 0]
+        away = (middle[:, None] - (box[:, :2] + box[:, 2:]) / 2).abs().amax(-1)
+        sides = torch.cat((middle[:, None] - box[:, :2], box[:, 2:] - middle[:, None]), -1)
+        low = torch.where(dense.level == 0, 0.0, 4 * extent)
+        high = torch.where(dense.level == dense.level[-1], torch.inf, 8 * extent)
+        widest = sides.amax(-1)
+        fits = (away < self.model.center_sampling_radius * extent[:, None]) & (sides.amin(-1) > 0)
+        fits &= (widest > low[:, None]) & (widest < high[:, None])
+        area = (box[:, 2:] - box[:, :2]).prod(-1)
+        least, index = torch.where(fits, area, torch.inf).min(1)
+        return torch.where(least.isfinite(), index, -1)
+
+    def _levels(self, features: list[Tensor], height: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Level and stride (in the network's input) of each place."""
+        each = self.model.anchor_generator.num_anchors_per_location()
+        counts = [f.shape[2] * f.shape[3] * a for f, a in zip(features, each, strict=True)]
+        many = torch.tensor(counts, device=device)
+        level = torch.arange(len(counts), device=device).repeat_interleave(many, output_size=sum(counts))
+        stride = torch.tensor([height / f.shape[2] for f in features], device=device)
+        return level, stride[level]
+
+
+def full(value: Tensor) -> Tensor:
+    """In float32 at least."""
+    return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
+
+
+def scale_of(inside: tuple[int, int], size: tuple[int, int], like: Tensor) -> Tensor:
+    """[4]: what a box of a picture of `size` is multiplied by to stand in the network's input of size `inside`."""
+    x, y = inside[1] / size[1], inside[0] / size[0]
+    return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
+
+
+def _runs(level: Tensor) -> list[tuple[int, int]]:
+    """First place and number of places of each level."""
+    counts = torch.bincount(level).tolist()
+    starts = torch.tensor([0, *counts]).cumsum(0).tolist()
+    return list(zip(starts, counts, strict=False))
+
+
+def _centreness(target: Tensor, anchors: Tensor) -> Tensor:
+    """FCOS's target [M]: how far the place is from the middle of its object."""
+    middle = (anchors[:, :2] + anchors[:, 2:]) / 2
+    low, high = middle - target[:, :2], target[:, 2:] - middle
+    share = torch.minimum(low, high) / torch.maximum(low, high)
+    return share.prod(-1).sqrt()

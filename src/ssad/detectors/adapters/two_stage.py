@@ -1,0 +1,285 @@
+"""Faster R-CNN of torchvision as a detector whose places are its proposals.
+
+What is reduced, so that a two-stage model fits the protocol:
+- Places are the proposals of the first stage, best first, K for every image (`Dense.logit` is -30 in places that an
+  image does not fill). They differ from image to image, so `Dense.place` is the picture's middle and `stride` its
+  larger side. Which boxes are proposed is a choice through which no gradient flows, as in the source.
+- In training the source draws at random the anchors and proposals that count (256 and 512 an image), and adds the true
+  boxes to the proposals. Here every one counts, weighted so that the loss is the expected value over those draws; the
+  truth is not added, but the proposal that overlaps an object most answers for it in any case.
+- Images run one by one: proposals are chosen by rank, and the rounding of a larger batch could change the choice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+import torchvision.models.detection as zoo
+from torch import Tensor, nn
+from torch.nn import functional
+from torchvision.models.detection.rpn import concat_box_prediction_layers
+from torchvision.ops import box_iou
+
+from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.detectors.adapters.common import (
+    check_images,
+    check_threshold,
+    check_truth,
+    evaluating,
+    log_odds,
+    suppress,
+)
+from ssad.detectors.adapters.torchvision import full, scale_of
+from ssad.detectors.yolo.assign import Targets
+from ssad.errors import ConfigError
+
+NONE = -30.0  # the logit of a place that is not filled
+SMALLEST = 1e-2
+BETA = 1 / 9
+
+
+class TwoStage(nn.Module):
+    """A Faster R-CNN of torchvision as a detector; see the module. Starts frozen and in eval mode.
+
+    `Dense`: logit is the log-odds of each class in the second stage's softmax, box the one of the likeliest class,
+    quality None (the source's score has no other factor). maps: class_logits [B, K, columns], box_regression
+    [B, K, 4 * columns], proposals [B, K, 4], filled [B, K], and of the first stage objectness [B, A], rpn_regression
+    [B, A, 4], anchors [A, 4], in the network's input; scale [4] leads to it.
+    """
+
+    task: Literal["2d", "3d"] = "2d"
+    columns: Tensor
+
+    def __init__(
+        self, model: Any, classes: Sequence[str], columns: Sequence[int], *, name: str, threshold: float | None = None
+    ) -> None:
+        super().__init__()
+        if not isinstance(model, zoo.FasterRCNN):
+            raise ConfigError(f"{name}: a {type(model).__name__} is no Faster R-CNN of torchvision")
+        self.model = model
+        self.name = name
+        self.classes = tuple(classes)
+        self.threshold = check_threshold(name, model.roi_heads.score_thresh if threshold is None else threshold)
+        self.register_buffer("columns", torch.tensor(list(columns)), persistent=False)
+        self.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> TwoStage:
+        """As any module; resizing and the number of proposals stay those of evaluation."""
+        super().train(mode)
+        self.model.transform.training = False
+        self.model.rpn.training = False
+        return self
+
+    def forward(self, images: Tensor) -> Dense:
+        """As `dense`."""
+        return self.dense(images)
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
+        size = check_images(self.name, images)
+        rows = [self._one(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)]
+        maps = {name: torch.cat([row[name] for row in rows]) for name in rows[0] if name not in ("anchors", "inside")}
+        anchors, inside = rows[0]["anchors"], rows[0]["inside"].tolist()
+        scale = scale_of((inside[0], inside[1]), size, anchors)
+        filled = maps["filled"]
+        logit = log_odds(maps["class_logits"])[..., self.columns].masked_fill(~filled[..., None], NONE)
+        column = self.columns[logit.argmax(-1)]
+        boxes = self._boxes(maps["box_regression"], maps["proposals"])
+        box = boxes.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
+        count = filled.shape[1]
+        middle = torch.tensor([size[1] / 2, size[0] / 2], device=box.device, dtype=box.dtype)
+        features = [name for name in maps if name.startswith("feature")]
+        return Dense(
+            logit=logit,
+            quality=None,
+            box=torch.where(filled[..., None], box, 0.0) / scale,
+            place=middle.expand(count, 2),
+            stride=torch.full((count,), float(max(size)), device=box.device),
+            level=torch.zeros(count, dtype=torch.int64, device=box.device),
+            maps={n: [v] for n, v in maps.items() if n not in features} | {"anchors": [anchors], "scale": [scale]},
+            features=tuple(maps[name] for name in features),
+            size=size,
+        )
+
+    def _one(self, image: Tensor) -> dict[str, Tensor]:
+        """Both stages on one image [1, 3, H, W]: the maps of `dense`, the size inside, the features."""
+        rpn, roi = self.model.rpn, self.model.roi_heads
+        batch, _ = self.model.transform(list(image))
+        features = self.model.backbone(batch.tensors)
+        levels = list(features.values())
+        scores, regressions = rpn.head(levels)
+        anchors = full(rpn.anchor_generator(batch, levels)[0])
+        counts = [s.shape[1] * s.shape[2] * s.shape[3] for s in scores]
+        objectness, regression = concat_box_prediction_layers(scores, regressions)
+        objectness, regression = full(objectness), full(regression)
+        with torch.no_grad():
+            proposals = rpn.box_coder.decode(regression.detach(), [anchors]).view(1, -1, 4)
+            chosen, _ = rpn.filter_proposals(proposals, objectness.detach()[None], batch.image_sizes, counts)
+        pooled = roi.box_head(roi.box_roi_pool(features, [c.to(levels[0].dtype) for c in chosen], batch.image_sizes))
+        logit, boxes = roi.box_predictor(pooled)
+        empty = rpn.post_nms_top_n() - len(chosen[0])
+
+        def fill(value: Tensor) -> Tensor:
+            return functional.pad(full(value), (0, 0, 0, empty))[None]
+
+        filled = torch.arange(len(chosen[0]) + empty, device=image.device) < len(chosen[0])
+        found = {
+            "class_logits": fill(logit), "box_regression": fill(boxes), "proposals": fill(chosen[0]),
+            "filled": filled[None], "objectness": objectness[None, :, 0], "rpn_regression": regression[None],
+            "anchors": anchors, "inside": torch.tensor(batch.image_sizes[0]),
+        }  # fmt: skip
+        return found | {f"feature{k}": value for k, value in enumerate(levels)}
+
+    def _boxes(self, regression: Tensor, proposals: Tensor) -> Tensor:
+        """Boxes [B, K, columns, 4] in the network's input."""
+        flat = self.model.roi_heads.box_coder.decode(regression.flatten(0, 1), [proposals.reshape(-1, 4)])
+        box: Tensor = flat.view(*regression.shape[:2], -1, 4)
+        return box
+
+    @torch.no_grad()
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Detections of each image, best first: every class of every proposal above the threshold, each with its own
+        box; then suppression within a class."""
+        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
+        with evaluating(self):
+            dense = self.dense(images)
+        boxes = self._boxes(dense.maps["box_regression"][0], dense.maps["proposals"][0])[:, :, self.columns]
+        boxes = boxes / dense.maps["scale"][0]
+        roi = self.model.roi_heads
+        limit = dense.box.new_tensor([dense.size[1], dense.size[0]] * 2)
+        found = []
+        for score, box, filled in zip(dense.logit.sigmoid(), boxes, dense.maps["filled"][0], strict=True):
+            extent = box.clamp(min=0).minimum(limit)
+            large = ((extent[..., 2:] - extent[..., :2]) * dense.maps["scale"][0][:2] >= SMALLEST).all(-1)
+            place, label = ((score > least) & filled[:, None] & large).nonzero(as_tuple=True)
+            found.append(
+                suppress(
+                    score[place, label], label, box[place, label], iou=roi.nms_thresh,
+                    limit=roi.detections_per_img, size=dense.size,
+                )
+            )  # fmt: skip
+        return found
+
+    @torch.no_grad()
+    def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
+        """By overlap of proposals, and of anchors for the first stage, with the objects. extra: box [B, K, 4] the
+        target in pixels of the picture; anchor_label [B, A] (1 object, 0 background, -2 ignored); anchor_box;
+        proposals [B, K, 4] for which it was made."""
+        scale, anchors = dense.maps["scale"][0], dense.maps["anchors"][0]
+        targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
+        label, owner, target = self._second(dense, targets, targets.label)
+        rows = []
+        for k, one in enumerate(truth):
+            real = len(one.label)
+            if not real:
+                zero = torch.zeros(len(anchors), dtype=torch.int64, device=anchors.device)
+                rows.append((zero, torch.zeros_like(anchors)))
+                continue
+            first = self.model.rpn.proposal_matcher(box_iou(targets.box[k, :real], anchors))
+            everywhere = torch.ones_like(first, dtype=torch.bool)
+            near, _ = _labels(first, torch.ones_like(targets.label[k]), targets.crowd[k], everywhere)
+            rows.append((torch.where(near == -1, 0, near), targets.box[k, first.clamp(min=0)] / scale))
+        near, far = (torch.stack(column) for column in zip(*rows, strict=True))
+        extra = {
+            "box": target / scale,
+            "anchor_label": near,
+            "anchor_box": far,
+            "proposals": dense.maps["proposals"][0],
+        }
+        return Assignment(label, owner, tuple(truth), extra)
+
+    def _second(self, dense: Dense, targets: Targets, kinds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Label, owner [B, K] and target [B, K, 4] (in the network's input) of the proposals; kinds [B, Q]: classes."""
+        rows = []
+        for k, real in enumerate(targets.real.sum(1).tolist()):
+            filled, proposals = dense.maps["filled"][0][k], dense.maps["proposals"][0][k]
+            if not real:
+                none = torch.full_like(filled, -1, dtype=torch.int64)
+                rows.append((none.masked_fill(~filled, -2), none, torch.zeros_like(proposals)))
+                continue
+            box = targets.box[k, :real]
+            overlap = box_iou(box, proposals).masked_fill(~filled, 0.0)
+            owner = self.model.roi_heads.proposal_matcher(overlap)
+            most, best = overlap.max(1)
+            owner[best[most > 0]] = torch.arange(real, device=owner.device)[most > 0]
+            label, owner = _labels(owner, kinds[k], targets.crowd[k], filled)
+            rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))
+        label, owner, target = (torch.stack(column) for column in zip(*rows, strict=True))
+        return label, owner, target
+
+    def losses(
+        self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
+    ) -> dict[str, Tensor]:
+        """loss_classifier, loss_box_reg, loss_objectness, loss_rpn_box_reg, the expected values over the source's
+        random choice; see the module. Proposals that are not those of the assignment (the picture has changed) are
+        matched anew to the same objects, with the classes that the assignment gives to them."""
+        if assignment.label.shape != dense.box.shape[:2]:
+            raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
+        rpn, roi, maps, scale = self.model.rpn, self.model.roi_heads, dense.maps, dense.maps["scale"][0]
+        label, target = assignment.label, assignment.extra["box"].to(scale) * scale
+        if not torch.equal(maps["proposals"][0], assignment.extra["proposals"].to(scale)):
+            label, target = self._again(dense, assignment)
+        column = torch.where(label >= 0, self.columns[label.clamp(min=0)], 0)
+        kind = functional.cross_entropy(maps["class_logits"][0].transpose(1, 2), column, reduction="none")
+        regression = maps["box_regression"][0].reshape(*label.shape, -1, 4)
+        regression = regression.gather(2, column[..., None, None].expand(-1, -1, 1, 4))[:, :, 0]
+        second = _smooth(roi.box_coder, regression, target, maps["proposals"][0], label >= 0)
+        near = assignment.extra["anchor_label"]
+        anchors = maps["anchors"][0].expand(len(label), -1, -1)
+        far = assignment.extra["anchor_box"].to(scale) * scale
+        first = _smooth(rpn.box_coder, maps["rpn_regression"][0], far, anchors, near == 1)
+        logit, wanted = maps["objectness"][0], (near == 1).to(scale)
+        seen = functional.binary_cross_entropy_with_logits(logit, wanted, reduction="none")
+        many = _expected(label >= 0, label == -1, roi.fg_bg_sampler)
+        few = _expected(near == 1, near == 0, rpn.fg_bg_sampler)
+        parts = {
+            "loss_classifier": (kind * many[0], many[1]),
+            "loss_box_reg": (second * many[0], many[1]),
+            "loss_objectness": (seen * few[0], few[1]),
+            "loss_rpn_box_reg": (first * few[0], few[1]),
+        }
+        if reduction == "image":
+            return {name: each.sum(1) / drawn.clamp(min=1) for name, (each, drawn) in parts.items()}
+        return {name: each.sum() / drawn.sum().clamp(min=1) for name, (each, drawn) in parts.items()}
+
+    @torch.no_grad()
+    def _again(self, dense: Dense, assignment: Assignment) -> tuple[Tensor, Tensor]:
+        """Label and target of other proposals than those of the assignment."""
+        scale = dense.maps["scale"][0]
+        truth = assignment.truth
+        targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
+        kinds = targets.label.clone()
+        image, place = (assignment.label >= 0).nonzero(as_tuple=True)
+        kinds[image, assignment.owner[image, place]] = assignment.label[image, place]
+        label, _, target = self._second(dense, targets, kinds)
+        return label, target
+
+
+def _labels(owner: Tensor, label: Tensor, crowd: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+    """Label and owner [K] of places that a matcher gave to objects (-1 none, -2 in between)."""
+    index = owner.clamp(min=0)
+    kind = torch.where(owner >= 0, label[index], owner)
+    kind = torch.where((owner >= 0) & crowd[index], -2, kind).masked_fill(~usable, -2)
+    return kind, torch.where(kind >= 0, owner, -1)
+
+
+def _smooth(coder: Any, regression: Tensor, target: Tensor, boxes: Tensor, found: Tensor) -> Tensor:
+    """Smooth L1 [B, K] of the encoded boxes where `found`, 0 elsewhere."""
+    image, place = found.nonzero(as_tuple=True)
+    wanted = coder.encode_single(target[image, place], boxes[image, place])
+    each = functional.smooth_l1_loss(regression[image, place], wanted, beta=BETA, reduction="none").sum(-1)
+    return torch.zeros_like(regression[..., 0]).index_put((image, place), each)
+
+
+def _expected(found: Tensor, background: Tensor, sampler: Any) -> tuple[Tensor, Tensor]:
+    """Chance [B, K] that a random choice takes a place, and how many it takes [B]."""
+    size, most = sampler.batch_size_per_image, int(sampler.batch_size_per_image * sampler.positive_fraction)
+    objects, others = found.sum(1), background.sum(1)
+    near = objects.clamp(max=most)
+    far = torch.minimum(others, size - near)
+    chance = found * (near / objects.clamp(min=1))[:, None] + background * (far / others.clamp(min=1))[:, None]
+    return chance, near + far

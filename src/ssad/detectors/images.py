@@ -1,0 +1,185 @@
+"""What people hand in as pictures, as detectors take them: [B, 3, H, W] float32 in [0, 1], RGB."""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from ssad.errors import ConfigError, FormatError
+from ssad.safeio import MIB, read_bytes
+
+MAX_FILE = 256 * MIB
+MAX_PIXELS = 1 << 26
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
+HINTS = {
+    torch.int16: "; 16-bit pictures are uint16", torch.int32: "; convert to uint8 or uint16",
+    torch.int64: "; convert to uint8 or uint16", torch.bool: "; a mask is no picture",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """tensor: [B, 3, H, W] float32 (float64 stays) in [0, 1], RGB; notes: what was done that a user may want to know,
+    each once: "greyscale repeated to three channels", "alpha left out", "16 bit", ..."""
+
+    tensor: Tensor
+    notes: tuple[str, ...] = ()
+
+
+def as_images(x: Any, *, where: str = "images") -> Images:
+    """One picture or a batch, from files, arrays or tensors; gradients of float tensors are kept.
+
+    x: a file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright as its EXIF says, or 16); a numpy array
+    [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; a list of any of these, of
+    one size. Channels are RGB (OpenCV reads BGR: turn its arrays round first). uint8 is divided by 255, uint16 by 65535
+    (also when only 12 of its bits are used, with a note); floats must lie in [0, 1]. Greyscale is repeated to three
+    channels and alpha is left out, both with a note, since detectors are made for colour. Any size goes.
+
+    ConfigError: another shape, type or range, or pictures of different sizes; FormatError: a file that is no picture.
+    """
+    if isinstance(x, Sequence) and not isinstance(x, str | bytes):
+        if not x:
+            raise ConfigError(f"{where}: no picture")
+        parts = [as_images(one, where=f"{where}[{k}]") for k, one in enumerate(x)]
+        sizes = sorted({tuple(part.tensor.shape[2:]) for part in parts})
+        if len(sizes) > 1:
+            shown = ", ".join(f"{height} x {width}" for height, width in sizes[:3])
+            raise ConfigError(f"{where}: pictures of different sizes ({shown}, height x width) make no batch")
+        notes = dict.fromkeys(note for part in parts for note in part.notes)
+        return Images(torch.cat([part.tensor for part in parts]), tuple(notes))
+    if isinstance(x, str | os.PathLike):
+        return _scaled(*_read(Path(x).expanduser()), where=str(x))
+    if isinstance(x, np.ndarray):
+        return _scaled(_from_array(x, where), (), where=where)
+    if isinstance(x, Tensor):
+        return _scaled(_from_tensor(x, where), (), where=where)
+    raise ConfigError(f"{where}: a {type(x).__name__} is no picture; give a file name, an array or a tensor")
+
+
+def _from_array(x: npt.NDArray[Any], where: str) -> Tensor:
+    """[H, W], [H, W, C] or [B, H, W, C] as [B, C, H, W]."""
+    if x.ndim == 2:
+        x = x[..., None]
+    if x.ndim == 3:
+        x = x[None]
+    if x.ndim != 4 or x.shape[3] not in (1, 3, 4):
+        turned = ", with channels last (turn [3, H, W] by .transpose(1, 2, 0))" if 3 in x.shape[:2] else ""
+        raise ConfigError(f"{where}: an array of shape {list(x.shape)}; pictures are [H, W, 3] or [B, H, W, 3]{turned}")
+    if x.dtype.kind not in "uifb" or x.dtype.itemsize > 8:
+        raise ConfigError(f"{where}: an array of {x.dtype}; pictures are uint8, uint16 or floats in [0, 1]")
+    native = np.ascontiguousarray(x.astype(x.dtype.newbyteorder("="), copy=False))
+    return torch.from_numpy(native if native.flags.writeable else native.copy()).permute(0, 3, 1, 2)
+
+
+def _from_tensor(x: Tensor, where: str) -> Tensor:
+    if x.ndim == 3:
+        x = x[None]
+    if x.ndim != 4 or x.shape[1] not in (1, 3, 4):
+        turned = ", with channels first (turn [H, W, 3] by .permute(2, 0, 1))" if x.shape[-1:] == (3,) else ""
+        shape = list(x.shape)
+        raise ConfigError(f"{where}: a tensor of shape {shape}; pictures are [3, H, W] or [B, 3, H, W]{turned}")
+    return x
+
+
+def _read(path: Path) -> tuple[Tensor, tuple[str, ...]]:
+    """A file as [1, C, H, W], and what was done. FormatError."""
+    from PIL import Image, ImageOps
+
+    data = read_bytes(path, limit=MAX_FILE)
+    try:
+        # Pillow warns of broken EXIF, which decides nothing but the turn
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(data), formats=FORMATS) as picture,
+        ):
+            if picture.width * picture.height > MAX_PIXELS:
+                raise FormatError(f"{path}: {picture.width} x {picture.height} pixels are more than {MAX_PIXELS}")
+            picture.load()  # raises where the file is cut short
+            deep = _is_deep(picture, data)
+            upright = ImageOps.exif_transpose(picture)
+    except FormatError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        why = "cut short" if "truncated" in str(error) else f"not a picture of {', '.join(FORMATS)}"
+        raise FormatError(f"{path}: {why}, or broken") from None
+    if deep:
+        return _read_deep(data, path)
+    if upright.mode == "P":
+        upright = upright.convert("RGBA" if "transparency" in upright.info else "RGB")
+    elif upright.mode in ("1", "CMYK", "YCbCr", "LAB", "HSV"):
+        upright = upright.convert("L" if upright.mode == "1" else "RGB")
+    if upright.mode not in ("L", "LA", "RGB", "RGBA"):
+        raise FormatError(f"{path}: pixels of mode {upright.mode}; pictures have 8 or 16 bits a channel")
+    return _channels(np.array(upright))
+
+
+def _is_deep(picture: Any, data: bytes) -> bool:
+    """Whether a file has 16 bits a channel, which Pillow keeps for greyscale only."""
+    if picture.format == "PNG":
+        return data[24] == 16
+    return picture.format == "TIFF" and bool(picture.tag_v2.get(258, (8,))[0] == 16)
+
+
+def _read_deep(data: bytes, path: Path) -> tuple[Tensor, tuple[str, ...]]:
+    import cv2
+
+    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if raw is None or raw.dtype != np.uint16:
+        raise FormatError(f"{path}: 16 bits a channel in a way that is not known")
+    order = {3: [2, 1, 0], 4: [2, 1, 0, 3]}
+    return _channels(raw[..., order[raw.shape[2]]] if raw.ndim == 3 and raw.shape[2] in order else raw)
+
+
+def _channels(pixels: npt.NDArray[Any]) -> tuple[Tensor, tuple[str, ...]]:
+    """[H, W] or [H, W, C] as [1, 1 or 3, H, W]."""
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    notes = ("alpha left out",) if pixels.shape[2] in (2, 4) else ()
+    kept = np.ascontiguousarray(pixels[..., : 1 if pixels.shape[2] < 3 else 3])
+    return torch.from_numpy(kept).permute(2, 0, 1)[None], notes
+
+
+def _scaled(x: Tensor, notes: tuple[str, ...], *, where: str) -> Images:
+    """[B, C, H, W] of any type as three channels of floats in [0, 1]."""
+    if 0 in x.shape:
+        raise ConfigError(f"{where}: an empty picture, shape {list(x.shape)}")
+    kind = str(x.dtype).removeprefix("torch.")
+    if x.dtype == torch.uint8:
+        image = x.float() / 255
+    elif x.dtype == torch.uint16:
+        wide = x.to(torch.int32)
+        most = int(wide.max())
+        image = wide.float() / 65535
+        notes = (*notes, "16 bit" if most > 4095 else f"16 bit, none above {most}: dark, or of fewer bits")
+    elif x.is_floating_point():
+        image = x if x.dtype in (torch.float32, torch.float64) else x.float()
+        _check_range(image.detach(), where)
+    else:
+        raise ConfigError(
+            f"{where}: {kind} numbers; pictures are uint8, uint16 or floats in [0, 1]{HINTS.get(x.dtype, '')}"
+        )
+    if image.shape[1] == 4:
+        image = image[:, :3]
+        notes = (*notes, "alpha left out")
+    if image.shape[1] == 1:
+        image = image.expand(-1, 3, -1, -1)
+        notes = (*notes, "greyscale repeated to three channels")
+    return Images(image.contiguous(), notes)
+
+
+def _check_range(image: Tensor, where: str) -> None:
+    low, high = (float(value) for value in image.aminmax())
+    if not bool(image.isfinite().all()):
+        raise ConfigError(f"{where}: holds NaN or infinite values")
+    if low < 0 or high > 1:
+        unit = "; divide by 255" if low >= 0 and 1 < high <= 255 else ""
+        raise ConfigError(f"{where}: floats from {low:.4g} to {high:.4g}; they must lie in [0, 1]{unit}")
