@@ -43,31 +43,40 @@ def run(
 ) -> None:
     """Run a suite and write its report; run again to resume.
 
-    Exit code 0: every episode ran; 1: some failed (they are in the results with the reason); 2: wrong input.
+    Exit code 0: all of it ran; 1: some failed (they are in the results with the reason); 2: wrong input.
     """
     from rich.console import Console
 
     from ssad.bench.pictures import make_pictures
     from ssad.bench.run import pick_device, plan
     from ssad.bench.run import run as run_plan
-    from ssad.bench.suite import load_suite
-    from ssad.bench.summary import table
+    from ssad.bench.suite import Suite, load_suite
+    from ssad.bench.summary import name_of, shift_table, table
 
     chosen = load_suite(suite, settings or [])
     folder = out or Path("runs") / chosen.name
-    todo = plan(chosen, device=pick_device(device))
+    where = pick_device(device)
     try:
-        records = run_plan(todo, folder, workers=workers)
+        if isinstance(chosen, Suite):
+            records = run_plan(plan(chosen, device=where), folder, workers=workers)
+            make_pictures(list(chosen.pictures), folder)
+            shown = table(chosen.title or chosen.name, records)
+        else:
+            from ssad.bench.component.pictures import draw_detections
+            from ssad.bench.component.run import plan_detection, run_detection
+
+            todo = plan_detection(chosen, device=where)
+            records = run_detection(todo, folder, workers=workers)
+            draw_detections(todo, folder)
+            shown = shift_table(chosen.title or chosen.name, records)
     except KeyboardInterrupt:
         print(f"stopped; what is done is kept in {folder}: the same command goes on from there", file=sys.stderr)
         raise typer.Exit(130) from None
-    make_pictures(list(chosen.pictures), folder)
     console = Console()
-    console.print(table(chosen.title or chosen.name, records))
+    console.print(shown)
     failed = [r for r in records if r["status"] != "ok"]
     for record in failed[:5]:
-        name = f"{record['system']}/{record['spec']['scenario']['name']}"
-        console.print(f"{record['status']}: {name}: {record['reason']}", markup=False, soft_wrap=True)
+        console.print(f"{record['status']}: {name_of(record)}: {record['reason']}", markup=False, soft_wrap=True)
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     report(folder)

@@ -5,28 +5,32 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ssad.bench.cast import make_cast
+from ssad.bench.clips import Clips, record_clips
 from ssad.bench.drives import make_drive
 from ssad.bench.record import AHEAD, CATEGORY, Recording, drive, record_nuscenes
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.camera.street import cached_street
 from ssad.datasets.nuscenes.reader import NuScenes, read_image, read_points
 from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
-from ssad.errors import ConfigError, StoreError
+from ssad.errors import ConfigError, MapError, StoreError
 from ssad.frames import rotation_matrix
 from ssad.geometry import obb_distance
-from ssad.roads import load_town
+from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
+from ssad.types import LaneType
 
 SMALL = {"towns": ("Twinford", "Oldmarket"), "held_out": ("Oldmarket",), "scenes": 1, "seconds": 1.0, "width": 160}
 
@@ -170,3 +174,42 @@ def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
     blocked.write_text("")
     with pytest.raises(StoreError):
         record_nuscenes(Recording(blocked / "out", **SMALL), workers=1)
+
+
+def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
+    tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("record", "clips"):  # its street takes long to build, and is not needed
+        monkeypatch.setattr(f"ssad.bench.{module}.cached_street", lambda town: None)
+    town = ssad_home / "towns" / "Paths.npz"
+    graph = load_town("ProvingGround")
+    # every lane to drive on lies within a junction: no place to start from
+    inside = np.where(graph.kind == LaneType.DRIVING, 0, graph.junction).astype(graph.junction.dtype)
+    save_graph(replace(graph, name="Paths", junction=inside), town)
+    with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
+        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+    assert "\n" not in str(error.value)
+    with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
+        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=1)
+    assert "\n" not in str(error.value)
+    with np.load(town) as stored:
+        arrays = dict(stored)
+    arrays["kind"] = np.full_like(arrays["kind"], LaneType.SIDEWALK)
+    np.savez(town, **arrays)
+    with pytest.raises(MapError, match="no drivable lane") as error:
+        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+    assert "\n" not in str(error.value)
+
+
+def test_a_stop_while_tables_are_written_and_a_folder_without_its_page(root: Path, tmp_path: Path) -> None:
+    again = tmp_path / "d"
+    shutil.copytree(root, again)
+    todo = Recording(again, sweeps=1, **SMALL)
+    (again / todo.version / "splits.json").unlink()  # the last that is written
+    record_nuscenes(todo, workers=1)
+    assert contents(again) == contents(root)
+    shutil.rmtree(again / ".parts")
+    with pytest.raises(StoreError, match="not how it was recorded") as error:
+        record_nuscenes(replace(todo, seed=7), workers=1)
+    assert "\n" not in str(error.value)
+    assert contents(again) == contents(root)

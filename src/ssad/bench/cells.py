@@ -47,12 +47,17 @@ class Cell:
         return asdict(self)
 
 
-@lru_cache(maxsize=1)
 def code_version() -> str:
-    """12 hex digits over the source that results depend on."""
+    """12 hex digits over the source that episodes depend on."""
+    return source_version(_CODE)
+
+
+@lru_cache(maxsize=4)
+def source_version(parts: tuple[str, ...]) -> str:
+    """12 hex digits over files, and folders of source, of the package."""
     package = Path(ssad.__file__).resolve().parent
     total = hashlib.sha256()
-    for part in _CODE:
+    for part in parts:
         path = package / part
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             total.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())

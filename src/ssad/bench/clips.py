@@ -297,7 +297,8 @@ def record_clips(
     finished = out / "annotations" / "all.json"
     if finished.is_file() and not (out / ".parts").is_dir():
         data = safeio.read_json(finished)
-        if not isinstance(data, dict) or data.get("info", {}).get("recording") != identity:
+        info = data.get("info") if isinstance(data, dict) else None
+        if not isinstance(info, dict) or info.get("recording") != identity:
             raise StoreError(f"{out}: holds another recording; choose another folder")
     for town, count in clips.images:
         for number, start in enumerate(range(0, count, EACH)):

@@ -94,6 +94,8 @@ def _image(
         raise ValueError(f"{what}: file name '{file}' points out of the folder of images")
     box = np.zeros((len(own), 4))
     for n, thing in enumerate(own):
+        if not isinstance(thing["bbox"], list) or len(thing["bbox"]) != 4:
+            raise ValueError(f"{what}: a bbox that is no list of four numbers")
         x, y, w, h = (float(v) for v in thing["bbox"])
         box[n] = x, y, x + w, y + h
     if not np.isfinite(box).all() or (box[:, 2:] <= box[:, :2]).any():

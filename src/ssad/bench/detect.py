@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,9 +25,10 @@ from ssad.metrics.detection_boxes import BoxTable
 from ssad.protocols import Detector
 from ssad.types import F64, U8
 
-Picture = Callable[[SensorFrame], U8]
+Look = Callable[[Sequence[SensorFrame]], Sequence[U8]]
 LABEL = np.array([CLASSES.index(name) for name in CLASSES_3D])
 _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
+AT_ONCE = 6  # samples that a GPU is shown at once
 FLOOR = 0.001  # least score that counts for AP of 2D boxes
 
 
@@ -45,40 +47,66 @@ def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tenso
 
 
 def detect_scene(
-    detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", picture: Picture | None = None
+    detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
 ) -> list[SampleBoxes]:
-    """Boxes in the world for each sample of a scene. picture: gives a camera frame's picture (default: reads it)."""
+    """Boxes in the world for each sample of a scene. look: gives the pictures of camera frames (default: the files)."""
+    return detect_with([detector], root, scene, device=device, look=look)[0]
 
-    def read(frame: SensorFrame) -> U8:
-        return read_image(root / frame.filename)
 
-    look = picture or read
+def detect_with(
+    detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
+) -> list[list[SampleBoxes]]:
+    """As `detect_scene` for several detectors, which are shown the same pictures: a list a detector."""
     by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
             by_sample.setdefault(frame.sample_token, []).append(frame)
-    found = []
+    found: list[list[SampleBoxes]] = [[] for _ in detectors]
+    step = AT_ONCE if device != "cpu" else 1
     with ThreadPoolExecutor(4) as pool:
-        ahead = {s.token: [pool.submit(look, f) for f in by_sample.get(s.token, [])] for s in scene.samples[:2]}
-        for number, sample in enumerate(scene.samples):
-            for later in scene.samples[number + 1 : number + 3]:
-                if later.token not in ahead:
-                    ahead[later.token] = [pool.submit(look, f) for f in by_sample.get(later.token, [])]
-            frames = by_sample.get(sample.token, [])
-            pictures = [p.result() for p in ahead.pop(sample.token)]
-            detections: list[Detections] = []
-            sizes = sorted({p.shape[:2] for p in pictures})
-            order: list[int] = []
-            for size in sizes:  # pictures of one size in one call
-                rows = [k for k, p in enumerate(pictures) if p.shape[:2] == size]
-                lens = np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])
-                images = to_images([pictures[k] for k in rows], device)
-                detections += detector.predict(images, torch.from_numpy(lens).to(device))
-                order += rows
-            boxes = merge_cameras(
-                detections, [frames[k].sensor_to_ego for k in order], [frames[k].ego_to_world for k in order]
-            )
-            found.append(SampleBoxes(sample.token, boxes))
+
+        def read(frames: Sequence[SensorFrame]) -> Sequence[U8]:
+            if look is not None:
+                return look(frames)
+            return list(pool.map(lambda frame: read_image(root / frame.filename), frames))
+
+        with ThreadPoolExecutor(1) as ahead:  # the next pictures are made while these are looked at
+            blocks = [scene.samples[k : k + step] for k in range(0, len(scene.samples), step)]
+            flat = [[f for s in block for f in by_sample.get(s.token, [])] for block in blocks]
+            waiting = [ahead.submit(read, frames) for frames in flat[:2]]
+            for number, block in enumerate(blocks):
+                pictures = waiting[number].result()
+                waiting += [ahead.submit(read, frames) for frames in flat[number + 2 : number + 3]]
+                for k, boxes in enumerate(_predict(detectors, flat[number], pictures, device)):
+                    found[k] += _merged(block, by_sample, boxes)
+    return found
+
+
+def _predict(
+    detectors: Sequence[Detector], frames: Sequence[SensorFrame], pictures: Sequence[U8], device: str
+) -> list[list[Detections]]:
+    """Detections of each picture, in order, by detector; pictures of one size in one call."""
+    found: list[dict[int, Detections]] = [{} for _ in detectors]
+    for size in sorted({p.shape[:2] for p in pictures}):
+        rows = [k for k, p in enumerate(pictures) if p.shape[:2] == size]
+        lens = torch.from_numpy(np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])).to(device)
+        images = to_images([pictures[k] for k in rows], device)
+        for own, detector in zip(found, detectors, strict=True):
+            for k, one in zip(rows, detector.predict(images, lens), strict=True):
+                own[k] = one
+    return [[own[k] for k in range(len(frames))] for own in found]
+
+
+def _merged(
+    samples: Sequence[Any], by_sample: Mapping[str, Sequence[SensorFrame]], boxes: Sequence[Detections]
+) -> list[SampleBoxes]:
+    found, start = [], 0
+    for sample in samples:
+        frames = by_sample.get(sample.token, [])
+        own = boxes[start : start + len(frames)]
+        start += len(frames)
+        merged = merge_cameras(own, [f.sensor_to_ego for f in frames], [f.ego_to_world for f in frames])
+        found.append(SampleBoxes(sample.token, merged))
     return found
 
 

@@ -299,7 +299,9 @@ def record_nuscenes(
         for town in recording.towns
         for number in range(recording.scenes)
     ]
-    if (out / recording.version / "sample.json").is_file():
+    if (out / recording.version / "splits.json").is_file():  # written last
+        if not (out / ".parts" / "recording.json").is_file():
+            raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
         _check_page(out, recording.identity())
         return out
     run_parts(out, recording.identity(), _scene, tasks, workers=workers, progress=progress)
@@ -398,6 +400,7 @@ def link(source: Path, target: Path) -> None:
             try:
                 os.link(source, target)
             except OSError:
-                shutil.copyfile(source, target)
+                with safeio.atomic_path(target) as temporary:
+                    shutil.copyfile(source, temporary)
     except OSError as error:
         raise StoreError(f"{target}: cannot be written: {error.strerror or error}") from None

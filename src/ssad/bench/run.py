@@ -52,7 +52,7 @@ class Plan:
 def versions(device: str) -> dict[str, str]:
     """Versions that a record carries."""
     found = {"ssad": ssad.__version__, "python": platform.python_version(), "device": device}
-    for name in ("numpy", "warp-lang"):
+    for name in ("numpy", "warp-lang", "torch"):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

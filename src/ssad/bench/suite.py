@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import ssad
+from ssad.bench.component.suite import DetectionSuite
 from ssad.errors import ConfigError, UnknownNameError, unknown_name
 from ssad.safeio import Document, dotted, parse_yaml, read_yaml_document
 from ssad.types import Scenario
@@ -29,6 +30,7 @@ class Suite(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
+    kind: Literal["driving"] = "driving"
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     title: str = ""
     description: str = ""
@@ -41,6 +43,10 @@ class Suite(BaseModel):
     reference: str | None = None
     witness: bool = True
     pictures: list[Literal["shifts", "camera"]] = []
+
+
+KINDS: dict[str, type[Suite] | type[DetectionSuite]] = {"driving": Suite, "detection": DetectionSuite}
+LISTS = ("systems", "scenarios", "pictures", "detectors", "shifts", "severities")  # one value alone is a list of one
 
 
 def suite_folders() -> list[Path]:
@@ -62,8 +68,8 @@ def suite_files() -> dict[str, Path]:
     return files
 
 
-def load_suite(ref: str, settings: Sequence[str] = ()) -> Suite:
-    """The suite of that name or YAML file, with `--set key=value` settings applied.
+def load_suite(ref: str, settings: Sequence[str] = ()) -> Suite | DetectionSuite:
+    """The suite of that name or YAML file, with `--set key=value` settings applied; its key `kind` says of which kind.
 
     ConfigError or FormatError say file, line and key; UnknownNameError shows the closest names.
     """
@@ -77,13 +83,18 @@ def load_suite(ref: str, settings: Sequence[str] = ()) -> Suite:
     if not isinstance(document.data, dict):
         raise document.error((), "a suite is a mapping with the keys name, systems and scenarios")
     data = dict(document.data)
+    kind = KINDS.get(str(data.get("kind", "driving")))
+    if kind is None:
+        raise document.error(("kind",), f"'{data['kind']}' is no kind of suite; choose from: {', '.join(KINDS)}")
     changed: dict[str, str] = {}
     for setting in settings:
-        changed[_apply(data, setting)] = setting
+        changed[_apply(data, setting, list(kind.model_fields))] = setting
     try:
-        suite = Suite.model_validate(data)
+        suite = kind.model_validate(data)
     except ValidationError as error:
-        raise _explain(error, document, changed) from None
+        raise _explain(error, document, changed, list(kind.model_fields)) from None
+    if isinstance(suite, DetectionSuite):
+        return suite
     return suite.model_copy(update={"scenarios": [_beside(name, path) for name in suite.scenarios]})
 
 
@@ -95,20 +106,20 @@ def _beside(ref: str, suite_file: Path) -> str:
     return ref
 
 
-def _apply(data: dict[str, Any], setting: str) -> str:
+def _apply(data: dict[str, Any], setting: str, known: Sequence[str]) -> str:
     """Put one `key=value` into the data; returns the top-level key."""
     key, equals, text = setting.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError(f"--set {setting}: expected key=value, such as --set repetitions=3")
-    known = list(Suite.model_fields)
     if parts[0] not in known:
         raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], known)}")
     value = parse_yaml(text, f"--set {key}")
-    if parts[0] in ("systems", "scenarios", "pictures") and isinstance(value, str):
-        value = [value]  # one name alone is a list of one
+    if len(parts) == 1 and parts[0] in LISTS and isinstance(value, str | int):
+        value = [value]
     place = data
     for part in parts[:-1]:
+        place.setdefault(part, {})
         if not isinstance(place.get(part), dict):
             raise ConfigError(f"--set {setting}: '{part}' has no keys of its own")
         place[part] = dict(place[part])
@@ -122,12 +133,12 @@ def _unknown_key(key: str, known: Sequence[str]) -> str:
     return f"unknown key '{key}'; closest: {', '.join(close)}"
 
 
-def _explain(error: ValidationError, document: Document, changed: dict[str, str]) -> ConfigError:
+def _explain(error: ValidationError, document: Document, changed: dict[str, str], known: Sequence[str]) -> ConfigError:
     """The first problem as one line with file, line and key, or with the setting that caused it."""
     problem = error.errors(include_url=False)[0]
     location = tuple(problem["loc"])
     if problem["type"] == "extra_forbidden":
-        text = _unknown_key(str(location[-1]), list(Suite.model_fields))
+        text = _unknown_key(str(location[-1]), known)
         location = (*location[:-1], str(location[-1]))
     elif problem["type"] == "missing":
         text = f"the key '{location[-1]}' is missing"

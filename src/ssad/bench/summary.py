@@ -57,5 +57,38 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     return result
 
 
+def name_of(record: Mapping[str, Any]) -> str:
+    """What people call a cell."""
+    if "detector" in record:
+        return f"{record['detector']}/{record['shift'] or 'clean'}/{record['severity']}"
+    return f"{record['system']}/{record['spec']['scenario']['name']}"
+
+
+def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
+    """A Rich table of a detection suite: shifts x detectors, mAP and NDS at "random", else means over severities."""
+    from rich import box
+
+    detectors = list(dict.fromkeys(r["detector"] for r in records))
+    shifts = list(dict.fromkeys(r["shift"] for r in records))
+    result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    result.add_column("shift", no_wrap=True)
+    for detector in detectors:
+        result.add_column(f"{detector} mAP", justify="right")
+        result.add_column("NDS", justify="right")
+    drawn = any(r["severity"] == "random" for r in records)
+    result.caption = f"percent; {'severities drawn from 1 to 5' if drawn else 'means over the severities that ran'}"
+    result.caption_justify = "left"
+    for shift in shifts:
+        row = [str(shift or "clean").replace("_", " ")]
+        for detector in detectors:
+            own = [r for r in records if r["detector"] == detector and r["shift"] == shift and r["status"] == "ok"]
+            own = [r for r in own if r["severity"] == "random"] or own
+            for metric in ("mAP", "NDS"):
+                values = [r["metrics"][metric] for r in own]
+                row.append(f"{100 * sum(values) / len(values):.1f}" if values else "failed")
+        result.add_row(*row, end_section=shift is None)
+    return result
+
+
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2f}"

@@ -119,7 +119,9 @@ def _usual(trial: Trial, images: Tensor) -> float:
     for _ in range(20):  # the detector may count something else in
         (found,) = trial.predict(images[:1], threshold=least)
         if len(found.score) > 2:
-            return float(found.score[:20][-1]) * (1 - 1e-4)
+            score = found.score.detach().sort(descending=True).values
+            usable = score[(score >= least) & (score <= 1)][:20]  # wrong order and range are told elsewhere
+            return float(usable[-1]) * (1 - 1e-4) if len(usable) else least
         least *= 0.7
     return 0.0
 

@@ -144,11 +144,11 @@ class State:
             ("requires_grad or grad", self.grads, now.grads),
         ):
             names = sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
-            found += [f"{what} of {names[0][2:] or 'itself'}"] if names else []
+            found += [f"{what} of {names[0][2:].lstrip('.') or 'itself'}"] if names else []
         for name, value in self.values.items():
             other = now.values.get(name)
             if other is None or other.shape != value.shape or not torch.equal(other.nan_to_num(), value.nan_to_num()):
-                found.append(f"the values of {name[2:]}")
+                found.append(f"the values of {name[2:].lstrip('.')}")
                 break
         if self.settings != now.settings:
             found.append("torch's gradient mode, default type or number of threads")

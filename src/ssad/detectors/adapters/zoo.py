@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import torch
 from torch import nn
 from torchvision import models
 from torchvision.models import detection
+from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from ssad.detectors.adapters.torchvision import OneStage
 from ssad.detectors.adapters.two_stage import TwoStage
@@ -51,6 +54,7 @@ def torchvision_detector(
         if not classes or len(set(classes)) != len(classes) or isinstance(classes, str):
             raise ConfigError(f"{model}: classes must be distinct names, at least one")
         columns, count = list(range(1, len(classes) + 1)), len(classes) + 1
+    _check_options(model, options)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
@@ -61,6 +65,18 @@ def torchvision_detector(
     if weights is not None:
         fit_torchvision(detector, load_weights(weights), weights)
     return detector
+
+
+def _check_options(model: str, options: Iterable[str]) -> None:
+    """ConfigError: an option that torchvision's builder would let pass without a word."""
+    owners = {"fasterrcnn": detection.FasterRCNN, "fcos": detection.FCOS, "retinanet": detection.RetinaNet}
+    owner = owners.get(model.split("_", maxsplit=1)[0], detection.ssd.SSD)
+    known = {n for f in (getattr(detection, model), owner, GeneralizedRCNNTransform) for n in signature(f).parameters}
+    for key in options:
+        if key not in known:
+            close = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.3)
+            hint = f"; closest: {', '.join(close)}" if close else ""
+            raise ConfigError(f"torchvision:{model}: no option '{key}'{hint}")
 
 
 def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where: str | Path) -> None:

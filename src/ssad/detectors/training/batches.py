@@ -195,7 +195,8 @@ def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> 
     pictures = pictures.clamp(1e-4, 1.0) ** about(recipe.jitter)
     if recipe.noise > 0:
         level = torch.rand((len(pictures), 1, 1, 1), generator=draws).to(device) ** 2 * recipe.noise
-        pictures = pictures + torch.randn_like(pictures) * level
+        grain = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=draws)))
+        pictures = pictures + torch.randn(pictures.shape, generator=grain, device=device) * level
     return pictures.clamp(0.0, 1.0)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from ssad import safeio
 from ssad.detections import Truth
@@ -124,10 +124,19 @@ def train(
                         "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step,
                         "recipe": safeio.dump_json(recipe_data(recipe))}, row)  # fmt: skip
             say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
-        if seconds is not None and time.monotonic() - start > seconds:
+        if seconds is not None and _over(time.monotonic() - start > seconds, share, where):
             break
     best = average if average is not None else detector
     return best.requires_grad_(False).eval()
+
+
+def _over(mine: bool, share: Share, where: torch.device) -> bool:
+    """Whether time is over, as the first process says: all must stop after the same epoch."""
+    if share.world == 1:
+        return mine
+    flag = torch.tensor(float(mine), device=where)
+    distributed.broadcast(flag, 0)
+    return bool(flag)
 
 
 def _unfreeze(detector: Any, recipe: Recipe) -> None:
@@ -189,10 +198,18 @@ def _resume(
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise FormatError(f"{path}: not a checkpoint of a training ({type(error).__name__}); delete it") from None
-    if state.get("recipe") != safeio.dump_json(recipe_data(recipe)):
+    if not isinstance(state, dict) or "recipe" not in state:
+        raise FormatError(f"{path}: not a checkpoint of a training; delete it")
+    if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
         raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
-    detector.load_state_dict(state["model"])
-    if average is not None:
-        average.load_state_dict(state["average"])
-    optimizer.load_state_dict(state["optimizer"])
-    return int(state["epoch"]), int(state["step"])
+    try:
+        detector.load_state_dict(state["model"])
+        if average is not None:
+            average.load_state_dict(state["average"])
+        optimizer.load_state_dict(state["optimizer"])
+        return int(state["epoch"]), int(state["step"])
+    except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        why = type(error).__name__
+        raise FormatError(
+            f"{path}: of another detector or data set, or broken ({why}); choose another folder"
+        ) from None

@@ -1,0 +1,119 @@
+"""What the first detector of a suite sees under each shift: one moment, its boxes and the true ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from ssad import safeio
+from ssad.bench.component.run import Plan
+from ssad.bench.component.work import Job, Unit, detector_of, shifter_of
+from ssad.bench.detect import to_images
+from ssad.bench.pictures import FOLDER, PAGE
+from ssad.bench.toolbox.sheet import save_picture
+from ssad.bench.training_data import camera_truth
+from ssad.datasets.nuscenes.reader import NuScenes, read_image
+from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
+from ssad.datasets.nuscenes.splits import scenes_of_split
+from ssad.detections import Solids
+from ssad.detectors.mono3d.decode import corners
+from ssad.scenarios.static.shifts import SHIFTS
+from ssad.types import F64, U8
+
+WIDTH, COLUMNS, LEAST, STRONG = 640, 3, 0.3, 3
+EDGES = tuple((a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit)  # corners that differ in one axis
+TRUE, FOUND = (255, 255, 255), (255, 170, 30)
+
+
+def draw_detections(todo: Plan, folder: str | Path) -> None:
+    """DIR/pictures/detections.jpg: clean and every shift at severity 3 (or the nearest that ran). StoreError."""
+    target = Path(folder) / FOLDER
+    path = target / "detections.jpg"
+    name, weights = todo.detectors[0]
+    caption = (
+        f"What {name} finds (orange, score at least {LEAST}) and what is there (white), clean and under each shift "
+        f"at severity {_severity(todo)}."
+    )
+    if not path.is_file():
+        save_picture(path, _sheet(todo, Path(folder), name, weights))
+    safeio.write_atomic(target / PAGE, safeio.dump_json({path.name: caption}, indent=1) + "\n")
+
+
+def _severity(todo: Plan) -> int:
+    numbers = [s for s in todo.suite.severities if isinstance(s, int)] or [STRONG]
+    return min(numbers, key=lambda s: abs(s - STRONG))
+
+
+def _sheet(todo: Plan, folder: Path, name: str, weights: str) -> U8:
+    suite, root = todo.suite, todo.root or folder / "data"
+    with NuScenes(root, suite.version) as data:
+        version = data.version
+        scene, frame = _richest(data, scenes_of_split(root, version, suite.split))
+        job = Job(folder, root, version, todo.detectors, suite.calibration, suite.seed, 0, todo.device, 1)
+        detector = detector_of(name, weights, todo.device)
+        clean = read_image(root / frame.filename)
+        tiles = [_tile((detector, todo.device), scene, frame, clean, title="clean")]
+        for shift in suite.shifts:
+            shifter = shifter_of(job, data, Unit(shift, _severity(todo), scene.record.name))
+            assert shifter is not None
+            tiles.append(_tile((detector, todo.device), scene, frame, shifter.image(frame)[0], title=shift))
+    while len(tiles) % COLUMNS:
+        tiles.append(np.full_like(tiles[0], 255))
+    rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]
+    return np.concatenate(rows)
+
+
+def _richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorFrame]:
+    """The camera frame with most objects within 30 m, by day if it can be, among the first of each scene."""
+    best: tuple[float, SceneData, SensorFrame] | None = None
+    for name in scenes:
+        scene = data.scene(name)
+        for frame in [f for f in scene.frames if f.modality == "camera" and f.key_frame][:6]:
+            truth = camera_truth(frame, scene.annotations(frame.sample_token))
+            assert truth.solid is not None
+            near = float((truth.solid.centre[:, 2] < 30).sum())
+            light = float(np.median(read_image(data.root / frame.filename)))
+            value = near * min(max(light - 20.0, 1.0) / 60.0, 1.0)
+            if best is None or value > best[0]:
+                best = value, scene, frame
+    assert best is not None
+    return best[1], best[2]
+
+
+@torch.no_grad()
+def _tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, *, title: str) -> U8:
+    """A picture with the boxes of a detector (on a device) and the true ones, and its name."""
+    detector, device = eye
+    truth = camera_truth(frame, scene.annotations(frame.sample_token))
+    assert frame.intrinsic is not None
+    assert truth.solid is not None
+    lens = torch.from_numpy(np.asarray(frame.intrinsic, np.float32))[None].to(device)
+    (found,) = detector.predict(to_images([image], device), lens, threshold=LEAST)
+    scale = WIDTH / image.shape[1]
+    canvas = cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
+    intrinsic = np.asarray(frame.intrinsic, np.float64)
+    _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
+    _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
+    text = f"{title.replace('_', ' ')} ({SHIFTS[title][0]})" if title in SHIFTS else title
+    cv2.rectangle(canvas, (0, 0), (12 + 11 * len(text), 26), (0, 0, 0), -1)
+    cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+    return np.asarray(canvas)
+
+
+def _draw(
+    canvas: U8, solid: Solids | None, intrinsic: F64, scale: float, *, colour: tuple[int, int, int], width: int
+) -> None:
+    """Edges of boxes that lie before the camera."""
+    if solid is None or not len(solid.yaw):
+        return
+    points = corners(solid.centre.double(), solid.size.double(), solid.yaw.double()).cpu().numpy()
+    for box in points[(points[..., 2] > 0.5).all(1)]:
+        flat = box @ intrinsic.T
+        place = np.rint((flat[:, :2] / flat[:, 2:] + 0.5) * scale * 8).clip(-1e6, 1e6).astype(int)
+        for a, b in EDGES:
+            first, last = (int(v) for v in place[a]), (int(v) for v in place[b])
+            cv2.line(canvas, tuple(first), tuple(last), colour, width, cv2.LINE_AA, 3)

@@ -1,0 +1,227 @@
+"""`ssad run` for suites of kind `detection`: data, then boxes, then scores; run again to go on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+
+from ssad import safeio
+from ssad.bench.cells import source_version
+from ssad.bench.component.suite import RECORDED, DetectionSuite
+from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, score_cell
+from ssad.bench.progress import Live
+from ssad.bench.record import Recording, record_nuscenes
+from ssad.bench.run import default_workers, versions
+from ssad.bench.store import Store
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.splits import scenes_of_split
+from ssad.errors import ConfigError, StoreError
+from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity
+from ssad.seeding import digest
+
+# a change in any of these may change a number
+_CODE = ("detections.py", "detectors", "scenarios/static/shifts", "metrics", "datasets", "geometry.py", "frames.py")
+_WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
+GPU_WORKERS = 6  # processes that share a GPU: planning a shift and reading pictures is work for the host
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything that a run will do, checked before anything is written. detectors: name -> weights, "" for the
+    shipped ones; data: what the results depend on of the data set."""
+
+    suite: DetectionSuite
+    detectors: tuple[tuple[str, str], ...]
+    device: str
+    root: Path | None
+    data: Mapping[str, Any]
+    weights: Mapping[str, str]
+
+    @property
+    def conditions(self) -> list[tuple[str | None, int | str]]:
+        """Clean, then every shift at every severity."""
+        return [(None, 0), *((shift, s) for shift in self.suite.shifts for s in self.suite.severities)]
+
+    def key(self, detector: str, shift: str | None, severity: int | str) -> str:
+        """Of a cell: a hash of all that its result depends on."""
+        suite = self.suite
+        parts = (detector, self.weights[detector], shift or "clean", severity, safeio.dump_json(dict(self.data)))
+        code = source_version(_CODE + (_WORLD if self.root is None else ()))
+        return digest("detection", code, self.device, suite.calibration, suite.seed, suite.replicates, *parts)[:16]
+
+    def run_json(self) -> dict[str, Any]:
+        """What run.json says."""
+        cells = [
+            {"key": self.key(d, shift, severity), "detector": d, "shift": shift, "severity": severity}
+            for d, _ in self.detectors for shift, severity in self.conditions
+        ]  # fmt: skip
+        return {
+            "identity": digest("detection run", *[c["key"] for c in cells])[:16],
+            "suite": self.suite.model_dump(mode="json"), "versions": versions(self.device), "data": dict(self.data),
+            "weights": dict(self.weights), "cells": cells,
+        }  # fmt: skip
+
+
+def plan_detection(suite: DetectionSuite, *, device: str = "cpu") -> Plan:
+    """Resolve a suite: detectors are built once, the data set is looked at. ConfigError, FormatError."""
+    if len(set(suite.shifts)) != len(suite.shifts) or len(set(suite.severities)) != len(suite.severities):
+        raise ConfigError(f"suite {suite.name}: a shift or a severity appears twice")
+    for shift in suite.shifts:
+        ShiftSpec(shift, calibration=suite.calibration)
+    detectors, weights = [], {}
+    for text in suite.detectors:
+        name, _, file = text.partition("=")
+        if name in weights:
+            raise ConfigError(f"suite {suite.name}: detectors: {name} appears twice")
+        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
+        detector = detector_of(name, path, "cpu")
+        if getattr(detector, "task", None) != "3d":
+            raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
+        detectors.append((name, path))
+        weights[name] = state_hash(detector)
+    if suite.data == RECORDED:
+        about = _recording(suite, Path(RECORDED)).identity()
+        about["split"] = suite.split
+        if suite.split not in ("val", "all"):
+            raise ConfigError(f"suite {suite.name}: recorded data have the splits val and all, not '{suite.split}'")
+        return Plan(suite, tuple(detectors), device, None, about, weights)
+    root = Path(suite.data).expanduser()
+    if not root.is_dir():
+        raise ConfigError(f"suite {suite.name}: data: {root} is no folder; give the root of a data set, or {RECORDED}")
+    with NuScenes(root, suite.version) as data:
+        version = data.version
+    scenes_of_split(root, version, suite.split)
+    tables = {
+        name: hashlib.sha256(safeio.read_bytes(root / version / f"{name}.json", limit=1 << 34)).hexdigest()[:16]
+        for name in ("sample", "sample_annotation", "sample_data", "calibrated_sensor")
+    }
+    return Plan(suite, tuple(detectors), device, root, {"version": version, "split": suite.split} | tables, weights)
+
+
+def state_hash(detector: Any) -> str:
+    """12 hex digits over the weights of a detector; "" for one that is no module."""
+    if not hasattr(detector, "state_dict"):
+        return ""
+    from ssad.detectors.checkpoints import hash_state
+
+    return hash_state(detector.state_dict())[:12]
+
+
+def _recording(suite: DetectionSuite, out: Path) -> Recording:
+    """On the CPU, on any machine: it decides bits."""
+    own = suite.recorded
+    return Recording(
+        out, tuple(own.towns), tuple(own.towns), scenes=own.scenes, seconds=own.seconds, width=own.width,
+        seed=own.seed,
+    )  # fmt: skip
+
+
+def run_detection(
+    todo: Plan, folder: str | Path, *, workers: int | None = None, console: Console | None = None
+) -> list[dict[str, Any]]:
+    """Run what is missing and return all records, in the order of the plan. StoreError, SSADError."""
+    console, suite = console or Console(stderr=True), todo.suite
+    header, out = todo.run_json(), Path(folder)
+    with Store.open(out, header) as store:
+        order = [cell["key"] for cell in header["cells"]]
+        if all(key in store.results for key in order):
+            return [store.results[key] for key in order]
+        root = todo.root
+        if root is None:
+            recording = _recording(suite, out / "data")
+            with Live("recording", suite.recorded.scenes * len(suite.recorded.towns), 0, console=console) as live:
+
+                def recorded(done: int, of: int) -> None:
+                    live.done = done
+                    live.tick()
+
+                root = record_nuscenes(recording, workers=workers, progress=recorded)
+        with NuScenes(root, suite.version) as data:
+            version = data.version
+            scenes = scenes_of_split(root, version, suite.split)
+            tokens = {name: data.scene(name).record.token for name in scenes}
+        count = workers or (default_workers() if todo.device == "cpu" else min(GPU_WORKERS, default_workers()))
+        threads = max(1, default_workers() // count)
+        job = Job(
+            out, root, version, todo.detectors, suite.calibration, suite.seed, suite.replicates, todo.device, threads
+        )
+        cells = [
+            Cell(todo.key(d, shift, severity), d, shift, severity, _units(todo, shift, severity, tokens))
+            for d, _ in todo.detectors for shift, severity in todo.conditions
+        ]  # fmt: skip
+        missing = [cell for cell in cells if cell.key not in store.results]
+        units = list(dict.fromkeys(unit for cell in missing for unit in cell.units))
+        failed: dict[Unit, str] = {}
+        began = time.monotonic()
+        with Live(suite.name, len(units) + len(missing), 0, console=console) as live:
+            for unit, why in _spread(make_unit, [(job, unit) for unit in units], count):
+                if why:
+                    failed[unit] = why
+                live.advance(not why)
+                live.tick()
+            wall = (time.monotonic() - began) / max(len(missing), 1)
+            ready = []
+            for cell in missing:
+                why = next((f"{u.scene}: {failed[u]}" for u in cell.units if u in failed), "")
+                if why:
+                    store.append(_record(todo, cell, header, {"reason": why}, wall), None)
+                    live.advance(False)
+                else:
+                    ready.append((job, cell))
+            for cell, result in _spread(score_cell, ready, count):
+                store.append(_record(todo, cell, header, result, wall), None)
+                live.advance(True)
+                live.tick()
+        return [store.results[key] for key in order]
+
+
+def _units(todo: Plan, shift: str | None, severity: int | str, tokens: Mapping[str, str]) -> tuple[Unit, ...]:
+    """The pieces of work that a condition needs. A severity drawn by scene is one of the five: nothing runs twice."""
+    if shift is None or severity != "random" or todo.suite.calibration == "paper":
+        return tuple(Unit(shift, severity, scene) for scene in tokens)
+    spec = ShiftSpec(shift, seed=todo.suite.seed, calibration=todo.suite.calibration)
+    return tuple(Unit(shift, random_severity(spec, token, ""), scene) for scene, token in tokens.items())
+
+
+def _record(
+    todo: Plan, cell: Cell, header: Mapping[str, Any], result: Mapping[str, Any], wall: float
+) -> dict[str, Any]:
+    return {
+        "key": cell.key, "suite": todo.suite.name, "status": "failed" if "reason" in result else "ok",
+        "reason": result.get("reason", ""), "detector": cell.detector, "shift": cell.shift,
+        "family": SHIFTS[cell.shift][0] if cell.shift else "clean", "severity": cell.severity,
+        "seed": todo.suite.seed, "spec": {"calibration": todo.suite.calibration, "labels": "original"},
+        **{k: v for k, v in result.items() if k != "reason"}, "versions": header["versions"], "wall_s": round(wall, 3),
+        "artefacts": {"detections": sorted({str(Path(u.path).parent) for u in cell.units})},
+    }  # fmt: skip
+
+
+def _spread(function: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[R]:
+    """Results as they come, from processes. StoreError: one died."""
+    count = min(workers, len(tasks))
+    if count <= 1:
+        yield from map(function, tasks)
+        return
+    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
+        futures = [pool.submit(function, task) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise

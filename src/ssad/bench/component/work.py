@@ -1,0 +1,201 @@
+"""The pieces of work of a detection suite: one scene under one shift, seen by all detectors; written, then scored."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ssad import safeio
+from ssad.bench.detect import SampleBoxes, detect_with, match_boxes
+from ssad.bench.execute import quiet_warp
+from ssad.bench.toolbox.scene import SceneShifter
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
+from ssad.detectors import make_detector
+from ssad.detectors.mono3d.merge import WorldBoxes
+from ssad.errors import FormatError, SSADError
+from ssad.metrics.detection import DetectionScores
+from ssad.metrics.uncertainty import percentile_interval
+from ssad.scenarios.static.shifts import Calibration, ShiftSpec
+from ssad.seeding import generator
+from ssad.types import U8
+
+FOLDER = "detections"
+_COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label")
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """One scene under one shift (None: clean) at one severity ("random": drawn by sample)."""
+
+    shift: str | None
+    severity: int | str
+    scene: str
+
+    @property
+    def path(self) -> str:
+        """Where its boxes lie in the results folder."""
+        name = "clean" if self.shift is None else f"{self.shift}-{self.severity}"
+        return f"{FOLDER}/{name}/{self.scene}.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is the same for all pieces of work. detectors: name -> weights ("" for the shipped ones)."""
+
+    folder: Path
+    root: Path
+    version: str
+    detectors: tuple[tuple[str, str], ...]
+    calibration: Calibration
+    seed: int
+    replicates: int
+    device: str
+    threads: int
+
+
+def detector_of(name: str, weights: str, device: str) -> Any:
+    """A detector by name and weights."""
+    return make_detector(name, weights=weights or None, device=device)
+
+
+@lru_cache(maxsize=4)
+def _detectors(job: Job) -> list[Any]:
+    quiet_warp()
+    torch.set_num_threads(job.threads)
+    return [detector_of(name, weights, job.device) for name, weights in job.detectors]
+
+
+def shifter_of(job: Job, data: NuScenes, unit: Unit) -> SceneShifter | None:
+    """The scene through the unit's shift; None for the clean one."""
+    if unit.shift is None:
+        return None
+    drawn = unit.severity == "random"
+    spec = ShiftSpec(unit.shift, 1 if drawn else int(unit.severity), seed=job.seed, calibration=job.calibration)
+    return SceneShifter(job.root, data.scene(unit.scene), spec, random=drawn)
+
+
+def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
+    """Writes the boxes that each detector finds, unless they are there; the unit, and why it failed ("": it did not).
+
+    Memory that is used up, and a device that is lost, end the run: only what the data cause is a result.
+    """
+    job, unit = task
+    path = job.folder / unit.path
+    if path.is_file():
+        return unit, ""
+    try:
+        with NuScenes(job.root, job.version) as data:
+            scene, shifter = data.scene(unit.scene), shifter_of(job, data, unit)
+            applied: Counter[str] = Counter()
+
+            def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
+                assert shifter is not None
+                images, done = shifter.images(frames, device=None if job.device == "cpu" else job.device)
+                applied.update("applied" if one.applied else "not applied" for one in done)
+                for one in done:
+                    applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
+                return images
+
+            found = detect_with(
+                _detectors(job), job.root, scene, device=job.device, look=None if shifter is None else look
+            )
+    except SSADError as error:
+        return unit, str(error)
+    columns: dict[str, Any] = {}
+    for (name, _), samples in zip(job.detectors, found, strict=True):
+        boxes = [one.boxes for one in samples]
+        columns[f"{name}/sample"] = np.array([one.token for one in samples])
+        columns[f"{name}/count"] = np.array([len(b) for b in boxes], np.int32)
+        for column in _COLUMNS:
+            columns[f"{name}/{column}"] = np.concatenate([getattr(b, column) for b in boxes])
+        columns[f"{name}/attribute"] = np.array([a for b in boxes for a in b.attribute], "U40")
+    columns["applied"] = np.array(safeio.dump_json(dict(sorted(applied.items()))))
+    file = io.BytesIO()
+    np.savez_compressed(file, **columns)
+    safeio.write_atomic(path, file.getvalue())
+    return unit, ""
+
+
+def read_unit(path: Path, detector: str) -> tuple[list[SampleBoxes], dict[str, int]]:
+    """Boxes by sample of one detector, and how often the shift was applied. FormatError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            ends = np.cumsum(file[f"{detector}/count"])
+            parts = {c: np.split(file[f"{detector}/{c}"], ends[:-1]) for c in (*_COLUMNS, "attribute")}
+            tokens = [str(token) for token in file[f"{detector}/sample"]]
+            applied = safeio.parse_json(str(file["applied"]))
+    except (OSError, KeyError, ValueError, EOFError) as error:
+        raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
+    names = parts.pop("attribute")
+    found = [
+        SampleBoxes(token, WorldBoxes(**{c: parts[c][k] for c in _COLUMNS}, attribute=tuple(map(str, names[k]))))
+        for k, token in enumerate(tokens)
+    ]
+    return found, {str(k): int(v) for k, v in applied.items()}
+
+
+@lru_cache(maxsize=2)
+def _truth(root: Path, version: str, scenes: tuple[str, ...]) -> GroundTruth:
+    return read_truth(root, version, scenes=frozenset(scenes))
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One row of the results: a detector under a shift (None: clean) at a severity, over units that hold its boxes."""
+
+    key: str
+    detector: str
+    shift: str | None
+    severity: int | str
+    units: tuple[Unit, ...]
+
+
+def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
+    """Metrics of a cell, their intervals by the bootstrap over scenes, and the replicates (paired between cells)."""
+    job, cell = task
+    scenes = tuple(unit.scene for unit in cell.units)
+    truth = _truth(job.root, job.version, scenes)
+    found: list[SampleBoxes] = []
+    applied: Counter[str] = Counter()
+    for unit in cell.units:
+        boxes, counts = read_unit(job.folder / unit.path, cell.detector)
+        found += boxes
+        applied.update(counts)
+    matches = match_boxes(found, truth)
+    values = numbers(matches.scores())
+    draws: list[dict[str, float]] = []
+    if len(truth.scenes) > 1:
+        chance = generator("detection suite", job.seed, len(truth.scenes))  # the same draws for every cell
+        even = np.full(len(truth.scenes), 1.0 / len(truth.scenes))
+        for draw in chance.multinomial(len(truth.scenes), even, size=job.replicates):
+            draws.append(numbers(matches.scores(draw[truth.scene]), few=True))
+    replicates = {name: [round(d[name], 5) for d in draws] for name in (draws[0] if draws else {})}
+    intervals = {name: [round(v, 5) for v in percentile_interval(np.array(r))] for name, r in replicates.items()}
+    return cell, {
+        "metrics": values, "intervals": intervals, "replicates": replicates, "n": len(truth.samples),
+        "scenes": len(truth.scenes), "applied": dict(sorted(applied.items())),
+    }  # fmt: skip
+
+
+def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
+    """mAP, NDS, AP of each class, true-positive errors; few: mAP, NDS and the AP of cars alone. NaN is left out."""
+    found = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
+    if not few:
+        found |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
+        found |= {short: scores.tp_errors[name] for short, name in ERRORS.items()}
+    return {name: round(float(value), 6) for name, value in found.items() if np.isfinite(value)}
+
+
+ERRORS: Mapping[str, str] = {
+    "mATE": "trans_err", "mASE": "scale_err", "mAOE": "orient_err", "mAVE": "vel_err", "mAAE": "attr_err",
+}  # fmt: skip
