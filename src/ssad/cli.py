@@ -348,10 +348,34 @@ def _shift_list() -> dict[str, str]:
     return {name: f"{family}: {text}" for name, (family, text) in SHIFTS.items()}
 
 
+def _detector_list() -> dict[str, str]:
+    from ssad.detectors import SHIPPED, detector_names
+
+    def about(name: str, where: str) -> str:
+        if where.startswith("ssad."):
+            kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
+            return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
+        return where
+
+    rows = {name: about(name, where) for name, where in detector_names().items()}
+    return rows | {"module:object": "a detector of your own, see docs/detectors.md"}
+
+
+def _recipe_list() -> dict[str, str]:
+    from ssad.detectors.training.recipe import RECIPES
+
+    return {
+        name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
+        for name, r in RECIPES.items()
+    }
+
+
 KINDS = {
     "suites": _suite_list,
     "scenarios": _scenario_list,
     "systems": _system_list,
+    "detectors": _detector_list,
+    "recipes": _recipe_list,
     "shifts": _shift_list,
     "towns": _town_list,
 }
@@ -361,10 +385,10 @@ ALIASES = {"agents": "systems"}
 @app.command("list")
 def list_names(
     kind: Annotated[
-        str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, shifts, towns.")
+        str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, detectors, recipes, ...")
     ] = None,
 ) -> None:
-    """List what can be named: suites, scenarios, systems (agents), shifts, towns."""
+    """List what can be named: suites, scenarios, systems (agents), detectors, recipes, shifts, towns."""
     chosen = ALIASES.get(kind or "", kind)
     if chosen is not None and chosen not in KINDS:
         raise unknown_name("kind", str(kind), [*KINDS, *ALIASES])

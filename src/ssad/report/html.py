@@ -18,7 +18,7 @@ from ssad.errors import SSADError
 from ssad.metrics import METRICS, aggregate
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
 from ssad.report.figures import interval_plot
-from ssad.report.load import Record, Run, load_run
+from ssad.report.load import Record, Run, load_header, load_run
 from ssad.report.paper import SCENARIOS
 from ssad.report.tables import Cell, Table, tables, write_tables
 from ssad.roads.graph import LaneGraph, load_graph
@@ -40,6 +40,11 @@ def write_report(run_dir: Path | str) -> Path:
     StoreError if DIR holds no run, has no results, or cannot be written. A trace that is missing or broken leaves its
     episode without a replay, and the page says so.
     """
+    header = load_header(run_dir)
+    if header.get("suite", {}).get("kind") == "detection":
+        from ssad.report.detection import write_detection_report
+
+        return write_detection_report(Path(run_dir), header)
     run = load_run(run_dir)
     found = tables(run)
     write_tables(run.folder, found)
@@ -116,8 +121,12 @@ def _pictures(run: Run) -> list[dict[str, Any]]:
 
 
 def _command(run: Run) -> str:
-    """The command that runs the same suite again; only what differs from the suite of that name is spelt out."""
-    suite = dict(run.header.get("suite", {}))
+    """The command that runs the same suite again."""
+    return shlex.join(command_of(dict(run.header.get("suite", {}))))
+
+
+def command_of(suite: dict[str, Any]) -> list[str]:
+    """Words of the command that runs a suite; only what differs from the suite of that name is spelt out."""
     name = str(suite.pop("name", "quick"))
     try:
         stock = load_suite(name).model_dump(mode="json")
@@ -127,8 +136,10 @@ def _command(run: Run) -> str:
     for key, value in suite.items():
         if value != stock.get(key):
             text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            if isinstance(value, dict):
+                text = "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
             words += ["--set", f"{key}={text}"]
-    return shlex.join(words)
+    return words
 
 
 def _tile(run: Run, system: str) -> dict[str, Any]:

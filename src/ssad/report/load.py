@@ -62,19 +62,26 @@ class Run:
         return list(dict.fromkeys(r.system for r in self.records))
 
 
+def load_header(folder: Path | str) -> Mapping[str, Any]:
+    """run.json of a run folder. StoreError if it does not hold a run."""
+    folder = Path(folder)
+    if not (folder / "run.json").is_file():
+        raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
+    header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
+    return header
+
+
 def load_run(folder: Path | str) -> Run:
     """Read run.json, results.jsonl and episodes.jsonl; a torn last line is left out.
 
     StoreError if the folder does not hold a run or the run has no result yet.
     """
     folder = Path(folder)
-    if not (folder / "run.json").is_file():
-        raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
-    header = safeio.read_json(folder / "run.json")
-    results = _lines(folder / "results.jsonl")
+    header = load_header(folder)
+    results = read_records(folder / "results.jsonl")
     if not results:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
-    ends = {line["key"]: line.get("end", "") for line in _lines(folder / "episodes.jsonl")}
+    ends = {line["key"]: line.get("end", "") for line in read_records(folder / "episodes.jsonl")}
     order = {cell["key"]: k for k, cell in enumerate(header.get("cells", []))}
     records = [_record(line, ends.get(line["key"], "")) for line in results]
     records.sort(key=lambda r: order.get(r.key, len(order)))
@@ -102,7 +109,7 @@ def _record(line: Mapping[str, Any], end: str) -> Record:
     )
 
 
-def _lines(path: Path) -> list[dict[str, Any]]:
+def read_records(path: Path) -> list[dict[str, Any]]:
     """Lines of a JSONL file; what follows the last line end was torn by a kill and does not count."""
     if not path.is_file():
         return []

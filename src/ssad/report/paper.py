@@ -52,3 +52,20 @@ NATURAL: dict[tuple[str, str], dict[str, tuple[float, float, float]]] = {
     ("Autopilot", "Adv. PPO"): {"Town02": (0.17, 0.00, 0.07), "Town05": (0.21, 0.00, 0.06)},
     ("PPO", "Adv. PPO"): {"Town02": (0.81, 0.05, 0.22), "Town05": (0.59, 0.03, 0.12)},
 }
+
+# shift -> detector -> mAP, NDS in percent; nuScenes val, severities drawn from 1 to 5 ("" : clean)
+SHIFTS: dict[str, dict[str, tuple[float, float]]] = {
+    "": {"FCOS3D": (29.8, 37.7), "PGD": (31.7, 39.3)},
+    "snow": {"FCOS3D": (2.07, 5.87), "PGD": (3.45, 13.21)},
+    "rain": {"FCOS3D": (16.98, 29.08), "PGD": (18.24, 29.60)},
+    "fog": {"FCOS3D": (17.97, 29.50), "PGD": (17.48, 28.21)},
+    "sunlight": {"FCOS3D": (27.31, 36.92), "PGD": (30.68, 38.59)},
+    "uniform": {"FCOS3D": (5.53, 11.69), "PGD": (2.60, 10.75)},
+    "gaussian": {"FCOS3D": (3.62, 6.47), "PGD": (4.57, 7.30)},
+    "impulse": {"FCOS3D": (6.35, 10.97), "PGD": (5.86, 15.48)},
+    "scale": {"FCOS3D": (6.57, 19.53), "PGD": (6.82, 21.55)},
+    "shear": {"FCOS3D": (21.57, 31.63), "PGD": (23.63, 33.24)},
+    "rotation": {"FCOS3D": (13.25, 22.52), "PGD": (12.46, 20.46)},
+    "motion_blur": {"FCOS3D": (9.34, 20.30), "PGD": (8.19, 18.95)},
+}
+DETECTORS = {"fcos3d": "FCOS3D", "pgd-det": "PGD"}  # how a detector's name begins -> its column in the paper

@@ -66,6 +66,7 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[Row, ...]
     note: str = ""
+    source: str = SOURCE
 
 
 def _cell(estimate: Estimate) -> Cell:
@@ -252,7 +253,7 @@ def to_latex(table: Table) -> str:
         last = row
     if any(row.published for row in table.rows):
         width = len(table.heads) + len(table.columns)
-        lines += ["\\midrule", rf"\multicolumn{{{width}}}{{l}}{{\footnotesize $^\dagger$ {tex(SOURCE)}}} \\"]
+        lines += ["\\midrule", rf"\multicolumn{{{width}}}{{l}}{{\footnotesize $^\dagger$ {tex(table.source)}}} \\"]
     return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", ""])
 
 

@@ -11,14 +11,13 @@ import torch
 
 from ssad import safeio
 from ssad.bench.component.run import Plan
-from ssad.bench.component.work import Job, Unit, detector_of, shifter_of
+from ssad.bench.component.work import Job, Unit, detector_of, scenes_of, shifter_of
 from ssad.bench.detect import to_images
 from ssad.bench.pictures import FOLDER, PAGE
 from ssad.bench.toolbox.sheet import save_picture
 from ssad.bench.training_data import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes, read_image
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
-from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.detections import Solids
 from ssad.detectors.mono3d.decode import corners
 from ssad.scenarios.static.shifts import SHIFTS
@@ -52,7 +51,7 @@ def _sheet(todo: Plan, folder: Path, name: str, weights: str) -> U8:
     suite, root = todo.suite, todo.root or folder / "data"
     with NuScenes(root, suite.version) as data:
         version = data.version
-        scene, frame = _richest(data, scenes_of_split(root, version, suite.split))
+        scene, frame = _richest(data, scenes_of(data, suite.split))
         job = Job(folder, root, version, todo.detectors, suite.calibration, suite.seed, 0, todo.device, 1)
         detector = detector_of(name, weights, todo.device)
         clean = read_image(root / frame.filename)

@@ -17,13 +17,13 @@ from rich.console import Console
 from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
-from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, score_cell
+from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, scenes_of, score_cell
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.run import default_workers, versions
 from ssad.bench.store import Store
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.splits import scenes_of_split
+from ssad.detectors import DETECTORS, SHIPPED
 from ssad.errors import ConfigError, StoreError
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity
 from ssad.seeding import digest
@@ -86,6 +86,11 @@ def plan_detection(suite: DetectionSuite, *, device: str = "cpu") -> Plan:
         if name in weights:
             raise ConfigError(f"suite {suite.name}: detectors: {name} appears twice")
         path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
+        if not path and name in DETECTORS and not (SHIPPED / f"{name}.json").is_file():
+            raise ConfigError(
+                f"suite {suite.name}: no weights of {name} are shipped; give a file, {name}=FILE "
+                f"(docs/detectors.md: ssad train detector {name}, or official ones)"
+            )
         detector = detector_of(name, path, "cpu")
         if getattr(detector, "task", None) != "3d":
             raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
@@ -102,7 +107,7 @@ def plan_detection(suite: DetectionSuite, *, device: str = "cpu") -> Plan:
         raise ConfigError(f"suite {suite.name}: data: {root} is no folder; give the root of a data set, or {RECORDED}")
     with NuScenes(root, suite.version) as data:
         version = data.version
-    scenes_of_split(root, version, suite.split)
+        scenes_of(data, suite.split)
     tables = {
         name: hashlib.sha256(safeio.read_bytes(root / version / f"{name}.json", limit=1 << 34)).hexdigest()[:16]
         for name in ("sample", "sample_annotation", "sample_data", "calibrated_sensor")
@@ -150,7 +155,7 @@ def run_detection(
                 root = record_nuscenes(recording, workers=workers, progress=recorded)
         with NuScenes(root, suite.version) as data:
             version = data.version
-            scenes = scenes_of_split(root, version, suite.split)
+            scenes = scenes_of(data, suite.split)
             tokens = {name: data.scene(name).record.token for name in scenes}
         count = workers or (default_workers() if todo.device == "cpu" else min(GPU_WORKERS, default_workers()))
         threads = max(1, default_workers() // count)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,10 +20,11 @@ from ssad.bench.execute import quiet_warp
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.mono3d.merge import WorldBoxes
-from ssad.errors import FormatError, SSADError
+from ssad.errors import ConfigError, FormatError, SSADError
 from ssad.metrics.detection import DetectionScores
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
@@ -61,6 +63,15 @@ class Job:
     replicates: int
     device: str
     threads: int
+
+
+def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
+    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
+    there = {scene.name for scene in data.scenes()}
+    found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
+    if not found:
+        raise ConfigError(f"{data.root / data.version}: none of its {len(there)} scenes is in the split '{split}'")
+    return found
 
 
 def detector_of(name: str, weights: str, device: str) -> Any:
@@ -129,12 +140,12 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
 def read_unit(path: Path, detector: str) -> tuple[list[SampleBoxes], dict[str, int]]:
     """Boxes by sample of one detector, and how often the shift was applied. FormatError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             ends = np.cumsum(file[f"{detector}/count"])
             parts = {c: np.split(file[f"{detector}/{c}"], ends[:-1]) for c in (*_COLUMNS, "attribute")}
             tokens = [str(token) for token in file[f"{detector}/sample"]]
             applied = safeio.parse_json(str(file["applied"]))
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
     names = parts.pop("attribute")
     found = [

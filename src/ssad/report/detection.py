@@ -1,0 +1,350 @@
+"""The report of a suite of kind `detection`: 3D detectors under shifts, the paper's numbers beside ours."""
+
+from __future__ import annotations
+
+import base64
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from ssad import safeio
+from ssad.errors import ConfigError, StoreError
+from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
+from ssad.metrics.uncertainty import percentile_interval
+from ssad.report.load import read_records
+from ssad.report.paper import DETECTORS
+from ssad.report.paper import SHIFTS as PUBLISHED
+from ssad.report.tables import Cell, Row, Table, write_tables
+
+SOURCE = "published by the paper: nuScenes val, severities drawn from 1 to 5"
+FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "clean": "Clean"}
+TITLES = {"uniform": "uniform noise", "gaussian": "gaussian noise", "impulse": "impulse noise", "": "clean"}
+CLASSES = (
+    "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle", "traffic_cone",
+    "barrier",
+)  # fmt: skip
+ERRORS = {"mATE": "m", "mASE": "1 - IoU", "mAOE": "rad", "mAVE": "m/s", "mAAE": "1 - accuracy"}
+
+
+@dataclass(frozen=True)
+class DetectionRun:
+    """A run folder: its header, and its records by detector, shift ("": clean) and severity."""
+
+    folder: Path
+    header: Mapping[str, Any]
+    records: Mapping[tuple[str, str, str], Mapping[str, Any]]
+    planned: int
+
+    @property
+    def suite(self) -> Mapping[str, Any]:
+        """The resolved suite."""
+        found: Mapping[str, Any] = self.header["suite"]
+        return found
+
+    @property
+    def detectors(self) -> list[str]:
+        """In the order of the suite."""
+        return [text.partition("=")[0] for text in self.suite["detectors"]]
+
+    @property
+    def shifts(self) -> list[str]:
+        """In the order of the suite, without the clean data."""
+        return list(self.suite["shifts"])
+
+    @property
+    def numbers(self) -> list[str]:
+        """Severities that are numbers, in order."""
+        return sorted(str(s) for s in self.suite["severities"] if s != "random")
+
+    def record(self, detector: str, shift: str, severity: str) -> Mapping[str, Any] | None:
+        """A record that is there and not failed; the clean one has no severity."""
+        found = self.records.get((detector, shift, severity if shift else "0"))
+        return found if found is not None and found["status"] == "ok" else None
+
+    def family(self, shift: str) -> str:
+        """Title of the family of a shift."""
+        own = next((r for (_, s, _), r in self.records.items() if s == shift), None)
+        return FAMILIES[own["family"]] if own else ""
+
+
+def load_detection_run(folder: Path, header: Mapping[str, Any]) -> DetectionRun:
+    """Records of a run folder. StoreError: it has no result yet."""
+    lines = read_records(folder / "results.jsonl")
+    if not lines:
+        raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
+    records = {(r["detector"], r["shift"] or "", str(r["severity"])): r for r in lines}
+    return DetectionRun(folder, header, records, len(header.get("cells", [])))
+
+
+def cell_of(record: Mapping[str, Any] | None, metric: str, *, scale: float = 100.0) -> Cell:
+    """A metric in percent with its interval; a dash where there is none."""
+    if record is None or metric not in record["metrics"]:
+        return Cell(math.nan)
+    low, high = record["intervals"].get(metric, (math.nan, math.nan))
+    return Cell(scale * record["metrics"][metric], scale * low, scale * high, record["n"])
+
+
+def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+    """A shift's number: at the severity drawn from 1 to 5 if that ran, else the mean over severities."""
+    if not shift or run.record(detector, shift, "random") is not None:
+        return cell_of(run.record(detector, shift, "random"), metric)
+    found = [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
+    if not found or len(found) < len(run.numbers):
+        return Cell(math.nan)
+    mean = math.fsum(r["metrics"][metric] for r in found) / len(found)
+    draws = [r["replicates"].get(metric, []) for r in found]
+    low = high = math.nan
+    if all(draws):
+        low, high = percentile_interval([math.fsum(row) / len(row) for row in zip(*draws, strict=True)])
+    return Cell(100 * mean, 100 * low, 100 * high, found[0]["n"])
+
+
+def title_of(shift: str) -> str:
+    """What people call a shift."""
+    return TITLES.get(shift, shift.replace("_", " "))
+
+
+def main_table(run: DetectionRun) -> Table:
+    """Shift x detector: mAP and NDS, the paper's rows between ours."""
+    rows = []
+    columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
+    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    for shift in ["", *run.shifts]:
+        head = (run.family(shift), title_of(shift))
+        cells = [summary_cell(run, d, shift, metric) for d in run.detectors for metric in ("mAP", "NDS")]
+        rows.append(Row(head, tuple(cells)))
+        if run.suite.get("reference") and shift in PUBLISHED and any(names):
+            told = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
+            rows.append(Row(head, tuple(Cell(v) for pair in told for v in pair), published=True))
+    drawn = "random" in run.suite["severities"]
+    strength = "a severity drawn from 1 to 5" if drawn else f"the mean over severities {', '.join(run.numbers)}"
+    return Table(
+        "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
+        f"Percent; each shift at {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "
+        "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.", SOURCE,
+    )  # fmt: skip
+
+
+def severity_table(run: DetectionRun) -> Table:
+    """Every number by severity."""
+    names = [*run.numbers, *(["random"] if "random" in run.suite["severities"] else [])]
+    rows = []
+    for metric in ("mAP", "NDS", "AP_car"):
+        for detector in run.detectors:
+            for shift in run.shifts:
+                cells = [cell_of(run.record(detector, shift, s), metric) for s in names]
+                rows.append(Row((metric.replace("_", " "), detector, title_of(shift)), tuple(cells)))
+    return Table(
+        "severities", "By severity", ("Metric", "Detector", "Shift"), tuple(f"severity {s}" for s in names), tuple(rows)
+    )
+
+
+def car_table(run: DetectionRun) -> Table:
+    """AP of cars."""
+    rows = [
+        Row((run.family(s), title_of(s)), tuple(summary_cell(run, d, s, "AP_car") for d in run.detectors))
+        for s in ["", *run.shifts]
+    ]
+    return Table("car", "Cars alone: AP", ("Family", "Shift"), tuple(run.detectors), tuple(rows), "Percent.")
+
+
+def class_table(run: DetectionRun) -> Table:
+    """AP of each class and the errors of true positives on the clean data."""
+    columns = [*(c.replace("_", " ") for c in CLASSES), *(f"{k} ({unit})" for k, unit in ERRORS.items())]
+    rows = []
+    for detector in run.detectors:
+        record = run.record(detector, "", "0")
+        cells = [cell_of(record, f"AP_{c}") for c in CLASSES]
+        cells += [cell_of(record, error, scale=1.0) for error in ERRORS]
+        rows.append(Row((detector,), tuple(cells)))
+    note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
+    return Table("classes", "On the clean data", ("Detector",), tuple(columns), tuple(rows), note)
+
+
+def robustness_table(run: DetectionRun) -> Table | None:
+    """mCE and mRR of NDS and mAP; None where a number is missing. The first detector is the baseline of mCE."""
+    severities = run.numbers or ["random"]
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    draws: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
+    for detector in run.detectors:
+        for metric in ("NDS", "mAP"):
+            records = {s: [run.record(detector, s, n) for n in severities] for s in ["", *run.shifts]}
+            if any(r is None for row in records.values() for r in row):
+                return None
+            whole = {s: [r for r in row if r is not None] for s, row in records.items()}
+            found[detector, metric] = {s: [r["metrics"][metric] for r in row] for s, row in whole.items()}
+            draws[detector, metric] = {s: [r["replicates"].get(metric, []) for r in row] for s, row in whole.items()}
+    rows = []
+    for detector in run.detectors:
+        cells = []
+        for metric in ("NDS", "mAP"):
+            own, base = found[detector, metric], found[run.detectors[0], metric]
+            rate, error = _robustness(own, base)
+            sets = [
+                _robustness(_drawn(draws[detector, metric], k), _drawn(draws[run.detectors[0], metric], k))
+                for k in range(len(draws[detector, metric][""][0]))
+            ]
+            for value, several in ((error, [s[1] for s in sets]), (rate, [s[0] for s in sets])):
+                known = [v for v in several if not math.isnan(v)]
+                low, high = percentile_interval(known) if len(known) > 1 else (math.nan, math.nan)
+                cells.append(Cell(100 * value, 100 * low, 100 * high))
+        rows.append(Row((detector,), tuple(cells)))
+    return Table(
+        "robustness", "Robustness in one number", ("Detector",), ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)"),
+        tuple(rows),
+        f"Percent, over all shifts and severities {', '.join(severities)}. mCE: errors relative to those of "
+        f"{run.detectors[0]} (lower is better); mRR: share of the clean score that is left (higher is better).",
+    )  # fmt: skip
+
+
+def _drawn(values: Mapping[str, Sequence[Sequence[float]]], k: int) -> dict[str, list[float]]:
+    return {s: [row[k] for row in rows] for s, rows in values.items()}
+
+
+def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[float]]) -> tuple[float, float]:
+    """mRR and mCE of scores by shift, clean ones at ""; NaN where they are not defined."""
+    shifted = {s: v for s, v in own.items() if s}
+    reference = {s: v for s, v in base.items() if s}
+    try:
+        rate = mean_resilience_rate(shifted, own[""][0])
+        errors = corruption_error(shifted, reference)
+    except ConfigError:
+        return math.nan, math.nan
+    return rate, math.fsum(errors.values()) / len(errors)
+
+
+def curves(run: DetectionRun, metric: str = "NDS") -> str:
+    """A small plot for each shift: the metric over severity, a line a detector, its interval as a band; as SVG."""
+    if len(run.numbers) < 2:
+        return ""
+    wide, high, columns, gap = 178, 118, 4, 34
+    steps = ["0", *run.numbers]
+    top = max(
+        (
+            cell_of(run.record(d, s, n), metric).mean
+            for d in run.detectors
+            for s in ["", *run.shifts]
+            for n in steps
+            if run.record(d, s, n)
+        ),
+        default=1.0,
+    )
+    top = max(10.0, 10 * math.ceil(top / 10))
+    parts = []
+    for number, shift in enumerate(run.shifts):
+        left, under = 36 + (number % columns) * (wide + gap), 24 + (number // columns) * (high + 46)
+
+        def place(severity: str, value: float, left: int = left, under: int = under) -> str:
+            x = left + wide * int(severity) / 5
+            return f"{x:.1f},{under + high * (1 - min(max(value / top, 0.0), 1.0)):.1f}"
+
+        parts.append(f'<text x="{left}" y="{under - 8}" class="name">{escape(title_of(shift))}</text>')
+        for share in (0.0, 0.5, 1.0):
+            y = under + high * (1 - share)
+            parts.append(f'<line x1="{left}" x2="{left + wide}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
+            parts.append(f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{top * share:.0f}</text>')
+        for n in steps:
+            x = left + wide * int(n) / 5
+            label = "clean" if n == "0" else n
+            parts.append(f'<text x="{x:.1f}" y="{under + high + 15}" text-anchor="middle">{label}</text>')
+        for index, detector in enumerate(run.detectors):
+            found = [(n, cell_of(run.record(detector, shift if n != "0" else "", n), metric)) for n in steps]
+            found = [(n, c) for n, c in found if not math.isnan(c.mean)]
+            colour = f"var(--s{index % 5})"
+            known = [(n, c) for n, c in found if not math.isnan(c.low)]
+            if known:
+                edge = [place(n, c.high) for n, c in known] + [place(n, c.low) for n, c in reversed(known)]
+                parts.append(f'<polygon points="{" ".join(edge)}" fill="{colour}" opacity=".16"/>')
+            line = " ".join(place(n, c.mean) for n, c in found)
+            parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
+            for n, c in found:
+                at, down = place(n, c.mean).split(",")
+                tip = escape(f"{detector}, {title_of(shift)} {n}: {c.text} {c.interval}")
+                parts.append(f'<circle cx="{at}" cy="{down}" r="3" fill="{colour}"><title>{tip}</title></circle>')
+    rows = -(-len(run.shifts) // columns)
+    return (
+        f'<svg viewBox="0 0 {36 + columns * (wide + gap)} {rows * (high + 46) + 12}" role="img" '
+        f'aria-label="{metric} over severity">{"".join(parts)}</svg>'
+    )
+
+
+def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
+    """Headline numbers of each detector."""
+    found = []
+    for number, detector in enumerate(run.detectors):
+        clean = run.record(detector, "", "0")
+        scores = {s: [summary_cell(run, detector, s, "NDS").mean / 100] for s in run.shifts}
+        parts = {s: v for s, v in scores.items() if not math.isnan(v[0])}
+        base = cell_of(clean, "NDS").mean / 100
+        rates = resilience_rate(parts, base) if parts and base > 0 else {}
+        worst = min(rates, key=lambda s: rates[s], default="")
+        found.append(
+            {"name": detector, "mAP": cell_of(clean, "mAP"), "NDS": cell_of(clean, "NDS"),
+             "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
+             "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
+             "weights": run.header.get("weights", {}).get(detector, "")}
+        )  # fmt: skip
+    return found
+
+
+def write_detection_report(folder: Path, header: Mapping[str, Any]) -> Path:
+    """DIR/report.html and DIR/tables of a detection run. StoreError."""
+    run = load_detection_run(folder, header)
+    robust = robustness_table(run)
+    main, severities, cars, classes = main_table(run), severity_table(run), car_table(run), class_table(run)
+    write_tables(folder, [t for t in (main, robust, severities, cars, classes) if t is not None])
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("ssad.report"), autoescape=True, undefined=jinja2.StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    some = next(iter(run.records.values()))
+    page = environment.get_template("detection.html").render(
+        run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, severities=severities,
+        cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
+        plot_map=curves(run, "mAP"),
+        command=_command(run.suite), versions=header.get("versions", {}), pictures=_pictures(folder),
+        samples=some.get("n", 0), scenes=some.get("scenes", 0),
+        failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
+    )  # fmt: skip
+    path = folder / "report.html"
+    safeio.write_atomic(path, page)
+    return path
+
+
+def _skipped(run: DetectionRun) -> list[str]:
+    """Where a shift could not be applied as it should."""
+    found = []
+    for (detector, shift, severity), record in run.records.items():
+        if detector != run.detectors[0] or record["status"] != "ok":
+            continue
+        parts = [f"{k} {v}" for k, v in record.get("applied", {}).items() if k != "applied"]
+        if parts:
+            found.append(f"{title_of(shift)}, severity {severity}: {'; '.join(parts)}")
+    return found
+
+
+def _pictures(folder: Path) -> list[dict[str, str]]:
+    """Pictures with captions as data: URIs."""
+    place = folder / "pictures"
+    if not (place / "pictures.json").is_file():
+        return []
+    found = []
+    for file, caption in safeio.read_json(place / "pictures.json").items():
+        path = place / Path(str(file)).name
+        if path.is_file():
+            data = base64.b64encode(safeio.read_bytes(path)).decode()
+            found.append({"data": f"data:image/jpeg;base64,{data}", "caption": str(caption)})
+    return found
+
+
+def _command(suite: Mapping[str, Any]) -> str:
+    """The command that runs the same suite again."""
+    from ssad.report.html import command_of
+
+    return shlex.join(command_of(dict(suite)))

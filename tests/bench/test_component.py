@@ -1,0 +1,262 @@
+"""Suites of kind `detection`: what runs, what is kept, what the report says, and what ends in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from ssad.bench.component.run import plan_detection, run_detection
+from ssad.bench.component.suite import SHIFTS, DetectionSuite
+from ssad.bench.component.work import read_unit
+from ssad.bench.record import Recording, record_nuscenes
+from ssad.bench.suite import load_suite
+from ssad.cli import app
+from ssad.errors import ConfigError, FormatError, SSADError
+from ssad.metrics.detection import score_detections
+from ssad.report import write_report
+from ssad.report.detection import load_detection_run, main_table, robustness_table
+from ssad.report.load import load_header
+from ssad.report.paper import SHIFTS as PUBLISHED
+from ssad.scenarios.static.shifts import SHIFTS as KNOWN
+from ssad.scenarios.static.shifts import ShiftSpec, random_severity
+
+ORACLE = "helpers.oracle3d:build"
+TOWNS = ["Larkhill", "Oldmarket"]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("component") / "data"
+    return record_nuscenes(
+        Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3), workers=1
+    )
+
+
+@pytest.fixture(autouse=True)
+def known(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ORACLE_DATA", str(root))
+
+
+def suite_of(root: Path, **changes: Any) -> DetectionSuite:
+    base: dict[str, Any] = {
+        "kind": "detection", "name": "t", "detectors": [ORACLE], "data": str(root), "reference": "shifts",
+        "shifts": ["gaussian", "fog"], "severities": [1, 3, 5, "random"], "replicates": 20,
+    }  # fmt: skip
+    return DetectionSuite.model_validate(base | changes)
+
+
+@pytest.fixture(scope="module")
+def folder(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("component") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ORACLE_DATA", str(root))
+        run_detection(plan_detection(suite_of(root)), out, workers=1)
+        write_report(out)
+    return out
+
+
+def lines(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+
+
+def test_scores_fall_with_what_the_detector_sees(folder: Path) -> None:
+    found = {(r["shift"], r["severity"]): r["metrics"] for r in lines(folder)}
+    assert len(found) == 1 + 2 * 4
+    clean = found[None, 0]
+    assert clean["mAP"] > 0.3
+    assert clean["AP_car"] > 0.6
+    noise = [found["gaussian", s]["mAP"] for s in (1, 3, 5)]
+    assert clean["mAP"] >= noise[0] >= noise[1] >= noise[2]
+    assert noise[2] < 0.8 * clean["mAP"]
+
+
+def test_random_is_put_together_from_the_severities(folder: Path, root: Path) -> None:
+    """In the physical calibration each scene draws one: its boxes are those of that severity."""
+    assert not (folder / "detections" / "fog-random").exists()
+    record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
+    drawn = {Path(p).name for p in record["artefacts"]["detections"]}
+    tokens = [s["token"] for s in json.loads((root / "v1.0-ssad" / "scene.json").read_text())]
+    assert drawn == {f"fog-{random_severity(ShiftSpec('fog'), token, '')}" for token in tokens}
+
+
+def test_intervals_hold_the_value_and_replicates_are_paired(folder: Path) -> None:
+    for record in lines(folder):
+        low, high = record["intervals"]["NDS"]
+        assert low <= high
+        assert len(record["replicates"]["NDS"]) == 20
+    # two scenes: a replicate is one of three mixtures, the same one in every cell
+    pattern = {tuple(np.unique(r["replicates"]["mAP"], return_inverse=True)[1]) for r in lines(folder)[:1]}
+    assert len(pattern) == 1
+    assert {len(set(r["replicates"]["mAP"])) for r in lines(folder)} <= {1, 2, 3}
+
+
+def test_a_stopped_run_goes_on_to_the_same_records(folder: Path, root: Path, tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    shutil.copytree(folder, again)
+    (again / "results.jsonl").write_text("".join((folder / "results.jsonl").read_text().splitlines(True)[:3]) + '{"k')
+    shutil.rmtree(again / "detections" / "fog-3")
+    run_detection(plan_detection(suite_of(root)), again, workers=1)
+
+    def plain(record: dict[str, Any]) -> dict[str, Any]:
+        return {k: v for k, v in record.items() if k != "wall_s"}
+
+    assert sorted(map(str, map(plain, lines(again)))) == sorted(map(str, map(plain, lines(folder))))
+
+
+def test_the_tables_say_what_the_records_say(folder: Path) -> None:
+    run = load_detection_run(folder, load_header(folder))
+    rows = {(row.head, row.published): row for row in main_table(run).rows}
+    drawn = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
+    ours = rows[("Environment", "fog"), False].cells
+    assert ours[0].mean == pytest.approx(100 * drawn["metrics"]["mAP"])
+    assert ours[1].low == pytest.approx(100 * drawn["intervals"]["NDS"][0])
+    table = robustness_table(run)
+    assert table is not None
+    cells = dict(zip(table.columns, table.rows[0].cells, strict=True))
+    assert cells["mCE (NDS)"].mean == pytest.approx(100.0), "the baseline against itself"
+    found = {(r["shift"], r["severity"]): r["metrics"]["NDS"] for r in lines(folder)}
+    left = np.mean([np.mean([found[s, k] for k in (1, 3, 5)]) for s in ("gaussian", "fog")]) / found[None, 0]
+    assert cells["mRR (NDS)"].mean == pytest.approx(100 * float(left))
+    with open(folder / "tables" / "shifts.csv", encoding="utf-8") as file:
+        read = list(csv.DictReader(file))
+    assert {row["shift"] for row in read} == {"clean", "gaussian noise", "fog"}
+    page = (folder / "report.html").read_text()
+    assert f"<b>{ours[0].text}</b>" in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: Path) -> None:
+    """For a detector whose name begins as the paper's do; where nothing was drawn the mean over severities is told."""
+    copy = tmp_path / "run"
+    shutil.copytree(folder, copy)
+    header = json.loads((copy / "run.json").read_text().replace(ORACLE, "fcos3d-light"))
+    header["suite"]["severities"] = [1, 3, 5]
+    (copy / "run.json").write_text(json.dumps(header))
+    kept = [line for line in (copy / "results.jsonl").read_text().splitlines(True) if '"severity":"random"' not in line]
+    assert len(kept) == len(lines(folder)) - 2
+    (copy / "results.jsonl").write_text("".join(kept).replace(ORACLE, "fcos3d-light"))
+    table = main_table(load_detection_run(copy, load_header(copy)))
+    told = {row.head[1]: row for row in table.rows if row.published}
+    assert told["gaussian noise"].cells[0].mean == PUBLISHED["gaussian"]["FCOS3D"][0]
+    found = [r["metrics"]["mAP"] for r in lines(copy) if r["shift"] == "fog"]
+    ours = next(row for row in table.rows if row.head[1] == "fog" and not row.published)
+    assert len(found) == 3
+    assert ours.cells[0].mean == pytest.approx(100 * float(np.mean(found)))
+
+
+def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None:
+    from ssad.bench.detect import box_table
+    from ssad.datasets.nuscenes.truth import read_truth
+    from ssad.metrics.detection_boxes import filter_boxes
+
+    truth = read_truth(root, "v1.0-ssad")
+    found = [b for path in sorted((folder / "detections" / "gaussian-3").iterdir()) for b in read_unit(path, ORACLE)[0]]
+    scores = score_detections(
+        filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
+        filter_boxes(box_table(found, truth), racks=truth.racks), samples=len(truth.samples),
+    )  # fmt: skip
+    record = next(r for r in lines(folder) if (r["shift"], r["severity"]) == ("gaussian", 3))
+    assert record["metrics"]["NDS"] == pytest.approx(scores.nd_score, abs=1e-6)
+
+
+def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path) -> None:
+    """The clean data need it as well; a shift that needs nothing of that scene would go on."""
+    broken = tmp_path / "data"
+    shutil.copytree(root, broken)
+    shutil.rmtree(broken / ".parts", ignore_errors=True)
+    victim = next((broken / "samples" / "CAM_FRONT").iterdir())
+    victim.unlink()
+    todo = suite_of(broken, shifts=["gaussian"], severities=[3])
+    records = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    assert {r["status"] for r in records} == {"failed"}
+    assert all(victim.name in r["reason"] for r in records)
+    page = write_report(tmp_path / "run").read_text()
+    assert "Failed cells" in page
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "no such data": ({"data": "/nowhere"}, "is no folder"),
+    "no such split": ({"split": "evening"}, "unknown split 'evening'"),
+    "unknown shift": ({"shifts": ["hail"]}, "hail"),
+    "a shift twice": ({"shifts": ["fog", "fog"]}, "twice"),
+    "no weights are shipped": ({"detectors": ["fcos3d"]}, "fcos3d=FILE"),
+    "unknown detector": ({"detectors": ["fcos3d-lite"]}, "fcos3d-light"),
+    "a 2D detector": ({"detectors": ["yolov5n=random"]}, "2D"),
+    "weights that are not there": ({"detectors": ["fcos3d-light=/nowhere.pth"]}, "nowhere.pth"),
+    "the same detector twice": ({"detectors": [ORACLE, ORACLE]}, "twice"),
+    "a split of recorded data": ({"data": "recorded", "split": "mini_val"}, "mini_val"),
+    "a split without scenes": ({"split": "mini_val"}, "none of its 2 scenes"),
+    "an unknown town": ({"data": "recorded", "recorded": {"towns": ["Atlantis"]}}, "Atlantis"),
+}
+
+
+@pytest.mark.parametrize("case", BAD.values(), ids=BAD.keys())
+def test_bad_suites_end_in_one_line(root: Path, case: tuple[dict[str, Any], str]) -> None:
+    changes, words = case
+    with pytest.raises(SSADError, match=words) as caught:
+        plan_detection(suite_of(root, **changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_broken_file_of_boxes_is_named(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "boxes.npz"
+    path.write_bytes(next((folder / "detections" / "clean").iterdir()).read_bytes()[:200])
+    with pytest.raises(FormatError, match=r"boxes\.npz: broken"):
+        read_unit(path, ORACLE)
+
+
+def test_the_shipped_suites_load_and_take_settings() -> None:
+    full = load_suite("shifts")
+    assert isinstance(full, DetectionSuite)
+    assert sorted(full.shifts) == sorted(SHIFTS) == sorted(KNOWN)
+    assert full.severities == [1, 2, 3, 4, 5, "random"]
+    changed = load_suite("shifts", ["recorded.scenes=3", "severities=2", "shifts=fog"])
+    assert isinstance(changed, DetectionSuite)
+    assert changed.recorded.scenes == 3
+    assert (changed.severities, changed.shifts) == ([2], ["fog"])
+    for setting, words in (
+        ("severities=[6]", "severities"), ("systems=[blind]", "systems"), ("recorded.scenes=0", "scenes"),
+        ("recorded.town=[x]", "town"), ("split.x=1", "split"),
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match=words):
+            load_suite("shifts", [setting])
+
+
+def test_a_suite_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.yaml"
+    path.write_text("name: x\nkind: flying\n")
+    with pytest.raises(ConfigError, match=r"s\.yaml:2.*flying.*driving, detection"):
+        load_suite(str(path))
+
+
+def test_through_the_command(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    words = ["run", "shifts", "--out", str(out), "--device", "cpu", "--workers", "1"]
+    for setting in (f"data={root}", f"detectors={ORACLE}", "shifts=[impulse]", "severities=[2]", "replicates=5"):
+        words += ["--set", setting]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert "impulse" in done.output
+    assert (out / "pictures" / "detections.jpg").is_file()
+    assert (out / "report.html").is_file()
+
+
+def test_the_papers_table_is_the_papers() -> None:
+    source = sorted(Path(__file__).resolve().parents[3].glob("shared/paper/*.txt"))
+    if not source:
+        pytest.skip("the paper's source is not here")
+    text = source[0].read_text(errors="replace").replace(" ", "")
+    names = {"": "Clean}", "uniform": "UniformNoise", "gaussian": "GaussianNoise", "impulse": "ImpulseNoise"}
+    for shift, values in PUBLISHED.items():
+        name = names.get(shift, shift.replace("_", " ").title().replace(" ", ""))
+        row = "&".join(f"{v:g}" for pair in values.values() for v in pair)
+        shown = [line for line in text.splitlines() if f"{name}&" in line and line.count("&") >= 4]
+        numbers = ["&".join(f"{float(v):g}" for v in line.rstrip("\\").split("&")[-4:]) for line in shown]
+        assert row in numbers, shift
