@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from ssad.detections import ATTRIBUTES, CLASSES_3D, Assignment, Truth
 from ssad.detectors.mono3d.config import Mono3DConfig
@@ -21,55 +23,84 @@ def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: T
     extra: reg [B, P, 13]: offset (place minus projected centre, in strides), depth, size, local yaw, velocity (NaN
     where unknown), 2D distances in strides; attribute [B, P]; centreness [B, P]. ConfigError: truth without 3D boxes.
     """
-    rows = []
     for k, one in enumerate(truth):
         if one.solid is None:
             raise ConfigError(f"{config.name}: the truth of image {k} has no 3D boxes")
         if one.label.device.type == "cpu" and bool(((one.label < 0) | (one.label >= len(CLASSES_3D))).any()):
             raise ConfigError(f"{config.name}: a label of image {k} is none of the ten classes")
-        rows.append(_one(config, places, one, lens[k], scale))
-    label, owner, reg, attribute, centreness = (torch.stack(column) for column in zip(*rows, strict=True))
-    return Assignment(label, owner, tuple(truth), {"reg": reg, "attribute": attribute, "centreness": centreness})
-
-
-def _one(
-    config: Mono3DConfig, places: Places, truth: Truth, lens: Tensor, scale: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Label, owner, regression, attribute, centreness of every place of one image."""
     count = len(places.stride)
     device, dtype = places.xy.device, places.xy.dtype
-    label = torch.full((count,), -1, dtype=torch.int64, device=device)
-    owner = label.clone()
-    reg = torch.zeros((count, 13), dtype=dtype, device=device)
-    attribute = torch.full((count,), len(ATTRIBUTES) - 1, dtype=torch.int64, device=device)
-    centreness = torch.zeros(count, dtype=dtype, device=device)
-    solid = truth.solid
-    if solid is None or not len(truth.label):
-        return label, owner, reg, attribute, centreness
-    centre = project(solid.centre.to(dtype), lens)  # [Q, 2] in the network's input
-    box = truth.box.to(dtype) * scale.repeat(2)
-    away = places.xy[:, None] - centre
-    sides = torch.cat([places.xy[:, None] - box[:, :2], box[:, 2:] - places.xy[:, None]], -1)
+    if not any(len(one.label) for one in truth):
+        none = torch.full((len(truth), count), -1, dtype=torch.int64, device=device)
+        reg = torch.zeros((len(truth), count, 13), dtype=dtype, device=device)
+        extra = {"reg": reg, "attribute": torch.full_like(none, len(ATTRIBUTES) - 1), "centreness": reg[..., 0].clone()}
+        return Assignment(none, none.clone(), tuple(truth), extra)
+    label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale)
+    return Assignment(label, owner, tuple(truth), extra)
+
+
+class _Padded(NamedTuple):
+    """Objects of B images side by side, Q of each; real [B, Q]: those that are there and are no crowd."""
+
+    real: Tensor
+    label: Tensor
+    box: Tensor
+    centre: Tensor
+    size: Tensor
+    yaw: Tensor
+    velocity: Tensor
+    attribute: Tensor
+
+
+def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _Padded:
+    solids = [one.solid for one in truth if one.solid is not None]
+
+    def side_by_side(values: Sequence[Tensor]) -> Tensor:
+        one = pad_sequence(list(values), batch_first=True).to(device)
+        return one.to(dtype) if one.is_floating_point() else one
+
+    real = [torch.ones_like(one.label, dtype=torch.bool) if one.crowd is None else ~one.crowd for one in truth]
+    return _Padded(
+        side_by_side(real), side_by_side([one.label for one in truth]), side_by_side([one.box for one in truth]),
+        side_by_side([s.centre for s in solids]), side_by_side([s.size for s in solids]),
+        side_by_side([s.yaw for s in solids]), side_by_side([s.velocity for s in solids]),
+        side_by_side([s.attribute for s in solids]),
+    )  # fmt: skip
+
+
+def _all(
+    config: Mono3DConfig, places: Places, objects: _Padded, lens: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """Label and owner [B, P] of every place, and what it should say."""
+    centre = project(objects.centre, lens[:, None])  # [B, Q, 2] in the network's input
+    box = objects.box * scale.to(objects.box).repeat(2)
+    away = places.xy[:, None] - centre[:, None]  # [B, P, Q, 2]
+    xy = places.xy[:, None]
+    sides = torch.cat([xy - box[:, None, :, :2], box[:, None, :, 2:] - xy], -1)
     limit = places.xy.new_tensor([-1.0, *config.ranges])
     widest = sides.amax(-1)
     fits = (widest >= limit[places.level][:, None]) & (widest <= limit[places.level + 1][:, None])
-    inside = (away.abs() < config.radius * places.stride[:, None, None]).all(-1)
-    if truth.crowd is not None:
-        inside &= ~truth.crowd
-    distance = torch.where(inside & fits, away.norm(dim=-1), FAR)
-    least, nearest = distance.min(1)
+    fits &= (away.abs() < config.radius * places.stride[:, None, None]).all(-1) & objects.real[:, None]
+    least, nearest = torch.where(fits, away.norm(dim=-1), FAR).min(2)
     found = least < FAR
-    owner = torch.where(found, nearest, owner)
-    label = torch.where(found, truth.label[nearest], label)
+
+    def of(values: Tensor) -> Tensor:
+        """Those of the nearest object, [B, P, ...]."""
+        index = nearest.reshape(*nearest.shape, *(1,) * (values.ndim - 2)).expand(-1, -1, *values.shape[2:])
+        return values.gather(1, index)
+
+    picked = places.xy - of(centre)
     stride = places.stride[:, None]
-    picked = away[torch.arange(count, device=device), nearest]
-    local = solid.yaw.to(dtype) - torch.atan2(solid.centre[:, 0], solid.centre[:, 2]).to(dtype)
+    near = of(box)
+    local = objects.yaw - torch.atan2(objects.centre[..., 0], objects.centre[..., 2])
     reg = torch.cat(
-        [picked / stride, solid.centre[nearest, 2:].to(dtype), solid.size[nearest].to(dtype), local[nearest, None],
-         solid.velocity[nearest].to(dtype), sides[torch.arange(count, device=device), nearest] / stride], 1,
+        [picked / stride, of(objects.centre)[..., 2:], of(objects.size), of(local)[..., None], of(objects.velocity),
+         torch.cat([places.xy - near[..., :2], near[..., 2:] - places.xy], -1) / stride], -1,
     )  # fmt: skip
-    reg = torch.where(found[:, None], reg, torch.zeros_like(reg))
-    attribute = torch.where(found, solid.attribute[nearest], attribute)
     relative = picked.norm(dim=-1) / (1.414 * config.radius * places.stride)
-    centreness = torch.where(found, torch.exp(-2.5 * relative), centreness)
-    return label, owner, reg, attribute, centreness
+    extra = {
+        "reg": torch.where(found[..., None], reg, torch.zeros_like(reg)),
+        "attribute": torch.where(found, of(objects.attribute), len(ATTRIBUTES) - 1),
+        "centreness": torch.where(found, torch.exp(-2.5 * relative), torch.zeros_like(relative)),
+    }
+    return torch.where(found, of(objects.label), -1), torch.where(found, nearest, -1), extra

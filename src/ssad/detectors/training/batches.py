@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -95,18 +94,6 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
     ]
 
 
-def take(truth: Truth, rows: Tensor) -> Truth:
-    """Some of the objects."""
-
-    def pick(value: Any) -> Any:
-        return None if value is None else value[rows]
-
-    solid = truth.solid
-    if solid is not None:
-        solid = Solids(**{f.name: pick(getattr(solid, f.name)) for f in fields(Solids)})
-    return replace(truth, label=pick(truth.label), box=pick(truth.box), crowd=pick(truth.crowd), solid=solid)
-
-
 @dataclass(frozen=True, slots=True)
 class Change:
     """What happens to one picture: mirrored, then scaled by `zoom` and moved by `shift` (x, y) pixels."""
@@ -124,39 +111,84 @@ def draw_change(recipe: Recipe, size: tuple[int, int], rng: np.random.Generator)
 
 
 def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
-    """Truth of a changed picture. Objects go whose visible share falls under `keep` (2D) or whose middle leaves the
-    picture (3D); those that go in 2D become crowd while a part of them is in sight."""
+    """Truth of a changed picture; see `change_truths`."""
+    return change_truths([truth], [change], size, keep=keep)[0]
+
+
+def change_truths(
+    truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
+) -> list[Truth]:
+    """Truth of changed pictures of one size, all with or all without 3D boxes. Objects go whose visible share falls
+    under `keep` (2D) or whose middle leaves the picture (3D); those that go in 2D become crowd while a part of them is
+    in sight."""
     height, width = size
-    box, solid, lens = truth.box, truth.solid, truth.intrinsic
-    if change.mirror:
-        box = torch.stack([width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]], -1)
-        if solid is not None:
-            side = solid.centre.new_tensor([-1.0, 1.0, 1.0])
-            solid = replace(
-                solid, centre=solid.centre * side, yaw=torch.pi - solid.yaw, velocity=solid.velocity * side[[0, 2]]
-            )
-        if lens is not None:
-            lens = lens.clone()
-            lens[0, 2] = width - 1 - lens[0, 2]
-    move_by = box.new_tensor([*change.shift, *change.shift])
-    box = box * change.zoom + move_by
-    if lens is not None:
-        lens = lens.clone()
-        lens[:2, :2] *= change.zoom
-        for axis in (0, 1):
-            lens[axis, 2] = change.zoom * (lens[axis, 2] + 0.5) + change.shift[axis] - 0.5
+    counts = torch.tensor([len(t.label) for t in truths])
+    image = torch.repeat_interleave(torch.arange(len(truths)), counts)
+    mirror = torch.tensor([c.mirror for c in changes])
+    zoom = torch.tensor([c.zoom for c in changes], dtype=torch.float64)
+    shift = torch.tensor([c.shift for c in changes], dtype=torch.float64)
+    box = torch.cat([t.box for t in truths])
+    turned = torch.stack([width - box[:, 2], box[:, 1], width - box[:, 0], box[:, 3]], -1)
+    box = torch.where(mirror[image][:, None], turned, box) * zoom.to(box)[image][:, None]
+    box = box + shift.to(box).repeat(1, 2)[image]
     limit = box.new_tensor([width, height, width, height])
     cut = box.clamp_min(0.0).minimum(limit)
     area = (box[:, 2:] - box[:, :2]).prod(-1).clamp_min(1e-6)
     share = (cut[:, 2:] - cut[:, :2]).prod(-1) / area
-    changed = replace(truth, box=cut, solid=solid, intrinsic=lens)
+    lens = _changed_lens([t.intrinsic for t in truths], mirror, zoom, shift, width)
+    solid = None if truths[0].solid is None or lens is None else _mirrored([t.solid for t in truths], mirror[image])
+    crowd = torch.cat([torch.zeros(len(t.box), dtype=torch.bool) if t.crowd is None else t.crowd for t in truths])
     if solid is not None and lens is not None:
-        flat = solid.centre @ lens.T
+        flat = (lens[image] @ solid.centre[..., None])[..., 0]
         middle = flat[:, :2] / flat[:, 2:].clamp_min(1e-3)
-        inside = (middle >= 0).all(-1) & (middle[:, 0] < width) & (middle[:, 1] < height)
-        return take(changed, inside & (solid.centre[:, 2] > 0) & (share > 0))
-    crowd = torch.zeros(len(box), dtype=torch.bool) if truth.crowd is None else truth.crowd
-    return take(replace(changed, crowd=crowd | (share < keep)), share > 0.02)
+        stays = (middle >= 0).all(-1) & (middle[:, 0] < width) & (middle[:, 1] < height)
+        stays &= (solid.centre[:, 2] > 0) & (share > 0)
+    else:
+        crowd |= share < keep
+        stays = share > 0.02
+    ends = torch.bincount(image[stays], minlength=len(truths)).tolist()
+
+    def parts(values: Tensor) -> tuple[Tensor, ...]:
+        return torch.split(values[stays], ends)
+
+    labels, boxes, crowds = parts(torch.cat([t.label for t in truths])), parts(cut), parts(crowd)
+    solids: list[Solids | None] = [None] * len(truths)
+    if solid is not None:
+        columns = {f.name: parts(getattr(solid, f.name)) for f in fields(Solids)}
+        solids = [Solids(**{name: values[k] for name, values in columns.items()}) for k in range(len(truths))]
+    return [
+        Truth(
+            labels[k], boxes[k], solids[k], None if lens is None else lens[k],
+            crowd=None if solid is not None and truths[k].crowd is None else crowds[k],
+        )
+        for k in range(len(truths))
+    ]  # fmt: skip
+
+
+def _changed_lens(
+    lenses: Sequence[Tensor | None], mirror: Tensor, zoom: Tensor, shift: Tensor, width: int
+) -> Tensor | None:
+    """Intrinsics [B, 3, 3] of the changed pictures; None where there are none."""
+    given = [k for k in lenses if k is not None]
+    if len(given) < len(lenses):
+        return None
+    lens = torch.stack(given)
+    lens[:, 0, 2] = torch.where(mirror, width - 1 - lens[:, 0, 2], lens[:, 0, 2])
+    lens[:, :2, :2] *= zoom.to(lens)[:, None, None]
+    lens[:, :2, 2] = zoom.to(lens)[:, None] * (lens[:, :2, 2] + 0.5) + shift.to(lens) - 0.5
+    return lens
+
+
+def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
+    """All solids in one, those of mirrored pictures mirrored."""
+    given = [s for s in solids if s is not None]
+    columns = {f.name: torch.cat([getattr(s, f.name) for s in given]) for f in fields(Solids)}
+    side = torch.where(mirror, -1.0, 1.0).to(columns["centre"])[:, None]
+    one = torch.ones_like(side)
+    columns["centre"] = columns["centre"] * torch.cat([side, one, one], 1)
+    columns["velocity"] = columns["velocity"] * torch.cat([side, one], 1)
+    columns["yaw"] = torch.where(mirror, torch.pi - columns["yaw"], columns["yaw"])
+    return Solids(**columns)
 
 
 def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
@@ -210,7 +242,5 @@ def make_batch(
     pictures = bank.pictures[chosen].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
     size = (pictures.shape[2], pictures.shape[3])
     changes = [draw_change(recipe, size, rng) for _ in indices]
-    truths = [
-        change_truth(bank.truth[i], change, size, keep=recipe.keep) for i, change in zip(indices, changes, strict=True)
-    ]
+    truths = change_truths([bank.truth[i] for i in indices], changes, size, keep=recipe.keep)
     return change_colours(change_pictures(pictures, changes), recipe, draws), move(truths, device)
