@@ -110,6 +110,19 @@ def camera() -> list[str]:
     ]
 
 
+def recorder() -> list[str]:
+    """Samples of the recorder."""
+    cpu = read("record-cpu")
+    return [
+        "# Speed of the recorder",
+        "",
+        f"`benchmarks/record_speed.py`: six cameras of {cpu['width']} x {cpu['width'] * 9 // 16} and a LiDAR, dense",
+        f"traffic, files and tables included, {cpu['samples']} samples on {cpu['workers']} cores:",
+        f"{cpu['s_per_1000'] / 60:.0f} minutes for 1,000 samples.",
+        "",
+    ]
+
+
 def scores() -> list[str]:
     """Scoring beside the official toolkit."""
     data = read("score_speed")
@@ -143,7 +156,7 @@ def main() -> None:
     ]
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
-    lines += shifts() + scores() + camera()
+    lines += shifts() + scores() + camera() + recorder()
     (ROOT / "docs" / "benchmarks.md").write_text("\n".join(lines))
 
 
