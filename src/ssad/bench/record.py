@@ -10,7 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from ssad import safeio
-from ssad.bench.cast import Standing, make_cast
+from ssad.bench.cast import Cast, Standing, make_cast
 from ssad.bench.drives import make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.gallery import RIG, place, rig_camera
@@ -57,6 +57,8 @@ AHEAD: Final = {
     "CAM_BACK": 0.0104, "CAM_BACK_LEFT": 0.0005,
 }  # fmt: skip
 NOISE: Final = 0.012  # of the sensor
+FIRST: Final = 0.1  # s, when the first sweep ends
+GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,13 +173,52 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     samples: list[dict[str, Any]] = []
     files = _Files(folder, recording.quality)
     spacing = max(1, KEY // (recording.sweeps + 1))
-    # the first sweep ends when every camera has fired
-    first = 0.1
-    for step in range(min(int(recording.seconds / trace.dt), len(trace.x) - 2) + 1):
-        on_key = step % KEY == 0
-        if not on_key and (step % spacing or step % KEY > spacing * recording.sweeps):
-            continue
-        now = first + step * trace.dt
+    steps = [
+        step
+        for step in range(min(int(recording.seconds / trace.dt), len(trace.x) - 2) + 1)
+        if step % KEY == 0 or (step % spacing == 0 and step % KEY <= spacing * recording.sweeps)
+    ]
+    at_once = GPU_STEPS if recording.device != "cpu" else 1
+    for start in range(0, len(steps), at_once):
+        moments = [_Moment.of(step, cast, trace, cameras, weather, key) for step in steps[start : start + at_once]]
+        for moment, shares in _look(stage, moments, files, number, together=recording.device != "cpu"):
+            now = moment.now
+            ego = ego_at(trace, now)
+            around = cast.at(now, ego[:2, 3], 140.0)
+            points, _ = sweep(stage, HDL32E, ego, [s.thing for s in around], key=("lidar", *key, moment.step))
+            files.cloud(points, sweep=moment.step, moment=moment_of(number, now), on_key=moment.on_key, ego=ego)
+            if moment.on_key:
+                boxes = _annotate([s for s in around if s.body.kind], ego, points, shares)
+                samples.append({"time": moment_of(number, now), "sweep": moment.step, "boxes": boxes})
+    part = {
+        "name": name, "town": town, "drive": episode.key, "samples": samples, "frames": files.rows,
+        "weather": repr(weather), "sensors": _sensors(cameras),
+    }  # fmt: skip
+    safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    """What the cameras look at in one step; now: when the sweep ends, s; times and egos: of each view."""
+
+    step: int
+    now: float
+    views: list[View]
+    times: list[float]
+    egos: list[F64]
+
+    @property
+    def on_key(self) -> bool:
+        """Whether it is a key frame."""
+        return self.step % KEY == 0
+
+    @staticmethod
+    def of(  # noqa: PLR0917
+        step: int, cast: Cast, trace: EpisodeTrace, cameras: list[Camera], weather: Weather, key: tuple[object, ...]
+    ) -> _Moment:
+        """Each camera at its own time; the first sweep ends when every camera has fired."""
+        now = FIRST + step * trace.dt
         views, times, egos = [], [], []
         for c, camera in enumerate(cameras):
             fired = now - AHEAD[camera.channel]
@@ -185,33 +226,33 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
             things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], 140.0))
             noise = int(digest("noise", *key, step, c)[:7], 16)
             views.append(View(camera, ego @ camera.to_ego, things, weather, NOISE, noise))
-            times.append(moment_of(number, fired))
+            times.append(fired)
             egos.append(ego)
-        shares: dict[int, float] = {}
-        at_once = len(views) if recording.device != "cpu" else 1
-        for k in range(0, len(views), at_once):
-            picture = render(stage, views[k : k + at_once], linear=False)
-            for n in range(at_once):
-                if on_key:
-                    for tag, share in visible_share(stage, views[k + n], picture, n).items():
-                        shares[tag] = max(shares.get(tag, 0.0), share)
-                files.picture(
-                    cameras[k + n], picture.image[n], picture.depth[n], sweep=step, moment=times[k + n], on_key=on_key,
-                    ego=egos[k + n],
-                )  # fmt: skip
-        ego = ego_at(trace, now)
-        around = cast.at(now, ego[:2, 3], 140.0)
-        points, _ = sweep(stage, HDL32E, ego, [s.thing for s in around], key=("lidar", *key, step))
-        files.cloud(points, sweep=step, moment=moment_of(number, now), on_key=on_key, ego=ego)
-        if on_key:
-            boxes = _annotate([s for s in around if s.body.kind], ego, points, shares)
-            samples.append({"time": moment_of(number, now), "sweep": step, "boxes": boxes})
-    part = {
-        "name": name, "town": town, "drive": episode.key, "samples": samples, "frames": files.rows,
-        "weather": repr(weather), "sensors": _sensors(cameras),
-    }  # fmt: skip
-    safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
-    return name
+        return _Moment(step, now, views, times, egos)
+
+
+def _look(
+    stage: Stage, moments: Sequence[_Moment], files: _Files, number: int, *, together: bool
+) -> Iterator[tuple[_Moment, dict[int, float]]]:
+    """Renders and writes the pictures of some moments, all of them in one call or one by one; each moment with the
+    largest share of each thing that a camera sees (of key frames)."""
+    flat = [(moment, c) for moment in moments for c in range(len(moment.views))]
+    found: list[dict[int, float]] = [{} for _ in moments]
+    count = len(flat) if together else 1
+    for k in range(0, len(flat), count):
+        block = flat[k : k + count]
+        picture = render(stage, [moment.views[c] for moment, c in block], linear=False)
+        for n, (moment, c) in enumerate(block):
+            view = moment.views[c]
+            if moment.on_key:
+                shares = found[next(i for i, one in enumerate(moments) if one is moment)]
+                for tag, share in visible_share(stage, view, picture, n).items():
+                    shares[tag] = max(shares.get(tag, 0.0), share)
+            files.picture(
+                view.camera, picture.image[n], picture.depth[n], sweep=moment.step,
+                moment=moment_of(number, moment.times[c]), on_key=moment.on_key, ego=moment.egos[c],
+            )  # fmt: skip
+    yield from zip(moments, found, strict=True)
 
 
 def moment_of(number: int, time: float) -> int:

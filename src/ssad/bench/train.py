@@ -158,11 +158,32 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     metrics = validate(final, quick=False)
     say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
     card = Card(
-        data=", ".join(folder.name for folder in plan.data), command=command_of(plan), seed=recipe.seed,
+        data="; ".join(map(describe_data, plan.data)), command=command_of(plan), seed=recipe.seed,
         metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"detector": recipe.detector},
     )  # fmt: skip
     save_weights(plan.out / f"{recipe.detector}.safetensors", final.state_dict(), card=card, half=True)
     draw_curves(plan.out)
+
+
+def describe_data(folder: Path) -> str:
+    """The command that records a folder anew, for data that SSAD recorded; else the folder's name."""
+    clips = folder / "annotations" / "all.json"
+    if clips.is_file():
+        about = safeio.read_json(clips, limit=1 << 30).get("info", {}).get("recording", {})
+        if "clips" not in about:
+            return folder.name
+        towns, counts = zip(*about["images"], strict=True)
+        words = ["--clips", about["clips"], "--towns", ",".join(towns), "--images", ",".join(map(str, counts))]
+        words += ["--style", about["style"]] if about.get("style") else []
+    elif (folder / ".parts" / "recording.json").is_file():
+        about = safeio.read_json(folder / ".parts" / "recording.json")
+        words = ["--towns", ",".join(about["towns"]), "--scenes", str(about["scenes"])]
+        words += ["--seconds", f"{about['seconds']:g}", "--width", str(about["width"])]
+    else:
+        return folder.name
+    held = ",".join(about["held_out"])
+    words += ["--held-out", held or '""', *(["--seed", str(about["seed"])] if about["seed"] else [])]
+    return " ".join(["ssad record", folder.name, *words])
 
 
 def command_of(plan: Plan) -> str:

@@ -1,0 +1,81 @@
+"""The shipped weights: they are those of their cards, and find a car in a town that they never saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.bench.clips import Clips, record_clips
+from ssad.bench.coco import CocoSet, read_coco
+from ssad.bench.detect import score_2d
+from ssad.bench.train import coco_items, coco_truth
+from ssad.datasets.nuscenes.files import read_image
+from ssad.detectors import SHIPPED, make_detector
+from ssad.detectors.checkpoints import read_card
+from ssad.detectors.training.batches import Bank, fill
+from ssad.errors import FormatError
+
+NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
+TWO = [name for name in NAMES if name.startswith("yolo")]
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> tuple[CocoSet, Bank]:
+    """Eight pictures from 20 m behind, in a held-out town and with a seed that no training had."""
+    out = tmp_path_factory.mktemp("shipped") / "clips"
+    record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=1)
+    data = read_coco(out / "annotations" / "test.json")
+    bank = fill(coco_items(out, "test")[1], threads=1)
+    return data, Bank(bank.pictures, tuple(coco_truth(data, target=True)))
+
+
+def test_some_are_shipped() -> None:
+    assert {"yolov3-tiny", "yolov5n"} <= set(NAMES)
+    assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 60 << 20
+    assert all(path.stat().st_size < 15 << 20 for path in SHIPPED.iterdir())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cards_say_where_they_are_from(name: str) -> None:
+    card = read_card(SHIPPED / f"{name}.safetensors")
+    assert card.command.startswith(f"ssad train detector {name} --data")
+    assert "ssad record" in card.data
+    assert card.metrics
+    make_detector(name)  # checks the hash
+
+
+@pytest.mark.parametrize("name", TWO)
+def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, Bank]) -> None:
+    data, bank = clips
+    detector = make_detector(name)
+    assert detector.classes == data.classes
+    assert score_2d(detector, bank)["AP50_car"] > 0.7  # eight pictures: each is an eighth
+    fresh = make_detector(name, weights="random", classes=data.classes)
+    assert score_2d(fresh, bank)["AP50_car"] < 0.2
+
+
+def test_other_weights_under_a_shipped_card_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from safetensors.torch import load_file, save_file
+
+    import ssad.detectors as package
+
+    state = load_file(SHIPPED / "yolov5n.safetensors")
+    first = next(iter(state))
+    state[first] = state[first] + torch.ones_like(state[first])
+    save_file(state, tmp_path / "yolov5n.safetensors")
+    (tmp_path / "yolov5n.json").write_bytes((SHIPPED / "yolov5n.json").read_bytes())
+    monkeypatch.setattr(package, "SHIPPED", tmp_path)
+    with pytest.raises(FormatError, match="another hash"):
+        make_detector("yolov5n")
+
+
+def test_pictures_are_what_the_card_says_of_them(clips: tuple[CocoSet, Bank]) -> None:
+    data, bank = clips
+    assert len(bank) == 8
+    for image in data.images:
+        assert read_image(image.file).shape == (640, 640, 3)
+        assert int(image.target.sum()) == 1
+        assert np.isfinite(image.box).all()
