@@ -248,10 +248,10 @@ def test_through_the_command(root: Path, tmp_path: Path) -> None:
     assert (out / "report.html").is_file()
 
 
-def test_the_papers_table_is_the_papers() -> None:
-    source = sorted(Path(__file__).resolve().parents[3].glob("shared/paper/*.txt"))
+def test_the_papers_table_is_the_papers(data_dir: Path) -> None:
+    source = sorted((data_dir.parent / "paper").glob("*.txt"))
     if not source:
-        pytest.skip("the paper's source is not here")
+        pytest.skip("the paper's source is not beside the data folder")
     text = source[0].read_text(errors="replace").replace(" ", "")
     names = {"": "Clean}", "uniform": "UniformNoise", "gaussian": "GaussianNoise", "impulse": "ImpulseNoise"}
     for shift, values in PUBLISHED.items():
