@@ -123,6 +123,29 @@ def recorder() -> list[str]:
     ]
 
 
+def detectors() -> list[str]:
+    """Images a second of the detectors."""
+    cpu = read("detectors-cpu")
+    lines = [
+        "# Speed of the detectors",
+        "",
+        f"`benchmarks/detector_speed.py`: {cpu['device']} of a 2-core machine, {cpu['batch']} picture a call, float32,",
+        "medians, in turns with torchvision's FCOS (ResNet-50, 32.1 M parameters) on pictures of the same size, and with",
+        "ultralytics' models of like size. Attack: losses and their gradient to the picture. Images/s, and in brackets the",
+        "ratio to torchvision's FCOS in the same run.",
+        "",
+        "| detector | parameters | picture | forward | attack | training step |",
+        "|---|---:|---|---:|---:|---:|",
+    ]
+    for row in cpu["rows"]:
+        if row["detector"].startswith("torchvision"):
+            continue
+        cells = [f"{row['images_s'][k]:.1f} ({row['ratio'][k]:.1f})" for k in ("forward", "attack", "training")]
+        size = " x ".join(map(str, row["size"]))
+        lines.append(f"| {row['detector']} | {row['parameters'] / 1e6:.1f} M | {size} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
 def scores() -> list[str]:
     """Scoring beside the official toolkit."""
     data = read("score_speed")
@@ -156,7 +179,7 @@ def main() -> None:
     ]
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
-    lines += shifts() + scores() + camera() + recorder()
+    lines += shifts() + scores() + camera() + recorder() + detectors()
     (ROOT / "docs" / "benchmarks.md").write_text("\n".join(lines))
 
 
