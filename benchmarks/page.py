@@ -126,12 +126,14 @@ def recorder() -> list[str]:
 def detectors() -> list[str]:
     """Images a second of the detectors."""
     cpu = read("detectors-cpu")
+    beside = next(row for row in cpu["rows"] if row["detector"].startswith("torchvision"))
     lines = [
         "# Speed of the detectors",
         "",
         f"`benchmarks/detector_speed.py`: {cpu['device']} of a 2-core machine, {cpu['batch']} picture a call, float32,",
-        "medians, in turns with torchvision's FCOS (ResNet-50, 32.1 M parameters) on pictures of the same size, and with",
-        "ultralytics' models of like size. Attack: losses and their gradient to the picture. Images/s, and in brackets the",
+        f"medians, in turns with torchvision's FCOS (ResNet-50, {beside['parameters'] / 1e6:.1f} M parameters) on pictures",
+        "of the same size, and with ultralytics' models of like size. Attack: losses and their gradient to the picture.",
+        "Images/s, and in brackets the",
         "ratio to torchvision's FCOS in the same run.",
         "",
         "| detector | parameters | picture | forward | attack | training step |",
