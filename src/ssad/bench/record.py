@@ -7,12 +7,9 @@ at any moment and gone on with, and the bytes do not depend on the number of pro
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +22,7 @@ from ssad.bench.cast import Cast, Standing, make_cast
 from ssad.bench.drives import make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.gallery import RIG, place, rig_camera
+from ssad.bench.pool import spread
 from ssad.camera.labels import visibility_token, visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
@@ -367,26 +365,9 @@ def run_parts(
     """Records every part that is not there yet, in processes. StoreError: another recording, or a worker died."""
     safeio.make_folder(out / ".parts")
     _check_page(out, identity)
-    count = min(workers or os.cpu_count() or 1, len(tasks))
-    if count <= 1:
-        for done, task in enumerate(tasks, 1):
-            record(task)
-            if progress:
-                progress(done, len(tasks))
-        return
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(record, task) for task in tasks]
-        try:
-            for done, future in enumerate(as_completed(futures), 1):
-                future.result()
-                if progress:
-                    progress(done, len(tasks))
-        except BrokenProcessPool:
-            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
+    for done, _ in enumerate(spread(record, tasks, workers), 1):
+        if progress:
+            progress(done, len(tasks))
 
 
 def _merge(recording: Recording, names: list[str]) -> None:

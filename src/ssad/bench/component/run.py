@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rich.console import Console
 
@@ -18,13 +15,14 @@ from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
 from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, scenes_of, score_cell
+from ssad.bench.pool import spread
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.run import default_workers, versions
 from ssad.bench.store import Store
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
-from ssad.errors import ConfigError, StoreError
+from ssad.errors import ConfigError
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity
 from ssad.seeding import digest
 
@@ -32,9 +30,6 @@ from ssad.seeding import digest
 _CODE = ("detections.py", "detectors", "scenarios/static/shifts", "metrics", "datasets", "geometry.py", "frames.py")
 _WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
 GPU_WORKERS = 6  # processes that share a GPU: planning a shift and reading pictures is work for the host
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +166,7 @@ def run_detection(
         failed: dict[Unit, str] = {}
         began = time.monotonic()
         with Live(suite.name, len(units) + len(missing), 0, console=console) as live:
-            for unit, why in _spread(make_unit, [(job, unit) for unit in units], count):
+            for unit, why in spread(make_unit, [(job, unit) for unit in units], count):
                 if why:
                     failed[unit] = why
                 live.advance(not why)
@@ -185,7 +180,7 @@ def run_detection(
                     live.advance(False)
                 else:
                     ready.append((job, cell))
-            for cell, result in _spread(score_cell, ready, count):
+            for cell, result in spread(score_cell, ready, count):
                 store.append(_record(todo, cell, header, result, wall), None)
                 live.advance(True)
                 live.tick()
@@ -211,22 +206,3 @@ def _record(
         **{k: v for k, v in result.items() if k != "reason"}, "versions": header["versions"], "wall_s": round(wall, 3),
         "artefacts": {"detections": sorted({str(Path(u.path).parent) for u in cell.units})},
     }  # fmt: skip
-
-
-def _spread(function: Callable[[T], R], tasks: Sequence[T], workers: int) -> Iterator[R]:
-    """Results as they come, from processes. StoreError: one died."""
-    count = min(workers, len(tasks))
-    if count <= 1:
-        yield from map(function, tasks)
-        return
-    with ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn")) as pool:
-        futures = [pool.submit(function, task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool:
-            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise

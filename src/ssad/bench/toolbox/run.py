@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import re
 import shutil
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ssad import safeio
+from ssad.bench.pool import spread
 from ssad.bench.toolbox.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
 from ssad.bench.toolbox.plan import Options, Shard, Strength
 from ssad.bench.toolbox.work import UNFINISHED, check_folders, finished, link, make_shard
@@ -167,34 +163,7 @@ def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> I
     if ray is not None:
         yield from _on_ray(shards, ray)
         return
-    count = min(workers or os.cpu_count() or 1, len(shards))
-    if count == 1:
-        yield from map(make_shard, shards)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
-        futures = [pool.submit(make_shard, shard) for shard in shards]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool:
-            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
-
-
-def _end_with_parent() -> None:
-    """Ends this worker when the process that started it is gone, even by kill -9."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    yield from spread(make_shard, shards, workers)
 
 
 def _on_ray(shards: Sequence[Shard], address: str) -> Iterator[dict[str, int]]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchvision.ops import batched_nms
 
 from ssad.detections import Detections, Truth
@@ -65,16 +64,3 @@ def sums(value: Tensor, image: Tensor, images: int) -> Tensor:
     """Sums [B] of value [N] by image [N]; no atomic additions, hence the same bits in every run."""
     member = torch.arange(images, device=image.device)[:, None] == image
     return torch.where(member, value, torch.zeros_like(value)).sum(1)
-
-
-@contextmanager
-def evaluating(module: nn.Module) -> Iterator[None]:
-    """Every part in eval mode within the block, then each in the mode it had."""
-    training = [part for part in module.modules() if part.training]
-    for part in training:
-        part.training = False
-    try:
-        yield
-    finally:
-        for part in training:
-            part.training = True

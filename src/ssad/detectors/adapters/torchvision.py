@@ -20,11 +20,11 @@ from ssad.detectors.adapters.common import (
     check_images,
     check_threshold,
     check_truth,
-    evaluating,
     log_odds,
     sums,
     suppress,
 )
+from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets
 from ssad.errors import ConfigError
 

@@ -27,11 +27,11 @@ from ssad.detectors.adapters.common import (
     check_images,
     check_threshold,
     check_truth,
-    evaluating,
     log_odds,
     suppress,
 )
 from ssad.detectors.adapters.torchvision import full, scale_of
+from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets
 from ssad.errors import ConfigError
 

@@ -29,8 +29,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, evaluating, sums
+from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums
 from ssad.detectors.checkpoints import fit_state, load_weights
+from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import select

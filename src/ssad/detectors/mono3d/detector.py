@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.detections import CLASSES_3D, Assignment, Dense, Detections, Solids, Truth
+from ssad.detectors.modes import evaluating
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
     Flat,
@@ -95,7 +95,7 @@ class Mono3D(nn.Module):
         least = self.config.threshold if threshold is None else threshold
         if not 0 <= least < 1:
             raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
-        with _evaluating(self):
+        with evaluating(self):
             dense = self.dense(images, intrinsic)
         found = self.select(dense, least)
         return [_best_first(one) for one in found]
@@ -258,16 +258,3 @@ def _best_first(found: Detections) -> Detections:
 def _exact(like: Tensor) -> torch.autocast:
     """No mixed precision within the block: boxes and losses need all their digits."""
     return torch.autocast(like.device.type, enabled=False)
-
-
-@contextmanager
-def _evaluating(module: nn.Module) -> Iterator[None]:
-    """Every part in eval mode within the block, then each in the mode it had."""
-    training = [part for part in module.modules() if part.training]
-    for part in training:
-        part.training = False
-    try:
-        yield
-    finally:
-        for part in training:
-            part.training = True

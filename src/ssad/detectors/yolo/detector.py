@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import label_places, match_best, match_near, pad_truth
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import Grid, decode, flatten, make_grid, select
@@ -95,7 +95,7 @@ class Yolo(nn.Module):
         least = self.threshold if threshold is None else threshold
         if not 0 <= least < 1:
             raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
-        with _evaluating(self):
+        with evaluating(self):
             dense = self.dense(images)
         assert dense.quality is not None
         score = dense.logit.sigmoid() * dense.quality.sigmoid()[..., None]
@@ -181,16 +181,3 @@ class Yolo(nn.Module):
 
     def _grid_of(self, dense: Dense) -> Grid:
         return self._grid([(part.shape[2], part.shape[3]) for part in dense.maps["raw"]])
-
-
-@contextmanager
-def _evaluating(module: nn.Module) -> Iterator[None]:
-    """Every part in eval mode within the block, then each in the mode it had."""
-    training = [part for part in module.modules() if part.training]
-    for part in training:
-        part.training = False
-    try:
-        yield
-    finally:
-        for part in training:
-            part.training = True

@@ -1,0 +1,52 @@
+"""Work shared out over processes of this machine."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from typing import TypeVar
+
+from ssad.errors import StoreError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def spread(function: Callable[[T], R], tasks: Sequence[T], workers: int | None = None) -> Iterator[R]:
+    """Results as they come, in any order; workers: how many processes (default: one a core), one: this one.
+
+    An error ends it, and what has not begun is not begun. StoreError: a process died.
+    """
+    count = min(workers or os.cpu_count() or 1, len(tasks))
+    if count <= 1:
+        yield from map(function, tasks)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
+        futures = [pool.submit(function, task) for task in tasks]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool:
+            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+
+def _end_with_parent() -> None:
+    """Ends this worker when the process that started it is gone, even by kill -9."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
