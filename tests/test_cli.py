@@ -168,3 +168,22 @@ def test_run_report_and_replay(tmp_path: Path) -> None:
     assert {p.suffix for p in (folder / "replays").iterdir()} == {".mp4", ".npz"}
     assert all(p.stat().st_size > 1000 for p in (folder / "replays").iterdir())
     fails(ssad("replay", "runs/little", "blind/StraightObstacle/01", cwd=tmp_path), "closest: blind/Str")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--clips", "drive", "--scenes", "3"], "--scenes does not go with --clips"),
+        (["--clips", "orbit", "--width", "640"], "--width does not go with --clips"),
+        (["--images", "5"], "--images goes only with --clips"),
+    ],
+)
+def test_record_refuses_options_that_would_do_nothing(words: list[str], message: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "ssad.cli", "record", str(tmp_path / "x"), *words],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "x").exists()

@@ -225,6 +225,7 @@ def score(
 
 @app.command()
 def record(
+    context: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set.")],
     towns: Annotated[
         str, typer.Option(help="Towns with commas between them.")
@@ -253,6 +254,11 @@ def record(
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
+    idle = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "style")
+    for name in idle:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise ConfigError(f"--{name} {'does not go' if clips is not None else 'goes only'} with --clips")
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("record", total=None)
