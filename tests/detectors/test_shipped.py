@@ -72,7 +72,7 @@ def test_other_weights_under_a_shipped_card_are_refused(tmp_path: Path, monkeypa
         make_detector("yolov5n")
 
 
-def test_pictures_are_what_the_card_says_of_them(clips: tuple[CocoSet, Bank]) -> None:
+def test_each_picture_has_one_target(clips: tuple[CocoSet, Bank]) -> None:
     data, bank = clips
     assert len(bank) == 8
     for image in data.images:

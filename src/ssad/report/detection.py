@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import base64
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 from ssad import safeio
 from ssad.errors import ConfigError, StoreError
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.report.load import read_records
+from ssad.report.pages import command_of, template
 from ssad.report.paper import DETECTORS
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.report.tables import Cell, Row, Table, write_tables
@@ -299,16 +297,12 @@ def write_detection_report(folder: Path, header: Mapping[str, Any]) -> Path:
     robust = robustness_table(run)
     main, severities, cars, classes = main_table(run), severity_table(run), car_table(run), class_table(run)
     write_tables(folder, [t for t in (main, robust, severities, cars, classes) if t is not None])
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ssad.report"), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
     some = next(iter(run.records.values()))
-    page = environment.get_template("detection.html").render(
+    page = template("detection.html").render(
         run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, severities=severities,
         cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
         plot_map=curves(run, "mAP"),
-        command=_command(run.suite), versions=header.get("versions", {}), pictures=_pictures(folder),
+        command=command_of(dict(run.suite)), versions=header.get("versions", {}), pictures=_pictures(folder),
         samples=some.get("n", 0), scenes=some.get("scenes", 0),
         failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
     )  # fmt: skip
@@ -341,10 +335,3 @@ def _pictures(folder: Path) -> list[dict[str, str]]:
             data = base64.b64encode(safeio.read_bytes(path)).decode()
             found.append({"data": f"data:image/jpeg;base64,{data}", "caption": str(caption)})
     return found
-
-
-def _command(suite: Mapping[str, Any]) -> str:
-    """The command that runs the same suite again."""
-    from ssad.report.html import command_of
-
-    return shlex.join(command_of(dict(suite)))

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import base64
-import math
-import shlex
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jinja2
-
 from ssad import safeio
-from ssad.bench.suite import load_suite
 from ssad.errors import SSADError
 from ssad.metrics import METRICS, aggregate
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
 from ssad.report.figures import interval_plot
 from ssad.report.load import Record, Run, load_header, load_run
+from ssad.report.pages import command_of, template
 from ssad.report.paper import SCENARIOS
-from ssad.report.tables import Cell, Table, tables, write_tables
+from ssad.report.tables import Table, tables, write_tables
 from ssad.roads.graph import LaneGraph, load_graph
 from ssad.traces import load_trace
 from ssad.types import EpisodeTrace
@@ -55,23 +51,15 @@ def write_report(run_dir: Path | str) -> Path:
 
 def render(run: Run, found: list[Table]) -> str:
     """The page's text."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ssad.report"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["heat"] = _heat
     replay = replay_data(run)
     named = {table.name: table for table in found}
     suite = run.header.get("suite", {})
-    return environment.get_template("report.html").render(
+    return template("report.html").render(
         run=run,
         suite=suite,
         title=suite.get("title") or suite.get("name", "SSAD"),
         versions=run.header.get("versions", {}),
-        command=_command(run),
+        command=command_of(run.header.get("suite", {})),
         tiles=[_tile(run, system) for system in run.systems],
         precrash=named.get("precrash"),
         natural=named.get("natural"),
@@ -120,28 +108,6 @@ def _pictures(run: Run) -> list[dict[str, Any]]:
     return groups
 
 
-def _command(run: Run) -> str:
-    """The command that runs the same suite again."""
-    return shlex.join(command_of(dict(run.header.get("suite", {}))))
-
-
-def command_of(suite: dict[str, Any]) -> list[str]:
-    """Words of the command that runs a suite; only what differs from the suite of that name is spelt out."""
-    name = str(suite.pop("name", "quick"))
-    try:
-        stock = load_suite(name).model_dump(mode="json")
-    except SSADError:  # a suite of the user's own, by its file
-        stock = suite
-    words = ["ssad", "run", name]
-    for key, value in suite.items():
-        if value != stock.get(key):
-            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
-            if isinstance(value, dict):
-                text = "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
-            words += ["--set", f"{key}={text}"]
-    return words
-
-
 def _tile(run: Run, system: str) -> dict[str, Any]:
     """Headline numbers of one system."""
     mine = [r for r in run.records if r.system == system]
@@ -154,17 +120,6 @@ def _tile(run: Run, system: str) -> dict[str, Any]:
             values = aggregate([r.metrics for r in members])
             parts.append({"name": name, "n": len(members), "CR": values["CR"], "RC": values["RC"], "DS": values["DS"]})
     return {"system": system, "parts": parts, "failed": sum(r.status != "ok" for r in mine)}
-
-
-def _heat(cell: Cell, symbol: str) -> str:
-    """Background of a table cell, from good (0) to bad (1), as a CSS colour mix."""
-    metric = METRICS.get(symbol)
-    if metric is None or math.isnan(cell.mean) or metric.unit not in ("", "m") or not metric.better:
-        return ""
-    scale = {"OR": 10.0, "DR": 5.0}.get(symbol, 1.0)
-    share = min(max(cell.mean / scale, 0.0), 1.0)
-    bad = share if metric.better == "lower" else 1.0 - share
-    return f"--bad:{100 * bad:.0f}%"
 
 
 def _outcome(record: Record) -> str:
