@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
+from multiprocessing.sharedctypes import Synchronized
 from typing import TypeVar
 
 from ssad.errors import StoreError
@@ -17,17 +18,21 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def spread(function: Callable[[T], R], tasks: Sequence[T], workers: int | None = None) -> Iterator[R]:
+def spread(
+    function: Callable[[T], R], tasks: Sequence[T], workers: int | None = None, *, gpus: Sequence[str] = ()
+) -> Iterator[R]:
     """Results as they come, in any order; workers: how many processes (default: one a core), one: this one.
 
-    An error ends it, and what has not begun is not begun. StoreError: a process died.
+    gpus: the processes see one of these each, in turn (see `visible_gpus`). An error ends it, and what has not begun
+    is not begun. StoreError: a process died.
     """
     count = min(workers or os.cpu_count() or 1, len(tasks))
     if count <= 1:
         yield from map(function, tasks)
         return
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_end_with_parent) as pool:
+    turn = spawn.Value("i", 0)
+    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_begin, initargs=(turn, tuple(gpus))) as pool:
         futures = [pool.submit(function, task) for task in tasks]
         try:
             for future in as_completed(futures):
@@ -38,6 +43,26 @@ def spread(function: Callable[[T], R], tasks: Sequence[T], workers: int | None =
             for future in futures:
                 future.cancel()
             raise
+
+
+def visible_gpus() -> list[str]:
+    """The CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name.strip() for name in given.split(",") if name.strip()]
+    import torch
+
+    return [str(k) for k in range(torch.cuda.device_count())]
+
+
+def _begin(turn: Synchronized[int], gpus: tuple[str, ...]) -> None:
+    """Makes a worker ready."""
+    if gpus:
+        with turn.get_lock():
+            number = turn.value
+            turn.value = number + 1
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
+    _end_with_parent()
 
 
 def _end_with_parent() -> None:

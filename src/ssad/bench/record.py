@@ -22,7 +22,7 @@ from ssad.bench.cast import Cast, Standing, make_cast
 from ssad.bench.drives import make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.gallery import RIG, place, rig_camera
-from ssad.bench.pool import spread
+from ssad.bench.pool import spread, visible_gpus
 from ssad.camera.labels import visibility_token, visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
@@ -343,7 +343,8 @@ def record_nuscenes(
             raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
         _check_page(out, recording.identity())
         return out
-    run_parts(out, recording.identity(), _scene, tasks, workers=workers, progress=progress)
+    gpus = visible_gpus() if recording.device != "cpu" else []
+    run_parts(out, recording.identity(), _scene, tasks, workers=workers, progress=progress, gpus=gpus)
     _merge(recording, [task[3] for task in tasks])
     return out
 
@@ -360,12 +361,13 @@ def _check_page(out: Path, identity: dict[str, Any]) -> None:
 
 def run_parts(
     out: Path, identity: dict[str, Any], record: Callable[[Any], str], tasks: Sequence[Any], *,
-    workers: int | None = None, progress: Callable[[int, int], None] | None = None,
+    workers: int | None = None, progress: Callable[[int, int], None] | None = None, gpus: Sequence[str] = (),
 ) -> None:  # fmt: skip
-    """Records every part that is not there yet, in processes. StoreError: another recording, or a worker died."""
+    """Records every part that is not there yet, in processes (see `spread`). StoreError: another recording, or a
+    worker died."""
     safeio.make_folder(out / ".parts")
     _check_page(out, identity)
-    for done, _ in enumerate(spread(record, tasks, workers), 1):
+    for done, _ in enumerate(spread(record, tasks, workers, gpus=gpus), 1):
         if progress:
             progress(done, len(tasks))
 

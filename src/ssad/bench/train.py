@@ -123,6 +123,8 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
     distributed.init_process_group(backend, rank=rank, world_size=world)
     try:
         device = f"cuda:{rank}" if backend == "nccl" else "cpu"
+        if backend == "nccl":
+            torch.cuda.set_device(rank)
         _run(plan, recipe, device, Share(rank, world), partial(print, flush=True))
     finally:
         distributed.destroy_process_group()

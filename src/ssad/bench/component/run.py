@@ -15,7 +15,7 @@ from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
 from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, scenes_of, score_cell
-from ssad.bench.pool import spread
+from ssad.bench.pool import spread, visible_gpus
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.run import default_workers, versions
@@ -152,7 +152,8 @@ def run_detection(
             version = data.version
             scenes = scenes_of(data, suite.split)
             tokens = {name: data.scene(name).record.token for name in scenes}
-        count = workers or (default_workers() if todo.device == "cpu" else min(GPU_WORKERS, default_workers()))
+        gpus = visible_gpus() if todo.device != "cpu" else []
+        count = workers or min(GPU_WORKERS * len(gpus) or default_workers(), default_workers())
         threads = max(1, default_workers() // count)
         job = Job(
             out, root, version, todo.detectors, suite.calibration, suite.seed, suite.replicates, todo.device, threads
@@ -166,7 +167,7 @@ def run_detection(
         failed: dict[Unit, str] = {}
         began = time.monotonic()
         with Live(suite.name, len(units) + len(missing), 0, console=console) as live:
-            for unit, why in spread(make_unit, [(job, unit) for unit in units], count):
+            for unit, why in spread(make_unit, [(job, unit) for unit in units], count, gpus=gpus):
                 if why:
                     failed[unit] = why
                 live.advance(not why)

@@ -32,7 +32,8 @@ class Mono3DConfig:
     score, IoU, places kept of each level, detections kept of an image. input_width: pictures are resized to it inside;
     virtual_focal: depth is predicted as for a camera of this focal length (pixels, after resizing) and scaled.
     mean, std: of B, G, R in 0..255; start: depth, length, height, width that fresh weights predict (None: 1, as the
-    source).
+    source); rays: the regression also sees where each place looks (tangents to the right of and below the axis),
+    so that the line where an object meets the ground tells its distance whatever the lens.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Mono3DConfig:
     mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     start: tuple[float, float, float, float] | None = None
+    rays: bool = False
     radius: float = 1.5
     dir_offset: float = 0.7854
 
@@ -80,6 +82,7 @@ PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights
 FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
     deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395), start=(20.0, 4.0, 1.7, 1.8),
+    rays=True,
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
     FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS, start=None

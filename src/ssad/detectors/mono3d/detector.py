@@ -72,7 +72,7 @@ class Mono3D(nn.Module):
         scale = self._scale(size, lens)
         lens = self._scaled(lens, scale)
         features = self.neck(self.backbone(self._prepare(images)))
-        maps = self.bbox_head(features, self._factor(lens))
+        maps = self.bbox_head(features, self._factor(lens), self._rays(features, lens))
         flat = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
         with _exact(images):
@@ -227,6 +227,21 @@ class Mono3D(nn.Module):
         if self.config.virtual_focal is None:
             return None
         return lens[..., 0, 0] / self.config.virtual_focal
+
+    def _rays(self, maps: list[Tensor], lens: Tensor) -> list[Tensor] | None:
+        """Tangents [B, 2, h, w] of each place of each level, to the right and down, times 4 (about 1 at the border)."""
+        if not self.config.rays:
+            return None
+        found = []
+        for m, stride in zip(maps, self.config.strides, strict=True):
+            x, y = (
+                stride * (torch.arange(n, device=m.device, dtype=lens.dtype) + 0.5) for n in (m.shape[3], m.shape[2])
+            )
+            right = (x - lens[:, 0, 2:]) / lens[:, 0, :1]
+            down = (y - lens[:, 1, 2:]) / lens[:, 1, 1:2]
+            shape = (len(m), m.shape[2], m.shape[3])
+            found.append(4.0 * torch.stack([right[:, None].expand(shape), down[:, :, None].expand(shape)], 1))
+        return found
 
     def _prepare(self, images: Tensor) -> Tensor:
         """BGR in 0..255, less the mean, padded with 0 at the right and bottom."""

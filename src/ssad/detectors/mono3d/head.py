@@ -67,8 +67,8 @@ class Head(nn.Module):
         super().__init__()
         self.config = config
         c = config.channels
-        for name in ("cls_convs", "reg_convs"):
-            self.add_module(name, nn.ModuleList([Unit(c, c), Unit(c, c, deformable=config.deformable)]))
+        for name, inside in (("cls_convs", c), ("reg_convs", c + 2 if config.rays else c)):
+            self.add_module(name, nn.ModuleList([Unit(inside, c), Unit(c, c, deformable=config.deformable)]))
         self.conv_cls_prev = nn.ModuleList([Unit(c, c)])
         self.conv_cls = _last(c, len(CLASSES_3D), rare=True)
         self.conv_reg_prevs = nn.ModuleList(
@@ -96,18 +96,21 @@ class Head(nn.Module):
         self.register_buffer("base_depths", torch.tensor(BASE_DEPTHS), persistent=False)
         self.register_buffer("base_dims", torch.tensor(BASE_DIMS), persistent=False)
 
-    def forward(self, maps: list[Tensor], lens: Tensor | None) -> dict[str, list[Tensor]]:
+    def forward(
+        self, maps: list[Tensor], lens: Tensor | None, rays: list[Tensor] | None = None
+    ) -> dict[str, list[Tensor]]:
         """Maps by mmdetection3d's names, one a level: cls_scores [B, 10, h, w], bbox_preds [B, 9 or 13, h, w] (offset
         in pixels, depth m, size m, yaw, velocity, 2D distances in pixels), dir_cls_preds, attr_preds, centernesses,
-        and for PGD depth_cls_preds. lens [B]: factor of the depth, None for 1."""
+        and for PGD depth_cls_preds. lens [B]: factor of the depth, None for 1; rays: where each place looks
+        [B, 2, h, w], one a level, if the configuration wants them."""
         found: dict[str, list[Tensor]] = {}
         for level, x in enumerate(maps):
-            for name, value in self._level(level, x, lens).items():
+            for name, value in self._level(level, x, lens, None if rays is None else rays[level]).items():
                 found.setdefault(name, []).append(value)
         return found
 
-    def _level(self, level: int, x: Tensor, lens: Tensor | None) -> dict[str, Tensor]:
-        kinds, boxes = x, x
+    def _level(self, level: int, x: Tensor, lens: Tensor | None, rays: Tensor | None) -> dict[str, Tensor]:
+        kinds, boxes = x, x if rays is None else torch.cat([x, rays.to(x)], 1)
         for unit in self.get_submodule("cls_convs").children():
             kinds = unit(kinds)
         for unit in self.get_submodule("reg_convs").children():

@@ -103,11 +103,22 @@ class Change:
     shift: tuple[float, float]
 
 
-def draw_change(recipe: Recipe, size: tuple[int, int], rng: np.random.Generator) -> Change:
-    """A random change of a picture of `size` (height, width)."""
+def draw_change(
+    recipe: Recipe, size: tuple[int, int], rng: np.random.Generator, *, lens: Tensor | None = None
+) -> Change:
+    """A random change of a picture of `size` (height, width).
+
+    With an intrinsic `lens` [3, 3] the zoom is about the principal point, as a lens zooms: where the ground meets an
+    object keeps telling its distance. Without one the crop lies anywhere.
+    """
     zoom = float(np.exp(rng.uniform(np.log(recipe.zoom[0]), np.log(recipe.zoom[1]))))
     free = [length * (1.0 - zoom) for length in (size[1], size[0])]
-    return Change(bool(rng.random() < recipe.flip), zoom, (rng.random() * free[0], rng.random() * free[1]))
+    mirror = bool(rng.random() < recipe.flip)
+    share = [rng.random(), rng.random()]
+    if lens is not None:
+        share = [(float(lens[0, 2]) + 0.5) / size[1], (float(lens[1, 2]) + 0.5) / size[0]]
+        share[0] = 1.0 - share[0] if mirror else share[0]
+    return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1]))
 
 
 def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
@@ -241,6 +252,6 @@ def make_batch(
     chosen = torch.as_tensor(indices, device=bank.pictures.device)
     pictures = bank.pictures[chosen].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
     size = (pictures.shape[2], pictures.shape[3])
-    changes = [draw_change(recipe, size, rng) for _ in indices]
+    changes = [draw_change(recipe, size, rng, lens=bank.truth[i].intrinsic) for i in indices]
     truths = change_truths([bank.truth[i] for i in indices], changes, size, keep=recipe.keep)
     return change_colours(change_pictures(pictures, changes), recipe, draws), move(truths, device)

@@ -72,6 +72,8 @@ def train(
     """
     where = torch.device(device)
     detector.to(where)
+    layout = torch.channels_last if where.type == "cuda" else torch.contiguous_format
+    detector.to(memory_format=layout)
     _unfreeze(detector, recipe)
     step_of = Step(detector, amp=recipe.amp)
     shared: Any = step_of
@@ -96,7 +98,7 @@ def train(
                 group["lr"] = rate
             key = (recipe.seed, epoch, number, share.rank)
             images, truth = make_batch(bank, indices, recipe, key=key, device=where)
-            losses = shared(images, truth)
+            losses = shared(images.contiguous(memory_format=layout), truth)
             loss = torch.stack(list(losses.values())).sum()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
