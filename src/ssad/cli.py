@@ -239,6 +239,9 @@ def record(
     clips: Annotated[
         str | None, typer.Option(help="Instead of it pictures of one car for 2D detection, COCO: drive or orbit.")
     ] = None,
+    streets: Annotated[
+        str, typer.Option(help="town: what always stands there; any: built anew for each drive, for training.")
+    ] = "town",
     images: Annotated[str, typer.Option(help="With --clips: pictures of each of the towns.")] = "600,400,400,400",
     style: Annotated[str | None, typer.Option(help="With --clips: body of the target car (default: any).")] = None,
     device: Annotated[str, typer.Option(help="Where pictures are rendered: cpu or cuda.")] = "cpu",
@@ -270,13 +273,15 @@ def record(
             from ssad.bench.clips import Clips, pair_images, record_clips
 
             pairs = pair_images(names(towns), names(images))
-            todo = Clips(out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device))  # type: ignore[arg-type]
+            todo = Clips(
+                out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device), streets=streets,  # type: ignore[arg-type]
+            )  # fmt: skip
             record_clips(todo, workers=workers, progress=progress)
             text = f"{out}: {sum(count for _, count in pairs)} pictures, annotations train, test and all"
         else:
             drives = Recording(
                 out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
-                seed=seed, device=pick_device(device),
+                seed=seed, device=pick_device(device), streets=streets,
             )  # fmt: skip
             record_nuscenes(drives, workers=workers, progress=progress)
             text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"

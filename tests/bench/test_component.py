@@ -184,6 +184,26 @@ def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path
     assert "Failed cells" in page
 
 
+@pytest.mark.parametrize("way", ["raises", "breaks a promise"])
+def test_a_detector_that_fails_fails_its_own_cells_alone(
+    root: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    monkeypatch.setenv("ORACLE_WAY", way)
+    todo = suite_of(root, detectors=[ORACLE, "helpers.oracle3d:build_bad"], shifts=["gaussian"], severities=[3])
+    records = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    good = [r for r in records if r["detector"] == ORACLE]
+    bad = [r for r in records if r["detector"] != ORACLE]
+    assert {r["status"] for r in good} == {"ok"}
+    assert {r["status"] for r in bad} == {"failed"}
+    words = "ZeroDivisionError: on purpose" if way == "raises" else "broken promise: sizes are above 0"
+    assert all(words in r["reason"] and "\n" not in r["reason"] for r in bad)
+    alone = {(r["shift"], r["severity"]): r["metrics"] for r in lines(folder)}
+    assert all(r["metrics"] == alone[r["shift"], r["severity"]] for r in good), "as if it ran by itself"
+    assert "Failed cells" in write_report(tmp_path / "run").read_text()
+    again = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    assert again == records
+
+
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no such data": ({"data": "/nowhere"}, "is no folder"),
     "no such split": ({"split": "evening"}, "unknown split 'evening'"),

@@ -20,7 +20,7 @@ import pytest
 
 from ssad.bench.cast import make_cast
 from ssad.bench.clips import Clips, record_clips
-from ssad.bench.drives import make_drive
+from ssad.bench.drives import drive_street, make_drive
 from ssad.bench.record import AHEAD, CATEGORY, Recording, drive, record_nuscenes
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.camera.street import cached_street
@@ -177,11 +177,38 @@ def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
         record_nuscenes(Recording(blocked / "out", **SMALL), workers=1)
 
 
+def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
+    graph = load_town("Twinford")
+    own = cached_street(graph)
+    assert drive_street(graph, "town", key=(0, "Twinford", 3)).vertices.tobytes() == own.vertices.tobytes()
+    some = [drive_street(graph, "any", key=(0, "Twinford", k)) for k in (3, 3, 4)]
+    assert some[0].vertices.tobytes() == some[1].vertices.tobytes(), "the key decides"
+    assert some[0].vertices.shape != some[2].vertices.shape != own.vertices.shape
+    with pytest.raises(ConfigError, match="streets 'none'; choose from: town, any"):
+        drive_street(graph, "none", key=())
+
+
+def test_long_vehicles_stand_at_the_kerb(tmp_path: Path) -> None:
+    """A street full of parked cars would leave trucks, buses and trailers no room."""
+    found: Counter[str] = Counter()
+    for number in range(6):
+        graph = load_town("Twinford")
+        trace = drive(make_drive(graph, key=("long", number), seconds=1.0), graph)
+        cast = make_cast(trace, graph, cached_street(graph), key=("long", number))
+        parked = [body for body in cast.bodies if body.parked]
+        found.update(body.kind for body in parked)
+        for body in parked:
+            others = [b for b in parked if b is not body]
+            gap = [float(np.hypot(*(b.track[0, :2] - body.track[0, :2]))) for b in others]
+            assert min(gap, default=9.0) > 1.5
+    assert {"car", "truck", "bus", "trailer"} <= set(found)
+    assert found["car"] > found["truck"] > 0.05 * found["car"]
+
+
 def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
     tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("record", "clips"):  # its street takes long to build, and is not needed
-        monkeypatch.setattr(f"ssad.bench.{module}.cached_street", lambda town: None)
+    monkeypatch.setattr("ssad.bench.drives.cached_street", lambda town: None)  # takes long to build, is not needed
     town = ssad_home / "towns" / "Paths.npz"
     graph = load_town("ProvingGround")
     # every lane to drive on lies within a junction: no place to start from

@@ -13,6 +13,8 @@ import pytest
 import torch
 from helpers.mono3d import lens, one_thread, some_truth
 from helpers.training import COLOURS, RECIPE, SIZE, bank, fresh, learn
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 from torch.multiprocessing.spawn import spawn
 
@@ -28,6 +30,7 @@ from ssad.detectors.training.batches import (
     fill,
     make_batch,
     order,
+    repeats,
 )
 from ssad.detectors.training.loop import LAST, LOG, train
 from ssad.detectors.training.recipe import RECIPES, Recipe, find_recipe
@@ -203,6 +206,53 @@ def test_every_picture_is_seen_once_an_epoch() -> None:
     assert seen == order(10, 3, seed=1, epoch=2)
     assert seen != order(10, 3, seed=1, epoch=3)
     assert order(2, 5, seed=0, epoch=0) in ([[0, 1]], [[1, 0]])
+
+
+def with_classes(*labels: int, crowd: bool = False) -> Truth:
+    """Truth of a picture with objects of some classes."""
+    marks = torch.tensor([crowd] * len(labels)) if crowd else None
+    return Truth(torch.tensor(labels, dtype=torch.int64), torch.zeros(len(labels), 4), crowd=marks)
+
+
+def test_pictures_of_rare_classes_are_repeated() -> None:
+    truths = [with_classes(0)] * 98 + [with_classes(0, 1)] + [with_classes(2, crowd=True)]
+    often = repeats(truths, 0.04)
+    assert often is not None
+    np.testing.assert_allclose(often[:98], 1.0)
+    np.testing.assert_allclose(often[98], 2.0)  # sqrt(0.04 / 0.01)
+    assert often[99] == 1.0, "what is not learned from does not count"
+    assert repeats(truths, 0.0) is None
+
+
+@given(st.integers(0, 10**6), st.integers(1, 7), st.lists(st.floats(1.0, 3.0), min_size=8, max_size=40))
+def test_an_epoch_shows_each_picture_as_often_as_asked(seed: int, batch: int, wanted: list[float]) -> None:
+    often = np.array(wanted)
+    epochs = [order(len(often), batch, seed=seed, epoch=e, often=often) for e in range(2)]
+    shown = math.ceil(often.sum() - 1e-9)
+    assert len(epochs[0]) == len(epochs[1]) == max(shown // batch, 1)
+    single = [k for one in order(len(often), 1, seed=seed, epoch=0, often=often) for k in one]
+    counts = np.bincount(single, minlength=len(often))
+    assert counts.sum() == shown
+    assert (counts >= np.floor(often)).all()
+    assert (counts <= np.ceil(often * shown / often.sum() - 1e-9)).all()
+    whole = np.full(len(often), 2.0)
+    twice = np.bincount([k for one in order(len(often), 1, seed=seed, epoch=1, often=whole) for k in one])
+    assert (twice == 2).all()
+
+
+def test_a_zoom_is_about_the_principal_point() -> None:
+    lens = torch.tensor([[500.0, 0.0, 30.0], [0.0, 500.0, 15.0], [0.0, 0.0, 1.0]])
+    recipe = replace(find_recipe("fcos3d-light"), zoom=(0.5, 2.0))
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        change = draw_change(recipe, (40, 80), rng, lens=lens)
+        truth = change_truth(
+            Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4), intrinsic=lens), change, (40, 80), keep=0
+        )
+        assert truth.intrinsic is not None
+        across = 79.0 - 30.0 if change.mirror else 30.0
+        np.testing.assert_allclose(truth.intrinsic[:2, 2].numpy(), [across, 15.0], atol=1e-4)
+        np.testing.assert_allclose(truth.intrinsic[0, 0], 500.0 * change.zoom, rtol=1e-6)
 
 
 def test_a_batch_is_decided_by_its_key() -> None:

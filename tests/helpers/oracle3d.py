@@ -47,6 +47,28 @@ def told(truth: Truth, rows: Tensor) -> Detections:
     return Detections(torch.linspace(0.9, 0.5, len(rows)), truth.label[rows], truth.box[rows], part)
 
 
+class Bad(Oracle):
+    """Fails in the way that ORACLE_WAY names."""
+
+    name = "bad"
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        found = super().predict(images, intrinsic)
+        if os.environ["ORACLE_WAY"] == "raises":
+            raise ZeroDivisionError("on\npurpose")
+        for one in found:
+            assert one.solid is not None
+            one.solid.size.neg_()
+        return found
+
+
+def build_bad() -> Bad:
+    """For the data set that ORACLE_DATA names."""
+    return Bad(Path(os.environ["ORACLE_DATA"]))
+
+
 def build() -> Oracle:
     """For the data set that ORACLE_DATA names."""
     return Oracle(Path(os.environ["ORACLE_DATA"]))

@@ -33,9 +33,10 @@ STYLES: dict[str, tuple[str, tuple[str, ...]]] = {
 }  # fmt: skip
 # what stands at the kerb, how often, and how much of the kerb it takes, m
 PARKED = {
-    "car": (10.0, 6.3), "truck": (1.2, 10.5), "trailer": (1.3, 14.5), "construction": (1.6, 9.5),
-    "motorcycle": (1.6, 3.0), "bicycle": (2.0, 2.6),
+    "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
+    "motorcycle": (1.4, 3.0), "bicycle": (1.6, 2.6),
 }  # fmt: skip
+LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,10 +235,14 @@ def _kerb(cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear) 
             x, y, yaw, width = graph.at(int(lane), s)  # the edge of the driving lane:
             kerbs.append((x - width / 2 * np.sin(yaw), y + width / 2 * np.cos(yaw), yaw, KERB if width < 1 else 0.0))
             s += 6.5
-    for spot, (edge_x, edge_y, yaw, z) in enumerate([*lots, *kerbs]):
-        if np.hypot(way[:, 0] - edge_x, way[:, 1] - edge_y).min() > 55.0 or draws.random() > busy:
+    spots = []
+    for spot, at in enumerate([*lots, *kerbs]):
+        if np.hypot(way[:, 0] - at[0], way[:, 1] - at[1]).min() > 55.0 or draws.random() > busy:
             continue
         kind = str(draws.choice(kinds, p=share / share.sum()))
+        long = PARKED[kind][1] > LONG
+        spots.append((not long, spot, "car" if long and spot < len(lots) else kind, at))
+    for _, spot, kind, (edge_x, edge_y, yaw, z) in sorted(spots):
         number = len(cast.meshes)
         own = generator("record prop", *cast.key, number)
         style = "parked" if kind in ("motorcycle", "bicycle") else draw_style(kind, generator=own)

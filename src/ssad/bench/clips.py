@@ -21,7 +21,7 @@ import numpy as np
 from ssad import safeio
 from ssad.bench.cast import Body, Cast, Standing, make_cast
 from ssad.bench.coco import coco_data
-from ssad.bench.drives import make_drive
+from ssad.bench.drives import check_streets, drive_street, make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.record import HELD_OUT, NOISE, draw_weather, drive, run_parts
 from ssad.bench.shots import Shot, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
@@ -29,7 +29,6 @@ from ssad.camera.bodies import BODIES, draw_paint, draw_size, draw_style, make_b
 from ssad.camera.labels import label_picture
 from ssad.camera.render import Picture, View, render
 from ssad.camera.stage import Stage, Thing
-from ssad.camera.street import cached_street
 from ssad.datasets.nuscenes.files import encode_jpeg
 from ssad.detections import CLASSES_3D
 from ssad.errors import ConfigError, StoreError
@@ -57,7 +56,8 @@ NEAR: Final = 0.2  # largest share of the picture that something right before th
 class Clips:
     """What to record. images: town -> how many pictures; mode; size: pixels a side; style: of the target car (None:
     any); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of the orbit;
-    quality: of JPEG files; device: where pictures are rendered. ConfigError for what cannot be."""
+    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`. ConfigError for what
+    cannot be."""
 
     out: Path
     images: tuple[tuple[str, int], ...] = tuple(IMAGES.items())
@@ -73,11 +73,13 @@ class Clips:
     seed: int = 0
     quality: int = 92
     device: str = "cpu"
+    streets: str = "town"
 
     def __post_init__(self) -> None:
         for town in (*(t for t, _ in self.images), *self.held_out):
             if town not in town_names():
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
+        check_streets(self.streets)
         if not self.images or self.mode not in ("drive", "orbit"):
             raise ConfigError("name a town to record, and drive or orbit")
         for town, count in self.images:
@@ -133,7 +135,8 @@ class _Set:
 
 
 def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
-    graph, street = load_town(town), cached_street(town)
+    graph = load_town(town)
+    street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
     cast = make_cast(trace, graph, street, key=key)
     count = TARGETS if clips.mode == "orbit" else 1

@@ -6,7 +6,8 @@ import math
 
 import numpy as np
 
-from ssad.errors import MapError
+from ssad.camera.street import STYLES, Street, build_street, cached_street
+from ssad.errors import ConfigError, MapError
 from ssad.roads.graph import LaneGraph
 from ssad.roads.router import random_route
 from ssad.scenarios.dynamic.episode import forced_signals
@@ -18,11 +19,30 @@ from ssad.world.models import model
 NEAR = 120.0  # m from the ego's way within which traffic starts
 WAY = 260.0  # m of the ego's way that counts for this: what is driven in 30 s
 MOST = 44  # vehicles
+TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
     "car": 0.27, "suv": 0.15, "coupe": 0.06, "compact": 0.14, "van": 0.06, "motorcycle": 0.08, "bicycle": 0.07,
     "truck": 0.10, "bus": 0.07,
 }  # fmt: skip
+
+STREETS = ("town", "any")
+
+
+def check_streets(streets: str) -> None:
+    """ConfigError: no such kind of streets."""
+    if streets not in STREETS:
+        raise ConfigError(f"streets '{streets}'; choose from: {', '.join(STREETS)}")
+
+
+def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> Street:
+    """What stands along the roads in a drive. "town": what always stands there; "any": built for this drive alone, in
+    any style, so that a detector cannot learn a town by heart. ConfigError: neither."""
+    check_streets(streets)
+    if streets == "town":
+        return cached_street(graph)
+    draws = generator("drive street", graph.name, *key)
+    return build_street(graph, seed=int(draws.integers(1, 2**31)), style=str(draws.choice(sorted(STYLES))))
 
 
 def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float) -> Episode:
@@ -55,7 +75,11 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float) -> 
             continue
         body = str(draws.choice(list(MIX), p=list(MIX.values())))
         path = random_route(graph, lane, s, 400.0, draws)
-        if not fits(body, path):
+        for _ in range(TRIES):
+            if fits(body, path):
+                break
+            path = random_route(graph, lane, s, 400.0, draws)
+        else:
             body = "compact"
         room = 0.5 * model(body).length + 4.0
         if any(math.hypot(a.pose.x - x, a.pose.y - y) < room + 0.5 * model(a.model).length for a in agents):

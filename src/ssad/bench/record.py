@@ -19,7 +19,7 @@ import numpy as np
 
 from ssad import safeio
 from ssad.bench.cast import Cast, Standing, make_cast
-from ssad.bench.drives import make_drive
+from ssad.bench.drives import check_streets, drive_street, make_drive
 from ssad.bench.execute import quiet_warp
 from ssad.bench.gallery import RIG, place, rig_camera
 from ssad.bench.pool import spread, visible_gpus
@@ -27,7 +27,6 @@ from ssad.camera.labels import visibility_token, visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
 from ssad.camera.stage import Stage
-from ssad.camera.street import cached_street
 from ssad.datasets.nuscenes.files import encode_jpeg, points_bytes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 from ssad.errors import ConfigError, StoreError
@@ -63,7 +62,7 @@ GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 class Recording:
     """What to record. scenes: of each town; seconds: of each scene; width: of the pictures (16:9); sweeps: frames
     between key frames that are written too (0 to 4); quality: of JPEG files; device: where pictures are rendered (it
-    decides bits, though few: see docs/camera.md). ConfigError for what cannot be."""
+    decides bits, though few: see docs/camera.md); streets: see `drive_street`. ConfigError for what cannot be."""
 
     out: Path
     towns: tuple[str, ...] = TOWNS
@@ -76,11 +75,13 @@ class Recording:
     quality: int = 90
     version: str = "v1.0-ssad"
     device: str = "cpu"
+    streets: str = "town"
 
     def __post_init__(self) -> None:
         for town in self.towns:
             if town not in town_names():
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
+        check_streets(self.streets)
         if not self.towns or self.scenes < 1:
             raise ConfigError("nothing to record: name a town, and one scene or more")
         if self.width < 64 or self.width % 16 or not 0 <= self.sweeps < KEY or self.seconds < 0.5:
@@ -91,7 +92,7 @@ class Recording:
         return {
             "towns": list(self.towns), "held_out": list(self.held_out), "scenes": self.scenes, "seconds": self.seconds,
             "width": self.width, "sweeps": self.sweeps, "seed": self.seed, "quality": self.quality,
-            "version": self.version, "device": self.device,
+            "version": self.version, "device": self.device, "streets": self.streets,
         }  # fmt: skip
 
 
@@ -161,7 +162,8 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     quiet_warp()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
-    graph, street = load_town(town), cached_street(town)
+    graph = load_town(town)
+    street = drive_street(graph, recording.streets, key=key)
     episode = make_drive(graph, key=(recording.seed, number), seconds=recording.seconds + 0.2)
     trace = drive(episode, graph)
     cast = make_cast(trace, graph, street, key=key)

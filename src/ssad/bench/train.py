@@ -159,8 +159,9 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
         return
     metrics = validate(final, quick=False)
     say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
     card = Card(
-        data="; ".join(map(describe_data, plan.data)), command=command_of(plan), seed=recipe.seed,
+        data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
         metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"detector": recipe.detector},
     )  # fmt: skip
     save_weights(plan.out / f"{recipe.detector}.safetensors", final.state_dict(), card=card, half=True)
@@ -183,6 +184,7 @@ def describe_data(folder: Path) -> str:
         words += ["--seconds", f"{about['seconds']:g}", "--width", str(about["width"])]
     else:
         return folder.name
+    words += ["--streets", about["streets"]] if about.get("streets", "town") != "town" else []
     held = ",".join(about["held_out"])
     words += ["--held-out", held or '""', *(["--seed", str(about["seed"])] if about["seed"] else [])]
     return " ".join(["ssad record", folder.name, *words])
@@ -193,6 +195,8 @@ def command_of(plan: Plan) -> str:
     parts = ["ssad train detector", plan.recipe, f"--data {plan.data[0].name}"]
     parts += [f"--more {folder.name}" for folder in plan.data[1:]]
     parts += [f"--val-data {plan.val_data.name}"] if plan.val_data else []
+    parts += [f"--weights {plan.weights.name}"] if plan.weights else []
+    parts += [f"--gpus {plan.gpus}"] if plan.gpus > 1 else []
     parts += [f"--set {key}={list(v) if isinstance(v, tuple) else v}" for key, v in plan.changes]
     return " ".join(parts)
 

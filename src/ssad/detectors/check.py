@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -133,22 +133,9 @@ def _check_predict(trial: Trial) -> None:
     everything = trial.predict(images, threshold=least)
     some = False
     for found in everything:
-        count = len(found.score)
-        some |= count > 0
-        need(found.score.shape == found.label.shape == (count,), "score and label of Detections are [N]")
-        need(found.box.shape == (count, 4), "Detections.box is [N, 4]")
-        need(not found.label.is_floating_point(), "labels are whole numbers")
-        need(bool(((found.score >= least) & (found.score <= 1)).all()), "scores lie between the threshold and 1")
-        need(bool((found.score.diff() <= 0).all()), "detections come best first")
-        need(
-            bool(((found.label >= 0) & (found.label < len(trial.detector.classes))).all()), "labels are within classes"
-        )
-        ordered = bool((found.box[:, 2:] >= found.box[:, :2]).all()) and bool(found.box.isfinite().all())
-        need(ordered, "boxes are x1, y1, x2, y2, finite, x1 <= x2 and y1 <= y2")
-        need(not found.score.requires_grad and not found.box.requires_grad, "predict keeps no gradient")
-        need((found.solid is not None) == trial.three, 'Detections.solid is there for task "3d" and only then')
-        if found.solid is not None:
-            _check_solids(trial, found.solid, count)
+        some |= len(found.score) > 0
+        for kept, promise in promises(found, classes=len(trial.detector.classes), three=trial.three, least=least):
+            need(kept, promise)
     need(some, "predict finds something when the threshold is low")
     for few, found in zip(trial.predict(images, threshold=0.5 * (1 + least)), everything, strict=True):
         need(bool((few.score >= 0.5 * (1 + least)).all()), "no score lies under the threshold")
@@ -161,16 +148,33 @@ def _check_predict(trial: Trial) -> None:
     need(len(trial.predict(images.double(), threshold=least)) == BATCH, "float64 images are taken")
 
 
-def _check_solids(trial: Trial, solid: Solids, count: int) -> None:
+def promises(found: Detections, *, classes: int, three: bool, least: float = 0.0) -> Iterator[tuple[bool, str]]:
+    """What a detector promises of its detections in one image, and whether it is kept; shapes first."""
+    count = len(found.score)
+    yield found.score.shape == found.label.shape == (count,), "score and label of Detections are [N]"
+    yield found.box.shape == (count, 4), "Detections.box is [N, 4]"
+    yield (found.solid is not None) == three, 'Detections.solid is there for task "3d" and only then'
+    yield not found.label.is_floating_point(), "labels are whole numbers"
+    yield bool(((found.score >= least) & (found.score <= 1)).all()), "scores lie between the threshold and 1"
+    yield bool((found.score.diff() <= 0).all()), "detections come best first"
+    yield bool(((found.label >= 0) & (found.label < classes)).all()), "labels are within classes"
+    ordered = bool((found.box[:, 2:] >= found.box[:, :2]).all()) and bool(found.box.isfinite().all())
+    yield ordered, "boxes are x1, y1, x2, y2, finite, x1 <= x2 and y1 <= y2"
+    yield not found.score.requires_grad and not found.box.requires_grad, "predict keeps no gradient"
+    if found.solid is not None:
+        yield from _solid_promises(found.solid, count)
+
+
+def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
     shapes = {"centre": (count, 3), "size": (count, 3), "yaw": (count,), "velocity": (count, 2), "attribute": (count,)}
     for name, shape in shapes.items():
         value = getattr(solid, name)
-        trial.need(tuple(value.shape) == shape, f"Solids.{name} is {['N', *shape[1:]]}")
+        yield tuple(value.shape) == shape, f"Solids.{name} is {['N', *shape[1:]]}"
         finite = not value.is_floating_point() or bool(value.isfinite().all())
-        trial.need(finite or name == "velocity", f"Solids.{name} is finite")
-    trial.need(bool((solid.size > 0).all()), "sizes are above 0")
+        yield finite or name == "velocity", f"Solids.{name} is finite"
+    yield bool((solid.size > 0).all()), "sizes are above 0"
     inside = bool(((solid.attribute >= 0) & (solid.attribute < len(ATTRIBUTES))).all())
-    trial.need(inside, "attributes are within ssad.detections.ATTRIBUTES")
+    yield inside, "attributes are within ssad.detections.ATTRIBUTES"
 
 
 def _check_batch(trial: Trial) -> None:

@@ -11,8 +11,9 @@ import torch
 
 from ssad import safeio
 from ssad.bench.component.run import Plan
-from ssad.bench.component.work import Job, Unit, detector_of, scenes_of, shifter_of
+from ssad.bench.component.work import Job, Unit, Watched, detector_of, scenes_of, shifter_of
 from ssad.bench.detect import to_images
+from ssad.bench.execute import quiet_warp
 from ssad.bench.pictures import FOLDER, PAGE
 from ssad.bench.toolbox.sheet import save_picture
 from ssad.bench.training_data import camera_truth
@@ -49,11 +50,12 @@ def _severity(todo: Plan) -> int:
 
 def _sheet(todo: Plan, folder: Path, name: str, weights: str) -> U8:
     suite, root = todo.suite, todo.root or folder / "data"
+    quiet_warp()
     with NuScenes(root, suite.version) as data:
         version = data.version
         scene, frame = _richest(data, scenes_of(data, suite.split))
         job = Job(folder, root, version, todo.detectors, suite.calibration, suite.seed, 0, todo.device, 1)
-        detector = detector_of(name, weights, todo.device)
+        detector = Watched(detector_of(name, weights, todo.device))
         clean = read_image(root / frame.filename)
         tiles = [_tile((detector, todo.device), scene, frame, clean, title="clean")]
         for shift in suite.shifts:

@@ -29,7 +29,7 @@ from ssad.seeding import digest
 # a change in any of these may change a number
 _CODE = ("detections.py", "detectors", "scenarios/static/shifts", "metrics", "datasets", "geometry.py", "frames.py")
 _WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
-GPU_WORKERS = 6  # processes that share a GPU: planning a shift and reading pictures is work for the host
+GPU_WORKERS = 10  # processes that share a GPU: planning a shift and reading pictures is work for the host
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,7 @@ def run_detection(
                     ready.append((job, cell))
             for cell, result in spread(score_cell, ready, count):
                 store.append(_record(todo, cell, header, result, wall), None)
-                live.advance(True)
+                live.advance("reason" not in result)
                 live.tick()
         return [store.results[key] for key in order]
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ssad import safeio
 from ssad.bench.detect import SampleBoxes, detect_with, match_boxes
@@ -22,7 +23,9 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
+from ssad.detections import Detections, Solids
 from ssad.detectors import make_detector
+from ssad.detectors.check import promises
 from ssad.detectors.mono3d.merge import WorldBoxes
 from ssad.errors import ConfigError, FormatError, SSADError
 from ssad.metrics.detection import DetectionScores
@@ -79,6 +82,40 @@ def detector_of(name: str, weights: str, device: str) -> Any:
     return make_detector(name, weights=weights or None, device=device)
 
 
+class Watched:
+    """A detector whose failure is a result: once it has raised, or broken a promise, it finds nothing more. reason:
+    why, in one line, "" while it works. Memory that is used up and a device that is lost are raised."""
+
+    def __init__(self, detector: Any) -> None:
+        self.detector, self.reason = detector, ""
+
+    def predict(self, images: Tensor, intrinsic: Tensor | None = None) -> list[Detections]:
+        """As the detector, or nothing."""
+        if not self.reason:
+            try:
+                found: list[Detections] = self.detector.predict(images, intrinsic)
+                self.reason = self._broken(found, len(images))
+                if not self.reason:
+                    return found
+            except Exception as error:  # whatever a stranger's detector raises
+                if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA" in str(error):
+                    raise
+                text = " ".join(str(error).split())
+                self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
+        nothing, whole = images.new_zeros(0), torch.zeros(0, dtype=torch.int64, device=images.device)
+        solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
+        return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
+
+    def _broken(self, found: Sequence[Detections], images: int) -> str:
+        if len(found) != images:
+            return "broken promise: predict answers for each image"
+        for one in found:
+            for kept, promise in promises(one, classes=len(self.detector.classes), three=True):
+                if not kept:
+                    return f"broken promise: {promise}"
+        return ""
+
+
 @lru_cache(maxsize=4)
 def _detectors(job: Job) -> list[Any]:
     quiet_warp()
@@ -117,15 +154,18 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
                     applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
                 return images
 
-            found = detect_with(
-                _detectors(job), job.root, scene, device=job.device, look=None if shifter is None else look
-            )
+            watched = [Watched(one) for one in _detectors(job)]
+            shown: list[Any] = [*watched]
+            found = detect_with(shown, job.root, scene, device=job.device, look=None if shifter is None else look)
     except SSADError as error:
         return unit, str(error)
     columns: dict[str, Any] = {}
-    for (name, _), samples in zip(job.detectors, found, strict=True):
-        boxes = [one.boxes for one in samples]
-        columns[f"{name}/sample"] = np.array([one.token for one in samples])
+    for (name, _), samples, one in zip(job.detectors, found, watched, strict=True):
+        if one.reason:
+            columns[f"{name}/failed"] = np.array(one.reason)
+            continue
+        boxes = [sample.boxes for sample in samples]
+        columns[f"{name}/sample"] = np.array([sample.token for sample in samples])
         columns[f"{name}/count"] = np.array([len(b) for b in boxes], np.int32)
         for column in _COLUMNS:
             columns[f"{name}/{column}"] = np.concatenate([getattr(b, column) for b in boxes])
@@ -137,10 +177,16 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
     return unit, ""
 
 
+class DetectorFailed(SSADError):
+    """A detector failed on a scene; why."""
+
+
 def read_unit(path: Path, detector: str) -> tuple[list[SampleBoxes], dict[str, int]]:
-    """Boxes by sample of one detector, and how often the shift was applied. FormatError."""
+    """Boxes by sample of one detector, and how often the shift was applied. FormatError; DetectorFailed."""
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            if f"{detector}/failed" in file:
+                raise DetectorFailed(str(file[f"{detector}/failed"]))
             ends = np.cumsum(file[f"{detector}/count"])
             parts = {c: np.split(file[f"{detector}/{c}"], ends[:-1]) for c in (*_COLUMNS, "attribute")}
             tokens = [str(token) for token in file[f"{detector}/sample"]]
@@ -172,14 +218,18 @@ class Cell:
 
 
 def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
-    """Metrics of a cell, their intervals by the bootstrap over scenes, and the replicates (paired between cells)."""
+    """Metrics of a cell, their intervals by the bootstrap over scenes, and the replicates (paired between cells);
+    or the reason why it failed."""
     job, cell = task
     scenes = tuple(unit.scene for unit in cell.units)
     truth = _truth(job.root, job.version, scenes)
     found: list[SampleBoxes] = []
     applied: Counter[str] = Counter()
     for unit in cell.units:
-        boxes, counts = read_unit(job.folder / unit.path, cell.detector)
+        try:
+            boxes, counts = read_unit(job.folder / unit.path, cell.detector)
+        except DetectorFailed as error:
+            return cell, {"reason": f"{unit.scene}: {error}"}
         found += boxes
         applied.update(counts)
     matches = match_boxes(found, truth)

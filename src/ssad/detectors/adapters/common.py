@@ -1,16 +1,52 @@
-"""What the adapters share: input, truth, choice of detections, sums."""
+"""What the adapters share: the frame of a detector, input, truth, choice of detections, sums."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torchvision.ops import batched_nms
 
-from ssad.detections import Detections, Truth
+from ssad.detections import Dense, Detections, Truth
+from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets, pad_truth
 from ssad.errors import ConfigError
+
+
+class Adapter(nn.Module):
+    """What every adapted 2D detector has. threshold: default of `predict`. ConfigError: not in [0, 1)."""
+
+    task: Literal["2d", "3d"] = "2d"
+
+    def __init__(self, name: str, classes: Sequence[str], threshold: float) -> None:
+        super().__init__()
+        self.name = name
+        self.classes = tuple(classes)
+        self.threshold = check_threshold(name, threshold)
+
+    def forward(self, images: Tensor) -> Dense:
+        """As `dense`."""
+        return self.dense(images)
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        """Raw outputs; see `ssad.protocols.Detector`."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Detections of each image, best first, chosen as the source does."""
+        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
+        with evaluating(self):
+            dense = self.dense(images)
+        return self.choose(dense, least)
+
+    def choose(self, dense: Dense, least: float) -> list[Detections]:
+        """Detections of each image above a score of `least`."""
+        raise NotImplementedError
 
 
 def check_images(name: str, images: Tensor) -> tuple[int, int]:

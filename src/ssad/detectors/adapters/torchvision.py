@@ -11,25 +11,17 @@ from typing import Any, Literal
 
 import torch
 import torchvision.models.detection as zoo
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 from torchvision.ops import box_iou, generalized_box_iou_loss, sigmoid_focal_loss
 
 from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.common import (
-    check_images,
-    check_threshold,
-    check_truth,
-    log_odds,
-    sums,
-    suppress,
-)
-from ssad.detectors.modes import evaluating
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, sums, suppress
 from ssad.detectors.yolo.assign import Targets
 from ssad.errors import ConfigError
 
 
-class OneStage(nn.Module):
+class OneStage(Adapter):
     """An FCOS, RetinaNet or SSD model of torchvision as a detector. Starts frozen and in eval mode.
 
     model: the network; classes: their names in the order of the head's columns `columns`, which leave out background
@@ -41,22 +33,18 @@ class OneStage(nn.Module):
     and scale [4] from the picture to it. The model's own resizing happens inside.
     """
 
-    task: Literal["2d", "3d"] = "2d"
     columns: Tensor
 
     def __init__(
         self, model: Any, classes: Sequence[str], columns: Sequence[int], *, name: str, threshold: float | None = None
     ) -> None:
-        super().__init__()
         kinds = {zoo.FCOS: "fcos", zoo.RetinaNet: "retinanet", zoo.ssd.SSD: "ssd"}
         kind = next((kinds[own] for own in kinds if isinstance(model, own)), None)
         if kind is None:
             raise ConfigError(f"{name}: a {type(model).__name__} is no FCOS, RetinaNet or SSD of torchvision")
+        super().__init__(name, classes, model.score_thresh if threshold is None else threshold)
         self.model = model
         self.kind = kind
-        self.name = name
-        self.classes = tuple(classes)
-        self.threshold = check_threshold(name, model.score_thresh if threshold is None else threshold)
         self.register_buffer("columns", torch.tensor(list(columns)), persistent=False)
         self.requires_grad_(False).eval()
 
@@ -65,10 +53,6 @@ class OneStage(nn.Module):
         super().train(mode)
         self.model.transform.training = False
         return self
-
-    def forward(self, images: Tensor) -> Dense:
-        """As `dense`."""
-        return self.dense(images)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
@@ -92,15 +76,9 @@ class OneStage(nn.Module):
             size=size,
         )
 
-    @torch.no_grad()
-    def predict(
-        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
-    ) -> list[Detections]:
-        """Detections of each image, best first, chosen as the source does: FCOS and RetinaNet the 1,000 best of each
-        level, SSD the 400 best of each class; then suppression within a class."""
-        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
-        with evaluating(self):
-            dense = self.dense(images)
+    def choose(self, dense: Dense, least: float) -> list[Detections]:
+        """As the source: FCOS and RetinaNet the 1,000 best of each level, SSD the 400 best of each class; then
+        suppression within a class."""
         score = dense.logit.sigmoid()
         if dense.quality is not None:
             score = (score * dense.quality.sigmoid()[..., None]).sqrt()

@@ -17,21 +17,14 @@ from typing import Any, Literal
 
 import torch
 import torchvision.models.detection as zoo
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 from torchvision.models.detection.rpn import concat_box_prediction_layers
 from torchvision.ops import box_iou
 
 from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.common import (
-    check_images,
-    check_threshold,
-    check_truth,
-    log_odds,
-    suppress,
-)
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, suppress
 from ssad.detectors.adapters.torchvision import full, scale_of
-from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets
 from ssad.errors import ConfigError
 
@@ -40,7 +33,7 @@ SMALLEST = 1e-2
 BETA = 1 / 9
 
 
-class TwoStage(nn.Module):
+class TwoStage(Adapter):
     """A Faster R-CNN of torchvision as a detector; see the module. Starts frozen and in eval mode.
 
     `Dense`: logit is the log-odds of each class in the second stage's softmax, box the one of the likeliest class,
@@ -49,19 +42,15 @@ class TwoStage(nn.Module):
     [B, A, 4], anchors [A, 4], in the network's input; scale [4] leads to it.
     """
 
-    task: Literal["2d", "3d"] = "2d"
     columns: Tensor
 
     def __init__(
         self, model: Any, classes: Sequence[str], columns: Sequence[int], *, name: str, threshold: float | None = None
     ) -> None:
-        super().__init__()
         if not isinstance(model, zoo.FasterRCNN):
             raise ConfigError(f"{name}: a {type(model).__name__} is no Faster R-CNN of torchvision")
+        super().__init__(name, classes, model.roi_heads.score_thresh if threshold is None else threshold)
         self.model = model
-        self.name = name
-        self.classes = tuple(classes)
-        self.threshold = check_threshold(name, model.roi_heads.score_thresh if threshold is None else threshold)
         self.register_buffer("columns", torch.tensor(list(columns)), persistent=False)
         self.requires_grad_(False).eval()
 
@@ -71,10 +60,6 @@ class TwoStage(nn.Module):
         self.model.transform.training = False
         self.model.rpn.training = False
         return self
-
-    def forward(self, images: Tensor) -> Dense:
-        """As `dense`."""
-        return self.dense(images)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
@@ -138,15 +123,8 @@ class TwoStage(nn.Module):
         box: Tensor = flat.view(*regression.shape[:2], -1, 4)
         return box
 
-    @torch.no_grad()
-    def predict(
-        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
-    ) -> list[Detections]:
-        """Detections of each image, best first: every class of every proposal above the threshold, each with its own
-        box; then suppression within a class."""
-        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
-        with evaluating(self):
-            dense = self.dense(images)
+    def choose(self, dense: Dense, least: float) -> list[Detections]:
+        """Every class of every proposal above the threshold, each with its own box; then suppression within a class."""
         boxes = self._boxes(dense.maps["box_regression"][0], dense.maps["proposals"][0])[:, :, self.columns]
         boxes = boxes / dense.maps["scale"][0]
         roi = self.model.roi_heads

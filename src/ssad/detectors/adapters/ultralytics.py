@@ -29,9 +29,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, sums
 from ssad.detectors.checkpoints import fit_state, load_weights
-from ssad.detectors.modes import evaluating
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import select
@@ -106,15 +105,13 @@ def load_package() -> Any:
         warnings.filters[:] = filters  # type: ignore[index]
 
 
-class Ultralytics(nn.Module):
+class Ultralytics(Adapter):
     """An anchor-free detection network of the package as a detector. Starts frozen and in eval mode.
 
     There is no objectness: `Dense.quality` is None, and an attack on objectness takes the largest class score. Places
     are the cells of all levels, finest first. maps: scores [B, C, P], boxes [B, 4 * bins, P], as the head gives them.
     Pictures are padded at the right and bottom with grey to a multiple of the coarsest stride.
     """
-
-    task: Literal["2d", "3d"] = "2d"
 
     def __init__(
         self,
@@ -125,21 +122,14 @@ class Ultralytics(nn.Module):
         input_width: int | None = None,
         threshold: float = THRESHOLD,
     ) -> None:
-        super().__init__()
         strides = getattr(network, "stride", None)
         if not isinstance(strides, Tensor) or not len(classes) or len(set(classes)) != len(classes):
             raise ConfigError(f"{name}: needs a detection network with strides, and distinct names of classes")
+        super().__init__(name, classes, threshold)
         self.network = network
         self.strides = tuple(int(stride) for stride in strides)
-        self.name = name
-        self.classes = tuple(classes)
         self.input_width = input_width
-        self.threshold = check_threshold(name, threshold)
         self.requires_grad_(False).eval()
-
-    def forward(self, images: Tensor) -> Dense:
-        """As `dense`."""
-        return self.dense(images)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type,
@@ -163,14 +153,8 @@ class Ultralytics(nn.Module):
             size=size,
         )
 
-    @torch.no_grad()
-    def predict(
-        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
-    ) -> list[Detections]:
-        """Detections of each image, best first: score sigmoid(class), suppressed within a class."""
-        least = check_threshold(self.name, self.threshold if threshold is None else threshold)
-        with evaluating(self):
-            dense = self.dense(images)
+    def choose(self, dense: Dense, least: float) -> list[Detections]:
+        """Score sigmoid(class), suppressed within a class."""
         return [
             select(score, box, threshold=least, iou=NMS_IOU, limit=MOST, size=dense.size)
             for score, box in zip(dense.logit.sigmoid(), dense.box, strict=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -14,7 +17,7 @@ from torch.nn.functional import affine_grid, grid_sample
 from ssad.detections import Solids, Truth
 from ssad.detectors.training.recipe import Recipe
 from ssad.errors import ConfigError
-from ssad.types import U8
+from ssad.types import F64, U8
 
 GREY = 0.447
 
@@ -38,7 +41,7 @@ class Bank:
         return len(self.truth)
 
 
-def fill(items: Sequence[Item], *, device: str = "cpu", threads: int = 8) -> Bank:
+def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> Bank:
     """Reads all pictures, in parallel, to the device. ConfigError: no picture, or pictures of different sizes."""
     if not items:
         raise ConfigError("no picture to train on")
@@ -54,16 +57,34 @@ def fill(items: Sequence[Item], *, device: str = "cpu", threads: int = 8) -> Ban
             block.append(torch.from_numpy(np.ascontiguousarray(picture)))
         pictures[start : start + len(block)] = torch.stack(block).to(device)
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads or max(8, (os.cpu_count() or 8) // 4)) as pool:
         list(pool.map(load, range(0, len(items), 32)))
     return Bank(pictures, tuple(item.truth for item in items))
 
 
-def order(count: int, batch: int, *, seed: int, epoch: int) -> list[list[int]]:
-    """Indices of each batch of an epoch; the last one is dropped if it is short, unless it is the only one."""
-    shuffled = np.random.default_rng([seed, epoch]).permutation(count).tolist()
-    full = max(count // batch, 1)
-    return [shuffled[k * batch : (k + 1) * batch] for k in range(full)]
+def repeats(truths: Sequence[Truth], least: float) -> F64 | None:
+    """How often each picture is shown an epoch, so that rare classes are seen: at least once; sqrt(least / share) times
+    if it shows a class whose share of the pictures is under `least` (Gupta et al., LVIS, CVPR 2019). None: all once."""
+    if least <= 0:
+        return None
+    kinds = [torch.unique(t.label if t.crowd is None else t.label[~t.crowd]).tolist() for t in truths]
+    share = Counter(kind for one in kinds for kind in one)
+    factor = {kind: max(1.0, math.sqrt(least * len(truths) / count)) for kind, count in share.items()}
+    return np.array([max((factor[kind] for kind in one), default=1.0) for one in kinds])
+
+
+def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = None) -> list[list[int]]:
+    """Indices of each batch of an epoch; the last one is dropped if it is short, unless it is the only one. often:
+    see `repeats`; what is left of a whole number is drawn, so that every epoch has as many batches."""
+    rng = np.random.default_rng([seed, epoch])
+    shuffled = rng.permutation(count)
+    if often is not None:
+        ends = np.cumsum(often[shuffled])
+        shown = math.ceil(ends[-1] - 1e-9)
+        places = (np.arange(shown) + rng.random()) * (ends[-1] / shown)
+        shuffled = rng.permutation(shuffled[np.searchsorted(ends, places, side="right").clip(max=count - 1)])
+    full = max(len(shuffled) // batch, 1)
+    return [shuffled[k * batch : (k + 1) * batch].tolist() for k in range(full)]
 
 
 def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:

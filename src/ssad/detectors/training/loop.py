@@ -16,7 +16,7 @@ from torch import Tensor, distributed, nn
 
 from ssad import safeio
 from ssad.detections import Truth
-from ssad.detectors.training.batches import Bank, make_batch, order
+from ssad.detectors.training.batches import Bank, make_batch, order, repeats
 from ssad.detectors.training.recipe import Recipe, recipe_data
 from ssad.errors import ConfigError, FormatError, StoreError
 
@@ -83,7 +83,8 @@ def train(
     optimizer = _optimizer(detector, recipe)
     average = copy.deepcopy(detector).requires_grad_(False).eval() if recipe.average else None
     batch = max(recipe.batch // share.world, 1)
-    per_epoch = len(order(len(bank), batch, seed=0, epoch=0))
+    often = repeats(bank.truth, recipe.rare)
+    per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
     total = per_epoch * recipe.epochs
     epoch, step = _resume(out / LAST, detector, average, optimizer, recipe)
     start = time.monotonic()
@@ -92,7 +93,8 @@ def train(
         sums: dict[str, Tensor] = {}
         began = time.monotonic()
         rate = recipe.lr
-        for number, indices in enumerate(order(len(bank), batch, seed=recipe.seed * 1000 + share.rank, epoch=epoch)):
+        seed = recipe.seed * 1000 + share.rank
+        for number, indices in enumerate(order(len(bank), batch, seed=seed, epoch=epoch, often=often)[:per_epoch]):
             rate = recipe.rate(step, total, per_epoch)
             for group in optimizer.param_groups:
                 group["lr"] = rate
@@ -130,6 +132,15 @@ def train(
             break
     best = average if average is not None else detector
     return best.requires_grad_(False).eval()
+
+
+def _same(count: int, share: Share, where: torch.device) -> int:
+    """The least of all processes' counts: their shares of the data differ, their numbers of steps must not."""
+    if share.world == 1:
+        return count
+    least = torch.tensor(float(count), device=where)
+    distributed.all_reduce(least, distributed.ReduceOp.MIN)
+    return int(least)
 
 
 def _over(mine: bool, share: Share, where: torch.device) -> bool:

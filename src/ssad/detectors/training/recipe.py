@@ -19,6 +19,7 @@ class Recipe:
     bfloat16 on a GPU; freeze: prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
     flip: chance of a mirror image; zoom: range of the scale of a random crop; jitter: of brightness, contrast,
     saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop.
+    rare: pictures with a class that fewer than this share of them show are repeated (see `batches.repeats`), 0 none.
     validate: epochs from one validation to the next.
     """
 
@@ -43,6 +44,7 @@ class Recipe:
     jitter: float = 0.3
     noise: float = 0.02
     keep: float = 0.3
+    rare: float = 0.0
     validate: int = 5
     seed: int = 0
 
@@ -80,7 +82,7 @@ _PAPER_YOLO = Recipe(
     "yolov3", 100, 16, 0.01, optimizer="sgd", momentum=0.99, weight_decay=4e-4, schedule="linear", last=0.1, clip=10.0,
     zoom=(0.6, 1.4),
 )  # fmt: skip
-_LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, keep=0.25)
+_LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, keep=0.25, rare=0.1)
 _LIGHT_2D = Recipe("yolov5n", 60, 32, 2e-3, zoom=(0.4, 1.6), weight_decay=0.02, validate=20)
 
 RECIPES: dict[str, Recipe] = {
