@@ -10,7 +10,8 @@ import torch
 
 from ssad.bench.clips import Clips, record_clips
 from ssad.bench.coco import CocoSet, read_coco
-from ssad.bench.detect import score_2d
+from ssad.bench.detect import score_2d, score_3d
+from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.train import coco_items, coco_truth
 from ssad.datasets.nuscenes.files import read_image
 from ssad.detectors import SHIPPED, make_detector
@@ -20,6 +21,7 @@ from ssad.errors import FormatError
 
 NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
 TWO = [name for name in NAMES if name.startswith("yolo")]
+THREE = [name for name in NAMES if not name.startswith("yolo")]
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,7 @@ def clips(tmp_path_factory: pytest.TempPathFactory) -> tuple[CocoSet, Bank]:
 
 
 def test_some_are_shipped() -> None:
-    assert {"yolov3-tiny", "yolov5n"} <= set(NAMES)
+    assert {"fcos3d-light", "pgd-det-light", "yolov3-tiny", "yolov5n"} <= set(NAMES)
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 60 << 20
     assert all(path.stat().st_size < 15 << 20 for path in SHIPPED.iterdir())
 
@@ -55,6 +57,25 @@ def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[
     assert score_2d(detector, bank)["AP50_car"] > 0.7  # eight pictures: each is an eighth
     fresh = make_detector(name, weights="random", classes=data.classes)
     assert score_2d(fresh, bank)["AP50_car"] < 0.2
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three moments of six cameras in a held-out town, with a seed that no training had."""
+    out = tmp_path_factory.mktemp("shipped") / "drive"
+    return record_nuscenes(
+        Recording(out, ("Larkhill",), ("Larkhill",), scenes=1, seconds=1.0, width=800, seed=77), workers=1
+    )
+
+
+@pytest.mark.parametrize("name", THREE)
+def test_objects_are_found_in_space_in_a_town_never_seen(name: str, drive: Path) -> None:
+    scenes = ["scene-larkhill-000"]
+    scores = score_3d(make_detector(name), drive, "v1.0-ssad", scenes)
+    assert scores["AP_car"] > 0.2, scores
+    assert scores["mAP"] > 0.1, scores
+    fresh = score_3d(make_detector(name, weights="random"), drive, "v1.0-ssad", scenes)
+    assert fresh["AP_car"] < 0.02
 
 
 def test_other_weights_under_a_shipped_card_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

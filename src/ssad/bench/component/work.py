@@ -89,11 +89,13 @@ class Watched:
     def __init__(self, detector: Any) -> None:
         self.detector, self.reason = detector, ""
 
-    def predict(self, images: Tensor, intrinsic: Tensor | None = None) -> list[Detections]:
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
         """As the detector, or nothing."""
         if not self.reason:
             try:
-                found: list[Detections] = self.detector.predict(images, intrinsic)
+                found: list[Detections] = self.detector.predict(images, intrinsic, threshold=threshold)
                 self.reason = self._broken(found, len(images))
                 if not self.reason:
                     return found
