@@ -124,28 +124,35 @@ def recorder() -> list[str]:
 
 
 def detectors() -> list[str]:
-    """Images a second of the detectors."""
-    cpu = read("detectors-cpu")
-    beside = next(row for row in cpu["rows"] if row["detector"].startswith("torchvision"))
+    """Images a second of the detectors, on each device that was measured."""
     lines = [
         "# Speed of the detectors",
         "",
-        f"`benchmarks/detector_speed.py`: {cpu['device']} of a 2-core machine, {cpu['batch']} picture a call, float32,",
-        f"medians, in turns with torchvision's FCOS (ResNet-50, {beside['parameters'] / 1e6:.1f} M parameters) on",
-        "pictures of the same size, and with ultralytics' models of like size. Attack: losses and their gradient to",
-        "the picture. Images/s, and in brackets the",
-        "ratio to torchvision's FCOS in the same run.",
+        "`benchmarks/detector_speed.py`: medians, in turns with torchvision's FCOS (ResNet-50) on pictures of the same",
+        "size, and with ultralytics' models of like size where the package is there. Attack: losses and their gradient",
+        "to the picture, float32; the training step is in bfloat16 on a GPU. Images/s, and in brackets the ratio to",
+        "torchvision's FCOS in the same run.",
         "",
-        "| detector | parameters | picture | forward | attack | training step |",
-        "|---|---:|---|---:|---:|---:|",
     ]
-    for row in cpu["rows"]:
-        if row["detector"].startswith("torchvision"):
-            continue
-        cells = [f"{row['images_s'][k]:.1f} ({row['ratio'][k]:.1f})" for k in ("forward", "attack", "training")]
-        size = " x ".join(map(str, row["size"]))
-        lines.append(f"| {row['detector']} | {row['parameters'] / 1e6:.1f} M | {size} | " + " | ".join(cells) + " |")
-    return [*lines, ""]
+    for path in sorted((ROOT / "benchmarks" / "results").glob("detectors-*.json")):
+        data = read(path.stem)
+        machine = f"{data['device']} of a 2-core machine" if "threads" in data["device"] else data["device"]
+        lines += [
+            f"{machine}, {data['batch']} {'picture' if data['batch'] == 1 else 'pictures'} a call:",
+            "",
+            "| detector | parameters | picture | forward | attack | training step |",
+            "|---|---:|---|---:|---:|---:|",
+        ]
+        for row in data["rows"]:
+            if row["detector"].startswith("torchvision"):
+                continue
+            cells = [f"{row['images_s'][k]:.1f} ({row['ratio'][k]:.1f})" for k in ("forward", "attack", "training")]
+            size = " x ".join(map(str, row["size"]))
+            lines.append(
+                f"| {row['detector']} | {row['parameters'] / 1e6:.1f} M | {size} | " + " | ".join(cells) + " |"
+            )
+        lines.append("")
+    return lines
 
 
 def scores() -> list[str]:

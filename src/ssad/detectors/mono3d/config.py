@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 from ssad.errors import ConfigError
 
-# mean and deviation of depth (m), and mean length, height, width (m), in the order of CLASSES_3D. The sizes from
-# bicycle on are one row late: the published weights were trained with these numbers.
+# mean and deviation of depth (m), and mean length, height, width (m), in the order of CLASSES_3D. The bicycle
+# has the size of the construction vehicle: the published weights were trained with these numbers.
 BASE_DEPTHS = (
     (31.99, 21.12), (37.15, 24.63), (39.69, 23.97), (40.91, 26.34), (34.16, 20.11), (22.35, 13.70), (24.28, 16.05),
     (27.26, 15.50), (20.61, 13.68), (22.74, 15.01),
