@@ -79,6 +79,8 @@ def run(
         console.print(f"{record['status']}: {name_of(record)}: {record['reason']}", markup=False, soft_wrap=True)
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
+    if failed:
+        console.print(f"what failed is kept as it is; to try it again, remove {folder} or choose another --out")
     report(folder)
     raise typer.Exit(1 if failed else 0)
 
@@ -312,7 +314,9 @@ def train_detector(
     weights: Annotated[Path | None, typer.Option(help="Start from these weights.")] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     gpus: Annotated[int, typer.Option(min=1, help="GPUs to share the work, one process each.")] = 1,
-    seconds: Annotated[float | None, typer.Option(help="Stop after the epoch in which this time is over.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after the epoch in which this time is over.")
+    ] = None,
 ) -> None:
     """Train a detector; validates on towns that it does not learn from."""
     from ssad.bench.train import Plan, parse_changes, run_training

@@ -204,6 +204,26 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
     assert again == records
 
 
+def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path) -> None:
+    todo = suite_of(root, detectors=["fcos3d-light", "fcos3d-light@fresh=random"], shifts=["fog"], severities=[3])
+    plan = plan_detection(todo)
+    assert [name for name, _ in plan.detectors] == ["fcos3d-light", "fcos3d-light@fresh"]
+    assert plan.weights["fcos3d-light"] != plan.weights["fcos3d-light@fresh"]
+
+
+def test_a_changed_detector_of_ones_own_is_another_run(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    source = tmp_path / "own_eye.py"
+    source.write_text("from helpers.oracle3d import build\n")
+    todo = suite_of(root, detectors=["own_eye:build"], shifts=["fog"], severities=[3])
+    first = plan_detection(todo).run_json()["identity"]
+    assert plan_detection(todo).run_json()["identity"] == first
+    source.write_text("from helpers.oracle3d import build  # mended\n")
+    assert plan_detection(todo).run_json()["identity"] != first
+
+
 BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no such data": ({"data": "/nowhere"}, "is no folder"),
     "no such split": ({"split": "evening"}, "unknown split 'evening'"),
@@ -213,7 +233,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "unknown detector": ({"detectors": ["fcos3d-lite"]}, "fcos3d-light"),
     "a 2D detector": ({"detectors": ["yolov5n=random"]}, "2D"),
     "weights that are not there": ({"detectors": ["fcos3d-light=/nowhere.pth"]}, "nowhere.pth"),
-    "the same detector twice": ({"detectors": [ORACLE, ORACLE]}, "twice"),
+    "the same detector twice": ({"detectors": [ORACLE, ORACLE]}, "twice; .*@mine=FILE"),
     "a split of recorded data": ({"data": "recorded", "split": "mini_val"}, "mini_val"),
     "a split without scenes": ({"split": "mini_val"}, "none of its 2 scenes"),
     "an unknown town": ({"data": "recorded", "recorded": {"towns": ["Atlantis"]}}, "Atlantis"),

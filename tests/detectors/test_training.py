@@ -23,6 +23,7 @@ from ssad.detectors.mono3d.decode import corners, hull, project
 from ssad.detectors.training.batches import (
     Change,
     Item,
+    OnDisk,
     change_colours,
     change_pictures,
     change_truth,
@@ -99,8 +100,8 @@ def test_the_log_has_a_line_an_epoch(tmp_path: Path) -> None:
     rows = [json.loads(line) for line in (tmp_path / LOG).read_text().splitlines()]
     assert [row["epoch"] for row in rows] == [1, 2, 3]
     assert all({"lr", "images_s", "loss_box", "loss_obj", "loss_cls"} <= row.keys() for row in rows)
-    assert [row.get("AP50") for row in rows] == [None, 0.25, 0.25]
-    assert len(seen) == 2
+    assert [row.get("AP50") for row in rows] == [None, 0.25, None], "after the last epoch the caller measures all"
+    assert len(seen) == 1
     assert len(said) == 3
     assert all("\n" not in line for line in said)
 
@@ -267,6 +268,37 @@ def test_a_batch_is_decided_by_its_key() -> None:
     assert all(torch.equal(a.box, b.box) for a, b in zip(truth, again[1], strict=True))
     assert images.shape == (2, 3, *SIZE)
     assert 0 <= float(images.min()) <= float(images.max()) <= 1
+
+
+def test_pictures_that_do_not_fit_are_read_when_they_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    items = [
+        Item(lambda k=k: np.full((6, 8, 3), k, np.uint8), Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4)))  # type: ignore[misc]
+        for k in range(9)
+    ]
+    held = fill(items)
+    monkeypatch.setattr("ssad.detectors.training.batches.free_memory", lambda device: 100.0)
+    bank = fill(items)
+    assert isinstance(bank.pictures, OnDisk)
+    rows = torch.tensor([8, 0, 3])
+    assert torch.equal(bank.pictures[rows], held.pictures[rows])
+    assert torch.equal(bank.pictures[2:5], held.pictures[2:5])
+    where = torch.device("cpu")
+    one, two = (make_batch(b, [4, 1], RECIPE, key=(1, 2), device=where)[0] for b in (bank, held))
+    assert torch.equal(one, two)
+    broken = fill([*items[:-1], Item(lambda: np.zeros((5, 8, 3), np.uint8), items[0].truth)])
+    with pytest.raises(ConfigError, match="picture 8 has the size"):
+        _ = broken.pictures[torch.tensor([8])]
+
+
+def test_a_prefix_that_freezes_nothing_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="freeze: no parameter's name starts with 'bla'"):
+        train(fresh(), bank(), replace(RECIPE, freeze=("bla",)), out=tmp_path)
+
+
+def test_other_data_or_first_weights_in_the_same_folder_are_one_line(tmp_path: Path) -> None:
+    train(fresh(), bank(), RECIPE, out=tmp_path, about="a")
+    with pytest.raises(FormatError, match="of other data, other first weights"):
+        train(fresh(), bank(), RECIPE, out=tmp_path, about="b")
 
 
 def test_pictures_are_read_in_order_and_must_be_of_one_size() -> None:
@@ -444,8 +476,17 @@ def test_the_learning_rate_rises_and_falls(name: str) -> None:
 def test_a_recipe_that_is_unknown_or_wrong_is_one_line() -> None:
     with pytest.raises(UnknownNameError, match="yolov5n"):
         find_recipe("yolov5")
-    with pytest.raises(UnknownNameError, match="epochs"):
+    with pytest.raises(ConfigError, match=r"no value 'epoch'; it has .*epochs"):
         find_recipe("yolov5n", epoch=3)
-    for wrong in ({"epochs": 0}, {"lr": 0.0}, {"zoom": (0.0, 1.0)}, {"average": 1.0}):
-        with pytest.raises(ConfigError, match="recipe yolov5n"):
-            find_recipe("yolov5n", **wrong)
+    with pytest.raises(ConfigError, match="no value 'detector'"):
+        find_recipe("yolov5n", detector="yolov3")
+    numbers = ({"epochs": 0}, {"lr": 0.0}, {"zoom": (0.0, 1.0)}, {"average": 1.0}, {"validate": 0}, {"clip": -1.0},
+               {"jitter": 5}, {"momentum": 2}, {"seed": -1}, {"lr": math.nan}, {"warmup": -5})  # fmt: skip
+    kinds = ({"lr": "abc"}, {"epochs": 1.5}, {"epochs": True}, {"zoom": 1}, {"zoom": (1.0,)}, {"zoom": ("a", "b")},
+             {"rare": "abc"}, {"optimizer": "adam"}, {"schedule": "foo"}, {"amp": "maybe"}, {"steps": 8},
+             {"epochs": None}, {"freeze": "backbone"})  # fmt: skip
+    for wrong in (*numbers, *kinds):
+        with pytest.raises(ConfigError, match="recipe yolov5n") as error:
+            find_recipe("yolov5n", **wrong)  # type: ignore[arg-type]
+        assert "\n" not in str(error.value)
+    assert find_recipe("yolov5n", lr=1, zoom=(1, 2), freeze=("backbone",)).zoom == (1, 2)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shlex
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,22 +16,22 @@ from typing import Any
 import numpy as np
 import torch
 from torch import distributed
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
-from ssad import safeio
+from ssad import errors, safeio
 from ssad.bench.coco import CocoSet, read_coco
 from ssad.bench.detect import score_2d, score_3d
-from ssad.bench.training_data import nuscenes_items
+from ssad.bench.training_data import nuscenes_items, scenes_of
 from ssad.datasets.nuscenes.files import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.detections import Truth
 from ssad.detectors import make_detector
-from ssad.detectors.checkpoints import Card, fit_state, load_weights, save_weights
+from ssad.detectors.checkpoints import Card, fit_state, hash_state, load_weights, save_weights
 from ssad.detectors.training.batches import Bank, Item, fill
-from ssad.detectors.training.loop import LOG, Share, train
+from ssad.detectors.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
 from ssad.detectors.training.recipe import Recipe, find_recipe, recipe_data
 from ssad.errors import ConfigError
+from ssad.seeding import digest
 
 Say = Callable[[str], None]
 VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the end all are used
@@ -95,11 +98,26 @@ def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
         if device != "cuda" or torch.cuda.device_count() < plan.gpus:
             raise ConfigError(f"--gpus {plan.gpus}: this machine has {torch.cuda.device_count()} usable GPUs")
         safeio.make_folder(plan.out)
-        spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
+        with _one_line():
+            spawn(_worker, (plan, recipe, _free_port(), "nccl"), nprocs=plan.gpus)  # type: ignore[no-untyped-call]
     else:
         _run(plan, recipe, device, Share(), say)
     log = safeio.read_text(plan.out / LOG).splitlines()
     yield f"{plan.out / f'{recipe.detector}.safetensors'}: {len(log)} epochs; card, {LOG} and curves.png beside it"
+
+
+@contextmanager
+def _one_line() -> Iterator[None]:
+    """The SSADError of a process, which comes as the text of its traceback, as what it was."""
+    try:
+        yield
+    except ProcessRaisedException as error:
+        last = str(error).strip().splitlines()[-1]
+        kind, _, text = last.partition(": ")
+        module, _, name = kind.rpartition(".")
+        if module != errors.__name__ or not hasattr(errors, name):
+            raise
+        raise getattr(errors, name)(text) from None
 
 
 def _device(wanted: str) -> str:
@@ -131,9 +149,59 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
 
 
 def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
-    """Data, detector, training, weights."""
-    three = recipe.detector.startswith(("fcos3d", "pgd"))
+    """Data, detector, training, weights. What can be wrong is looked at before pictures are read."""
+    items, options = _items(plan, three=_three(recipe))
+    detector = make_detector(recipe.detector, weights="random", device="cpu", **options)
+    if plan.weights is not None:
+        fit_state(detector, load_weights(plan.weights), str(plan.weights))
+    about = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(items))[:16]
+    last = read_last(plan.out / LAST, recipe, about)
+    validate = _validation(plan, device, three=_three(recipe))
+    weights = plan.out / f"{recipe.detector}.safetensors"
+    if last is not None and last["epoch"] >= recipe.epochs and _card_epochs(weights) == recipe.epochs:
+        say(f"all {recipe.epochs} epochs are done, and {weights.name} is there")
+        return
+    del last
+    mine = items[share.rank :: share.world][: len(items) // share.world]
+    say(f"{len(items)} pictures to learn from, {sum(len(i.truth.label) for i in items)} objects")
+    final = train(
+        detector, fill(mine, device=device), recipe, out=plan.out, device=device,
+        validate=lambda d: validate(d, quick=True), say=say, share=share, seconds=plan.seconds, about=about,
+    )  # fmt: skip
+    if share.rank:
+        return
+    metrics = validate(final, quick=False)
+    row = read_rows(plan.out)[-1]
+    write_row(plan.out, row | metrics)
+    say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
+    if row["epoch"] < recipe.epochs:
+        say(f"stopped after {row['epoch']} of {recipe.epochs} epochs; run it again to go on")
+    folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
+    card = Card(
+        data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
+        metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"epochs_done": row["epoch"]},
+    )  # fmt: skip
+    save_weights(weights, final.state_dict(), card=card, half=True)
+    draw_curves(plan.out)
+
+
+def _card_epochs(weights: Path) -> int:
+    """Epochs that the card of weights tells of; 0 without a card."""
+    path = weights.with_suffix(".json")
+    return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
+
+
+def _three(recipe: Recipe) -> bool:
+    return recipe.detector.startswith(("fcos3d", "pgd"))
+
+
+def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
+    """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
+    if three and len(plan.data) > 1:
+        raise ConfigError("--more is for 2D detectors; a 3D one learns from one data set in the nuScenes schema")
+    if not three and plan.val_data is not None:
+        raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
     if three:
         items = list(nuscenes_items(plan.data[0], None, plan.split))
     else:
@@ -144,28 +212,17 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
                 raise ConfigError(f"{folder}: other classes than {plan.data[0]}")
             options["classes"] = names
             items += found
-    detector = make_detector(recipe.detector, weights="random", device="cpu", **options)
-    if plan.weights is not None:
-        fit_state(detector, load_weights(plan.weights), str(plan.weights))
-    mine = items[share.rank :: share.world][: len(items) // share.world]
-    say(f"{len(items)} pictures to learn from, {sum(len(i.truth.label) for i in items)} objects")
-    bank = fill(mine, device=device)
-    validate = _validation(plan, device, three=three)
-    final = train(
-        detector, bank, recipe, out=plan.out, device=device, validate=lambda d: validate(d, quick=True), say=say,
-        share=share, seconds=plan.seconds,
-    )  # fmt: skip
-    if share.rank:
-        return
-    metrics = validate(final, quick=False)
-    say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
-    folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
-    card = Card(
-        data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
-        metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"detector": recipe.detector},
-    )  # fmt: skip
-    save_weights(plan.out / f"{recipe.detector}.safetensors", final.state_dict(), card=card, half=True)
-    draw_curves(plan.out)
+    if not items:
+        raise ConfigError(f"{', '.join(map(str, plan.data))}: no picture to learn from in the split '{plan.split}'")
+    return items, options
+
+
+def _hash_items(items: Sequence[Item]) -> str:
+    """Of what is to be learned: labels and boxes of all pictures, in their order."""
+    whole = hashlib.sha256()
+    for item in items:
+        whole.update(item.truth.label.numpy().tobytes() + b"|" + item.truth.box.numpy().tobytes())
+    return whole.hexdigest()
 
 
 def describe_data(folder: Path) -> str:
@@ -192,13 +249,18 @@ def describe_data(folder: Path) -> str:
 
 def command_of(plan: Plan) -> str:
     """The command that trains this anew, with the names of the folders."""
-    parts = ["ssad train detector", plan.recipe, f"--data {plan.data[0].name}"]
-    parts += [f"--more {folder.name}" for folder in plan.data[1:]]
-    parts += [f"--val-data {plan.val_data.name}"] if plan.val_data else []
-    parts += [f"--weights {plan.weights.name}"] if plan.weights else []
-    parts += [f"--gpus {plan.gpus}"] if plan.gpus > 1 else []
-    parts += [f"--set {key}={list(v) if isinstance(v, tuple) else v}" for key, v in plan.changes]
-    return " ".join(parts)
+    words = ["ssad", "train", "detector", plan.recipe, "--data", plan.data[0].name]
+    for folder in plan.data[1:]:
+        words += ["--more", folder.name]
+    for option, value, usual in (
+        ("--val-data", plan.val_data and plan.val_data.name, None), ("--split", plan.split, "train"),
+        ("--val", plan.val, "val"), ("--weights", plan.weights and plan.weights.name, None), ("--gpus", plan.gpus, 1),
+        ("--seconds", plan.seconds, None),
+    ):  # fmt: skip
+        words += [option, str(value)] if value != usual else []
+    for key, value in plan.changes:
+        words += ["--set", f"{key}={'[' + ','.join(map(str, value)) + ']' if isinstance(value, tuple) else value}"]
+    return shlex.join(words)
 
 
 def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:
@@ -207,7 +269,7 @@ def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[s
         root = plan.val_data or plan.data[0]
         with NuScenes(root) as data:
             version = data.version
-        scenes = scenes_of_split(root, version, plan.val)
+            scenes = scenes_of(data, plan.val)
         few = scenes[:: max(len(scenes) // VAL_SCENES, 1)][:VAL_SCENES]
 
         def check_3d(detector: Any, *, quick: bool) -> dict[str, float]:
@@ -215,6 +277,11 @@ def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[s
 
         return check_3d
     split = "test" if plan.val == "val" else plan.val
+    if len({folder.name for folder in plan.data}) < len(plan.data):
+        raise ConfigError("two folders of data have the same name, and metrics are named by it; rename one")
+    for folder in plan.data:
+        if not coco_items(folder, split)[1]:
+            raise ConfigError(f"{folder}: no picture to validate on in annotations/{split}.json")
     banks: dict[str, Bank] = {}
 
     def check_2d(detector: Any, *, quick: bool) -> dict[str, float]:

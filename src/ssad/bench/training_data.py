@@ -23,6 +23,15 @@ CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in
 NEAR = 0.1  # m in front of the camera at which boxes are cut
 
 
+def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
+    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
+    there = {scene.name for scene in data.scenes()}
+    found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
+    if not found:
+        raise ConfigError(f"{data.root / data.version}: none of its {len(there)} scenes is in the split '{split}'")
+    return found
+
+
 def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) -> Truth:
     """What a camera should find of a sample's boxes: those of the ten classes whose middle is in the picture.
 
@@ -79,7 +88,7 @@ def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool
 def nuscenes_items(root: Path, version: str | None, split: str, *, limit: int | None = None) -> Iterator[Item]:
     """Every key picture of every camera of a split; limit: of so many scenes. ConfigError: an unknown split."""
     with NuScenes(root, version) as data:
-        names = scenes_of_split(root, data.version, split)
+        names = scenes_of(data, split)
         for name in names[:limit]:
             scene = data.scene(name)
             for frame in scene.frames:

@@ -11,16 +11,17 @@ import torch
 
 from ssad import safeio
 from ssad.bench.component.run import Plan
-from ssad.bench.component.work import Job, Unit, Watched, detector_of, scenes_of, shifter_of
+from ssad.bench.component.work import Job, Unit, Watched, detector_of, shifter_of
 from ssad.bench.detect import to_images
 from ssad.bench.execute import quiet_warp
 from ssad.bench.pictures import FOLDER, PAGE
 from ssad.bench.toolbox.sheet import save_picture
-from ssad.bench.training_data import camera_truth
+from ssad.bench.training_data import camera_truth, scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes, read_image
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detections import Solids
 from ssad.detectors.mono3d.decode import corners
+from ssad.errors import FormatError
 from ssad.scenarios.static.shifts import SHIFTS
 from ssad.types import F64, U8
 
@@ -39,7 +40,10 @@ def draw_detections(todo: Plan, folder: str | Path) -> None:
         f"at severity {_severity(todo)}."
     )
     if not path.is_file():
-        save_picture(path, _sheet(todo, Path(folder), name, weights))
+        try:
+            save_picture(path, _sheet(todo, Path(folder), name, weights))
+        except FormatError:  # a picture that cannot be read has failed its cells, which say so
+            return
     safeio.write_atomic(target / PAGE, safeio.dump_json({path.name: caption}, indent=1) + "\n")
 
 

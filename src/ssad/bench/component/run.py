@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,12 +15,13 @@ from rich.console import Console
 from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
-from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, scenes_of, score_cell
+from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, score_cell
 from ssad.bench.pool import spread, visible_gpus
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.run import default_workers, versions
 from ssad.bench.store import Store
+from ssad.bench.training_data import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.errors import ConfigError
@@ -79,18 +81,22 @@ def plan_detection(suite: DetectionSuite, *, device: str = "cpu") -> Plan:
     for text in suite.detectors:
         name, _, file = text.partition("=")
         if name in weights:
-            raise ConfigError(f"suite {suite.name}: detectors: {name} appears twice")
-        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
-        if not path and name in DETECTORS and not (SHIPPED / f"{name}.json").is_file():
             raise ConfigError(
-                f"suite {suite.name}: no weights of {name} are shipped; give a file, {name}=FILE "
-                f"(docs/detectors.md: ssad train detector {name}, or official ones)"
+                f"suite {suite.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
+                f"{name}@mine=FILE"
+            )
+        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
+        kind = name.partition("@")[0]
+        if not path and kind in DETECTORS and not (SHIPPED / f"{kind}.json").is_file():
+            raise ConfigError(
+                f"suite {suite.name}: no weights of {kind} are shipped; give a file, {kind}=FILE "
+                f"(docs/detectors.md: ssad train detector {kind}, or official ones)"
             )
         detector = detector_of(name, path, "cpu")
         if getattr(detector, "task", None) != "3d":
             raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
         detectors.append((name, path))
-        weights[name] = state_hash(detector)
+        weights[name] = state_hash(detector) + source_hash(kind)
     if suite.data == RECORDED:
         about = _recording(suite, Path(RECORDED)).identity()
         about["split"] = suite.split
@@ -117,6 +123,13 @@ def state_hash(detector: Any) -> str:
     from ssad.detectors.checkpoints import hash_state
 
     return hash_state(detector.state_dict())[:12]
+
+
+def source_hash(name: str) -> str:
+    """For a detector of one's own, `module:object`, 12 hex digits over its module's file; "" for one of ours."""
+    module, colon, _ = name.partition(":")
+    path = getattr(sys.modules.get(module), "__file__", None) if colon else None
+    return "" if path is None else f" {hashlib.sha256(Path(path).read_bytes()).hexdigest()[:12]}"
 
 
 def _recording(suite: DetectionSuite, out: Path) -> Recording:

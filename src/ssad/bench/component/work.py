@@ -21,13 +21,12 @@ from ssad.bench.execute import quiet_warp
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
-from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detections import Detections, Solids
 from ssad.detectors import make_detector
 from ssad.detectors.check import promises
 from ssad.detectors.mono3d.merge import WorldBoxes
-from ssad.errors import ConfigError, FormatError, SSADError
+from ssad.errors import FormatError, SSADError
 from ssad.metrics.detection import DetectionScores
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
@@ -68,18 +67,9 @@ class Job:
     threads: int
 
 
-def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
-    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
-    there = {scene.name for scene in data.scenes()}
-    found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
-    if not found:
-        raise ConfigError(f"{data.root / data.version}: none of its {len(there)} scenes is in the split '{split}'")
-    return found
-
-
 def detector_of(name: str, weights: str, device: str) -> Any:
-    """A detector by name and weights."""
-    return make_detector(name, weights=weights or None, device=device)
+    """A detector by name (what follows an @ is a label of the suite's own) and weights."""
+    return make_detector(name.partition("@")[0], weights=weights or None, device=device)
 
 
 class Watched:
@@ -100,7 +90,7 @@ class Watched:
                 if not self.reason:
                     return found
             except Exception as error:  # whatever a stranger's detector raises
-                if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA" in str(error):
+                if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
                     raise
                 text = " ".join(str(error).split())
                 self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from ssad.errors import ConfigError
 from ssad.types import F64, U8
 
 GREY = 0.447
+ROOM = 0.6  # share of the free memory that pictures may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +33,28 @@ class Item:
 
 
 @dataclass(frozen=True, slots=True)
+class OnDisk:
+    """Pictures that are read when they are asked for: uint8 [n, H, W, 3] for indices [n] or a slice."""
+
+    items: Sequence[Item]
+    shape: tuple[int, ...]
+
+    @property
+    def device(self) -> torch.device:
+        """Where they come out."""
+        return torch.device("cpu")
+
+    def __getitem__(self, rows: Tensor | slice) -> Tensor:
+        numbers = range(len(self.items))[rows] if isinstance(rows, slice) else rows.tolist()
+        with ThreadPoolExecutor(8) as pool:
+            return torch.stack(list(pool.map(lambda k: _read(self.items, k, self.shape), numbers)))
+
+
+@dataclass(frozen=True, slots=True)
 class Bank:
     """All pictures of a set, uint8 [N, H, W, 3], and their truth (on the CPU)."""
 
-    pictures: Tensor
+    pictures: Tensor | OnDisk
     truth: tuple[Truth, ...]
 
     def __len__(self) -> int:
@@ -42,24 +62,43 @@ class Bank:
 
 
 def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> Bank:
-    """Reads all pictures, in parallel, to the device. ConfigError: no picture, or pictures of different sizes."""
+    """Reads all pictures, in parallel, to the device; if it has no room for them, to the host; if that has none, they
+    stay on disk and are read when they are wanted. ConfigError: no picture, or pictures of different sizes."""
     if not items:
         raise ConfigError("no picture to train on")
-    first = items[0].read()
-    pictures = torch.empty((len(items), *first.shape), dtype=torch.uint8, device=device)
+    shape = items[0].read().shape
+    truth = tuple(item.truth for item in items)
+    needed = len(items) * math.prod(shape)
+    device = next((d for d in (device, "cpu") if needed < ROOM * free_memory(d)), "")
+    if not device:
+        return Bank(OnDisk(items, shape), truth)
+    pictures = torch.empty((len(items), *shape), dtype=torch.uint8, device=device)
 
     def load(start: int) -> None:
-        block = []
-        for k in range(start, min(start + 32, len(items))):
-            picture = items[k].read()
-            if picture.shape != first.shape:
-                raise ConfigError(f"picture {k} has the size {picture.shape[:2]}, the first {first.shape[:2]}")
-            block.append(torch.from_numpy(np.ascontiguousarray(picture)))
+        block = [_read(items, k, shape) for k in range(start, min(start + 32, len(items)))]
         pictures[start : start + len(block)] = torch.stack(block).to(device)
 
     with ThreadPoolExecutor(threads or max(8, (os.cpu_count() or 8) // 4)) as pool:
         list(pool.map(load, range(0, len(items), 32)))
-    return Bank(pictures, tuple(item.truth for item in items))
+    return Bank(pictures, truth)
+
+
+def _read(items: Sequence[Item], number: int, shape: tuple[int, ...]) -> Tensor:
+    picture = items[number].read()
+    if picture.shape != shape:
+        raise ConfigError(f"picture {number} has the size {picture.shape[:2]}, the first {shape[:2]}")
+    return torch.from_numpy(np.ascontiguousarray(picture))
+
+
+def free_memory(device: str) -> float:
+    """Bytes that are free on a device; infinite where that cannot be told."""
+    if torch.device(device).type == "cuda":
+        return float(torch.cuda.mem_get_info(torch.device(device))[0])
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return 1024.0 * float(next(line for line in lines if line.startswith("MemAvailable")).split()[1])
+    except (OSError, StopIteration, ValueError):
+        return math.inf
 
 
 def repeats(truths: Sequence[Truth], least: float) -> F64 | None:

@@ -62,13 +62,14 @@ def train(
     say: Callable[[str], None] = lambda line: None,
     share: Share = Share(),
     seconds: float | None = None,
+    about: str = "",
 ) -> Any:
     """Trains a detector on a bank and gives back the one to use (the average of the weights, if one is kept).
 
     OUT/last.pt holds all that is needed to go on after a stop; OUT/log.jsonl a line an epoch. validate: metrics of a
-    detector, every `recipe.validate` epochs and at the end. seconds: stop after the epoch in which this time is over
-    (to be gone on with). FormatError: last.pt is of another recipe or broken; StoreError; ConfigError: the loss is not
-    finite.
+    detector, every `recipe.validate` epochs but the last. seconds: stop after the epoch in which this time is over (to
+    be gone on with). about: what else the result depends on (data, first weights), to be the same when it goes on.
+    FormatError: last.pt is of another recipe, of other data or broken; StoreError; ConfigError: the loss is not finite.
     """
     where = torch.device(device)
     detector.to(where)
@@ -86,7 +87,7 @@ def train(
     often = repeats(bank.truth, recipe.rare)
     per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
     total = per_epoch * recipe.epochs
-    epoch, step = _resume(out / LAST, detector, average, optimizer, recipe)
+    epoch, step = _resume(out / LAST, detector, average, optimizer, recipe, about)
     start = time.monotonic()
     while epoch < recipe.epochs:
         _training_mode(detector, recipe)
@@ -122,11 +123,12 @@ def train(
             raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
         if share.rank == 0:
             final = average if average is not None else detector
-            if validate is not None and (epoch % recipe.validate == 0 or epoch == recipe.epochs):
-                row |= validate(final.eval())
             _save(out, {"model": detector.state_dict(), "average": None if average is None else average.state_dict(),
-                        "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step,
+                        "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step, "about": about,
                         "recipe": safeio.dump_json(recipe_data(recipe))}, row)  # fmt: skip
+            if validate is not None and epoch % recipe.validate == 0 and epoch < recipe.epochs:
+                row |= validate(final.eval())
+                write_row(out, row)
             say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
         if seconds is not None and _over(time.monotonic() - start > seconds, share, where):
             break
@@ -153,7 +155,11 @@ def _over(mine: bool, share: Share, where: torch.device) -> bool:
 
 
 def _unfreeze(detector: Any, recipe: Recipe) -> None:
-    """Everything learns but what the recipe holds."""
+    """Everything learns but what the recipe holds. ConfigError: it holds what there is not."""
+    names = [name for name, _ in detector.named_parameters()]
+    for prefix in recipe.freeze:
+        if not any(name.startswith(prefix) for name in names):
+            raise ConfigError(f"recipe {recipe.detector}: freeze: no parameter's name starts with '{prefix}'")
     for name, value in detector.named_parameters():
         value.requires_grad_(not name.startswith(recipe.freeze) if recipe.freeze else True)
 
@@ -195,19 +201,31 @@ def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:
     try:
         with safeio.atomic_path(out / LAST) as path:
             torch.save(state, path)
-        lines = (out / LOG).read_text().splitlines() if (out / LOG).is_file() else []
-        kept = [line for line in lines if safeio.parse_json(line)["epoch"] < row["epoch"]]
-        safeio.write_atomic(out / LOG, "\n".join([*kept, safeio.dump_json(row)]) + "\n")
+    except OSError as error:
+        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
+    write_row(out, row)
+
+
+def read_rows(out: Path) -> list[dict[str, Any]]:
+    """The lines of OUT/log.jsonl, an epoch each."""
+    return [safeio.parse_json(line) for line in safeio.read_text(out / LOG).splitlines()]
+
+
+def write_row(out: Path, row: dict[str, Any]) -> None:
+    """Writes the line of an epoch; lines of this epoch and of later ones go. StoreError."""
+    try:
+        rows = read_rows(out) if (out / LOG).is_file() else []
+        kept = [one for one in rows if one["epoch"] < row["epoch"]]
+        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(one) + "\n" for one in [*kept, row]))
     except OSError as error:
         raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
 
 
-def _resume(
-    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe
-) -> tuple[int, int]:
-    """Epoch and step to go on with."""
+def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
+    """What a training left to go on with, None if there is nothing. FormatError: broken, of another recipe, of other
+    data or first weights."""
     if not path.is_file():
-        return 0, 0
+        return None
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
@@ -216,6 +234,20 @@ def _resume(
         raise FormatError(f"{path}: not a checkpoint of a training; delete it")
     if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
         raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
+    if state.get("about", "") != about:
+        raise FormatError(
+            f"{path}: of other data, other first weights or another number of GPUs; choose another folder, or delete it"
+        )
+    return state
+
+
+def _resume(  # noqa: PLR0917
+    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, about: str
+) -> tuple[int, int]:
+    """Epoch and step to go on with."""
+    state = read_last(path, recipe, about)
+    if state is None:
+        return 0, 0
     try:
         detector.load_state_dict(state["model"])
         if average is not None:

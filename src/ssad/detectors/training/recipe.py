@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ssad.errors import ConfigError, unknown_name
 
@@ -49,10 +49,23 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.epochs < 1 or self.batch < 1 or not self.lr > 0:
-            raise ConfigError(f"recipe {self.detector}: epochs and batch must be 1 or more, lr above 0")
-        if not 0 < self.zoom[0] <= self.zoom[1] or not 0 <= self.flip <= 1 or not 0 <= self.average < 1:
-            raise ConfigError(f"recipe {self.detector}: zoom needs 0 < low <= high, flip and average a share")
+        for name, kind in get_type_hints(type(self)).items():
+            if not _is(getattr(self, name), kind):
+                given = getattr(self, name)
+                raise ConfigError(f"recipe {self.detector}: {name}={given}: expected {_words(kind)}")
+        if min(self.epochs, self.batch, self.validate) < 1 or not 0 < self.lr < math.inf:
+            raise ConfigError(f"recipe {self.detector}: epochs, batch and validate must be 1 or more, lr above 0")
+        if not 0 < self.zoom[0] <= self.zoom[1]:
+            raise ConfigError(f"recipe {self.detector}: zoom needs 0 < low <= high")
+        for name in ("flip", "keep", "last", "rare", "jitter", "noise"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} is not in [0, 1]")
+        for name in ("momentum", "average"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} is not in [0, 1)")
+        for name in ("weight_decay", "warmup", "clip", "seed"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} must be 0 or more")
 
     def rate(self, step: int, total: int, per_epoch: int) -> float:
         """Learning rate of a step out of `total`."""
@@ -65,6 +78,31 @@ class Recipe:
         if step < self.warmup:
             factor *= 1 / 3 + 2 / 3 * step / self.warmup
         return self.lr * factor
+
+
+def _is(value: Any, kind: Any) -> bool:
+    """Whether a value is of an annotated type; a whole number is a number, but no truth value is."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        if not isinstance(value, tuple):
+            return False
+        kinds = (kinds[0],) * len(value) if kinds[-1] is ... else kinds
+        return len(value) == len(kinds) and all(map(_is, value, kinds))
+    if kind in (int, float):
+        return isinstance(value, int | kind) and not isinstance(value, bool)
+    return isinstance(value, kind)
+
+
+def _words(kind: Any) -> str:
+    """A type in words."""
+    if get_origin(kind) is Literal:
+        return " or ".join(map(str, get_args(kind)))
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        return f"a list of {'' if kinds[-1] is ... else f'{len(kinds)} '}{_words(kinds[0]).removeprefix('a ')}s"
+    return {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}[kind]
 
 
 def _official(detector: str, lr: float, **changes: Any) -> Recipe:
@@ -102,10 +140,10 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """A recipe by name with some of its values changed. UnknownNameError, ConfigError."""
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    known = {f.name for f in fields(Recipe)}
+    known = sorted(f.name for f in fields(Recipe) if f.name != "detector")
     for key in changes:
         if key not in known:
-            raise unknown_name("value of a recipe", key, sorted(known))
+            raise ConfigError(f"a recipe has no value '{key}'; it has {', '.join(known)}")
     return replace(RECIPES[name], **changes)
 
 
