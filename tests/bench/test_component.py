@@ -272,6 +272,11 @@ def test_the_shipped_suites_load_and_take_settings() -> None:
             load_suite("shifts", [setting])
 
 
+def test_a_severity_that_cannot_be_is_named_by_its_place() -> None:
+    with pytest.raises(ConfigError, match=r"--set severities=\[6\]: severities\[0\]: Input should be less than"):
+        load_suite("shifts-quick", ["severities=[6]"])
+
+
 def test_a_suite_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.yaml"
     path.write_text("name: x\nkind: flying\n")

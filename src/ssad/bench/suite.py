@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -133,10 +134,13 @@ def _unknown_key(key: str, known: Sequence[str]) -> str:
     return f"unknown key '{key}'; closest: {', '.join(close)}"
 
 
+UNION = re.compile(r"constrained-\w+|literal\[.*\]")  # how pydantic names the members of a union in a location
+
+
 def _explain(error: ValidationError, document: Document, changed: dict[str, str], known: Sequence[str]) -> ConfigError:
     """The first problem as one line with file, line and key, or with the setting that caused it."""
     problem = error.errors(include_url=False)[0]
-    location = tuple(problem["loc"])
+    location = tuple(part for part in problem["loc"] if not UNION.fullmatch(str(part)))
     if problem["type"] == "extra_forbidden":
         text = _unknown_key(str(location[-1]), known)
         location = (*location[:-1], str(location[-1]))
