@@ -333,8 +333,6 @@ def _other_shapes(module: nn.Module, differ: Iterable[tuple[Shape, Shape]]) -> s
                 if anchors and not rest and has % anchors == 0 and has // anchors > extra:
                     here.add(has // anchors - extra)
         guesses = here if guesses is None else guesses & here
-    if guesses and len(guesses) > 1:
-        return f"made for another number of classes; this detector has {classes}"
     if guesses:
-        return f"made for {min(guesses)} classes, this detector has {classes}"
+        return f"made for {' or '.join(map(str, sorted(guesses)))} classes, this detector has {classes}"
     return "another width or variant of the detector"
