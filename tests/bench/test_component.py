@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from ssad.bench.component.pictures import draw_detections
 from ssad.bench.component.run import plan_detection, run_detection
 from ssad.bench.component.suite import SHIFTS, DetectionSuite
 from ssad.bench.component.work import read_unit
@@ -178,6 +179,7 @@ def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path
     victim.unlink()
     todo = suite_of(broken, shifts=["gaussian"], severities=[3])
     records = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    draw_detections(plan_detection(todo), tmp_path / "run")  # goes without
     assert {r["status"] for r in records} == {"failed"}
     assert all(victim.name in r["reason"] for r in records)
     page = write_report(tmp_path / "run").read_text()
