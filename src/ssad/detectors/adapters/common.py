@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Literal
 
@@ -15,7 +16,7 @@ from ssad.detectors.yolo.assign import Targets, pad_truth
 from ssad.errors import ConfigError
 
 
-class Adapter(nn.Module):
+class Adapter(nn.Module, ABC):
     """What every adapted 2D detector has. threshold: default of `predict`. ConfigError: not in [0, 1)."""
 
     task: Literal["2d", "3d"] = "2d"
@@ -30,9 +31,9 @@ class Adapter(nn.Module):
         """As `dense`."""
         return self.dense(images)
 
+    @abstractmethod
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Raw outputs; see `ssad.protocols.Detector`."""
-        raise NotImplementedError
 
     @torch.no_grad()
     def predict(
@@ -44,9 +45,9 @@ class Adapter(nn.Module):
             dense = self.dense(images)
         return self.choose(dense, least)
 
+    @abstractmethod
     def choose(self, dense: Dense, least: float) -> list[Detections]:
         """Detections of each image above a score of `least`."""
-        raise NotImplementedError
 
 
 def check_images(name: str, images: Tensor) -> tuple[int, int]:
