@@ -59,6 +59,23 @@ def test_weights_come_with_a_card_that_says_all(done: Path, clips: Path) -> None
     assert (done / "curves.png").is_file()
 
 
+def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: Path, tmp_path: Path) -> None:
+    first = done / "yolov5n.safetensors"
+    more = Plan("yolov5n", (clips,), tmp_path / "a", changes=(*SHORT, ("epochs", 1)), weights=first, device="cpu")
+    list(run_training(more, say=lambda line: None))
+    second = tmp_path / "a" / "yolov5n.safetensors"
+    list(run_training(replace(more, out=tmp_path / "b", weights=second), say=lambda line: None))
+    cards = [read_card(path) for path in (first, second, tmp_path / "b" / "yolov5n.safetensors")]
+    known = [
+        {"data": c.data, "command": c.command, "hash": c.hash, "epochs_done": n}
+        for c, n in zip(cards, (2, 1, 1), strict=True)
+    ]
+    before = {"file": "yolov5n.safetensors", **known[0]}
+    assert cards[1].config["first_weights"] == before
+    assert cards[2].config["first_weights"] == {"file": "yolov5n.safetensors", **known[1], "first_weights": before}
+    assert "--weights yolov5n.safetensors" in cards[2].command
+
+
 def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in done.iterdir()}
     said: list[str] = []

@@ -21,6 +21,7 @@ Size = tuple[float, float, float]  # length, width, height
 KERB = 0.12  # m, height of sidewalks
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
+ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
 WALKERS = 10  # people of a cast; many walk in more than one place
 # model of the world -> kind of body and its styles; a trailer truck is driven as a bus
 STYLES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -36,6 +37,7 @@ PARKED = {
     "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
     "motorcycle": (1.4, 3.0), "bicycle": (1.6, 2.6),
 }  # fmt: skip
+AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
 LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
@@ -253,7 +255,8 @@ def _kerb(cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear) 
         if not clear.footprint(x, y, yaw, PARKED[kind][1], size[1]):
             continue
         clear.take(x, y, yaw, PARKED[kind][1], size[1])
-        facing = yaw + (np.pi if spot < len(lots) and own.random() < 0.5 else 0.0)
+        against = 0.5 if spot < len(lots) else AGAINST.get(kind, 0.0)
+        facing = yaw + (np.pi if own.random() < against else 0.0)
         cast.add(cast.make(kind, style, size), _still(x, y, facing, z), parked=True)
         if kind == "construction" or (kind == "truck" and own.random() < 0.3):
             _site(cast, (x, y, yaw, z), size, own, clear)
@@ -262,7 +265,7 @@ def _kerb(cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear) 
 def _site(
     cast: Cast, at: tuple[float, float, float, float], size: Size, own: np.random.Generator, clear: Clear
 ) -> None:
-    """Cones along the road side of a machine, barriers across both ends, a worker."""
+    """Cones or barriers along the road side of a machine, barriers across both ends."""
     x, y, yaw, z = at
     cos, sin = np.cos(yaw), np.sin(yaw)
 
@@ -270,10 +273,14 @@ def _site(
         style = draw_style(kind, generator=own)
         drawn = draw_size(kind, style, generator=own)
         px, py = x + forward * cos - left * sin, y + forward * sin + left * cos
-        cast.add(cast.make(kind, style, drawn), _still(px, py, yaw + turn, z))
+        cast.add(cast.make(kind, style, drawn), _still(px, py, yaw + turn + float(own.normal(0.0, ASKEW)), z))
 
-    for k in range(int(own.integers(3, 7))):
-        put("traffic_cone", -size[0] / 2 - 1.0 + k * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
+    if own.random() < 0.5:
+        for k in range(int(own.integers(3, 7))):
+            put("traffic_cone", -size[0] / 2 - 1.0 + k * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
+    else:
+        for k in range(int((size[0] + 2.0) / 2.8) + 1):
+            put("barrier", -size[0] / 2 + 0.4 + 2.8 * k, size[1] / 2 + 0.45, np.pi / 2)
     for end in (-1, 1):
         for k in range(int(own.integers(1, 3))):
             put("barrier", end * (size[0] / 2 + 1.2 + 1.3 * k), 0.0, 0.0)
@@ -311,14 +318,15 @@ def _sidewalks(cast: Cast, graph: LaneGraph, way: F64, clear: Clear, steps: int)
                     cast.add(who, _still(px, py, turned, KERB))
             elif pick < crowd + 0.13:
                 kind = "traffic_cone" if draws.random() < 0.5 else "barrier"
+                along = draws.random() < 0.6  # else barriers stand one behind the other, across the walk
                 for k in range(int(draws.integers(1, 5))):
                     style = draw_style(kind, generator=draws)
                     size = draw_size(kind, style, generator=draws)
                     gap = (1.6 if kind == "traffic_cone" else 2.8) * k
                     qx, qy, turn, _ = graph.at(int(lane), min(float(s) + gap, length))
                     if clear.footprint(qx, qy, 0.0, 0.5, 0.5):
-                        cross = np.pi / 2 if kind == "barrier" else 0.0
-                        cast.add(cast.make(kind, style, size), _still(qx, qy, turn + cross, KERB))
+                        turn += (np.pi / 2 if kind == "barrier" and along else 0.0) + float(draws.normal(0.0, ASKEW))
+                        cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
 
 
 def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:

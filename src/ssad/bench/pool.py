@@ -32,7 +32,10 @@ def spread(
         return
     spawn = multiprocessing.get_context("spawn")
     turn = spawn.Value("i", 0)
-    with ProcessPoolExecutor(count, mp_context=spawn, initializer=_begin, initargs=(turn, tuple(gpus))) as pool:
+    threads = max((os.cpu_count() or 1) // count, 1)
+    with ProcessPoolExecutor(
+        count, mp_context=spawn, initializer=_begin, initargs=(turn, tuple(gpus), threads)
+    ) as pool:
         futures = [pool.submit(function, task) for task in tasks]
         try:
             for future in as_completed(futures):
@@ -55,8 +58,10 @@ def visible_gpus() -> list[str]:
     return [str(k) for k in range(torch.cuda.device_count())]
 
 
-def _begin(turn: Synchronized[int], gpus: tuple[str, ...]) -> None:
-    """Makes a worker ready."""
+def _begin(turn: Synchronized[int], gpus: tuple[str, ...], threads: int) -> None:
+    """Makes a worker ready. threads: of the linear algebra in each, which would otherwise take every core in each."""
+    for library in ("OMP", "OPENBLAS", "MKL"):  # read when NumPy is imported, which has not happened yet
+        os.environ.setdefault(f"{library}_NUM_THREADS", str(threads))
     if gpus:
         with turn.get_lock():
             number = turn.value

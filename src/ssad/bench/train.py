@@ -179,10 +179,23 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
     card = Card(
         data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
-        metrics=metrics, classes=tuple(final.classes), config=recipe_data(recipe) | {"epochs_done": row["epoch"]},
+        metrics=metrics, classes=tuple(final.classes),
+        config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | _before(plan.weights),
     )  # fmt: skip
     save_weights(weights, final.state_dict(), card=card, half=True)
     draw_curves(plan.out)
+
+
+def _before(weights: Path | None) -> dict[str, Any]:
+    """What the card of the first weights says about how they were made, and what they had been made of in turn."""
+    if weights is None:
+        return {}
+    path = weights.with_suffix(".json")
+    card = safeio.read_json(path) if path.is_file() else {}
+    config = card.get("config", {})
+    about = {name: card[name] for name in ("data", "command", "hash") if name in card}
+    about |= {name: config[name] for name in ("epochs_done", "first_weights") if name in config}
+    return {"first_weights": {"file": weights.name, **about}}
 
 
 def _card_epochs(weights: Path) -> int:
@@ -242,6 +255,7 @@ def describe_data(folder: Path) -> str:
     else:
         return folder.name
     words += ["--streets", about["streets"]] if about.get("streets", "town") != "town" else []
+    words += ["--device", about["device"]] if about.get("device", "cpu") != "cpu" else []
     held = ",".join(about["held_out"])
     words += ["--held-out", held or '""', *(["--seed", str(about["seed"])] if about["seed"] else [])]
     return " ".join(["ssad record", folder.name, *words])
