@@ -20,7 +20,7 @@ import pytest
 
 from ssad.bench.cast import make_cast
 from ssad.bench.clips import Clips, record_clips
-from ssad.bench.drives import drive_street, make_drive
+from ssad.bench.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.bench.record import AHEAD, CATEGORY, Recording, drive, record_nuscenes
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.camera.street import cached_street
@@ -284,3 +284,13 @@ def test_the_official_toolkit_scores_true_boxes_as_perfect(root: Path, tmp_path:
         errors = told["label_tp_errors"][name]
         assert errors["trans_err"] < 1e-6
         assert errors["scale_err"] < 1e-6
+
+
+def test_streets_of_any_kind_have_fewer_cars_and_the_same_mix_of_all_else() -> None:
+    town, other = thinned(MIX, "town"), thinned(MIX, "any")
+    assert sum(town.values()) == pytest.approx(1.0)
+    assert sum(other.values()) == pytest.approx(1.0)
+    assert town == pytest.approx(MIX)
+    assert sum(other[body] for body in CARS) < 0.75 * sum(town[body] for body in CARS)
+    rest = [body for body in MIX if body not in CARS]
+    assert [other[b] / other["bus"] for b in rest] == pytest.approx([town[b] / town["bus"] for b in rest])

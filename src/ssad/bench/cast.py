@@ -3,10 +3,12 @@ at any moment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ssad.bench.drives import thinned
 from ssad.bench.gallery import place
 from ssad.camera.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.camera.mesh import Material, Mesh, box
@@ -158,14 +160,16 @@ class Clear:
 
 
 def make_cast(
-    trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1
-) -> Cast:
-    """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way."""
+    trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1,
+    streets: str = "town",
+) -> Cast:  # fmt: skip
+    """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way; streets:
+    see `ssad.bench.drives.thinned`."""
     cast = Cast(trace.dt, key, detail)
     _agents(cast, trace)
     way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
     clear = Clear(street)
-    _kerb(cast, graph, street, way, clear)
+    _kerb(cast, graph, street, way, clear, thinned({kind: PARKED[kind][0] for kind in PARKED}, streets))
     _sidewalks(cast, graph, way, clear, len(trace.x))
     return cast
 
@@ -220,12 +224,13 @@ def _still(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
     return np.array([[x, y, yaw, z]])
 
 
-def _kerb(cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear) -> None:
+def _kerb(  # noqa: PLR0917
+    cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear, shares: Mapping[str, float]
+) -> None:
     """Vehicles parked at the kerb and on parking places; building sites of cones and barriers round machines."""
     draws = generator("record kerb", *cast.key)
     busy = float(draws.uniform(0.25, 0.75))
-    kinds = list(PARKED)
-    share = np.array([PARKED[k][0] for k in kinds])
+    kinds, share = list(shares), np.array(list(shares.values()))
     lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
     kerbs = []
     for lane in np.flatnonzero(graph.kind == LaneType.SHOULDER):
@@ -241,7 +246,7 @@ def _kerb(cast: Cast, graph: LaneGraph, street: Street, way: F64, clear: Clear) 
     for spot, at in enumerate([*lots, *kerbs]):
         if np.hypot(way[:, 0] - at[0], way[:, 1] - at[1]).min() > 55.0 or draws.random() > busy:
             continue
-        kind = str(draws.choice(kinds, p=share / share.sum()))
+        kind = str(draws.choice(kinds, p=share))
         long = PARKED[kind][1] > LONG
         spots.append((not long, spot, "car" if long and spot < len(lots) else kind, at))
     for _, spot, kind, (edge_x, edge_y, yaw, z) in sorted(spots):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -25,6 +26,8 @@ MIX = {
     "car": 0.27, "suv": 0.15, "coupe": 0.06, "compact": 0.14, "van": 0.06, "motorcycle": 0.08, "bicycle": 0.07,
     "truck": 0.10, "bus": 0.07,
 }  # fmt: skip
+CARS = ("car", "suv", "coupe", "compact", "van")
+FEWER = 0.4  # times as many cars, against all else, where streets are "any": a detector sees enough of them
 
 STREETS = ("town", "any")
 
@@ -45,11 +48,18 @@ def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> 
     return build_street(graph, seed=int(draws.integers(1, 2**31)), style=str(draws.choice(sorted(STYLES))))
 
 
-def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float) -> Episode:
-    """One drive: ego first, all on Autopilot, signals green. Deterministic in the key.
+def thinned(shares: Mapping[str, float], streets: str) -> dict[str, float]:
+    """Shares of bodies, of the sum 1; fewer cars for "any" (see `FEWER`)."""
+    found = {body: share * (FEWER if streets == "any" and body in CARS else 1.0) for body, share in shares.items()}
+    return {body: share / sum(found.values()) for body, share in found.items()}
+
+
+def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, streets: str = "town") -> Episode:
+    """One drive: ego first, all on Autopilot, signals green. Deterministic in the key. streets: see `thinned`.
 
     MapError: the town has no road to drive on.
     """
+    mix = thinned(MIX, streets)
     draws = generator("drive", graph.name, *key)
     lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 25.0))
     if not len(lanes):
@@ -73,7 +83,7 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float) -> 
         x, y, yaw, _ = graph.at(lane, s)
         if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > NEAR or draws.random() > density:
             continue
-        body = str(draws.choice(list(MIX), p=list(MIX.values())))
+        body = str(draws.choice(list(mix), p=list(mix.values())))
         path = random_route(graph, lane, s, 400.0, draws)
         for _ in range(TRIES):
             if fits(body, path):

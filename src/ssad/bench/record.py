@@ -164,9 +164,10 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     key = (recording.seed, town, number)
     graph = load_town(town)
     street = drive_street(graph, recording.streets, key=key)
-    episode = make_drive(graph, key=(recording.seed, number), seconds=recording.seconds + 0.2)
+    seconds, streets = recording.seconds + 0.2, recording.streets
+    episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive(episode, graph)
-    cast = make_cast(trace, graph, street, key=key)
+    cast = make_cast(trace, graph, street, key=key, streets=streets)
     stage = Stage(street, cast.meshes, device=recording.device)
     weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
