@@ -150,13 +150,13 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
 
 def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
     """Data, detector, training, weights. What can be wrong is looked at before pictures are read."""
-    items, options = _items(plan, three=_three(recipe))
+    items, options = _items(plan, three=recipe.three)
     detector = make_detector(recipe.detector, weights="random", device="cpu", **options)
     if plan.weights is not None:
         fit_state(detector, load_weights(plan.weights), str(plan.weights))
     about = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(items))[:16]
     last = read_last(plan.out / LAST, recipe, about)
-    validate = _validation(plan, device, three=_three(recipe))
+    validate = _validation(plan, device, three=recipe.three)
     weights = plan.out / f"{recipe.detector}.safetensors"
     if last is not None and last["epoch"] >= recipe.epochs and _card_epochs(weights) == recipe.epochs:
         say(f"all {recipe.epochs} epochs are done, and {weights.name} is there")
@@ -202,10 +202,6 @@ def _card_epochs(weights: Path) -> int:
     """Epochs that the card of weights tells of; 0 without a card."""
     path = weights.with_suffix(".json")
     return int(safeio.read_json(path).get("config", {}).get("epochs_done", 0)) if path.is_file() else 0
-
-
-def _three(recipe: Recipe) -> bool:
-    return recipe.detector.startswith(("fcos3d", "pgd"))
 
 
 def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from dataclasses import asdict, fields, replace
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 
 from ssad.errors import ConfigError, unknown_name
 
+Whole = Annotated[int, Field(ge=1)]
+FromNone = Annotated[int, Field(ge=0)]
+Above = Annotated[float, Field(gt=0.0)]
+Least = Annotated[float, Field(ge=0.0)]
+Part = Annotated[float, Field(ge=0.0, le=1.0)]
+Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, allow_inf_nan=False))
 class Recipe:
     """A training run. Learning rates are for one step on `batch` images over all devices.
 
@@ -18,54 +28,48 @@ class Recipe:
     (epochs); warmup: iterations from a third of lr; average: decay of the weights' moving average, 0 none; amp:
     bfloat16 on a GPU; freeze: prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
     flip: chance of a mirror image; zoom: range of the scale of a random crop; jitter: of brightness, contrast,
-    saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop.
-    rare: pictures with a class that fewer than this share of them show are repeated (see `batches.repeats`), 0 none.
-    validate: epochs from one validation to the next.
+    saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop, 2D
+    only (a 3D box stays while its middle is in sight). rare: pictures with a class that fewer than this share of them
+    show are repeated (see `batches.repeats`), 0 none. validate: epochs from one validation to the next.
     """
 
     detector: str
-    epochs: int
-    batch: int
-    lr: float
+    epochs: Whole
+    batch: Whole
+    lr: Above
     optimizer: Literal["sgd", "adamw"] = "adamw"
-    momentum: float = 0.9
-    weight_decay: float = 0.01
+    momentum: Decay = 0.9
+    weight_decay: Least = 0.01
     schedule: Literal["cosine", "linear", "step"] = "cosine"
-    last: float = 0.02
+    last: Part = 0.02
     steps: tuple[int, ...] = ()
-    warmup: int = 200
-    clip: float = 10.0
-    average: float = 0.998
+    warmup: FromNone = 200
+    clip: Least = 10.0
+    average: Decay = 0.998
     amp: bool = True
     freeze: tuple[str, ...] = ()
     norm_eval: bool = False
-    flip: float = 0.5
-    zoom: tuple[float, float] = (1.0, 1.0)
-    jitter: float = 0.3
-    noise: float = 0.02
-    keep: float = 0.3
-    rare: float = 0.0
-    validate: int = 5
-    seed: int = 0
+    flip: Part = 0.5
+    zoom: tuple[Above, Above] = (1.0, 1.0)
+    jitter: Part = 0.3
+    noise: Part = 0.02
+    keep: Part = 0.0
+    rare: Part = 0.0
+    validate: Whole = 5
+    seed: FromNone = 0
 
-    def __post_init__(self) -> None:
-        for name, kind in get_type_hints(type(self)).items():
-            if not _is(getattr(self, name), kind):
-                given = getattr(self, name)
-                raise ConfigError(f"recipe {self.detector}: {name}={given}: expected {_words(kind)}")
-        if min(self.epochs, self.batch, self.validate) < 1 or not 0 < self.lr < math.inf:
-            raise ConfigError(f"recipe {self.detector}: epochs, batch and validate must be 1 or more, lr above 0")
-        if not 0 < self.zoom[0] <= self.zoom[1]:
-            raise ConfigError(f"recipe {self.detector}: zoom needs 0 < low <= high")
-        for name in ("flip", "keep", "last", "rare", "jitter", "noise"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} is not in [0, 1]")
-        for name in ("momentum", "average"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} is not in [0, 1)")
-        for name in ("weight_decay", "warmup", "clip", "seed"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"recipe {self.detector}: {name}={getattr(self, name)} must be 0 or more")
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.zoom[0] > self.zoom[1]:
+            raise ValueError("zoom: needs low <= high")
+        if self.keep and self.three:
+            raise ValueError("keep: is for 2D detectors; a 3D box stays while its middle is in sight")
+        return self
+
+    @property
+    def three(self) -> bool:
+        """Whether the detector is a 3D one."""
+        return self.detector.startswith(("fcos3d", "pgd"))
 
     def rate(self, step: int, total: int, per_epoch: int) -> float:
         """Learning rate of a step out of `total`."""
@@ -80,37 +84,12 @@ class Recipe:
         return self.lr * factor
 
 
-def _is(value: Any, kind: Any) -> bool:
-    """Whether a value is of an annotated type; a whole number is a number, but no truth value is."""
-    if get_origin(kind) is Literal:
-        return value in get_args(kind)
-    if get_origin(kind) is tuple:
-        kinds = get_args(kind)
-        if not isinstance(value, tuple):
-            return False
-        kinds = (kinds[0],) * len(value) if kinds[-1] is ... else kinds
-        return len(value) == len(kinds) and all(map(_is, value, kinds))
-    if kind in (int, float):
-        return isinstance(value, int | kind) and not isinstance(value, bool)
-    return isinstance(value, kind)
-
-
-def _words(kind: Any) -> str:
-    """A type in words."""
-    if get_origin(kind) is Literal:
-        return " or ".join(map(str, get_args(kind)))
-    if get_origin(kind) is tuple:
-        kinds = get_args(kind)
-        return f"a list of {'' if kinds[-1] is ... else f'{len(kinds)} '}{_words(kinds[0]).removeprefix('a ')}s"
-    return {int: "a whole number", float: "a number", bool: "true or false", str: "a name"}[kind]
-
-
 def _official(detector: str, lr: float, **changes: Any) -> Recipe:
     """As mmdetection3d 1.4 trains its nuScenes models, 1x: SGD, 12 epochs, a tenth after 8 and 11."""
     base = Recipe(
         detector, 12, 16, lr, optimizer="sgd", weight_decay=1e-4, schedule="step", steps=(8, 11), warmup=500, clip=35.0,
         average=0.0, amp=False, freeze=("backbone.conv1", "backbone.bn1", "backbone.layer1"), norm_eval=True,
-        jitter=0.0, noise=0.0, keep=0.0,
+        jitter=0.0, noise=0.0,
     )  # fmt: skip
     return replace(base, **changes)
 
@@ -118,10 +97,10 @@ def _official(detector: str, lr: float, **changes: Any) -> Recipe:
 # The paper: SGD, momentum 0.99, weight decay 4e-4, from 0.01 to 0.001, from COCO weights
 _PAPER_YOLO = Recipe(
     "yolov3", 100, 16, 0.01, optimizer="sgd", momentum=0.99, weight_decay=4e-4, schedule="linear", last=0.1, clip=10.0,
-    zoom=(0.6, 1.4),
+    zoom=(0.6, 1.4), keep=0.3,
 )  # fmt: skip
-_LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, keep=0.25, rare=0.1)
-_LIGHT_2D = Recipe("yolov5n", 60, 32, 2e-3, zoom=(0.4, 1.6), weight_decay=0.02, validate=20)
+_LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, rare=0.1)
+_LIGHT_2D = Recipe("yolov5n", 60, 32, 2e-3, zoom=(0.4, 1.6), weight_decay=0.02, validate=20, keep=0.3)
 
 RECIPES: dict[str, Recipe] = {
     "fcos3d-light": _LIGHT_3D,
@@ -144,7 +123,13 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     for key in changes:
         if key not in known:
             raise ConfigError(f"a recipe has no value '{key}'; it has {', '.join(known)}")
-    return replace(RECIPES[name], **changes)
+    try:
+        return replace(RECIPES[name], **changes)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = str(problem["loc"][0]) if problem["loc"] else ""
+        text = problem["msg"].removeprefix("Value error, ")
+        raise ConfigError(f"recipe {name}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
