@@ -40,6 +40,7 @@ def run(
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Run again what failed.")] = False,
 ) -> None:
     """Run a suite and write its report; run again to resume.
 
@@ -58,7 +59,7 @@ def run(
     where = pick_device(device)
     try:
         if isinstance(chosen, Suite):
-            records = run_plan(plan(chosen, device=where), folder, workers=workers)
+            records = run_plan(plan(chosen, device=where), folder, workers=workers, retry=retry)
             make_pictures(list(chosen.pictures), folder)
             shown = table(chosen.title or chosen.name, records)
         else:
@@ -66,7 +67,7 @@ def run(
             from ssad.bench.component.run import plan_detection, run_detection
 
             todo = plan_detection(chosen, device=where)
-            records = run_detection(todo, folder, workers=workers)
+            records = run_detection(todo, folder, workers=workers, retry=retry)
             draw_detections(todo, folder)
             shown = shift_table(chosen.title or chosen.name, records)
     except KeyboardInterrupt:
@@ -80,7 +81,7 @@ def run(
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     if failed:
-        console.print(f"what failed is kept as it is; to try it again, remove {folder} or choose another --out")
+        console.print("what failed is kept as it is; to try it again: the same command with --retry")
     report(folder)
     raise typer.Exit(1 if failed else 0)
 

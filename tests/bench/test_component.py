@@ -184,6 +184,9 @@ def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path
     assert all(victim.name in r["reason"] for r in records)
     page = write_report(tmp_path / "run").read_text()
     assert "Failed cells" in page
+    shutil.copy(root / "samples" / "CAM_FRONT" / victim.name, victim)
+    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=1, retry=True)
+    assert {r["status"] for r in mended} == {"ok"}
 
 
 @pytest.mark.parametrize("way", ["raises", "breaks a promise"])
@@ -204,6 +207,12 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
     assert "Failed cells" in write_report(tmp_path / "run").read_text()
     again = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
     assert again == records
+    monkeypatch.setenv("ORACLE_WAY", "none")
+    assert run_detection(plan_detection(todo), tmp_path / "run", workers=1) == records, "what failed is kept"
+    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=1, retry=True)
+    assert [r["key"] for r in mended] == [r["key"] for r in records]
+    assert [r for r in mended if r["detector"] == ORACLE] == good, "what worked was not run again"
+    assert [r["metrics"] for r in mended if r["detector"] != ORACLE] == [r["metrics"] for r in good]
 
 
 def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path) -> None:

@@ -149,6 +149,9 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     assert "4 of 5 episodes failed and count" in shown
     with pytest.raises(StoreError, match="left no trace: failed"):
         replay(tmp_path / "run", "wicked_system:Wicked/StraightObstacle/00")
+    again = run(plan(chosen), tmp_path / "run", workers=1, console=console, retry=True)
+    assert {r["group"]: r["status"] for r in again} == {name: records[name]["status"] for name in names}
+    assert len((tmp_path / "run" / "results.jsonl").read_text().splitlines()) == len(names)
 
 
 def test_a_changed_system_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

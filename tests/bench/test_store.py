@@ -57,6 +57,23 @@ def test_every_cut_of_the_files_is_mended(tmp_path: Path) -> None:
         assert (folder / "episodes.jsonl").read_bytes() == episodes
 
 
+def test_what_failed_goes_when_it_is_to_be_tried_again(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    with Store.open(tmp_path, RUN) as store:
+        store.append({"key": "b", "status": "failed"}, None)
+    fill(tmp_path, "c")
+    before = (tmp_path / "results.jsonl").read_bytes()
+    with Store.open(tmp_path, RUN) as store:
+        assert list(store.results) == ["a", "b", "c"]
+    assert (tmp_path / "results.jsonl").read_bytes() == before
+    with Store.open(tmp_path, RUN, retry=True) as store:
+        assert list(store.results) == ["a", "c"]
+        store.append(result("b"), {"key": "b", "raw": "b"})
+    fill(tmp_path / "never", "a", "c", "b")
+    for name in ("results.jsonl", "episodes.jsonl"):
+        assert (tmp_path / name).read_bytes() == (tmp_path / "never" / name).read_bytes()
+
+
 def test_a_last_line_of_zeros_is_cut(tmp_path: Path) -> None:
     fill(tmp_path, "a", "b")
     with open(tmp_path / "results.jsonl", "ab") as file:

@@ -116,11 +116,13 @@ def run(
     workers: int | None = None,
     execute: str = EXECUTE,
     console: Console | None = None,
+    retry: bool = False,
 ) -> list[dict[str, Any]]:
-    """Run what is missing and return all records, in the order of the plan. StoreError, SSADError."""
+    """Run what is missing (retry: and what failed) and return all records, in the order of the plan. StoreError,
+    SSADError."""
     console = console or Console(stderr=True)
     suite, header = todo.suite, todo.run_json()
-    with Store.open(folder, header) as store:
+    with Store.open(folder, header, retry=retry) as store:
         missing = [cell for cell in todo.cells if cell.key not in store.results]
         _keep_towns(Path(folder), todo.towns)
         settings = {"folder": str(Path(folder).resolve()), "device": todo.device, "witness": suite.witness}

@@ -1,7 +1,8 @@
 """The results folder: append-only, safe against kill -9, never a line lost or doubled.
 
 DIR/run.json says what runs; DIR/episodes.jsonl and DIR/results.jsonl get one line a cell, the latter last: a cell is
-finished when its line in results.jsonl is whole. What was cut off in the middle is dropped on the next start.
+finished when its line in results.jsonl is whole. What was cut off in the middle is dropped on the next start; what
+failed goes when it is to be tried again.
 """
 
 from __future__ import annotations
@@ -68,11 +69,12 @@ class Store:
         self.results: dict[str, dict[str, Any]] = {}
 
     @classmethod
-    def open(cls, folder: str | Path, run: Mapping[str, Any]) -> Self:
+    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
         """Take the folder for this run: a new one, or one of the same run to go on with.
 
-        run: what run.json shall say; its "identity" must equal that of a run already there. StoreError when the
-        folder cannot be written, is in use, or belongs to another run; nothing is changed then.
+        run: what run.json shall say; its "identity" must equal that of a run already there. retry: cells that failed
+        are as if they had never run. StoreError when the folder cannot be written, is in use, or belongs to another
+        run; nothing is changed then.
         """
         path = Path(folder)
         _check_content(path, run)
@@ -80,13 +82,13 @@ class Store:
         store = cls(path, _lock(path))
         try:
             _check_content(path, run)  # again: another process may have begun meanwhile
-            store._begin(run)
+            store._begin(run, retry=retry)
         except BaseException:
             store.close()
             raise
         return store
 
-    def _begin(self, run: Mapping[str, Any]) -> None:
+    def _begin(self, run: Mapping[str, Any], *, retry: bool) -> None:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
         results, ends = _scan(self.folder / RESULTS)
@@ -95,6 +97,10 @@ class Store:
             if record["key"] in self.results:
                 raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
             self.results[record["key"]] = record
+        if retry and any(_failed(record) for record in results):
+            self.results = {key: record for key, record in self.results.items() if not _failed(record)}
+            lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
+            safeio.write_atomic(self.folder / RESULTS, "".join(lines))
         episodes, ends = _scan(self.folder / EPISODES)
         while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
             episodes.pop()
@@ -138,6 +144,10 @@ class Store:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _failed(record: Mapping[str, Any]) -> bool:
+    return bool(record.get("status", "ok") != "ok")
 
 
 def _check_content(folder: Path, run: Mapping[str, Any]) -> None:

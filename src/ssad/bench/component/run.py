@@ -15,7 +15,7 @@ from rich.console import Console
 from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
-from ssad.bench.component.work import Cell, Job, Unit, detector_of, make_unit, score_cell
+from ssad.bench.component.work import Cell, Job, Unit, detector_of, forget_failures, make_unit, score_cell
 from ssad.bench.pool import spread, visible_gpus
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
@@ -142,12 +142,13 @@ def _recording(suite: DetectionSuite, out: Path) -> Recording:
 
 
 def run_detection(
-    todo: Plan, folder: str | Path, *, workers: int | None = None, console: Console | None = None
+    todo: Plan, folder: str | Path, *, workers: int | None = None, console: Console | None = None, retry: bool = False
 ) -> list[dict[str, Any]]:
-    """Run what is missing and return all records, in the order of the plan. StoreError, SSADError."""
+    """Run what is missing (retry: and what failed) and return all records, in the order of the plan. StoreError,
+    SSADError."""
     console, suite = console or Console(stderr=True), todo.suite
     header, out = todo.run_json(), Path(folder)
-    with Store.open(out, header) as store:
+    with Store.open(out, header, retry=retry) as store:
         order = [cell["key"] for cell in header["cells"]]
         if all(key in store.results for key in order):
             return [store.results[key] for key in order]
@@ -177,6 +178,8 @@ def run_detection(
         ]  # fmt: skip
         missing = [cell for cell in cells if cell.key not in store.results]
         units = list(dict.fromkeys(unit for cell in missing for unit in cell.units))
+        if retry:
+            forget_failures(out, units)
         failed: dict[Unit, str] = {}
         began = time.monotonic()
         with Live(suite.name, len(units) + len(missing), 0, console=console) as live:

@@ -169,6 +169,17 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
     return unit, ""
 
 
+def forget_failures(folder: Path, units: Sequence[Unit]) -> None:
+    """Takes away the boxes of units in which a detector failed, so that they are made anew."""
+    for unit in units:
+        path = folder / unit.path
+        if path.is_file():
+            with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+                failed = any(name.endswith("/failed") for name in file.files)
+            if failed:
+                path.unlink()
+
+
 class DetectorFailed(SSADError):
     """A detector failed on a scene; why."""
 
