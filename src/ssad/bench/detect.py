@@ -19,7 +19,7 @@ from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detections import CLASSES_3D, Detections
 from ssad.detectors.mono3d.merge import WorldBoxes, merge_cameras
 from ssad.detectors.training.batches import Bank
-from ssad.metrics.detection import Matches, filter_boxes, match
+from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
 from ssad.protocols import Detector
@@ -30,6 +30,9 @@ LABEL = np.array([CLASSES.index(name) for name in CLASSES_3D])
 _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
 AT_ONCE = 6  # samples that a GPU is shown at once
 FLOOR = 0.001  # least score that counts for AP of 2D boxes
+ERRORS: Mapping[str, str] = {
+    "mATE": "trans_err", "mASE": "scale_err", "mAOE": "orient_err", "mAVE": "vel_err", "mAAE": "attr_err",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,10 +154,18 @@ def match_boxes(found: Sequence[SampleBoxes], truth: GroundTruth) -> Matches:
 def score_3d(
     detector: Detector, root: Path, version: str, scenes: Sequence[str], *, device: str = "cpu"
 ) -> dict[str, float]:
-    """mAP, NDS and the AP of each class over some scenes."""
+    """`numbers` over some scenes."""
     truth = read_truth(root, version, scenes=frozenset(scenes))
-    scores = match_boxes(detect(detector, root, version, scenes, device=device), truth).scores()
-    return {"mAP": scores.mean_ap, "NDS": scores.nd_score} | {f"AP_{k}": v for k, v in scores.mean_dist_aps.items()}
+    return numbers(match_boxes(detect(detector, root, version, scenes, device=device), truth).scores())
+
+
+def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
+    """mAP, NDS, AP of each class, true-positive errors; few: mAP, NDS and the AP of cars alone. NaN is left out."""
+    found = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
+    if not few:
+        found |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
+        found |= {short: scores.tp_errors[name] for short, name in ERRORS.items()}
+    return {name: round(float(value), 6) for name, value in found.items() if np.isfinite(value)}
 
 
 def score_2d(detector: Detector, bank: Bank, *, device: str = "cpu", batch: int = 32) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ssad import safeio
-from ssad.bench.detect import SampleBoxes, detect_with, match_boxes
+from ssad.bench.detect import SampleBoxes, detect_with, match_boxes, numbers
 from ssad.bench.execute import quiet_warp
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -27,7 +27,6 @@ from ssad.detectors import make_detector
 from ssad.detectors.check import promises
 from ssad.detectors.mono3d.merge import WorldBoxes
 from ssad.errors import FormatError, SSADError
-from ssad.metrics.detection import DetectionScores
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 from ssad.seeding import generator
@@ -249,17 +248,3 @@ def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
         "metrics": values, "intervals": intervals, "replicates": replicates, "n": len(truth.samples),
         "scenes": len(truth.scenes), "applied": dict(sorted(applied.items())),
     }  # fmt: skip
-
-
-def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
-    """mAP, NDS, AP of each class, true-positive errors; few: mAP, NDS and the AP of cars alone. NaN is left out."""
-    found = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
-    if not few:
-        found |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}
-        found |= {short: scores.tp_errors[name] for short, name in ERRORS.items()}
-    return {name: round(float(value), 6) for name, value in found.items() if np.isfinite(value)}
-
-
-ERRORS: Mapping[str, str] = {
-    "mATE": "trans_err", "mASE": "scale_err", "mAOE": "orient_err", "mAVE": "vel_err", "mAAE": "attr_err",
-}  # fmt: skip
