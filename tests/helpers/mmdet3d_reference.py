@@ -7,7 +7,8 @@ The first builds the model from mmdetection3d's own nuScenes configuration with 
 same classes, ResNet-50 with 8 channels, heads of 32) and writes OUT/weights.safetensors (not for --small) and
 OUT/reference.npz: maps/NAME/LEVEL (the head's, eval mode), boxes/NAME, targets/NAME [B, P, ...], losses/NAME of a batch
 of three pictures (the last without an object), alone/NAME [B] of each by itself, gradient [B, 3, H, W] of the sum of
-the batch's losses to the normalised pictures (--small: summed over cells of 8 x 8), truth/IMAGE/NAME. The second
+the batch's losses to the normalised pictures (--small: summed over cells of 8 x 8), truth/IMAGE/NAME; targets, the
+batch's losses and the gradient in double precision. The second
 formats made-up detections of six cameras as NuScenesMetric does for a submission: OUT/reference.npz with translation,
 size, rotation, velocity, score, label, attribute. Other names: mono3d_case.py, which draws all from the seed.
 """
@@ -21,8 +22,9 @@ from pathlib import Path
 import mmdet3d
 import numpy as np
 import torch
+from mmdet3d.models.dense_heads import pgd_head
 from mmdet3d.registry import MODELS
-from mmdet3d.structures import CameraInstance3DBoxes, Det3DDataSample
+from mmdet3d.structures import CameraInstance3DBoxes, Det3DDataSample, points_cam2img
 from mmdet3d.utils import register_all_modules
 from mmengine.config import Config
 from mmengine.structures import InstanceData
@@ -120,12 +122,20 @@ def training(model, pictures, lens, truths):
         for name, value in losses.items():
             alone.setdefault(name.removeprefix("loss_"), []).append(float(value))
     found.update({f"alone/{name}": np.array(values) for name, values in alone.items()})
+    model.double()  # in single precision a gradient through 101 layers has three digits
+    batch = batch.double()
+    for one in samples:
+        solid = one.gt_instances_3d
+        solid.bboxes_3d.tensor = solid.bboxes_3d.tensor.double()
+        solid.centers_2d, solid.depths = solid.centers_2d.double(), solid.depths.double()
+        one.gt_instances.bboxes = one.gt_instances.bboxes.double()
+    pgd_head.points_cam2img = lambda points, lens, **named: points_cam2img(points.to(lens.dtype), lens, **named)
     # the head turns the true boxes' yaw in place: each call has a copy of its own
     batch.requires_grad_(True)
     maps = head(model.extract_feat({"imgs": batch}))
     copies = copy.deepcopy(samples)
     sizes = [m.shape[-2:] for m in maps[0]]
-    points = head.get_points(sizes, torch.float32, batch.device)
+    points = head.get_points(sizes, batch.dtype, batch.device)
     columns = head.get_targets(points, [s.gt_instances_3d for s in copies], [s.gt_instances for s in copies])
     for name, levels in zip(("label", "reg", "centreness", "attribute"), columns, strict=True):
         rows = [level.unflatten(0, (len(pictures), -1)) for level in levels]
@@ -137,8 +147,7 @@ def training(model, pictures, lens, truths):
     found.update({f"losses/{name.removeprefix('loss_')}": np.array(float(v)) for name, v in losses.items()})
     sum(losses.values()).backward()
     found["gradient"] = batch.grad[:, :, : size[0], : size[1]].numpy()
-    model.eval()
-    return found
+    return {name: v.astype(np.float32) if v.dtype == np.float64 else v for name, v in found.items()}
 
 
 def export(seed):
