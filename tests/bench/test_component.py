@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from ssad.bench.component.pictures import draw_detections
 from ssad.bench.component.run import plan_detection, run_detection
 from ssad.bench.component.suite import SHIFTS, DetectionSuite
-from ssad.bench.component.work import read_unit
+from ssad.bench.component.work import Unit, forget_failures, read_unit
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.suite import load_suite
 from ssad.cli import app
@@ -264,6 +264,11 @@ def test_a_broken_file_of_boxes_is_named(folder: Path, tmp_path: Path) -> None:
     path.write_bytes(next((folder / "detections" / "clean").iterdir()).read_bytes()[:200])
     with pytest.raises(FormatError, match=r"boxes\.npz: broken"):
         read_unit(path, ORACLE)
+    unit = Unit(None, 0, "scene")
+    (tmp_path / unit.path).parent.mkdir(parents=True)
+    path.rename(tmp_path / unit.path)
+    with pytest.raises(FormatError, match=r"scene\.npz: broken"):
+        forget_failures(tmp_path, [unit])
 
 
 def test_the_shipped_suites_load_and_take_settings() -> None:

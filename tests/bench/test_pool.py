@@ -18,6 +18,11 @@ def seen(number: int) -> tuple[int, str]:
     return os.getpid(), os.environ.get("CUDA_VISIBLE_DEVICES", "all")
 
 
+def threads(number: int) -> str | None:
+    """Of the linear algebra in the process which does this."""
+    return os.environ.get("OPENBLAS_NUM_THREADS")
+
+
 def die(number: int) -> int:
     """Ends its process without a word."""
     os._exit(3)
@@ -38,6 +43,14 @@ def test_each_process_sees_one_gpu_in_turn() -> None:
     assert abs(counts["0"] - counts["3"]) <= 4 - len(by_process) + 1, "shared out evenly"
     before = os.environ.get("CUDA_VISIBLE_DEVICES", "all")
     assert {gpus for _, gpus in spread(seen, range(2), 2)} == {before}, "left alone when none are named"
+
+
+def test_processes_share_the_cores_in_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    assert set(spread(threads, range(4), 2)) == {"3"}
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
+    assert set(spread(threads, range(4), 2)) == {"7"}, "what the user set is kept"
 
 
 def test_visible_gpus_follow_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

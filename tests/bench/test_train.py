@@ -76,6 +76,12 @@ def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: P
     assert "--weights yolov5n.safetensors" in cards[2].command
 
 
+@pytest.mark.parametrize("text", ["[1, 2]", '{"config": [3]}', "{}"])
+def test_first_weights_with_a_page_that_is_no_card(text: str, tmp_path: Path) -> None:
+    (tmp_path / "w.json").write_text(text)
+    assert training._before(tmp_path / "w.safetensors") == {"first_weights": {"file": "w.safetensors"}}
+
+
 def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
     before = {path.name: path.stat().st_mtime_ns for path in done.iterdir()}
     said: list[str] = []

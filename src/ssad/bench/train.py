@@ -157,6 +157,7 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     about = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(items))[:16]
     last = read_last(plan.out / LAST, recipe, about)
     validate = _validation(plan, device, three=recipe.three)
+    before = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
     if last is not None and last["epoch"] >= recipe.epochs and _card_epochs(weights) == recipe.epochs:
         say(f"all {recipe.epochs} epochs are done, and {weights.name} is there")
@@ -180,19 +181,21 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     card = Card(
         data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
         metrics=metrics, classes=tuple(final.classes),
-        config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | _before(plan.weights),
+        config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | before,
     )  # fmt: skip
     save_weights(weights, final.state_dict(), card=card, half=True)
     draw_curves(plan.out)
 
 
 def _before(weights: Path | None) -> dict[str, Any]:
-    """What the card of the first weights says about how they were made, and what they had been made of in turn."""
+    """What the card of the first weights says about how they were made, and what they had been made of in turn; what
+    lies beside them may be no card of ours. FormatError: it is no JSON."""
     if weights is None:
         return {}
     path = weights.with_suffix(".json")
     card = safeio.read_json(path) if path.is_file() else {}
-    config = card.get("config", {})
+    card = card if isinstance(card, dict) else {}
+    config = card["config"] if isinstance(card.get("config"), dict) else {}
     about = {name: card[name] for name in ("data", "command", "hash") if name in card}
     about |= {name: config[name] for name in ("epochs_done", "first_weights") if name in config}
     return {"first_weights": {"file": weights.name, **about}}

@@ -169,14 +169,21 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
 
 
 def forget_failures(folder: Path, units: Sequence[Unit]) -> None:
-    """Takes away the boxes of units in which a detector failed, so that they are made anew."""
-    for unit in units:
-        path = folder / unit.path
-        if path.is_file():
+    """Takes away the boxes of units in which a detector failed, so that they are made anew. FormatError: broken."""
+    for path in (folder / unit.path for unit in units):
+        if not path.is_file():
+            continue
+        try:
             with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
                 failed = any(name.endswith("/failed") for name in file.files)
-            if failed:
-                path.unlink()
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise _broken_file(path, error) from None
+        if failed:
+            path.unlink()
+
+
+def _broken_file(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again")
 
 
 class DetectorFailed(SSADError):
@@ -194,7 +201,7 @@ def read_unit(path: Path, detector: str) -> tuple[list[SampleBoxes], dict[str, i
             tokens = [str(token) for token in file[f"{detector}/sample"]]
             applied = safeio.parse_json(str(file["applied"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
+        raise _broken_file(path, error) from None
     names = parts.pop("attribute")
     found = [
         SampleBoxes(token, WorldBoxes(**{c: parts[c][k] for c in _COLUMNS}, attribute=tuple(map(str, names[k]))))

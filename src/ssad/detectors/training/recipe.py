@@ -128,7 +128,7 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         key = str(problem["loc"][0]) if problem["loc"] else ""
-        text = problem["msg"].removeprefix("Value error, ")
+        text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it is written with --set
         raise ConfigError(f"recipe {name}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
 
 
