@@ -16,7 +16,7 @@ from ssad.datasets.nuscenes.results import with_ego
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.schema import ATTRIBUTES, CLASSES
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detections import CLASSES_3D, Detections
+from ssad.detections import CLASSES_3D, Detections, Solids
 from ssad.detectors.mono3d.merge import WorldBoxes, merge_cameras
 from ssad.detectors.training.batches import Bank
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
@@ -47,6 +47,25 @@ def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tenso
     """uint8 RGB [H, W, 3] of one size as float [B, 3, H, W] in [0, 1] on the device."""
     stacked = torch.from_numpy(np.stack(pictures)).to(device)
     return stacked.permute(0, 3, 1, 2).float() / 255
+
+
+def to_host(found: Sequence[Detections]) -> list[Detections]:
+    """Detections of a batch on the CPU: a copy a column, as each copy waits for the device."""
+    flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
+    solids = [one.solid for one in found if one.solid is not None]
+    names = ("centre", "size", "yaw", "velocity", "attribute")
+    moved = zip(*(_host([getattr(one, name) for one in solids]) for name in names), strict=True)
+    rows = [None if one.solid is None else Solids(*next(moved)) for one in found]
+    return [Detections(score, label, box, solid) for (score, label, box), solid in zip(flat, rows, strict=True)]
+
+
+def _host(parts: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Tensors on the CPU, in one copy where they are rows of a like kind."""
+    if all(part.device.type == "cpu" for part in parts):
+        return list(parts)
+    if len({(part.dtype, part.shape[1:], part.device, part.ndim) for part in parts}) > 1 or not parts[0].ndim:
+        return [part.cpu() for part in parts]
+    return list(torch.split(torch.cat(list(parts)).cpu(), [len(part) for part in parts]))
 
 
 def detect_scene(
@@ -95,7 +114,7 @@ def _predict(
         lens = torch.from_numpy(np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])).to(device)
         images = to_images([pictures[k] for k in rows], device)
         for own, detector in zip(found, detectors, strict=True):
-            for k, one in zip(rows, detector.predict(images, lens), strict=True):
+            for k, one in zip(rows, to_host(detector.predict(images, lens)), strict=True):
                 own[k] = one
     return [[own[k] for k in range(len(frames))] for own in found]
 

@@ -5,17 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent import futures
+from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from multiprocessing.sharedctypes import Synchronized
-from typing import TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 from ssad.errors import StoreError
 
 T = TypeVar("T")
 R = TypeVar("R")
+AHEAD = 2  # pieces of work that are handed out, for each process: the next one waits there
 
 
 def spread(
@@ -26,26 +30,58 @@ def spread(
     gpus: the processes see one of these each, in turn (see `visible_gpus`). An error ends it, and what has not begun
     is not begun. StoreError: a process died.
     """
-    count = min(workers or os.cpu_count() or 1, len(tasks))
-    if count <= 1:
-        yield from map(function, tasks)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    turn = spawn.Value("i", 0)
-    threads = max((os.cpu_count() or 1) // count, 1)
-    with ProcessPoolExecutor(
-        count, mp_context=spawn, initializer=_begin, initargs=(turn, tuple(gpus), threads)
-    ) as pool:
-        futures = [pool.submit(function, task) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool:
-            raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
+    with Crew(min(workers or os.cpu_count() or 1, len(tasks)), gpus=gpus) as crew:
+        for task in tasks:
+            crew.add(function, task)
+        yield from crew.results()
+
+
+class Crew:
+    """Processes that work through a queue, to which more may be added while results are read; a context.
+
+    workers: how many processes; one (or fewer): this one. gpus, errors: see `spread`.
+    """
+
+    def __init__(self, workers: int, *, gpus: Sequence[str] = ()) -> None:
+        self._queue: deque[tuple[Callable[[Any], Any], Any]] = deque()
+        self._running: set[Future[Any]] = set()
+        self._pool: ProcessPoolExecutor | None = None
+        self._count = workers
+        if workers > 1:
+            spawn = multiprocessing.get_context("spawn")
+            threads = max((os.cpu_count() or 1) // workers, 1)
+            start = (spawn.Value("i", 0), tuple(gpus), threads)
+            self._pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin, initargs=start)
+
+    def add(self, function: Callable[[Any], Any], task: Any, *, first: bool = False) -> None:
+        """One more piece of work; first: before all that has not begun."""
+        (self._queue.appendleft if first else self._queue.append)((function, task))
+
+    def results(self) -> Iterator[Any]:
+        """What the functions return, until nothing is left to do."""
+        while self._queue or self._running:
+            if self._pool is None:
+                function, task = self._queue.popleft()
+                yield function(task)
+                continue
+            try:
+                while self._queue and len(self._running) < AHEAD * self._count:
+                    function, task = self._queue.popleft()
+                    self._running.add(self._pool.submit(function, task))
+                done, self._running = futures.wait(self._running, return_when=futures.FIRST_COMPLETED)
+                found = [future.result() for future in done]
+            except BrokenProcessPool:
+                raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
+            yield from found
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
 
 
 def visible_gpus() -> list[str]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,8 @@ from rich.console import Console
 from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
-from ssad.bench.component.work import Cell, Job, Unit, detector_of, forget_failures, make_unit, score_cell
-from ssad.bench.pool import spread, visible_gpus
+from ssad.bench.component.work import Cell, Job, Made, Scored, Unit, detector_of, forget_failures, make_unit, score_cell
+from ssad.bench.pool import Crew, visible_gpus
 from ssad.bench.progress import Live
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.run import default_workers, versions
@@ -177,31 +176,54 @@ def run_detection(
             for d, _ in todo.detectors for shift, severity in todo.conditions
         ]  # fmt: skip
         missing = [cell for cell in cells if cell.key not in store.results]
-        units = list(dict.fromkeys(unit for cell in missing for unit in cell.units))
+        units = sorted(dict.fromkeys(unit for cell in missing for unit in cell.units), key=_late)
         if retry:
             forget_failures(out, units)
-        failed: dict[Unit, str] = {}
-        began = time.monotonic()
-        with Live(suite.name, len(units) + len(missing), 0, console=console) as live:
-            for unit, why in spread(make_unit, [(job, unit) for unit in units], count, gpus=gpus):
-                if why:
-                    failed[unit] = why
-                live.advance(not why)
-                live.tick()
-            wall = (time.monotonic() - began) / max(len(missing), 1)
-            ready = []
-            for cell in missing:
-                why = next((f"{u.scene}: {failed[u]}" for u in cell.units if u in failed), "")
-                if why:
-                    store.append(_record(todo, cell, header, {"reason": why}, wall), None)
-                    live.advance(False)
-                else:
-                    ready.append((job, cell))
-            for cell, result in spread(score_cell, ready, count):
-                store.append(_record(todo, cell, header, result, wall), None)
-                live.advance("reason" not in result)
-                live.tick()
+        least = min(count, len(units) + len(missing))
+        with Live(suite.name, len(units) + len(missing), 0, console=console) as live, Crew(least, gpus=gpus) as crew:
+            for cell, result, seconds in _work(crew, job, units, missing, live):
+                store.append(_record(todo, cell, header, result, seconds), None)
         return [store.results[key] for key in order]
+
+
+def _work(
+    crew: Crew, job: Job, units: Sequence[Unit], cells: Sequence[Cell], live: Live
+) -> Iterator[tuple[Cell, dict[str, Any], float]]:
+    """Cells, what their records say and the seconds of work in them, each as soon as its last unit is there."""
+    left = {cell.key: set(cell.units) for cell in cells}
+    users: dict[Unit, list[Cell]] = {}
+    for cell in cells:
+        for unit in left[cell.key]:
+            users.setdefault(unit, []).append(cell)
+    made: dict[Unit, Made] = {}
+    for unit in units:
+        crew.add(make_unit, (job, unit))
+    for done in crew.results():
+        if isinstance(done, Scored):
+            shared = sum(made[unit].seconds for unit in done.cell.units) / len(job.detectors)
+            live.advance("reason" not in done.result)
+            yield done.cell, done.result, shared + done.seconds
+        else:
+            made[done.unit] = done
+            live.advance(not done.reason)
+            for cell in users[done.unit]:
+                left[cell.key].discard(done.unit)
+                if left[cell.key]:
+                    continue
+                bad = next((made[unit] for unit in cell.units if made[unit].reason), None)
+                if bad is None:
+                    crew.add(score_cell, (job, cell), first=True)
+                else:
+                    live.advance(False)
+                    yield cell, {"reason": f"{bad.unit.scene}: {bad.reason}"}, bad.seconds
+        live.tick()
+
+
+def _late(unit: Unit) -> int:
+    """Units in this order: clean, then the middle severity of every shift: what comes first says most."""
+    if unit.shift is None:
+        return 0
+    return 5 if isinstance(unit.severity, str) else 1 + abs(unit.severity - 3)
 
 
 def _units(todo: Plan, shift: str | None, severity: int | str, tokens: Mapping[str, str]) -> tuple[Unit, ...]:
@@ -213,13 +235,14 @@ def _units(todo: Plan, shift: str | None, severity: int | str, tokens: Mapping[s
 
 
 def _record(
-    todo: Plan, cell: Cell, header: Mapping[str, Any], result: Mapping[str, Any], wall: float
+    todo: Plan, cell: Cell, header: Mapping[str, Any], result: Mapping[str, Any], seconds: float
 ) -> dict[str, Any]:
     return {
         "key": cell.key, "suite": todo.suite.name, "status": "failed" if "reason" in result else "ok",
         "reason": result.get("reason", ""), "detector": cell.detector, "shift": cell.shift,
         "family": SHIFTS[cell.shift][0] if cell.shift else "clean", "severity": cell.severity,
         "seed": todo.suite.seed, "spec": {"calibration": todo.suite.calibration, "labels": "original"},
-        **{k: v for k, v in result.items() if k != "reason"}, "versions": header["versions"], "wall_s": round(wall, 3),
+        **{k: v for k, v in result.items() if k != "reason"}, "versions": header["versions"],
+        "wall_s": round(seconds, 3),
         "artefacts": {"detections": sorted({str(Path(u.path).parent) for u in cell.units})},
     }  # fmt: skip

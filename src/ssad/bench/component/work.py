@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 import zipfile
 from collections import Counter
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ssad import safeio
-from ssad.bench.detect import SampleBoxes, detect_with, match_boxes, numbers
+from ssad.bench.detect import SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.bench.execute import quiet_warp
 from ssad.bench.toolbox.scene import SceneShifter
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -73,7 +74,8 @@ def detector_of(name: str, weights: str, device: str) -> Any:
 
 class Watched:
     """A detector whose failure is a result: once it has raised, or broken a promise, it finds nothing more. reason:
-    why, in one line, "" while it works. Memory that is used up and a device that is lost are raised."""
+    why, in one line, "" while it works. Memory that is used up and a device that is lost are raised. What it finds is
+    on the host."""
 
     def __init__(self, detector: Any) -> None:
         self.detector, self.reason = detector, ""
@@ -84,7 +86,7 @@ class Watched:
         """As the detector, or nothing."""
         if not self.reason:
             try:
-                found: list[Detections] = self.detector.predict(images, intrinsic, threshold=threshold)
+                found = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
                 self.reason = self._broken(found, len(images))
                 if not self.reason:
                     return found
@@ -93,7 +95,7 @@ class Watched:
                     raise
                 text = " ".join(str(error).split())
                 self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
-        nothing, whole = images.new_zeros(0), torch.zeros(0, dtype=torch.int64, device=images.device)
+        nothing, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
         solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
         return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
 
@@ -123,15 +125,24 @@ def shifter_of(job: Job, data: NuScenes, unit: Unit) -> SceneShifter | None:
     return SceneShifter(job.root, data.scene(unit.scene), spec, random=drawn)
 
 
-def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
-    """Writes the boxes that each detector finds, unless they are there; the unit, and why it failed ("": it did not).
+@dataclass(frozen=True, slots=True)
+class Made:
+    """A unit that was worked at; reason: why it failed, "" if it did not."""
+
+    unit: Unit
+    reason: str
+    seconds: float
+
+
+def make_unit(task: tuple[Job, Unit]) -> Made:
+    """Writes the boxes that each detector finds, unless they are there.
 
     Memory that is used up, and a device that is lost, end the run: only what the data cause is a result.
     """
     job, unit = task
-    path = job.folder / unit.path
+    path, began = job.folder / unit.path, time.monotonic()
     if path.is_file():
-        return unit, ""
+        return Made(unit, "", 0.0)
     try:
         with NuScenes(job.root, job.version) as data:
             scene, shifter = data.scene(unit.scene), shifter_of(job, data, unit)
@@ -149,7 +160,7 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
             shown: list[Any] = [*watched]
             found = detect_with(shown, job.root, scene, device=job.device, look=None if shifter is None else look)
     except SSADError as error:
-        return unit, str(error)
+        return Made(unit, str(error), time.monotonic() - began)
     columns: dict[str, Any] = {}
     for (name, _), samples, one in zip(job.detectors, found, watched, strict=True):
         if one.reason:
@@ -165,7 +176,7 @@ def make_unit(task: tuple[Job, Unit]) -> tuple[Unit, str]:
     file = io.BytesIO()
     np.savez_compressed(file, **columns)
     safeio.write_atomic(path, file.getvalue())
-    return unit, ""
+    return Made(unit, "", time.monotonic() - began)
 
 
 def forget_failures(folder: Path, units: Sequence[Unit]) -> None:
@@ -226,10 +237,18 @@ class Cell:
     units: tuple[Unit, ...]
 
 
-def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
-    """Metrics of a cell, their intervals by the bootstrap over scenes, and the replicates (paired between cells);
-    or the reason why it failed."""
-    job, cell = task
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A cell that was worked at, and what its record says of it: numbers, or the reason why it failed."""
+
+    cell: Cell
+    result: dict[str, Any]
+    seconds: float
+
+
+def score_cell(task: tuple[Job, Cell]) -> Scored:
+    """Metrics of a cell, their intervals by the bootstrap over scenes, and the replicates (paired between cells)."""
+    (job, cell), began = task, time.monotonic()
     scenes = tuple(unit.scene for unit in cell.units)
     truth = _truth(job.root, job.version, scenes)
     found: list[SampleBoxes] = []
@@ -238,7 +257,7 @@ def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
         try:
             boxes, counts = read_unit(job.folder / unit.path, cell.detector)
         except DetectorFailed as error:
-            return cell, {"reason": f"{unit.scene}: {error}"}
+            return Scored(cell, {"reason": f"{unit.scene}: {error}"}, time.monotonic() - began)
         found += boxes
         applied.update(counts)
     matches = match_boxes(found, truth)
@@ -251,7 +270,8 @@ def score_cell(task: tuple[Job, Cell]) -> tuple[Cell, dict[str, Any]]:
             draws.append(numbers(matches.scores(draw[truth.scene]), few=True))
     replicates = {name: [round(d[name], 5) for d in draws] for name in (draws[0] if draws else {})}
     intervals = {name: [round(v, 5) for v in percentile_interval(np.array(r))] for name, r in replicates.items()}
-    return cell, {
+    result = {
         "metrics": values, "intervals": intervals, "replicates": replicates, "n": len(truth.samples),
         "scenes": len(truth.scenes), "applied": dict(sorted(applied.items())),
     }  # fmt: skip
+    return Scored(cell, result, time.monotonic() - began)

@@ -44,8 +44,8 @@ def flatten(maps: dict[str, list[Tensor]]) -> Flat:
     )  # fmt: skip
 
 
-def pick(flat: Flat, image: int, rows: Tensor) -> Flat:
-    """Some places [N] of one image."""
+def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
+    """Some places [N] of images [N]."""
     bins = None if flat.bins is None else flat.bins[image, rows]
     return Flat(
         flat.logit[image, rows], flat.reg[image, rows], flat.direction[image, rows], flat.attribute[image, rows],
@@ -67,11 +67,14 @@ def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
     return Places(torch.cat(xy), torch.cat(size), torch.cat(level))
 
 
-def unproject(points: Tensor, lens: Tensor) -> Tensor:
-    """Camera frame [..., 3] of u, v (pixels), depth (m) [..., 3]; lens [..., 3, 3] (broadcast)."""
+def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tensor:
+    """Camera frame [..., 3] of u, v (pixels), depth (m) [..., 3]; lens [..., 3, 3] (broadcast), or one an image
+    [B, 3, 3] and image [N] that points [N, 3] lie in."""
     u, v, d = points.unbind(-1)
     full = torch.stack([u * d, v * d, d], -1)
     inverse: Tensor = torch.linalg.inv_ex(lens.double())[0].to(points.dtype)
+    if image is not None:
+        inverse = inverse[image]
     return (inverse @ full[..., None])[..., 0]
 
 

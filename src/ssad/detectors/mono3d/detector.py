@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -14,7 +15,6 @@ from ssad.detectors.modes import evaluating
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
     Flat,
-    Places,
     corners,
     flatten,
     global_yaw,
@@ -97,25 +97,48 @@ class Mono3D(nn.Module):
             raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
         with evaluating(self):
             dense = self.dense(images, intrinsic)
-        found = self.select(dense, least)
-        return [_best_first(one) for one in found]
+        return self._chosen(dense, least, best_first=True)
 
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
         """Detections of each image in mmdetection3d's order: by class and falling score, or by score if some had to
         go. Boxes that the source suppresses are gone."""
-        with _exact(dense.logit):
-            return self._select(dense, threshold)
+        return self._chosen(dense, threshold, best_first=False)
 
-    def _select(self, dense: Dense, threshold: float) -> list[Detections]:
-        flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
-        places = places_of(dense.maps["cls_scores"], self.config.strides)
+    def _chosen(self, dense: Dense, threshold: float, *, best_first: bool) -> list[Detections]:
+        """Suppression is a chain of small steps and runs on the host: the device is asked twice, not for each step."""
+        with _exact(dense.logit):
+            flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
+            places = places_of(dense.maps["cls_scores"], self.config.strides)
+            share = self._shares(flat)
+            kept = self._leading(dense, share.amax(-1))
+            share = share.gather(1, kept[..., None].expand(-1, -1, share.shape[2]))
+            image, place, label = (share > threshold).nonzero(as_tuple=True)
+            rows, score = kept[image, place], share[image, place, label]
+            centre, size, yaw = self._solids(pick(flat, image, rows), places.xy[rows], lens, image)
+            ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1).cpu()
+            ends = torch.searchsorted(image, torch.arange(len(lens) + 1, device=image.device)).tolist()
+            stay = self._suppressed(ground, score.cpu(), label.cpu(), ends, best_first=best_first)
+            of = torch.cat(stay).to(image.device)
+            image, rows, score, label = image[of], rows[of], score[of], label[of]
+            centre, size, yaw = centre[of], size[of], yaw[of]
+            picked, xy = pick(flat, image, rows), places.xy[rows]
+            box = self._boxes(picked, xy, (centre, size, yaw), lens=lens[image], size=dense.size)
+            columns = (score, label, box, centre, size, yaw, picked.reg[:, 7:9], picked.attribute.argmax(-1))
+            parts = zip(*(torch.split(column, [len(s) for s in stay]) for column in columns), strict=True)
+            return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
+
+    def _shares(self, flat: Flat) -> Tensor:
+        """Scores [B, P, 10]: class times centreness, for PGD-Det times how sure it is of the depth."""
         share = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
         if flat.bins is not None:
             share = share * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True)
-        best = share.amax(-1)
+        return share
+
+    def _leading(self, dense: Dense, best: Tensor) -> Tensor:
+        """Places [B, R] of the best of each level, by their best scores [B, P]."""
         rows: list[Tensor] = []
         start = 0
-        for m in dense.maps["cls_scores"]:  # the best of each level
+        for m in dense.maps["cls_scores"]:
             count = m.shape[2] * m.shape[3]
             part = best[:, start : start + count]
             if count > self.config.before:
@@ -123,8 +146,20 @@ class Mono3D(nn.Module):
             else:
                 rows.append(torch.arange(start, start + count, device=part.device).expand(len(part), -1))
             start += count
-        kept = torch.cat(rows, 1)
-        return [self._one(dense, flat, places, lens[k], share[k], kept[k], k, threshold) for k in range(len(kept))]
+        return torch.cat(rows, 1)
+
+    def _suppressed(
+        self, ground: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], *, best_first: bool
+    ) -> list[Tensor]:
+        """Rows that stay of each image's candidates, which lie between `ends`; all on the host."""
+        stay = []
+        for start, end in pairwise(ends):
+            own = score[start:end]
+            rows = rotated_nms(ground[start:end], own, label[start:end], threshold=self.config.nms)
+            if len(rows) > self.config.most or best_first:
+                rows = rows[own[rows].argsort(descending=True, stable=True)[: self.config.most]]
+            stay.append(rows + start)
+        return stay
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
@@ -150,33 +185,17 @@ class Mono3D(nn.Module):
                 fuse=self.bbox_head.fuse, reduction=reduction,
             )  # fmt: skip
 
-    def _one(  # noqa: PLR0917
-        self, dense: Dense, flat: Flat, places: Places, lens: Tensor, share: Tensor, kept: Tensor, k: int,
-        threshold: float,
-    ) -> Detections:  # fmt: skip
-        """Detections of one image."""
-        share = share[kept]
-        place, label = (share > threshold).nonzero(as_tuple=True)
-        rows, score = kept[place], share[place, label]
-        picked = pick(flat, k, rows)
-        centre, size, yaw = self._solids(picked, places.xy[rows], lens)
-        ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1)
-        stay = rotated_nms(ground, score, label, threshold=self.config.nms)
-        if len(stay) > self.config.most:
-            stay = stay[score[stay].argsort(descending=True, stable=True)[: self.config.most]]
-        picked, xy = pick(flat, k, rows[stay]), places.xy[rows[stay]]
-        solid = Solids(centre[stay], size[stay], yaw[stay], picked.reg[:, 7:9], picked.attribute.argmax(-1))
-        box = self._boxes(picked, xy, (solid.centre, solid.size, solid.yaw), lens=lens, size=dense.size)
-        return Detections(score[stay], label[stay], box, solid)
-
-    def _solids(self, flat: Flat, xy: Tensor, lens: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast)."""
+    def _solids(
+        self, flat: Flat, xy: Tensor, lens: Tensor, image: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast), or one an image and image [P]."""
         centre2d, depth = xy - flat.reg[..., :2], flat.reg[..., 2]
+        own = lens if image is None else lens[image]
         if flat.bins is not None:
-            depth = self.bbox_head.fuse(depth, flat.bins, self._factor(lens))
-        centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens)
+            depth = self.bbox_head.fuse(depth, flat.bins, self._factor(own))
+        centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens, image)
         direction = flat.direction.argmax(-1)
-        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], lens, offset=self.config.dir_offset)
+        yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], own, offset=self.config.dir_offset)
         return centre, flat.reg[..., 3:6], yaw
 
     def _boxes(
@@ -258,16 +277,6 @@ class Mono3D(nn.Module):
 
 def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:
     return {name: value for name, value in dense.maps.items() if name != "intrinsic"}
-
-
-def _best_first(found: Detections) -> Detections:
-    order = found.score.argsort(descending=True, stable=True)
-    solid = found.solid
-    assert solid is not None
-    turned = Solids(
-        solid.centre[order], solid.size[order], solid.yaw[order], solid.velocity[order], solid.attribute[order]
-    )
-    return Detections(found.score[order], found.label[order], found.box[order], turned)
 
 
 def _exact(like: Tensor) -> torch.autocast:
