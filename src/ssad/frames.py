@@ -98,15 +98,15 @@ class SweepFrame:
 
 @dataclass(frozen=True, slots=True)
 class SceneContext:
-    """What is constant over a scene and drawn or measured once: the key, brightness, where cameras look.
+    """What is constant over a scene and drawn or measured once: the key, brightness, where it goes.
 
-    light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); headings: horizontal viewing
-    directions of the cameras in the world at the start of the scene, radians; start: its first time, s.
+    light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); heading: of the ego in the world at
+    the start of the scene, radians; start: its first time, s.
     """
 
     scene: str = ""
     light: float = 0.8
-    headings: tuple[float, ...] = (0.0,)
+    heading: float = 0.0
     start: float = 0.0
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
-from ssad.bench.pool import spread, visible_gpus
+from ssad.bench.pool import Crew, spread, visible_gpus
 from ssad.errors import StoreError
 
 
@@ -21,6 +22,12 @@ def seen(number: int) -> tuple[int, str]:
 def threads(number: int) -> str | None:
     """Of the linear algebra in the process which does this."""
     return os.environ.get("OPENBLAS_NUM_THREADS")
+
+
+def touch(path: Path) -> None:
+    """Leaves a trace."""
+    time.sleep(0.05)
+    path.touch()
 
 
 def die(number: int) -> int:
@@ -51,6 +58,29 @@ def test_processes_share_the_cores_in_linear_algebra(monkeypatch: pytest.MonkeyP
     assert set(spread(threads, range(4), 2)) == {"3"}
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     assert set(spread(threads, range(4), 2)) == {"7"}, "what the user set is kept"
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_work_that_turns_up_while_results_are_read_is_done(workers: int) -> None:
+    with Crew(workers) as crew:
+        for number in (10, 20, 30, 40, 50, 60, 70, 80):
+            crew.add(fail, number)
+        found = []
+        for number in crew.results():
+            found.append(number)
+            if not number % 10:
+                crew.add(fail, number + 1 + 1, first=True)
+    assert sorted(found) == sorted([n + k for n in range(10, 90, 10) for k in (0, 2)])
+    if workers == 1:
+        assert found[:6] == [10, 12, 20, 22, 30, 32], "what is to come first does not wait for the rest"
+
+
+def test_what_is_left_when_the_reader_goes_is_not_begun(tmp_path: Path) -> None:
+    with Crew(2) as crew:
+        for number in range(20):
+            crew.add(touch, tmp_path / str(number))
+        next(iter(crew.results()))
+    assert 1 <= len(list(tmp_path.iterdir())) < 20
 
 
 def test_visible_gpus_follow_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

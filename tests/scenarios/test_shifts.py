@@ -286,6 +286,47 @@ def test_one_sun_for_six_cameras(street: NuScenes) -> None:
     assert away >= 2
 
 
+def test_the_sun_is_low_over_the_road_ahead() -> None:
+    for seed in range(50):
+        x, y, z = sun_direction(ShiftSpec("sunlight", 1, seed=seed), SceneContext("s", heading=2.0))
+        assert abs(np.arctan2(y, x) - 2.0) <= np.radians(15) + 1e-9
+        assert np.radians(6) <= np.arcsin(z) <= np.radians(16)
+
+
+def sunlit(depth: float, severity: int) -> tuple[U8, Any]:
+    """A grey picture of something at one depth (m), the sun in view; and what was done."""
+    frame = Frame(CAMERA, "s", depth=np.full((HEIGHT, WIDTH), depth, np.float32))
+    heading = float(np.arctan2(*camera_to_world(frame)[[1, 0], 2]))
+    contexts = {"s": SceneContext("s", heading=heading)}
+    images, done = shift_images(GREY, frame, ShiftSpec("sunlight", severity), contexts=contexts)
+    assert done[0].details["in_view"], "the sun stands in the picture"
+    return images, done[0]
+
+
+def test_glare_is_the_eyes_at_most_and_none_behind_a_wall() -> None:
+    hidden, done = sunlit(30.0, 5)
+    assert not done.applied
+    assert done.skipped == {"the sun is behind something": 1}
+    assert (hidden == GREY).all(), "no light comes through a wall"
+    before = 0.0
+    for severity in (1, 2, 3, 4, 5):
+        seen, done = sunlit(np.inf, severity)
+        assert done.applied
+        toward = camera_to_world(Frame(CAMERA, "s"))[:3, :3].T @ np.array(done.details["direction"])
+        v, u = np.mgrid[:HEIGHT, :WIDTH]
+        k = CAMERA.intrinsic
+        rays = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+        angle = np.degrees(np.arccos(np.clip(rays @ toward, -1, 1)))
+        ring = np.abs(angle - 20.0) < 0.5  # beyond the star; the median passes by the ghosts
+        added = float(np.median(seen[ring][:, 0])) - 128 * (1 - 0.06 * severity)
+        glare = table.SUN_STRENGTH[severity - 1] * (1 / 20**2 + 0.06 / 21)
+        assert added == pytest.approx(glare, rel=0.05, abs=1.5), severity
+        assert seen[angle < 1.0].min() >= min(table.SUN_STRENGTH[severity - 1], 200)
+        assert added > before
+        before = added
+
+
 @pytest.mark.parametrize("name", ["rain", "snow"])
 def test_particles_are_fixed_in_the_world_and_move_with_time(name: str) -> None:
     dark = np.zeros_like(GREY)

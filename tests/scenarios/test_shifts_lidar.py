@@ -138,7 +138,7 @@ def test_rain_and_snow_reflect_near_by(name: str) -> None:
 
 def test_the_lidar_is_blind_towards_the_same_sun() -> None:
     points = turn(40000)
-    context = SceneContext("s", headings=(0.3,))
+    context = SceneContext("s", heading=0.3)
     spec = ShiftSpec("sunlight", 5)
     sun = sun_direction(spec, context)
     # lift the points so that some lie in front of the sun

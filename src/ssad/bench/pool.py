@@ -43,6 +43,7 @@ class Crew:
     """
 
     def __init__(self, workers: int, *, gpus: Sequence[str] = ()) -> None:
+        self._urgent: deque[tuple[Callable[[Any], Any], Any]] = deque()
         self._queue: deque[tuple[Callable[[Any], Any], Any]] = deque()
         self._running: set[Future[Any]] = set()
         self._pool: ProcessPoolExecutor | None = None
@@ -54,25 +55,28 @@ class Crew:
             self._pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin, initargs=start)
 
     def add(self, function: Callable[[Any], Any], task: Any, *, first: bool = False) -> None:
-        """One more piece of work; first: before all that has not begun."""
-        (self._queue.appendleft if first else self._queue.append)((function, task))
+        """One more piece of work; first: before all that has not begun and was not added so."""
+        (self._urgent if first else self._queue).append((function, task))
 
     def results(self) -> Iterator[Any]:
         """What the functions return, until nothing is left to do."""
-        while self._queue or self._running:
+        while self._urgent or self._queue or self._running:
             if self._pool is None:
-                function, task = self._queue.popleft()
+                function, task = self._next()
                 yield function(task)
                 continue
             try:
-                while self._queue and len(self._running) < AHEAD * self._count:
-                    function, task = self._queue.popleft()
+                while (self._urgent or self._queue) and len(self._running) < AHEAD * self._count:
+                    function, task = self._next()
                     self._running.add(self._pool.submit(function, task))
                 done, self._running = futures.wait(self._running, return_when=futures.FIRST_COMPLETED)
                 found = [future.result() for future in done]
             except BrokenProcessPool:
                 raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
             yield from found
+
+    def _next(self) -> tuple[Callable[[Any], Any], Any]:
+        return (self._urgent or self._queue).popleft()
 
     def __enter__(self) -> Self:
         return self

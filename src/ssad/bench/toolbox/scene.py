@@ -25,7 +25,6 @@ from ssad.scenarios.static.shifts import (
     shift_points,
     sky_light,
     transformed_boxes,
-    viewing_direction,
 )
 from ssad.types import F32, F64, U8
 
@@ -72,7 +71,7 @@ class SceneShifter:
 
     @property
     def context(self) -> SceneContext:
-        """Brightness of the sky and viewing directions, from the first sample whose images can be read."""
+        """Brightness of the sky and heading of the ego, from the first sample whose images can be read."""
         return self._opening[1]
 
     @cached_property
@@ -88,11 +87,12 @@ class SceneShifter:
             ]
             try:
                 images = [self.read(f) for f in cameras]
-                views = tuple(viewing_direction(self._frame(f, Boxes3D.empty(), None)) for f in cameras)
             except FormatError:
                 continue
             if images:
-                return sample.token, SceneContext(token, sky_light(images), views, start)
+                forward = cameras[0].ego_to_world[:2, 0]
+                heading = float(np.arctan2(forward[1], forward[0]))
+                return sample.token, SceneContext(token, sky_light(images), heading, start)
         return "", SceneContext(token, start=start)
 
     def basis(self, frame: SensorFrame) -> dict[str, str]:

@@ -71,7 +71,7 @@ def pick_frame(data: NuScenes, *, channel: str = "CAM_FRONT") -> tuple[U8, Frame
     weather = SceneShifter(data.root, scene, ShiftSpec("fog", 3))
     view = shifter.camera_frame(best)
     # the sun is drawn near a camera's view; here it is this one's
-    context = replace(weather.context, headings=(viewing_direction(view),))
+    context = replace(weather.context, heading=viewing_direction(view))
     return shifter.read(best), replace(view, points=weather.camera_frame(best).points), context
 
 

@@ -109,7 +109,7 @@ def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneCon
         return contexts[frame.scene]
     row = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
     light = sky_light([row.reshape(batch.height, batch.width, 3)[:, : batch.seen]])
-    return SceneContext(frame.scene, light, (viewing_direction(frame),), 0.0)
+    return SceneContext(frame.scene, light, viewing_direction(frame))
 
 
 def sky_light(images: Sequence[U8]) -> float:

@@ -16,13 +16,12 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.types import F64
 
 FACING = 75.0  # degrees from the optical axis beyond which the sun adds no light
-_BLOCKED = 0.25  # what is left of the glare when the sun itself is behind something
 
 
 def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
-    """Unit vector towards the sun [3], world: 6 to 16 degrees high, near the view of one camera of the first sample."""
+    """Unit vector towards the sun [3], world: 6 to 16 degrees high, within 15 of where the ego goes at first."""
     draws = spec.generator("sun", context.scene)
-    heading = context.headings[int(draws.integers(len(context.headings)))] + np.radians(draws.uniform(-22, 22))
+    heading = context.heading + np.radians(draws.uniform(-15, 15))
     height = np.radians(draws.uniform(6, 16))
     return np.array([np.cos(heading) * np.cos(height), np.sin(heading) * np.cos(height), np.sin(height)])
 
@@ -30,12 +29,13 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 def add_sun(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """sunlight: glare is added, the exposure goes down with it; a sun behind a building or the horizon is dimmer."""
+    """sunlight: glare is added, the exposure goes down with it; none where the sun is known to be behind something."""
     toward = np.zeros((batch.count, 3))
     place = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
     done: list[Applied] = []
     depth: F64 | None = None
+    sources: list[str] = []
     for b, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         world = sun_direction(spec, context)
         seen = camera_to_world(frame)[:3, :3].T @ world
@@ -51,21 +51,24 @@ def add_sun(
         free = 1.0
         if inside:
             if depth is None:
-                depth = depth_grid(batch, frames)[0].numpy()
+                grid, sources = depth_grid(batch, frames)
+                depth = grid.numpy()
             row, column, reach = int(y / 4), int(x / 4), max(2, batch.width // 260)
             around = depth[b, max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-            free = float((around > 120).mean())
-        power = table.SUN_STRENGTH[spec.severity - 1] * (_BLOCKED + (1 - _BLOCKED) * free)
-        strength[b] = power
-        # the camera exposes for what it sees: the nearer the sun to the picture, the darker the rest
-        outside = max(0.0, -x / batch.width, x / batch.width - 1, -y / batch.height, y / batch.height - 1)
-        gain[b] = 1 - 0.06 * spec.severity * (0.4 + 0.6 * free) * max(0.0, 1 - 2 * outside)
+            free = 1.0 if sources[b] == "assumed" else float((around > 120).mean())
         details = {
             "angle_deg": round(angle, 1),
             "in_view": inside,
             "free": round(free, 2),
             "direction": [round(float(v), 6) for v in world],
         }
+        if not free:
+            done.append(Applied(False, details, {"the sun is behind something": 1}))
+            continue
+        strength[b] = table.SUN_STRENGTH[spec.severity - 1] * free
+        # the camera exposes for what it sees: the nearer the sun to the picture, the darker the rest
+        outside = max(0.0, -x / batch.width, x / batch.width - 1, -y / batch.height, y / batch.height - 1)
+        gain[b] = 1 - 0.06 * spec.severity * free * max(0.0, 1 - 2 * outside)
         done.append(Applied(True, details))
     rows, columns = grid_size(batch)
     light = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)

@@ -174,6 +174,9 @@ def blend_particles(
         o1 = o3
 
 
+STAR = wp.constant(1400.0)  # grey levels one degree from the sun, beyond which star and ghosts grow no more
+
+
 @wp.kernel
 def glare(
     toward: wp.array(dtype=wp.vec3),
@@ -187,20 +190,21 @@ def glare(
 
     toward: unit direction of the sun in the camera frame; place: its pixel (x, y), and 1 if in front of the camera;
     strength: grey levels at one degree from the sun. Veiling glare falls with the square of the angle (CIE disability
-    glare: 10 / theta^2), with a bright aureole, a six-pointed diffraction star (`rays`: its angle) and two ghosts on
-    the line through the image centre.
+    glare: 10 / theta^2), with a bright aureole; the lens adds a six-pointed diffraction star (`rays`: its angle) and
+    two ghosts on the line through the image centre, which do not grow with the dirt on the screen before it.
     """
     b, y = wp.tid()
     focal = lens[b]
     sun = toward[b]
     v = ((float(y) + 0.5) * 4.0 - 0.5 - focal[3]) / focal[1]
     spot = place[b]
+    lens_light = wp.min(strength[b], STAR)
     for x in range(out.shape[2]):
         u = ((float(x) + 0.5) * 4.0 - 0.5 - focal[2]) / focal[0]
         ray = wp.normalize(wp.vec3(u, v, 1.0))
         chord = wp.length(ray - sun)
         degrees = chord * 57.29578
-        light = 1.0 / (degrees * degrees + 0.04) + 0.06 / (degrees + 1.0)
+        light = strength[b] * (1.0 / (degrees * degrees + 0.04) + 0.06 / (degrees + 1.0))
         if spot[2] > 0.5:
             dx = (float(x) + 0.5) * 4.0 - spot[0]
             dy = (float(y) + 0.5) * 4.0 - spot[1]
@@ -210,7 +214,8 @@ def glare(
                 star = star * star
                 star = star * star
                 star = star * star
-                light += star * star * 0.5 / (degrees * degrees * 0.35 + 1.0)
+                fade = 1.0 - degrees / 14.0
+                light += lens_light * star * star * fade * 0.5 / (degrees * degrees * 0.35 + 1.0)
             for g in range(2):
                 reach = -0.45 - 0.6 * float(g)
                 gx = (float(x) + 0.5) * 4.0 - (focal[2] + (spot[0] - focal[2]) * reach)
@@ -218,8 +223,8 @@ def glare(
                 size = (0.03 + 0.03 * float(g)) * focal[0]
                 r = wp.sqrt(gx * gx + gy * gy) / size
                 if r < 1.1:
-                    light += 0.035 * wp.clamp((1.1 - r) * 8.0, 0.0, 1.0) * (0.5 + 0.5 * r * r)
-        out[b, y, x] = strength[b] * light
+                    light += 0.035 * lens_light * wp.clamp((1.1 - r) * 8.0, 0.0, 1.0) * (0.5 + 0.5 * r * r)
+        out[b, y, x] = light
 
 
 @wp.func
