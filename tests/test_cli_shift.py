@@ -116,6 +116,10 @@ def test_contact_sheets(
     for panel in panels[1:]:
         assert np.abs(panel.astype(int) - panels[0]).mean() > 0.05, "every panel differs from the clean one"
     assert (tmp_path / "sheet-severities.png").is_file()
+    with NuScenes(tiny) as data:
+        other = data.scenes()[1].name
+    assert run(capsys, monkeypatch, "shift", str(tiny), str(tmp_path / "two.png"), "--scenes", other)[0] == 0
+    assert (cv2.imread(str(tmp_path / "two.png")) != sheet).any(), "the scene that was named"
     picture = next((tiny / "samples" / "CAM_BACK").iterdir())
     own = tmp_path / "own.jpg"
     code, text, _ = run(
@@ -141,6 +145,8 @@ def test_contact_sheets(
         (("shift", "{picture}", "{tmp}/x.png", "--box", "1,2,3"), ("--box 1,2,3", "x0,y0,x1,y1")),
         (("shift", "{picture}", "{tmp}/x.png", "--box", "1,2,90,20"), ("horizon",)),
         (("shift", "{picture}", "{tmp}/x.gif"), ("x.gif",)),
+        (("shift", "{tiny}", "{tmp}/x.png", "--scenes", "scene-9"), ("scene-9",)),
+        (("shift", "{tiny}", "{tmp}/x.png", "--scenes", "a,b"), ("of one scene",)),
         (
             ("score", "none.json", "--dataroot", "{tiny}", "--version", "v1.0-mini", "--split", "mini_val"),
             ("none.json",),

@@ -144,7 +144,9 @@ def shift(
     ] = "original",
     version: Annotated[str | None, typer.Option(help="Such as v1.0-mini.  [default: the only one]")] = None,
     split: Annotated[str | None, typer.Option(help="Only the scenes of a split, such as mini_val.")] = None,
-    scenes: Annotated[str, typer.Option(help="Only these scenes, with commas between them.")] = "",
+    scenes: Annotated[
+        str, typer.Option(help="Only these scenes, with commas between them; a contact sheet is of one.")
+    ] = "",
     sweeps: Annotated[bool, typer.Option(help="Shift the files between key frames too.")] = True,
     lidar: Annotated[bool, typer.Option(help="Shift the LiDAR too.")] = True,
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG files.")] = 95,
@@ -168,12 +170,14 @@ def shift(
     if verify:
         raise typer.Exit(verify_folder(out))
     names = [name.strip() for name in shifts.split(",") if name.strip()]
+    listed = [name.strip() for name in scenes.split(",") if name.strip()]
     if source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg"):
         write_contact_sheets(
             source,
             out,
             version=version,
             channel=channel,
+            scenes=listed,
             boxes=box or [],
             severity=severity,
             seed=seed,
@@ -187,7 +191,7 @@ def shift(
         severity=severity,
         version=version,
         split=split,
-        scenes=[name.strip() for name in scenes.split(",") if name.strip()],
+        scenes=listed,
         workers=workers,
         ray=ray,
         settings={

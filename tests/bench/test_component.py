@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from ssad.bench.component.pictures import draw_detections
 from ssad.bench.component.run import plan_detection, run_detection
 from ssad.bench.component.suite import SHIFTS, DetectionSuite
-from ssad.bench.component.work import Unit, forget_failures, read_unit
+from ssad.bench.component.work import Unit, forget_failures, make_unit, read_unit
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.suite import load_suite
 from ssad.cli import app
@@ -112,6 +112,30 @@ def test_a_stopped_run_goes_on_to_the_same_records(folder: Path, root: Path, tmp
         return {k: v for k, v in record.items() if k != "wall_s"}
 
     assert sorted(map(str, map(plain, lines(again)))) == sorted(map(str, map(plain, lines(folder))))
+
+
+def test_cells_are_scored_as_soon_as_their_boxes_are_there(
+    folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clean first, then the middle severity of each shift; what is scored by then outlives a stop."""
+    todo, order = plan_detection(suite_of(root)), []
+
+    def make(task: Any) -> Any:
+        if len(order) == 8:
+            raise KeyboardInterrupt
+        order.append(task[1])
+        return make_unit(task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ssad.bench.component.run.make_unit", make)
+        with pytest.raises(KeyboardInterrupt):
+            run_detection(todo, tmp_path / "run", workers=1)
+    first = [(None, 0), ("gaussian", 3), ("fog", 3)]
+    assert [(u.shift, u.severity) for u in order[:6:2]] == first
+    assert [(r["shift"], r["severity"]) for r in lines(tmp_path / "run")][:3] == first
+    run_detection(todo, tmp_path / "run", workers=1)
+    found = {r["key"]: r["metrics"] for r in lines(tmp_path / "run")}
+    assert found == {r["key"]: r["metrics"] for r in lines(folder)}
 
 
 def test_the_tables_say_what_the_records_say(folder: Path) -> None:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.detect import detect_scene, match_boxes, score_2d
+from ssad.bench.detect import detect_scene, match_boxes, score_2d, to_host
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.training_data import camera_truth, nuscenes_items
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
-from ssad.detections import Detections, Truth
+from ssad.detections import Detections, Solids, Truth
+from ssad.detectors import make_detector
 from ssad.detectors.training.batches import Bank
 from ssad.metrics.detection_boxes import TP_METRICS
 
@@ -75,3 +76,41 @@ def test_2d_truth_scores_one_and_noise_does_not(root: Path) -> None:
     wrong = Oracle(iter(moved))
     wrong.classes = perfect.classes
     assert score_2d(wrong, bank)["AP50"] < 0.3  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", ["fcos3d-light", "pgd-det-light"])
+def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    with NuScenes(root) as data:
+        scene = data.scene("scene-larkhill-000")
+        here, there = (
+            detect_scene(make_detector(name, device=device), root, scene, device=device) for device in ("cpu", "cuda")
+        )
+    for one, other in zip(here, there, strict=True):
+        sure, same = one.boxes.score > 0.1, other.boxes.score > 0.1
+        assert abs(int(sure.sum()) - int(same.sum())) <= 1, "but for one at the threshold"
+        for k in np.flatnonzero(sure):
+            alike = other.boxes.label == one.boxes.label[k]
+            alike &= np.linalg.norm(other.boxes.translation - one.boxes.translation[k], axis=1) < 0.05
+            alike &= np.abs(other.boxes.score - one.boxes.score[k]) < 0.01
+            assert alike.any()
+
+
+def test_detections_come_to_the_host_as_they_are() -> None:
+    def some(count: int, *, three: bool) -> Detections:
+        score, label, box = torch.rand(count), torch.arange(count), torch.rand(count, 4)
+        solid = Solids(torch.rand(count, 3), torch.rand(count, 3), torch.rand(count), torch.rand(count, 2), label)
+        return Detections(score, label, box, solid if three else None)
+
+    before = [some(3, three=True), some(0, three=True), some(5, three=False), some(2, three=True)]
+    after = to_host(before)
+    for one, other in zip(before, after, strict=True):
+        assert (one.score == other.score).all()
+        assert (one.label == other.label).all()
+        assert (one.box == other.box).all()
+        assert (one.solid is None) == (other.solid is None)
+        if one.solid is not None and other.solid is not None:
+            assert (one.solid.centre == other.solid.centre).all()
+            assert (one.solid.attribute == other.solid.attribute).all()
+    assert not to_host([])

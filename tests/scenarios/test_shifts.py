@@ -20,7 +20,7 @@ from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.errors import ConfigError, UnknownNameError
 from ssad.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world, rotation_matrix
 from ssad.metrics.robustness import page_trend
-from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, transformed_boxes
+from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, sky_light, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import sun_direction
@@ -325,6 +325,26 @@ def test_glare_is_the_eyes_at_most_and_none_behind_a_wall() -> None:
         assert seen[angle < 1.0].min() >= min(table.SUN_STRENGTH[severity - 1], 200)
         assert added > before
         before = added
+
+
+def test_there_is_no_sun_by_night() -> None:
+    frame, spec = Frame(CAMERA, "s"), ShiftSpec("sunlight", 5)
+    night = {"s": SceneContext("s", 0.1, float(np.arctan2(*camera_to_world(frame)[[1, 0], 2])))}
+    out, done = shift_images(GREY, frame, spec, contexts=night)
+    assert (out == GREY).all()
+    assert done[0].skipped == {"it is night": 1}
+
+
+def test_the_sky_is_what_is_infinitely_far() -> None:
+    image = np.full((60, 160, 3), 10, np.uint8)
+    image[:30, :60] = 250  # a wall in lamp light
+    depth = np.full((15, 40), np.inf, np.float32)
+    depth[8:] = 20
+    depth[:8, :15] = 5
+    assert sky_light([image]) == pytest.approx(250 / 255, abs=0.01)
+    assert sky_light([image], [depth]) == pytest.approx(0.06), "the least there is"
+    assert sky_light([image], [np.full_like(depth, 20)]) == pytest.approx(250 / 255, abs=0.01), "no sky to be seen"
+    assert sky_light([image, image], [None, depth]) == pytest.approx(0.06), "what is known counts"
 
 
 @pytest.mark.parametrize("name", ["rain", "snow"])

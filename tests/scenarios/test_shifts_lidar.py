@@ -152,6 +152,9 @@ def test_the_lidar_is_blind_towards_the_same_sun() -> None:
     toward = pose[:3, :3].T @ sun
     angle = np.degrees(np.arccos(np.clip(out[:, :3] @ toward / ranges(out), -1, 1)))
     assert angle.min() >= table.LIDAR_SUN_CONE[4] - 0.01
+    dark, done = shift_points(points, frame, spec, contexts={"s": SceneContext("s", 0.1, 0.3)})
+    assert (dark == points).all()
+    assert done.skipped == {"it is night": 1}
 
 
 def test_wrong_points_are_refused() -> None:

@@ -118,12 +118,15 @@ def write_contact_sheets(
     *,
     version: str | None,
     channel: str,
+    scenes: Sequence[str],
     boxes: Sequence[str],
     severity: str,
     seed: int,
     calibration: str,
 ) -> None:
-    """Contact sheets of a picture or of a dataset's camera."""
+    """Contact sheets of a picture or of a dataset's camera. ConfigError, SSADError."""
+    if len(scenes) > 1:
+        raise ConfigError(f"a contact sheet is of one scene, not of {len(scenes)}: --scenes {scenes[0]}")
     if calibration not in get_args(Calibration):
         raise unknown_name("calibration", calibration, get_args(Calibration))
     strength = severities(severity)[0]
@@ -131,8 +134,9 @@ def write_contact_sheets(
     level = 3 if strength == "random" else int(strength)
     kind: Calibration = "paper" if calibration == "paper" else "physical"
     first, second = write_sheets(
-        source, out, version=version, channel=channel, boxes=rectangles, severity=level, seed=seed, calibration=kind
-    )
+        source, out, version=version, channel=channel, scene=next(iter(scenes), None), boxes=rectangles,
+        severity=level, seed=seed, calibration=kind,
+    )  # fmt: skip
     print(f"12 panels: {first}\nseverities: {second}")
 
 

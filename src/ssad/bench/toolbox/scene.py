@@ -87,12 +87,13 @@ class SceneShifter:
             ]
             try:
                 images = [self.read(f) for f in cameras]
+                depths = [self._depth(f) for f in cameras]
             except FormatError:
                 continue
             if images:
                 forward = cameras[0].ego_to_world[:2, 0]
                 heading = float(np.arctan2(forward[1], forward[0]))
-                return sample.token, SceneContext(token, sky_light(images), heading, start)
+                return sample.token, SceneContext(token, sky_light(images, depths), heading, start)
         return "", SceneContext(token, start=start)
 
     def basis(self, frame: SensorFrame) -> dict[str, str]:

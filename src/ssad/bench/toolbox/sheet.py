@@ -59,20 +59,23 @@ def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
     return replace(frame, boxes=boxes)
 
 
-def pick_frame(data: NuScenes, *, channel: str = "CAM_FRONT") -> tuple[U8, Frame, SceneContext]:
-    """The key frame of a camera that shows most boxes in full, of the first scene; its image and scene."""
-    scene = data.scene(data.scenes()[0].token)
-    shifter = SceneShifter(data.root, scene, ShiftSpec("scale", 3))
-    frames = [f for f in scene.frames if f.channel == channel and f.key_frame]
+def pick_frame(
+    data: NuScenes, *, channel: str = "CAM_FRONT", scene: str | None = None
+) -> tuple[U8, Frame, SceneContext]:
+    """The key frame of a camera that shows most boxes in full, of a scene (default: the first); its image and scene."""
+    chosen = data.scene(data.scenes()[0].token if scene is None else scene)
+    shifter = SceneShifter(data.root, chosen, ShiftSpec("scale", 3))
+    frames = [f for f in chosen.frames if f.channel == channel and f.key_frame]
     if not frames:
-        known = sorted({f.channel for f in scene.frames if f.modality == "camera"})
+        known = sorted({f.channel for f in chosen.frames if f.modality == "camera"})
         raise ConfigError(f"{data.root}: no camera {channel}; there are: {', '.join(known)}")
     best = max(frames, key=lambda f: _in_view(shifter.camera_frame(f)))
-    weather = SceneShifter(data.root, scene, ShiftSpec("fog", 3))
+    weather = SceneShifter(data.root, chosen, ShiftSpec("fog", 3))
     view = shifter.camera_frame(best)
-    # the sun is drawn near a camera's view; here it is this one's
+    # the sun stands over where the ego goes; here, over what this camera sees
     context = replace(weather.context, heading=viewing_direction(view))
-    return shifter.read(best), replace(view, points=weather.camera_frame(best).points), context
+    seen = weather.camera_frame(best)
+    return shifter.read(best), replace(view, points=seen.points, depth=seen.depth), context
 
 
 def _in_view(frame: Frame) -> float:
@@ -164,6 +167,7 @@ def write_sheets(
     *,
     version: str | None = None,
     channel: str = "CAM_FRONT",
+    scene: str | None = None,
     boxes: Sequence[Sequence[float]] = (),
     severity: int = 3,
     seed: int = 0,
@@ -173,7 +177,7 @@ def write_sheets(
     quiet_warp()
     context: SceneContext | None = None
     if source.is_dir():
-        image, frame, context = pick_frame(NuScenes(source, version), channel=channel)
+        image, frame, context = pick_frame(NuScenes(source, version), channel=channel, scene=scene)
     else:
         image = read_image(source)
         frame = own_frame(image, boxes)

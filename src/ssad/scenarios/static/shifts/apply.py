@@ -15,7 +15,7 @@ from ssad.scenarios.static.shifts.objects import move_objects
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.scenarios.static.shifts.sun import add_sun
 from ssad.scenarios.static.shifts.weather import add_fog, add_precipitation
-from ssad.types import U8
+from ssad.types import F32, U8
 
 _CHUNK = 64
 
@@ -112,14 +112,26 @@ def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneCon
     return SceneContext(frame.scene, light, viewing_direction(frame))
 
 
-def sky_light(images: Sequence[U8]) -> float:
-    """Brightness in [0, 1] of the brightest thirtieth of the upper halves of images: what fog scatters."""
-    found = []
-    for image in images:
+def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = ()) -> float:
+    """Brightness in [0, 1] of the brightest thirtieth of the sky: what fog scatters.
+
+    depths: maps [h, w] of any size, inf where there is sky; of images without one the upper half counts. By night a
+    wall in lamp light is brighter than the sky.
+    """
+    found, sky = [], []
+    for n, image in enumerate(images):
         step = max(1, image.shape[1] // 160)
-        upper = image[: max(1, image.shape[0] // 2) : step, ::step].astype(np.float32)
-        found.append((upper @ np.array([0.299, 0.587, 0.114], np.float32)).ravel())
-    return float(np.clip(np.quantile(np.concatenate(found), 0.97) / 255, 0.06, 1.0))
+        light = image[: max(1, image.shape[0] // 2) : step, ::step].astype(np.float32)
+        light = light @ np.array([0.299, 0.587, 0.114], np.float32)
+        found.append(light.ravel())
+        depth = depths[n] if n < len(depths) else None
+        if depth is not None:
+            y = np.arange(light.shape[0]) * step * depth.shape[0] // image.shape[0]
+            x = np.arange(light.shape[1]) * step * depth.shape[1] // image.shape[1]
+            sky.append(light[np.isinf(depth[y][:, x])])
+    known = np.concatenate(sky) if sky else np.zeros(0)
+    seen = known if len(known) >= 100 else np.concatenate(found)
+    return float(np.clip(np.quantile(seen, 0.97) / 255, 0.06, 1.0))
 
 
 def viewing_direction(frame: Frame) -> float:

@@ -15,6 +15,7 @@ from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.types import F64
 
+NIGHT = 0.35  # brightness of the sky below which there is no sun
 FACING = 75.0  # degrees from the optical axis beyond which the sun adds no light
 
 
@@ -29,7 +30,7 @@ def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
 def add_sun(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """sunlight: glare is added, the exposure goes down with it; none where the sun is known to be behind something."""
+    """sunlight: glare is added, the exposure goes down with it; none by night, or where the sun is hidden."""
     toward = np.zeros((batch.count, 3))
     place = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
@@ -37,6 +38,9 @@ def add_sun(
     depth: F64 | None = None
     sources: list[str] = []
     for b, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
+        if context.light < NIGHT:
+            done.append(Applied(False, {"light": round(context.light, 2)}, {"it is night": 1}))
+            continue
         world = sun_direction(spec, context)
         seen = camera_to_world(frame)[:3, :3].T @ world
         toward[b] = seen
