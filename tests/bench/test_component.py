@@ -22,7 +22,7 @@ from ssad.cli import app
 from ssad.errors import ConfigError, FormatError, SSADError
 from ssad.metrics.detection import score_detections
 from ssad.report import write_report
-from ssad.report.detection import load_detection_run, main_table, robustness_table
+from ssad.report.detection import left_table, load_detection_run, main_table, robustness_table
 from ssad.report.load import load_header
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
@@ -152,6 +152,11 @@ def test_the_tables_say_what_the_records_say(folder: Path) -> None:
     found = {(r["shift"], r["severity"]): r["metrics"]["NDS"] for r in lines(folder)}
     left = np.mean([np.mean([found[s, k] for k in (1, 3, 5)]) for s in ("gaussian", "fog")]) / found[None, 0]
     assert cells["mRR (NDS)"].mean == pytest.approx(100 * float(left))
+    share = next(row for row in left_table(run).rows if row.head[1] == "fog").cells[1]
+    clean = next(r for r in lines(folder) if r["shift"] is None)
+    assert share.mean == pytest.approx(100 * drawn["metrics"]["NDS"] / clean["metrics"]["NDS"])
+    pairs = zip(drawn["replicates"]["NDS"], clean["replicates"]["NDS"], strict=True)
+    assert [share.low, share.high] == pytest.approx(list(np.percentile([100 * a / b for a, b in pairs], [2.5, 97.5])))
     with open(folder / "tables" / "shifts.csv", encoding="utf-8") as file:
         read = list(csv.DictReader(file))
     assert {row["shift"] for row in read} == {"clean", "gaussian noise", "fog"}
@@ -177,6 +182,11 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
     ours = next(row for row in table.rows if row.head[1] == "fog" and not row.published)
     assert len(found) == 3
     assert ours.cells[0].mean == pytest.approx(100 * float(np.mean(found)))
+    shares = {(row.head[1], row.published): row.cells for row in left_table(load_detection_run(copy, header)).rows}
+    assert shares["fog", True][0].mean == pytest.approx(100 * 17.97 / 29.8)
+    clean = next(r["metrics"]["mAP"] for r in lines(copy) if r["shift"] is None)
+    assert shares["fog", False][0].mean == pytest.approx(100 * float(np.mean(found)) / clean)
+    assert shares["fog", False][0].low <= shares["fog", False][0].mean <= shares["fog", False][0].high
 
 
 def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None:

@@ -103,6 +103,19 @@ def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> C
     return Cell(100 * mean, 100 * low, 100 * high, found[0]["n"])
 
 
+def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
+    """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
+    clean, own = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
+    if clean is None or math.isnan(own.mean) or not clean["metrics"][metric]:
+        return Cell(math.nan)
+    drawn = run.record(detector, shift, "random")
+    found = [drawn] if drawn else [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
+    rows = zip(clean["replicates"].get(metric, []), *(r["replicates"].get(metric, []) for r in found), strict=True)
+    shares = [100 * math.fsum(row[1:]) / len(found) / row[0] for row in rows if row[0] > 0]
+    low, high = percentile_interval(shares) if len(shares) > 1 else (math.nan, math.nan)
+    return Cell(own.mean / clean["metrics"][metric], low, high, own.n)
+
+
 def title_of(shift: str) -> str:
     """What people call a shift."""
     return TITLES.get(shift, shift.replace("_", " "))
@@ -126,6 +139,27 @@ def main_table(run: DetectionRun) -> Table:
         "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
         f"Percent; each shift at {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "
         "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.", SOURCE,
+    )  # fmt: skip
+
+
+def left_table(run: DetectionRun) -> Table:
+    """Shift x detector: the share of the detector's clean score that is left, the paper's shares between ours."""
+    rows = []
+    columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
+    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    for shift in run.shifts:
+        head = (run.family(shift), title_of(shift))
+        rows.append(Row(head, tuple(left_cell(run, d, shift, m) for d in run.detectors for m in ("mAP", "NDS"))))
+        if run.suite.get("reference") and shift in PUBLISHED and any(names):
+            cells = [
+                Cell(100 * PUBLISHED[shift][name][k] / PUBLISHED[""][name][k] if name else math.nan)
+                for name in names for k in (0, 1)
+            ]  # fmt: skip
+            rows.append(Row(head, tuple(cells), published=True))
+    return Table(
+        "left", "What is left of the clean score", ("Family", "Shift"), tuple(columns), tuple(rows),
+        "Percent of each detector's own clean score, which is what other pictures and detectors can be compared by. "
+        f"Shaded rows: from the numbers {SOURCE}.", SOURCE,
     )  # fmt: skip
 
 
@@ -225,11 +259,11 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
     steps = ["0", *run.numbers]
     top = max(
         (
-            cell_of(run.record(d, s, n), metric).mean
+            cell.mean if math.isnan(cell.high) else cell.high
             for d in run.detectors
             for s in ["", *run.shifts]
             for n in steps
-            if run.record(d, s, n)
+            if not math.isnan((cell := cell_of(run.record(d, s, n), metric)).mean)
         ),
         default=1.0,
     )
@@ -295,12 +329,13 @@ def write_detection_report(folder: Path, header: Mapping[str, Any]) -> Path:
     """DIR/report.html and DIR/tables of a detection run. StoreError."""
     run = load_detection_run(folder, header)
     robust = robustness_table(run)
-    main, severities, cars, classes = main_table(run), severity_table(run), car_table(run), class_table(run)
-    write_tables(folder, [t for t in (main, robust, severities, cars, classes) if t is not None])
+    main, left, severities = main_table(run), left_table(run), severity_table(run)
+    cars, classes = car_table(run), class_table(run)
+    write_tables(folder, [t for t in (main, left, robust, severities, cars, classes) if t is not None])
     some = next(iter(run.records.values()))
     page = template("detection.html").render(
-        run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, severities=severities,
-        cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
+        run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, left=left,
+        severities=severities, cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
         plot_map=curves(run, "mAP"),
         command=command_of(dict(run.suite)), versions=header.get("versions", {}), pictures=_pictures(folder),
         samples=some.get("n", 0), scenes=some.get("scenes", 0),

@@ -20,10 +20,10 @@ FACING = 75.0  # degrees from the optical axis beyond which the sun adds no ligh
 
 
 def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
-    """Unit vector towards the sun [3], world: 6 to 16 degrees high, within 15 of where the ego goes at first."""
+    """Unit vector towards the sun [3], world: 2 to 12 degrees high, within 15 of where the ego goes at first."""
     draws = spec.generator("sun", context.scene)
     heading = context.heading + np.radians(draws.uniform(-15, 15))
-    height = np.radians(draws.uniform(6, 16))
+    height = np.radians(draws.uniform(2, 12))
     return np.array([np.cos(heading) * np.cos(height), np.sin(heading) * np.cos(height), np.sin(height)])
 
 
