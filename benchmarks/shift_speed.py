@@ -72,7 +72,8 @@ def street() -> tuple[np.ndarray, Frame]:
         cv2.fillConvexPoly(image, hull, rng.integers(40, 230, 3).tolist())
         cv2.polylines(image, [hull], True, (15, 15, 15), 3)
     v = (np.arange(225) * 4 + 1.5)[:, None] - 491.5
-    depth = np.where(v > 5, 1.5 * 1266.4 / np.maximum(v, 5), 60).astype(np.float32) + np.zeros((1, 400), np.float32)
+    depth = np.where(v > 5, 1.5 * 1266.4 / np.maximum(v, 5), np.where(v > -133, 60, np.inf)).astype(np.float32)
+    depth = depth + np.zeros((1, 400), np.float32)  # houses 6 degrees high, the sun above them
     return image, Frame(camera, "scene", "sample", 3.0, ego_velocity=np.array([8.0, 0, 0]), boxes=boxes, depth=depth)
 
 
@@ -102,7 +103,7 @@ def main() -> None:
     image, frame = street()
     images: Batch = to_batch(np.repeat(image[None], options.batch, 0), device)
     frames = [frame] * options.batch
-    contexts = {"scene": SceneContext("scene", 0.8)}
+    contexts = {"scene": SceneContext("scene", 0.8, sun=(0.985, 0.0, 0.174))}
     rows: dict[str, dict[str, float]] = {}
     for calibration in ("physical", "paper"):
         total = 0.0

@@ -147,6 +147,8 @@ def test_contact_sheets(
         (("shift", "{picture}", "{tmp}/x.gif"), ("x.gif",)),
         (("shift", "{tiny}", "{tmp}/x.png", "--scenes", "scene-9"), ("scene-9",)),
         (("shift", "{tiny}", "{tmp}/x.png", "--scenes", "a,b"), ("of one scene",)),
+        (("shift", "{tiny}", "{tmp}/x.png", "--split", "mini_val"), ("--split does not go with",)),
+        (("shift", "{picture}", "{tmp}/x.png", "--scenes", "scene-9"), ("--scenes does not go with",)),
         (
             ("score", "none.json", "--dataroot", "{tiny}", "--version", "v1.0-mini", "--split", "mini_val"),
             ("none.json",),

@@ -177,6 +177,7 @@ def shift(
             out,
             version=version,
             channel=channel,
+            split=split,
             scenes=listed,
             boxes=box or [],
             severity=severity,

@@ -69,7 +69,8 @@ class Frame:
     scene, sample: keys of randomness (weather is drawn once a scene, sensor noise once a file); time s;
     ego_to_world [4, 4]; ego_velocity [3] m/s in the world frame; depth [h, w] metres along the optical axis, in any
     resolution (0: unknown, inf: sky); points [P, 3] LiDAR returns in the camera frame, from which depth is filled in
-    where `depth` is None.
+    where `depth` is None; sun: the share of the sun's disc that is free, where another camera of the moment sees it
+    (None: not known; each picture is then judged by itself).
     """
 
     camera: Camera
@@ -81,6 +82,7 @@ class Frame:
     boxes: Boxes3D = field(default_factory=Boxes3D.empty)
     depth: F32 | None = None
     points: F32 | None = None
+    sun: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +103,15 @@ class SceneContext:
     """What is constant over a scene and drawn or measured once: the key, brightness, where it goes.
 
     light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); heading: of the ego in the world at
-    the start of the scene, radians; start: its first time, s.
+    the start of the scene, radians; start: its first time, s; sun: unit vector towards it in the world, where it was
+    chosen so that it is seen (None: drawn).
     """
 
     scene: str = ""
     light: float = 0.8
     heading: float = 0.0
     start: float = 0.0
+    sun: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

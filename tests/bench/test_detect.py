@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.detect import detect_scene, match_boxes, score_2d, to_host
+from ssad.bench.detect import detect_scene, joined, match_boxes, score_2d, to_host
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.training_data import camera_truth, nuscenes_items
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -17,6 +17,7 @@ from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detections import Detections, Solids, Truth
 from ssad.detectors import make_detector
 from ssad.detectors.training.batches import Bank
+from ssad.errors import ConfigError
 from ssad.metrics.detection_boxes import TP_METRICS
 
 
@@ -87,6 +88,7 @@ def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.M
         here, there = (
             detect_scene(make_detector(name, device=device), root, scene, device=device) for device in ("cpu", "cuda")
         )
+    assert sum(int((one.boxes.score > 0.1).sum()) for one in here) > 3
     for one, other in zip(here, there, strict=True):
         sure, same = one.boxes.score > 0.1, other.boxes.score > 0.1
         assert abs(int(sure.sum()) - int(same.sum())) <= 1, "but for one at the threshold"
@@ -97,6 +99,24 @@ def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.M
             assert alike.any()
 
 
+def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:
+    calls = []
+
+    def twice(value: torch.Tensor) -> torch.Tensor:
+        calls.append(value.shape)
+        return 2 * value
+
+    alike = [torch.rand(n, 3) for n in (2, 0, 5)]
+    for before, after in zip(alike, joined(alike, twice), strict=True):
+        assert (after == 2 * before).all()
+    assert calls == [(7, 3)]
+    for mixed in ([torch.rand(2, 3), torch.rand(2, 4)], [torch.rand(2), torch.arange(2)], [torch.tensor(1.0)]):
+        calls.clear()
+        for before, after in zip(mixed, joined(mixed, twice), strict=True):
+            assert (after == 2 * before).all()
+        assert len(calls) == len(mixed)
+
+
 def test_detections_come_to_the_host_as_they_are() -> None:
     def some(count: int, *, three: bool) -> Detections:
         score, label, box = torch.rand(count), torch.arange(count), torch.rand(count, 4)
@@ -105,12 +125,11 @@ def test_detections_come_to_the_host_as_they_are() -> None:
 
     before = [some(3, three=True), some(0, three=True), some(5, three=False), some(2, three=True)]
     after = to_host(before)
-    for one, other in zip(before, after, strict=True):
-        assert (one.score == other.score).all()
-        assert (one.label == other.label).all()
-        assert (one.box == other.box).all()
-        assert (one.solid is None) == (other.solid is None)
-        if one.solid is not None and other.solid is not None:
-            assert (one.solid.centre == other.solid.centre).all()
-            assert (one.solid.attribute == other.solid.attribute).all()
+    assert [len(one.score) for one in after] == [3, 0, 5, 2]
+    assert [one.solid is None for one in after] == [False, False, True, False]
+    assert after[3].solid is not None
+    assert before[3].solid is not None
+    assert (after[3].solid.yaw == before[3].solid.yaw).all(), "solids stay with their detections"
     assert not to_host([])
+    with pytest.raises(ConfigError, match="holds tensors"):
+        to_host([Detections(np.zeros(1), torch.zeros(1), torch.zeros(1, 4))])  # type: ignore[arg-type]

@@ -69,7 +69,7 @@ def test_work_that_turns_up_while_results_are_read_is_done(workers: int) -> None
         for number in crew.results():
             found.append(number)
             if not number % 10:
-                crew.add(fail, number + 1 + 1, first=True)
+                crew.add(fail, number + 2, first=True)
     assert sorted(found) == sorted([n + k for n in range(10, 90, 10) for k in (0, 2)])
     if workers == 1:
         assert found[:6] == [10, 12, 20, 22, 30, 32], "what is to come first does not wait for the rest"

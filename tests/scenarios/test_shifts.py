@@ -23,7 +23,7 @@ from ssad.metrics.robustness import page_trend
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, sky_light, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import deformations
-from ssad.scenarios.static.shifts.sun import sun_direction
+from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
 from ssad.seeding import generator
 from ssad.types import U8
@@ -217,7 +217,7 @@ def test_noise_keeps_its_bits() -> None:
     assert found == GOLDEN
 
 
-GOLDEN = {"uniform": "4cf8ea31aa5f1a06", "gaussian": "844897cf3d8bc2b6", "impulse": "285b2ff378107601"}
+GOLDEN = {"uniform": "6350018bf537faf5", "gaussian": "e4d5d556c0e09fc5", "impulse": "60ad67ae506d72a7"}
 
 
 # ---------------------------------------------------------------- weather
@@ -327,6 +327,36 @@ def test_glare_is_the_eyes_at_most_and_none_behind_a_wall() -> None:
         before = added
 
 
+def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = street.scene(street.scenes()[0].name)
+    frames = [f for f in scene.frames if f.key_frame and f.modality == "camera"][:6]
+    for share in (0.0, 0.4, 1.0):
+        monkeypatch.setattr("ssad.bench.toolbox.scene.free_sun", lambda *_, share=share: share)
+        shifter = SceneShifter(street.root, scene, ShiftSpec("sunlight", 5))
+        found = [shifter.image(frame)[1] for frame in frames]
+        front = [one for one in found if "the sun is not in front of this camera" not in one.skipped]
+        assert len(front) >= 2
+        assert {one.details["free"] for one in front} == {share}
+        assert all(one.applied == (share > 0) for one in front)
+        assert sum(one.details["in_view"] for one in front) < len(front), "not all of them have it in the picture"
+
+
+def test_the_sun_rises_until_it_is_seen() -> None:
+    frame = Frame(CAMERA, "s")
+    elevation = np.degrees(np.arctan((CAMERA.intrinsic[1, 2] - np.arange(HEIGHT)) / CAMERA.intrinsic[1, 1]))
+    depth = np.where(elevation > 12, np.inf, 30.0)[:, None] * np.ones((1, WIDTH))
+    context = SceneContext("s", heading=float(np.arctan2(*camera_to_world(frame)[[1, 0], 2])))
+    walled, spec = replace(frame, depth=depth.astype(np.float32)), ShiftSpec("sunlight", 3)
+    chosen = choose_sun(spec, context, [(walled, GREY)])
+    assert np.degrees(np.arcsin(chosen[2])) > 12
+    open_sky = replace(frame, depth=np.full((HEIGHT, WIDTH), np.inf, np.float32))
+    first = sun_direction(spec, context)
+    assert choose_sun(spec, context, [(open_sky, GREY)]) == pytest.approx(tuple(first))
+    shut = replace(frame, depth=np.full((HEIGHT, WIDTH), 30.0, np.float32))
+    assert choose_sun(spec, context, [(shut, GREY)]) == pytest.approx(tuple(first)), "hidden in all"
+    assert sun_direction(spec, replace(context, sun=chosen)) == pytest.approx(chosen)
+
+
 def test_there_is_no_sun_by_night() -> None:
     frame, spec = Frame(CAMERA, "s"), ShiftSpec("sunlight", 5)
     night = {"s": SceneContext("s", 0.1, float(np.arctan2(*camera_to_world(frame)[[1, 0], 2])))}
@@ -345,6 +375,12 @@ def test_the_sky_is_what_is_infinitely_far() -> None:
     assert sky_light([image], [depth]) == pytest.approx(0.06), "the least there is"
     assert sky_light([image], [np.full_like(depth, 20)]) == pytest.approx(250 / 255, abs=0.01), "no sky to be seen"
     assert sky_light([image, image], [None, depth]) == pytest.approx(0.06), "what is known counts"
+    assert sky_light([image], night=True) == pytest.approx(0.06), "the median, where nothing is known"
+    lit, dark = Frame(CAMERA, "s", depth=np.full((HEIGHT, WIDTH), np.inf, np.float32)), np.zeros_like(GREY)
+    dark[: HEIGHT // 3, : WIDTH // 3] = 250
+    assert lit.depth is not None
+    lit.depth[: HEIGHT // 3, : WIDTH // 3] = 5
+    assert shift_images(dark, lit, ShiftSpec("sunlight", 3))[1][0].skipped == {"it is night": 1}
 
 
 @pytest.mark.parametrize("name", ["rain", "snow"])

@@ -19,6 +19,7 @@ from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detections import CLASSES_3D, Detections, Solids
 from ssad.detectors.mono3d.merge import WorldBoxes, merge_cameras
 from ssad.detectors.training.batches import Bank
+from ssad.errors import ConfigError
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
@@ -50,7 +51,7 @@ def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tenso
 
 
 def to_host(found: Sequence[Detections]) -> list[Detections]:
-    """Detections of a batch on the CPU: a copy a column, as each copy waits for the device."""
+    """Detections of a batch on the CPU: a copy a column, as each copy waits for the device. ConfigError: no tensors."""
     flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
     solids = [one.solid for one in found if one.solid is not None]
     names = ("centre", "size", "yaw", "velocity", "attribute")
@@ -60,12 +61,19 @@ def to_host(found: Sequence[Detections]) -> list[Detections]:
 
 
 def _host(parts: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-    """Tensors on the CPU, in one copy where they are rows of a like kind."""
+    """Tensors on the CPU."""
+    if not all(isinstance(part, torch.Tensor) for part in parts):
+        raise ConfigError("broken promise: Detections holds tensors")
     if all(part.device.type == "cpu" for part in parts):
         return list(parts)
+    return joined(parts, torch.Tensor.cpu)
+
+
+def joined(parts: Sequence[torch.Tensor], change: Callable[[torch.Tensor], torch.Tensor]) -> list[torch.Tensor]:
+    """`change`, which works on each row by itself, of all tensors [N, ...] at once where they are of a kind."""
     if len({(part.dtype, part.shape[1:], part.device, part.ndim) for part in parts}) > 1 or not parts[0].ndim:
-        return [part.cpu() for part in parts]
-    return list(torch.split(torch.cat(list(parts)).cpu(), [len(part) for part in parts]))
+        return [change(part) for part in parts]
+    return list(torch.split(change(torch.cat(list(parts))), [len(part) for part in parts]))
 
 
 def detect_scene(

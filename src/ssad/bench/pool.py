@@ -19,7 +19,6 @@ from ssad.errors import StoreError
 
 T = TypeVar("T")
 R = TypeVar("R")
-AHEAD = 2  # pieces of work that are handed out, for each process: the next one waits there
 
 
 def spread(
@@ -66,14 +65,15 @@ class Crew:
                 yield function(task)
                 continue
             try:
-                while (self._urgent or self._queue) and len(self._running) < AHEAD * self._count:
+                while (self._urgent or self._queue) and len(self._running) < self._count:
                     function, task = self._next()
                     self._running.add(self._pool.submit(function, task))
                 done, self._running = futures.wait(self._running, return_when=futures.FIRST_COMPLETED)
-                found = [future.result() for future in done]
             except BrokenProcessPool:
-                raise StoreError("a worker died (out of memory?); run the same command again to go on") from None
-            yield from found
+                raise _died() from None
+            yield from (future.result() for future in done if future.exception() is None)
+            for error in filter(None, (future.exception() for future in done)):
+                raise _died() if isinstance(error, BrokenProcessPool) else error
 
     def _next(self) -> tuple[Callable[[Any], Any], Any]:
         return (self._urgent or self._queue).popleft()
@@ -86,6 +86,10 @@ class Crew:
     ) -> None:
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+
+
+def _died() -> StoreError:
+    return StoreError("a worker died (out of memory?); run the same command again to go on")
 
 
 def visible_gpus() -> list[str]:

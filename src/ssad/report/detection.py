@@ -158,8 +158,8 @@ def left_table(run: DetectionRun) -> Table:
             rows.append(Row(head, tuple(cells), published=True))
     return Table(
         "left", "What is left of the clean score", ("Family", "Shift"), tuple(columns), tuple(rows),
-        "Percent of each detector's own clean score, which is what other pictures and detectors can be compared by. "
-        f"Shaded rows: from the numbers {SOURCE}.", SOURCE,
+        "Percent of each detector's own clean score, which is what other pictures and detectors can be compared by."
+        + (f" Shaded rows: from the numbers {SOURCE}." if any(row.published for row in rows) else ""), SOURCE,
     )  # fmt: skip
 
 

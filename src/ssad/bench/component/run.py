@@ -1,4 +1,4 @@
-"""`ssad run` for suites of kind `detection`: data, then boxes, then scores; run again to go on where it stopped."""
+"""`ssad run` for suites of kind `detection`: data, then boxes and, cell by cell, scores; run again to go on."""
 
 from __future__ import annotations
 
@@ -28,7 +28,18 @@ from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity
 from ssad.seeding import digest
 
 # a change in any of these may change a number
-_CODE = ("detections.py", "detectors", "scenarios/static/shifts", "metrics", "datasets", "geometry.py", "frames.py")
+_CODE = (
+    "detections.py",
+    "detectors",
+    "scenarios/static/shifts",
+    "metrics",
+    "datasets",
+    "geometry.py",
+    "frames.py",
+    "bench/toolbox/scene.py",
+    "bench/detect.py",
+    "bench/component/work.py",
+)
 _WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
 GPU_WORKERS = 10  # processes that share a GPU: planning a shift and reading pictures is work for the host
 
@@ -176,11 +187,11 @@ def run_detection(
             for d, _ in todo.detectors for shift, severity in todo.conditions
         ]  # fmt: skip
         missing = [cell for cell in cells if cell.key not in store.results]
-        units = sorted(dict.fromkeys(unit for cell in missing for unit in cell.units), key=_late)
+        units = list(dict.fromkeys(unit for cell in sorted(missing, key=_rank) for unit in cell.units))
         if retry:
             forget_failures(out, units)
-        least = min(count, len(units) + len(missing))
-        with Live(suite.name, len(units) + len(missing), 0, console=console) as live, Crew(least, gpus=gpus) as crew:
+        hands = min(count, len(units) + len(missing))
+        with Live(suite.name, len(units) + len(missing), 0, console=console) as live, Crew(hands, gpus=gpus) as crew:
             for cell, result, seconds in _work(crew, job, units, missing, live):
                 store.append(_record(todo, cell, header, result, seconds), None)
         return [store.results[key] for key in order]
@@ -189,7 +200,10 @@ def run_detection(
 def _work(
     crew: Crew, job: Job, units: Sequence[Unit], cells: Sequence[Cell], live: Live
 ) -> Iterator[tuple[Cell, dict[str, Any], float]]:
-    """Cells, what their records say and the seconds of work in them, each as soon as its last unit is there."""
+    """Cells, what their records say and the seconds of work in them, each as soon as its last unit is there.
+
+    Seconds: of scoring, and of those units that were made now, shared by the cells that need them.
+    """
     left = {cell.key: set(cell.units) for cell in cells}
     users: dict[Unit, list[Cell]] = {}
     for cell in cells:
@@ -200,7 +214,7 @@ def _work(
         crew.add(make_unit, (job, unit))
     for done in crew.results():
         if isinstance(done, Scored):
-            shared = sum(made[unit].seconds for unit in done.cell.units) / len(job.detectors)
+            shared = sum(made[unit].seconds / len(users[unit]) for unit in done.cell.units)
             live.advance("reason" not in done.result)
             yield done.cell, done.result, shared + done.seconds
         else:
@@ -215,15 +229,15 @@ def _work(
                     crew.add(score_cell, (job, cell), first=True)
                 else:
                     live.advance(False)
-                    yield cell, {"reason": f"{bad.unit.scene}: {bad.reason}"}, bad.seconds
+                    yield cell, {"reason": f"{bad.unit.scene}: {bad.reason}"}, bad.seconds / len(users[bad.unit])
         live.tick()
 
 
-def _late(unit: Unit) -> int:
-    """Units in this order: clean, then the middle severity of every shift: what comes first says most."""
-    if unit.shift is None:
+def _rank(cell: Cell) -> int:
+    """Which cells come first: clean, what the main table tells, the middle severity, the others."""
+    if cell.shift is None:
         return 0
-    return 5 if isinstance(unit.severity, str) else 1 + abs(unit.severity - 3)
+    return 1 if isinstance(cell.severity, str) else 2 + abs(cell.severity - 3)
 
 
 def _units(todo: Plan, shift: str | None, severity: int | str, tokens: Mapping[str, str]) -> tuple[Unit, ...]:

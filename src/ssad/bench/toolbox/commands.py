@@ -118,6 +118,7 @@ def write_contact_sheets(
     *,
     version: str | None,
     channel: str,
+    split: str | None,
     scenes: Sequence[str],
     boxes: Sequence[str],
     severity: str,
@@ -125,6 +126,10 @@ def write_contact_sheets(
     calibration: str,
 ) -> None:
     """Contact sheets of a picture or of a dataset's camera. ConfigError, SSADError."""
+    if split is not None or (scenes and source.is_file()):
+        raise ConfigError(
+            f"{'--split' if split is not None else '--scenes'} does not go with a contact sheet of {source}"
+        )
     if len(scenes) > 1:
         raise ConfigError(f"a contact sheet is of one scene, not of {len(scenes)}: --scenes {scenes[0]}")
     if calibration not in get_args(Calibration):

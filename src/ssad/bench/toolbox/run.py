@@ -22,6 +22,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.errors import ConfigError, FormatError, SSADError, StoreError
+from ssad.scenarios.static.shifts.sun import NO_SUN
 
 Progress = Callable[[int, int], None]
 
@@ -228,7 +229,8 @@ def _finish(
         tally.add(scene, lines)
         labels |= made.boxes
     transformed = _write_labels(options, root, labels)
-    if not tally.reasons and severity != 0 and not (tally.changed if tally.images else tally.states["shifted"]):
+    changed = tally.changed if tally.images else tally.states["shifted"]
+    if not tally.reasons and severity != 0 and not changed and not (tally.skipped.keys() & NO_SUN):
         why = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
         raise StoreError(f"{root}: {shift} changed none of {tally.images} images: {why or 'no reason was given'}")
     shutil.rmtree(root / UNFINISHED, ignore_errors=True)

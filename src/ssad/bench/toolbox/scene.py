@@ -26,6 +26,7 @@ from ssad.scenarios.static.shifts import (
     sky_light,
     transformed_boxes,
 )
+from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_direction, sun_in_picture
 from ssad.types import F32, F64, U8
 
 # least visible fraction for a visibility token
@@ -55,6 +56,7 @@ class SceneShifter:
     def __init__(self, root: Path, scene: SceneData, spec: ShiftSpec, *, random: bool = False) -> None:
         self.root, self.scene, self.base, self.random = Path(root), scene, spec, random
         self._clouds: OrderedDict[str, F32] = OrderedDict()
+        self._suns: dict[str, tuple[str, float | None]] = {}
         self._tracks: dict[str, tuple[F64, F64]] = {}
         for channel in {f.channel for f in scene.frames}:
             track = [f for f in scene.frames if f.channel == channel]
@@ -71,7 +73,7 @@ class SceneShifter:
 
     @property
     def context(self) -> SceneContext:
-        """Brightness of the sky and heading of the ego, from the first sample whose images can be read."""
+        """Brightness of the sky, heading of the ego and place of the sun, from the first sample that can be read."""
         return self._opening[1]
 
     @cached_property
@@ -80,11 +82,7 @@ class SceneShifter:
         start = self.scene.frames[0].timestamp_us / 1e6 if self.scene.frames else 0.0
         token = self.scene.record.token
         for sample in self.scene.samples:
-            cameras = [
-                f
-                for f in self.scene.frames
-                if f.key_frame and f.modality == "camera" and f.sample_token == sample.token
-            ]
+            cameras = self._cameras(sample.token)
             try:
                 images = [self.read(f) for f in cameras]
                 depths = [self._depth(f) for f in cameras]
@@ -93,14 +91,20 @@ class SceneShifter:
             if images:
                 forward = cameras[0].ego_to_world[:2, 0]
                 heading = float(np.arctan2(forward[1], forward[0]))
-                return sample.token, SceneContext(token, sky_light(images, depths), heading, start)
+                night = "night" in self.scene.record.description.lower()  # as nuScenes says it
+                context = SceneContext(token, sky_light(images, depths, night=night), heading, start)
+                if self._has_sun:
+                    shown = [(self._view(f), image) for f, image in zip(cameras, images, strict=True) if _has_lens(f)]
+                    context = replace(context, sun=choose_sun(self.base, context, shown))
+                return sample.token, context
         return "", SceneContext(token, start=start)
 
     def basis(self, frame: SensorFrame) -> dict[str, str]:
         """What else of the dataset decides about a frame under weather: plain data for the manifest.
 
         context: token of the sample that gave the brightness of the sky; sweep: name of the LiDAR file that gave
-        depth, "" when it could not be read. A better basis, after the dataset was mended, means another picture.
+        depth, "" when it could not be read; sun: name of the picture that says whether the sun is hidden, "" for
+        none. A better basis, after the dataset was mended, means another picture.
         """
         found = {}
         if self.base.family == "environment":
@@ -108,6 +112,8 @@ class SceneShifter:
         if frame.modality == "camera" and self._uses_depth and self._sweeps:
             sweep = self._nearest(frame)
             found["sweep"] = sweep.filename if self._read(sweep) is not None else ""
+        if frame.modality == "camera" and self._has_sun:
+            found["sun"] = self._sun(frame.sample_token)[0]
         return found
 
     def outdated(self, frame: SensorFrame, basis: Mapping[str, object]) -> bool:
@@ -116,7 +122,8 @@ class SceneShifter:
         made = order.get(str(basis["context"]), len(order)) if "context" in basis else 0
         if made and order.get(self._opening[0], len(order)) < made:
             return True
-        return basis.get("sweep") == "" and self.basis(frame).get("sweep") != ""
+        now = self.basis(frame)
+        return any(basis.get(name) == "" and now.get(name) != "" for name in ("sweep", "sun"))
 
     def velocity(self, frame: SensorFrame) -> F64:
         """Velocity [3] of the ego, m/s, world: from the poses of the channel before and after."""
@@ -173,7 +180,7 @@ class SceneShifter:
         return np.where(values == 65535, np.inf, values / 64).astype(np.float32)
 
     def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None) -> Frame:
-        if frame.intrinsic is None or not min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0:
+        if frame.intrinsic is None or not _has_lens(frame):
             raise FormatError(f"{frame.filename}: the camera {frame.channel} has no focal length")
         camera = Camera(frame.width, frame.height, frame.intrinsic, frame.sensor_to_ego, frame.channel)
         return Frame(
@@ -188,8 +195,38 @@ class SceneShifter:
             points=points,
         )
 
+    @property
+    def _has_sun(self) -> bool:
+        return self.base.calibration == "physical" and self.base.name == "sunlight"
+
+    def _cameras(self, sample_token: str) -> list[SensorFrame]:
+        """The pictures of a sample."""
+        return [
+            f for f in self.scene.frames if f.key_frame and f.modality == "camera" and f.sample_token == sample_token
+        ]
+
+    def _sun(self, sample_token: str) -> tuple[str, float | None]:
+        """The picture of a sample that the sun stands in most centrally, and the share of it that is free there; "" and
+        None when it stands in none that can be read."""
+        if sample_token not in self._suns:
+            toward = sun_direction(self.base, self.context)
+            views = [(f, self._view(f)) for f in self._cameras(sample_token) if _has_lens(f)]
+            views = [(f, view) for f, view in views if sun_in_picture(view, toward)]
+            self._suns[sample_token] = "", None
+            for f, view in sorted(views, key=lambda pair: sun_angle(pair[1], toward)):
+                try:
+                    self._suns[sample_token] = f.filename, free_sun(view, self.read(f), toward)
+                    break
+                except FormatError:
+                    continue
+        return self._suns[sample_token]
+
     def camera_frame(self, frame: SensorFrame) -> Frame:
         """What the shift is told about an image."""
+        view = self._view(frame)
+        return replace(view, sun=self._sun(frame.sample_token)[1]) if self._has_sun else view
+
+    def _view(self, frame: SensorFrame) -> Frame:
         objects = self.base.family == "object" or self._uses_depth
         boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
         return self._frame(frame, boxes, self._points(frame) if self._uses_depth else None)
@@ -268,6 +305,10 @@ class SceneShifter:
         if sweep is not None and lidar is not None:
             points[rows] = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
         return replace(found, centre=centre, size=size, rotation=rotation, lidar_points=points)
+
+
+def _has_lens(frame: SensorFrame) -> bool:
+    return frame.intrinsic is not None and min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0
 
 
 def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> npt.NDArray[np.int32]:

@@ -21,6 +21,7 @@ from ssad.errors import ConfigError
 from ssad.frames import Boxes3D, Camera, Frame, SceneContext, camera_to_world
 from ssad.safeio import write_atomic
 from ssad.scenarios.static.shifts import SEVERITIES, SHIFTS, Calibration, ShiftSpec, shift_images, viewing_direction
+from ssad.scenarios.static.shifts.sun import choose_sun
 from ssad.types import U8
 
 BAND = 26  # pixels of a caption
@@ -72,10 +73,11 @@ def pick_frame(
     best = max(frames, key=lambda f: _in_view(shifter.camera_frame(f)))
     weather = SceneShifter(data.root, chosen, ShiftSpec("fog", 3))
     view = shifter.camera_frame(best)
+    seen, image = weather.camera_frame(best), shifter.read(best)
     # the sun stands over where the ego goes; here, over what this camera sees
     context = replace(weather.context, heading=viewing_direction(view))
-    seen = weather.camera_frame(best)
-    return shifter.read(best), replace(view, points=seen.points, depth=seen.depth), context
+    context = replace(context, sun=choose_sun(ShiftSpec("sunlight", 3), context, [(seen, image)]))
+    return image, replace(view, points=seen.points, depth=seen.depth), context
 
 
 def _in_view(frame: Frame) -> float:

@@ -105,7 +105,7 @@ class Mono3D(nn.Module):
         return self._chosen(dense, threshold, best_first=False)
 
     def _chosen(self, dense: Dense, threshold: float, *, best_first: bool) -> list[Detections]:
-        """Suppression is a chain of small steps and runs on the host: the device is asked twice, not for each step."""
+        """Suppression is a chain of small steps and runs on the host; the device is asked once, not for each step."""
         with _exact(dense.logit):
             flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
             places = places_of(dense.maps["cls_scores"], self.config.strides)

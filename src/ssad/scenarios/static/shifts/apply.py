@@ -20,6 +20,9 @@ from ssad.types import F32, U8
 _CHUNK = 64
 
 
+_ENOUGH = 100  # pixels of sky, of a picture looked at in 160 columns
+
+
 def shift_images(
     images: Any,
     frames: Sequence[Frame] | Frame | None,
@@ -108,15 +111,16 @@ def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneCon
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
     row = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
-    light = sky_light([row.reshape(batch.height, batch.width, 3)[:, : batch.seen]])
+    light = sky_light([row.reshape(batch.height, batch.width, 3)[:, : batch.seen]], [frame.depth])
     return SceneContext(frame.scene, light, viewing_direction(frame))
 
 
-def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = ()) -> float:
+def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:
     """Brightness in [0, 1] of the brightest thirtieth of the sky: what fog scatters.
 
-    depths: maps [h, w] of any size, inf where there is sky; of images without one the upper half counts. By night a
-    wall in lamp light is brighter than the sky.
+    depths: maps [h, w] of any size, inf where there is sky; those of images without one are None. Where too little of
+    the sky is known, the upper halves of all images stand for it; by night their median, as lamps and walls in lamp
+    light are brighter than the sky.
     """
     found, sky = [], []
     for n, image in enumerate(images):
@@ -130,8 +134,9 @@ def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = ()) -> float:
             x = np.arange(light.shape[1]) * step * depth.shape[1] // image.shape[1]
             sky.append(light[np.isinf(depth[y][:, x])])
     known = np.concatenate(sky) if sky else np.zeros(0)
-    seen = known if len(known) >= 100 else np.concatenate(found)
-    return float(np.clip(np.quantile(seen, 0.97) / 255, 0.06, 1.0))
+    enough = len(known) >= _ENOUGH
+    seen = known if enough else np.concatenate(found)
+    return float(np.clip(np.quantile(seen, 0.5 if night and not enough else 0.97) / 255, 0.06, 1.0))
 
 
 def viewing_direction(frame: Frame) -> float:

@@ -34,18 +34,20 @@ def depth_grid(batch: Batch, frames: Sequence[Frame]) -> tuple[Any, list[str]]:
     Sources: "given", "lidar" (returns, road, image) or "assumed" (road and image alone).
     """
     rows, columns = grid_size(batch)
-    pixels = None
-    found, sources = [], []
-    for b, frame in enumerate(frames):
-        if frame.depth is not None:
-            found.append(_given(np.asarray(frame.depth, np.float32), rows, columns))
-            sources.append("given")
-            continue
-        if pixels is None:
-            pixels = batch.numpy()
-        found.append(fill_depth(frame, pixels[b], rows, columns))
-        sources.append("assumed" if frame.points is None or not len(frame.points) else "lidar")
-    return wp.array(np.stack(found), dtype=wp.float32, device=batch.device), sources
+    pixels = batch.numpy() if any(frame.depth is None for frame in frames) else None
+    found = [
+        depth_of(frame, None if pixels is None else pixels[b], rows, columns) for b, frame in enumerate(frames)
+    ]  # fmt: skip
+    grids, sources = zip(*found, strict=True)
+    return wp.array(np.stack(grids), dtype=wp.float32, device=batch.device), list(sources)
+
+
+def depth_of(frame: Frame, image: Any, rows: int, columns: int) -> tuple[F32, str]:
+    """Depth [rows, columns] of one frame, and its source; image [H, W, 3] is looked at where no depth is given."""
+    if frame.depth is not None:
+        return _given(np.asarray(frame.depth, np.float32), rows, columns), "given"
+    source = "assumed" if frame.points is None or not len(frame.points) else "lidar"
+    return fill_depth(frame, image, rows, columns), source
 
 
 def _given(depth: F32, rows: int, columns: int) -> F32:

@@ -16,7 +16,7 @@ from ssad.frames import Applied, SceneContext, SweepFrame
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import affine, deformed
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.scenarios.static.shifts.sun import NIGHT, sun_direction
+from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
 from ssad.types import F32, F64, Bool
 
@@ -41,7 +41,7 @@ def shift_points(
     if spec.name == "sunlight":
         context = (contexts or {}).get(frame.scene, SceneContext(frame.scene))
         if spec.calibration == "physical" and context.light < NIGHT:
-            return cloud, Applied(False, {"light": round(context.light, 2)}, {"it is night": 1})
+            return cloud, Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1})
         return _sun(cloud, frame, spec, context, draws)
     if spec.name == "fog":
         return _fog(cloud, spec, draws)

@@ -28,8 +28,8 @@ SNOW_RATE: Final[Five] = (0.5, 1.5, 3.5, 7.0, 14.0)
 # drops on the lens, from as many as a wiped lens has between two wipes
 LENS_DROPS: Final = (4, 9, 16, 26, 40)
 # sun: glare one degree from the sun, grey levels at full scale 255. In the eye a sun of 40,000 lx adds 400,000 cd/m2
-# there (CIE: 10 E / theta^2), 40 times what is white by day; a clean lens scatters a hundredth of the eye, a dirty
-# windscreen as much as the eye
+# there (CIE: 10 E / theta^2), 40 times what is white by day: 10,000 grey levels. A clean lens scatters a sixtieth of
+# that, a dirty windscreen as much
 SUN_STRENGTH: Final[Five] = (150.0, 400.0, 1200.0, 3500.0, 10_000.0)
 EXPOSURE: Final = 0.004  # s, by day
 APERTURE: Final = 0.0025  # m

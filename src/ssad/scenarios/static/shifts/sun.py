@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import count, islice
 
 import numpy as np
 import warp as wp
@@ -10,21 +11,77 @@ import warp as wp
 from ssad.frames import Applied, Frame, SceneContext, camera_to_world
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, on
-from ssad.scenarios.static.shifts.depth import depth_grid, grid_size, lens
+from ssad.scenarios.static.shifts.depth import depth_of, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.types import F64
+from ssad.types import F64, U8
 
+AT_NIGHT, HIDDEN = "it is night", "the sun is behind something"
+NO_SUN = frozenset({AT_NIGHT, HIDDEN})  # reasons for which a whole drive may be left as it is
+SKY = 120.0  # m from which on nothing hides the sun
 NIGHT = 0.35  # brightness of the sky below which there is no sun
 FACING = 75.0  # degrees from the optical axis beyond which the sun adds no light
 
 
 def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
-    """Unit vector towards the sun [3], world: 2 to 12 degrees high, within 15 of where the ego goes at first."""
+    """Unit vector towards the sun [3], world: the context's, or drawn 2 to 12 degrees high, within 15 of where the ego
+    goes at first."""
+    return np.array(next(_draws(spec, context)) if context.sun is None else context.sun)
+
+
+def choose_sun(
+    spec: ShiftSpec, context: SceneContext, pictures: Sequence[tuple[Frame, U8]]
+) -> tuple[float, float, float]:
+    """A sun that is free in one of the pictures of a moment: of 16 directions the first one where it is, each drawn one
+    degree higher than that before, the first as by `sun_direction`; that one if it is hidden in all."""
+    drawn = list(islice(_draws(spec, context), 16))
+    for toward in drawn:
+        direction = np.array(toward)
+        if any(sun_in_picture(f, direction) and free_sun(f, image, direction) > 0.5 for f, image in pictures):
+            return toward
+    return drawn[0]
+
+
+def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
     draws = spec.generator("sun", context.scene)
-    heading = context.heading + np.radians(draws.uniform(-15, 15))
-    height = np.radians(draws.uniform(2, 12))
-    return np.array([np.cos(heading) * np.cos(height), np.sin(heading) * np.cos(height), np.sin(height)])
+    for number in count():
+        heading = context.heading + np.radians(draws.uniform(-15, 15))
+        height = np.radians(draws.uniform(2, 12) + number)
+        toward = np.cos(heading) * np.cos(height), np.sin(heading) * np.cos(height), np.sin(height)
+        yield float(toward[0]), float(toward[1]), float(toward[2])
+
+
+def sun_angle(frame: Frame, toward: F64) -> float:
+    """Angle between a direction [3] in the world and the optical axis, degrees."""
+    seen = camera_to_world(frame)[:3, 2] @ toward
+    return float(np.degrees(np.arccos(np.clip(seen, -1, 1))))
+
+
+def _place(frame: Frame, toward: F64) -> tuple[float, float]:
+    """Pixel x, y of a direction [3] in the world that lies in front of the camera."""
+    seen, k = camera_to_world(frame)[:3, :3].T @ toward, frame.camera.intrinsic
+    return float(k[0, 0] * seen[0] / seen[2] + k[0, 2]), float(k[1, 1] * seen[1] / seen[2] + k[1, 2])
+
+
+def sun_in_picture(frame: Frame, toward: F64) -> bool:
+    """Whether the sun stands within the borders of the picture, whatever is before it."""
+    if sun_angle(frame, toward) > FACING:
+        return False
+    x, y = _place(frame, toward)
+    return 0 <= x < frame.camera.width and 0 <= y < frame.camera.height
+
+
+def free_sun(frame: Frame, image: U8, toward: F64) -> float:
+    """Share in [0, 1] of the sun's disc that is free in a picture [H, W, 3] which it stands in; 1 if nothing is known
+    of depth."""
+    height, width = image.shape[:2]
+    grid, source = depth_of(frame, image, -(-height // 4), -(-width // 4))
+    if source == "assumed":
+        return 1.0
+    x, y = _place(frame, toward)
+    row, column, reach = int(y / 4), int(x / 4), max(2, width // 260)
+    around = grid[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+    return float((around > SKY).mean())
 
 
 def add_sun(
@@ -35,31 +92,26 @@ def add_sun(
     place = np.zeros((batch.count, 3))
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
     done: list[Applied] = []
-    depth: F64 | None = None
-    sources: list[str] = []
+
+    def picture(b: int) -> U8:
+        rows = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
+        return np.asarray(rows.reshape(batch.height, batch.width, 3)[:, : batch.seen])
+
     for b, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         if context.light < NIGHT:
-            done.append(Applied(False, {"light": round(context.light, 2)}, {"it is night": 1}))
+            done.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
             continue
         world = sun_direction(spec, context)
-        seen = camera_to_world(frame)[:3, :3].T @ world
-        toward[b] = seen
-        angle = float(np.degrees(np.arccos(np.clip(seen[2], -1, 1))))
+        toward[b] = camera_to_world(frame)[:3, :3].T @ world
+        angle = sun_angle(frame, world)
         if angle > FACING:
             done.append(Applied(False, {"angle_deg": round(angle, 1)}, {"the sun is not in front of this camera": 1}))
             continue
-        k = frame.camera.intrinsic
-        x, y = k[0, 0] * seen[0] / seen[2] + k[0, 2], k[1, 1] * seen[1] / seen[2] + k[1, 2]
+        x, y = _place(frame, world)
         place[b] = x, y, 1
-        inside = bool(0 <= x < batch.width and 0 <= y < batch.height)
-        free = 1.0
-        if inside:
-            if depth is None:
-                grid, sources = depth_grid(batch, frames)
-                depth = grid.numpy()
-            row, column, reach = int(y / 4), int(x / 4), max(2, batch.width // 260)
-            around = depth[b, max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
-            free = 1.0 if sources[b] == "assumed" else float((around > 120).mean())
+        inside, free = sun_in_picture(frame, world), frame.sun
+        if free is None:
+            free = free_sun(frame, picture(b), world) if inside else 1.0
         details = {
             "angle_deg": round(angle, 1),
             "in_view": inside,
@@ -67,7 +119,7 @@ def add_sun(
             "direction": [round(float(v), 6) for v in world],
         }
         if not free:
-            done.append(Applied(False, details, {"the sun is behind something": 1}))
+            done.append(Applied(False, details, {HIDDEN: 1}))
             continue
         strength[b] = table.SUN_STRENGTH[spec.severity - 1] * free
         # the camera exposes for what it sees: the nearer the sun to the picture, the darker the rest

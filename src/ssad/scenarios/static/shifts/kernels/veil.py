@@ -190,8 +190,9 @@ def glare(
 
     toward: unit direction of the sun in the camera frame; place: its pixel (x, y), and 1 if in front of the camera;
     strength: grey levels at one degree from the sun. Veiling glare falls with the square of the angle (CIE disability
-    glare: 10 / theta^2), with a bright aureole; the lens adds a six-pointed diffraction star (`rays`: its angle) and
-    two ghosts on the line through the image centre, which do not grow with the dirt on the screen before it.
+    glare: 10 / theta^2), with a bright aureole; the lens adds a six-pointed diffraction star (`rays`: its angle) that
+    ends at 14 degrees and two ghosts on the line through the image centre, which do not grow with the dirt on the
+    screen before it.
     """
     b, y = wp.tid()
     focal = lens[b]
