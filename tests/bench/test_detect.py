@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from ssad.bench.component.run import workers_on
 from ssad.bench.detect import detect_scene, joined, match_boxes, score_2d, to_host
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.training_data import camera_truth, nuscenes_items
@@ -97,6 +99,43 @@ def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.M
             alike &= np.linalg.norm(other.boxes.translation - one.boxes.translation[k], axis=1) < 0.05
             alike &= np.abs(other.boxes.score - one.boxes.score[k]) < 0.01
             assert alike.any()
+
+
+def test_fewer_pictures_at_a_time_where_memory_is_short(root: Path) -> None:
+    class Small(Oracle):
+        """A detector on a small device."""
+
+        calls: list[int] = []  # noqa: RUF012
+        room = 2
+
+        def predict(self, images: torch.Tensor, intrinsic: torch.Tensor | None = None, **_: object) -> list[Detections]:
+            if len(images) > self.room:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            self.calls.append(len(images))
+            return super().predict(images, intrinsic)
+
+    with NuScenes(root) as data:
+        scene = data.scene("scene-larkhill-000")
+        key = [f for f in scene.frames if f.modality == "camera" and f.key_frame]
+        ordered = [
+            camera_truth(f, scene.annotations(f.sample_token))
+            for s in scene.samples for f in key if f.sample_token == s.token
+        ]  # fmt: skip
+        whole = detect_scene(Oracle(iter(ordered)), root, scene)  # type: ignore[arg-type]
+        parts = detect_scene(Small(iter(ordered)), root, scene)  # type: ignore[arg-type]
+        assert set(Small.calls) <= {1, 2}
+        assert sum(Small.calls) == len(key)
+        for one, other in zip(whole, parts, strict=True):
+            assert (one.boxes.translation == other.boxes.translation).all()
+        Small.room = 0
+        with pytest.raises(torch.OutOfMemoryError):
+            detect_scene(Small(iter(ordered)), root, scene)  # type: ignore[arg-type]
+
+
+def test_processes_share_the_memory_of_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = [141 << 30, 24 << 30, 2 << 30]
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda k: SimpleNamespace(total_memory=sizes[k]))
+    assert [workers_on(n) for n in (0, 1, 2, 3)] == [0, 14, 20, 21]
 
 
 def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:

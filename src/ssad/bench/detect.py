@@ -122,9 +122,21 @@ def _predict(
         lens = torch.from_numpy(np.stack([np.asarray(frames[k].intrinsic, np.float32) for k in rows])).to(device)
         images = to_images([pictures[k] for k in rows], device)
         for own, detector in zip(found, detectors, strict=True):
-            for k, one in zip(rows, to_host(detector.predict(images, lens)), strict=True):
+            for k, one in zip(rows, to_host(_fitting(detector, images, lens)), strict=True):
                 own[k] = one
     return [[own[k] for k in range(len(frames))] for own in found]
+
+
+def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> list[Detections]:
+    """`predict`, of half as many pictures at a time where memory does not suffice."""
+    try:
+        return list(detector.predict(images, lens))
+    except torch.OutOfMemoryError:
+        if len(images) == 1:
+            raise
+    torch.cuda.empty_cache()
+    half = len(images) // 2
+    return [*_fitting(detector, images[:half], lens[:half]), *_fitting(detector, images[half:], lens[half:])]
 
 
 def _merged(

@@ -41,7 +41,8 @@ _CODE = (
     "bench/component/work.py",
 )
 _WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
-GPU_WORKERS = 10  # processes that share a GPU: planning a shift and reading pictures is work for the host
+# processes that share a GPU: planning a shift and reading pictures is work for the host; and memory of each, bytes
+GPU_WORKERS, GPU_SHARE = 14, 4 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +178,7 @@ def run_detection(
             scenes = scenes_of(data, suite.split)
             tokens = {name: data.scene(name).record.token for name in scenes}
         gpus = visible_gpus() if todo.device != "cpu" else []
-        count = workers or min(GPU_WORKERS * len(gpus) or default_workers(), default_workers())
+        count = workers or min(workers_on(len(gpus)) or default_workers(), default_workers())
         threads = max(1, default_workers() // count)
         job = Job(
             out, root, version, todo.detectors, suite.calibration, suite.seed, suite.replicates, todo.device, threads
@@ -195,6 +196,14 @@ def run_detection(
             for cell, result, seconds in _work(crew, job, units, missing, live):
                 store.append(_record(todo, cell, header, result, seconds), None)
         return [store.results[key] for key in order]
+
+
+def workers_on(gpus: int) -> int:
+    """How many processes share so many GPUs (the first ones that are visible)."""
+    import torch
+
+    memory = [torch.cuda.get_device_properties(k).total_memory for k in range(gpus)]
+    return sum(max(1, min(GPU_WORKERS, size // GPU_SHARE)) for size in memory)
 
 
 def _work(
