@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ssad import cli
+from ssad.bench.toolbox.sheet import pick_frame
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.tiny import make_tiny
@@ -118,6 +119,8 @@ def test_contact_sheets(
     assert (tmp_path / "sheet-severities.png").is_file()
     with NuScenes(tiny) as data:
         other = data.scenes()[1].name
+        suns = [pick_frame(data, seed=seed)[2].sun for seed in (0, 1, 0)]
+    assert suns[0] == suns[2] != suns[1], "the seed moves the sun"
     assert run(capsys, monkeypatch, "shift", str(tiny), str(tmp_path / "two.png"), "--scenes", other)[0] == 0
     assert (cv2.imread(str(tmp_path / "two.png")) != sheet).any(), "the scene that was named"
     picture = next((tiny / "samples" / "CAM_BACK").iterdir())

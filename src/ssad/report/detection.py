@@ -121,16 +121,23 @@ def title_of(shift: str) -> str:
     return TITLES.get(shift, shift.replace("_", " "))
 
 
+def published_names(run: DetectionRun) -> list[str]:
+    """The paper's column for each detector; "": none, or the suite does not ask for them."""
+    if not run.suite.get("reference"):
+        return [""] * len(run.detectors)
+    return [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+
+
 def main_table(run: DetectionRun) -> Table:
     """Shift x detector: mAP and NDS, the paper's rows between ours."""
     rows = []
     columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
-    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    names = published_names(run)
     for shift in ["", *run.shifts]:
         head = (run.family(shift), title_of(shift))
         cells = [summary_cell(run, d, shift, metric) for d in run.detectors for metric in ("mAP", "NDS")]
         rows.append(Row(head, tuple(cells)))
-        if run.suite.get("reference") and shift in PUBLISHED and any(names):
+        if shift in PUBLISHED and any(names):
             told = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
             rows.append(Row(head, tuple(Cell(v) for pair in told for v in pair), published=True))
     drawn = "random" in run.suite["severities"]
@@ -146,11 +153,11 @@ def left_table(run: DetectionRun) -> Table:
     """Shift x detector: the share of the detector's clean score that is left, the paper's shares between ours."""
     rows = []
     columns = [f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS")]
-    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    names = published_names(run)
     for shift in run.shifts:
         head = (run.family(shift), title_of(shift))
         rows.append(Row(head, tuple(left_cell(run, d, shift, m) for d in run.detectors for m in ("mAP", "NDS"))))
-        if run.suite.get("reference") and shift in PUBLISHED and any(names):
+        if shift in PUBLISHED and any(names):
             cells = [
                 Cell(100 * PUBLISHED[shift][name][k] / PUBLISHED[""][name][k] if name else math.nan)
                 for name in names for k in (0, 1)

@@ -26,7 +26,7 @@ from ssad.scenarios.static.shifts import (
     sky_light,
     transformed_boxes,
 )
-from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_direction, sun_in_picture
+from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_depth, sun_direction, sun_in_picture
 from ssad.types import F32, F64, U8
 
 # least visible fraction for a visibility token
@@ -179,7 +179,7 @@ class SceneShifter:
             raise FormatError(f"{path}: not a depth map of 16 bits")
         return np.where(values == 65535, np.inf, values / 64).astype(np.float32)
 
-    def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None) -> Frame:
+    def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None = None, depth: F32 | None = None) -> Frame:
         if frame.intrinsic is None or not _has_lens(frame):
             raise FormatError(f"{frame.filename}: the camera {frame.channel} has no focal length")
         camera = Camera(frame.width, frame.height, frame.intrinsic, frame.sensor_to_ego, frame.channel)
@@ -191,7 +191,7 @@ class SceneShifter:
             frame.ego_to_world,
             self.velocity(frame),
             boxes,
-            depth=self._depth(frame) if points is not None or self._uses_depth else None,
+            depth=depth,
             points=points,
         )
 
@@ -210,15 +210,16 @@ class SceneShifter:
         None when it stands in none that can be read."""
         if sample_token not in self._suns:
             toward = sun_direction(self.base, self.context)
-            views = [(f, self._view(f)) for f in self._cameras(sample_token) if _has_lens(f)]
+            views = [(f, self._frame(f, Boxes3D.empty())) for f in self._cameras(sample_token) if _has_lens(f)]
             views = [(f, view) for f, view in views if sun_in_picture(view, toward)]
             self._suns[sample_token] = "", None
-            for f, view in sorted(views, key=lambda pair: sun_angle(pair[1], toward)):
+            for f, bare in sorted(views, key=lambda pair: sun_angle(pair[1], toward)):
                 try:
-                    self._suns[sample_token] = f.filename, free_sun(view, self.read(f), toward)
-                    break
+                    depth = sun_depth(self._view(f), self.read(f))
                 except FormatError:
                     continue
+                self._suns[sample_token] = f.filename, free_sun(bare, depth, toward)
+                break
         return self._suns[sample_token]
 
     def camera_frame(self, frame: SensorFrame) -> Frame:
@@ -227,9 +228,12 @@ class SceneShifter:
         return replace(view, sun=self._sun(frame.sample_token)[1]) if self._has_sun else view
 
     def _view(self, frame: SensorFrame) -> Frame:
+        """The same by its own picture alone."""
         objects = self.base.family == "object" or self._uses_depth
         boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
-        return self._frame(frame, boxes, self._points(frame) if self._uses_depth else None)
+        if not self._uses_depth:
+            return self._frame(frame, boxes)
+        return self._frame(frame, boxes, self._points(frame), self._depth(frame))
 
     def read(self, frame: SensorFrame) -> U8:
         """The clean image. FormatError, also when its size is not what the tables say."""

@@ -61,9 +61,12 @@ def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
 
 
 def pick_frame(
-    data: NuScenes, *, channel: str = "CAM_FRONT", scene: str | None = None
+    data: NuScenes, *, channel: str = "CAM_FRONT", scene: str | None = None, seed: int = 0
 ) -> tuple[U8, Frame, SceneContext]:
-    """The key frame of a camera that shows most boxes in full, of a scene (default: the first); its image and scene."""
+    """The key frame of a camera that shows most boxes in full, of a scene (default: the first); its image and scene.
+
+    seed: of the sun's place. ConfigError: no such scene or camera.
+    """
     chosen = data.scene(data.scenes()[0].token if scene is None else scene)
     shifter = SceneShifter(data.root, chosen, ShiftSpec("scale", 3))
     frames = [f for f in chosen.frames if f.channel == channel and f.key_frame]
@@ -76,7 +79,7 @@ def pick_frame(
     seen, image = weather.camera_frame(best), shifter.read(best)
     # the sun stands over where the ego goes; here, over what this camera sees
     context = replace(weather.context, heading=viewing_direction(view))
-    context = replace(context, sun=choose_sun(ShiftSpec("sunlight", 3), context, [(seen, image)]))
+    context = replace(context, sun=choose_sun(ShiftSpec("sunlight", 3, seed), context, [(seen, image)]))
     return image, replace(view, points=seen.points, depth=seen.depth), context
 
 
@@ -179,7 +182,7 @@ def write_sheets(
     quiet_warp()
     context: SceneContext | None = None
     if source.is_dir():
-        image, frame, context = pick_frame(NuScenes(source, version), channel=channel, scene=scene)
+        image, frame, context = pick_frame(NuScenes(source, version), channel=channel, scene=scene, seed=seed)
     else:
         image = read_image(source)
         frame = own_frame(image, boxes)

@@ -14,7 +14,7 @@ from ssad.scenarios.static.shifts.batch import Batch, on
 from ssad.scenarios.static.shifts.depth import depth_of, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.types import F64, U8
+from ssad.types import F32, F64, U8
 
 AT_NIGHT, HIDDEN = "it is night", "the sun is behind something"
 NO_SUN = frozenset({AT_NIGHT, HIDDEN})  # reasons for which a whole drive may be left as it is
@@ -35,14 +35,20 @@ def choose_sun(
     """A sun that is free in one of the pictures of a moment: of 16 directions the first one where it is, each drawn one
     degree higher than that before, the first as by `sun_direction`; that one if it is hidden in all."""
     drawn = list(islice(_draws(spec, context), 16))
+    depths: dict[int, F32 | None] = {}
     for toward in drawn:
         direction = np.array(toward)
-        if any(sun_in_picture(f, direction) and free_sun(f, image, direction) > 0.5 for f, image in pictures):
-            return toward
+        for n, (frame, image) in enumerate(pictures):
+            if sun_in_picture(frame, direction):
+                if n not in depths:
+                    depths[n] = sun_depth(frame, image)
+                if free_sun(frame, depths[n], direction) > 0.5:
+                    return toward
     return drawn[0]
 
 
 def _draws(spec: ShiftSpec, context: SceneContext) -> Iterator[tuple[float, float, float]]:
+    """Unit vectors, world, without end."""
     draws = spec.generator("sun", context.scene)
     for number in count():
         heading = context.heading + np.radians(draws.uniform(-15, 15))
@@ -71,16 +77,21 @@ def sun_in_picture(frame: Frame, toward: F64) -> bool:
     return 0 <= x < frame.camera.width and 0 <= y < frame.camera.height
 
 
-def free_sun(frame: Frame, image: U8, toward: F64) -> float:
-    """Share in [0, 1] of the sun's disc that is free in a picture [H, W, 3] which it stands in; 1 if nothing is known
-    of depth."""
+def sun_depth(frame: Frame, image: U8) -> F32 | None:
+    """Depth of a picture [H, W, 3] on the quarter grid, metres, by which the sun is hidden; None: nothing is known."""
     height, width = image.shape[:2]
     grid, source = depth_of(frame, image, -(-height // 4), -(-width // 4))
-    if source == "assumed":
+    return None if source == "assumed" else grid
+
+
+def free_sun(frame: Frame, depth: F32 | None, toward: F64) -> float:
+    """Share in [0, 1] of the sun's disc that is free in a picture which it stands in, by the depth of `sun_depth`; 1 if
+    that is None. toward: unit vector [3], world."""
+    if depth is None:
         return 1.0
     x, y = _place(frame, toward)
-    row, column, reach = int(y / 4), int(x / 4), max(2, width // 260)
-    around = grid[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+    row, column, reach = int(y / 4), int(x / 4), max(2, depth.shape[1] // 65)
+    around = depth[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
     return float((around > SKY).mean())
 
 
@@ -94,6 +105,7 @@ def add_sun(
     done: list[Applied] = []
 
     def picture(b: int) -> U8:
+        """One image [H, W, 3] of the batch in main memory."""
         rows = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
         return np.asarray(rows.reshape(batch.height, batch.width, 3)[:, : batch.seen])
 
@@ -111,7 +123,7 @@ def add_sun(
         place[b] = x, y, 1
         inside, free = sun_in_picture(frame, world), frame.sun
         if free is None:
-            free = free_sun(frame, picture(b), world) if inside else 1.0
+            free = free_sun(frame, sun_depth(frame, picture(b)), world) if inside else 1.0
         details = {
             "angle_deg": round(angle, 1),
             "in_view": inside,
