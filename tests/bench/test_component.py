@@ -26,7 +26,7 @@ from ssad.report.detection import left_table, load_detection_run, main_table, ro
 from ssad.report.load import load_header
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
-from ssad.scenarios.static.shifts import ShiftSpec, random_severity
+from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
 from ssad.seeding import generator
 
 ORACLE = "helpers.oracle3d:build"
@@ -80,12 +80,13 @@ def test_scores_fall_with_what_the_detector_sees(folder: Path) -> None:
 
 
 def test_random_is_put_together_from_the_severities(folder: Path, root: Path) -> None:
-    """In the physical calibration each scene draws one: its boxes are those of that severity."""
+    """In the physical calibration each scene is dealt one: its boxes are those of that severity."""
     assert not (folder / "detections" / "fog-random").exists()
     record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     drawn = {Path(p).name for p in record["artefacts"]["detections"]}
     tokens = [s["token"] for s in json.loads((root / "v1.0-ssad" / "scene.json").read_text())]
-    assert drawn == {f"fog-{random_severity(ShiftSpec('fog'), token, '')}" for token in tokens}
+    assert drawn == {f"fog-{severity}" for severity in dealt_severities(ShiftSpec("fog"), tokens).values()}
+    assert len(drawn) == len(tokens)
 
 
 def test_intervals_hold_the_value_and_replicates_are_paired(folder: Path) -> None:

@@ -20,7 +20,15 @@ from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.errors import ConfigError, UnknownNameError
 from ssad.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world, rotation_matrix
 from ssad.metrics.robustness import page_trend
-from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, sky_light, transformed_boxes
+from ssad.scenarios.static.shifts import (
+    SHIFTS,
+    ShiftSpec,
+    dealt_severities,
+    random_severity,
+    shift_images,
+    sky_light,
+    transformed_boxes,
+)
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
@@ -410,6 +418,25 @@ def test_severity_is_drawn_by_scene_or_by_sample() -> None:
     assert len({random_severity(physical, "a", str(k)) for k in range(50)}) == 1
     assert {random_severity(paper, "a", str(k)) for k in range(100)} == {1, 2, 3, 4, 5}
     assert {random_severity(physical, str(k), "a") for k in range(100)} == {1, 2, 3, 4, 5}
+
+
+@given(scenes=st.sets(st.text("abc0123", min_size=1, max_size=6), max_size=40), seed=st.integers(0, 99))
+def test_severities_are_dealt_evenly(scenes: set[str], seed: int) -> None:
+    spec = ShiftSpec("fog", seed=seed)
+    dealt = dealt_severities(spec, scenes)
+    assert set(dealt) == scenes
+    counts = [sum(value == severity for value in dealt.values()) for severity in (1, 2, 3, 4, 5)]
+    assert sum(counts) == len(scenes)
+    assert max(counts) - min(counts) <= 1
+    assert dealt_severities(spec.at(5), sorted(scenes, reverse=True)) == dealt, "the order they come in decides"
+
+
+def test_dealt_severities_differ_by_shift_and_seed() -> None:
+    scenes = [f"scene-{k}" for k in range(24)]
+    specs = [ShiftSpec(name, seed=seed) for name in ("fog", "snow", "scale") for seed in range(3)]
+    assert len({tuple(sorted(dealt_severities(spec, scenes).items())) for spec in specs}) == 9
+    first = {dealt_severities(ShiftSpec("fog", seed=seed), scenes)["scene-0"] for seed in range(60)}
+    assert first == {1, 2, 3, 4, 5}
 
 
 # ---------------------------------------------------------------- objects

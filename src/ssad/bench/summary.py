@@ -76,7 +76,7 @@ def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
         result.add_column(f"{detector} mAP", justify="right")
         result.add_column("NDS", justify="right")
     drawn = any(r["severity"] == "random" for r in records)
-    result.caption = f"percent; {'severities drawn from 1 to 5' if drawn else 'means over the severities that ran'}"
+    result.caption = f"percent; {'severities from 1 to 5' if drawn else 'means over the severities that ran'}"
     result.caption_justify = "left"
     for shift in shifts:
         row = [str(shift or "clean").replace("_", " ")]

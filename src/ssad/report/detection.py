@@ -89,7 +89,7 @@ def cell_of(record: Mapping[str, Any] | None, metric: str, *, scale: float = 100
 
 
 def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
-    """A shift's number: at the severity drawn from 1 to 5 if that ran, else the mean over severities."""
+    """A shift's number: at the random severity if that ran, else the mean over severities."""
     if not shift or run.record(detector, shift, "random") is not None:
         return cell_of(run.record(detector, shift, "random"), metric)
     found = [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
@@ -140,11 +140,15 @@ def main_table(run: DetectionRun) -> Table:
         if shift in PUBLISHED and any(names):
             told = [PUBLISHED[shift].get(name, (math.nan, math.nan)) for name in names]
             rows.append(Row(head, tuple(Cell(v) for pair in told for v in pair), published=True))
-    drawn = "random" in run.suite["severities"]
-    strength = "a severity drawn from 1 to 5" if drawn else f"the mean over severities {', '.join(run.numbers)}"
+    if "random" not in run.suite["severities"]:
+        strength = f"mean over severities {', '.join(run.numbers)}"
+    elif run.suite["calibration"] == "paper":
+        strength = "each sample at a severity drawn from 1 to 5"
+    else:
+        strength = "each scene at one severity from 1 to 5, each severity in as many scenes"
     return Table(
         "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
-        f"Percent; each shift at {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "
+        f"Percent; {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "
         "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.", SOURCE,
     )  # fmt: skip
 

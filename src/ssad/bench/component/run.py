@@ -24,7 +24,7 @@ from ssad.bench.training_data import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.errors import ConfigError
-from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity
+from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, dealt_severities
 from ssad.seeding import digest
 
 # a change in any of these may change a number
@@ -250,11 +250,12 @@ def _rank(cell: Cell) -> int:
 
 
 def _units(todo: Plan, shift: str | None, severity: int | str, tokens: Mapping[str, str]) -> tuple[Unit, ...]:
-    """The pieces of work that a condition needs. A severity drawn by scene is one of the five: nothing runs twice."""
+    """The pieces of work that a condition needs. A severity dealt to a scene is one of the five: nothing runs twice."""
     if shift is None or severity != "random" or todo.suite.calibration == "paper":
         return tuple(Unit(shift, severity, scene) for scene in tokens)
     spec = ShiftSpec(shift, seed=todo.suite.seed, calibration=todo.suite.calibration)
-    return tuple(Unit(shift, random_severity(spec, token, ""), scene) for scene, token in tokens.items())
+    dealt = dealt_severities(spec, tokens.values())
+    return tuple(Unit(shift, dealt[token], scene) for scene, token in tokens.items())
 
 
 def _record(

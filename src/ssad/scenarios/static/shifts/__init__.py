@@ -6,7 +6,15 @@
 from ssad.scenarios.static.shifts.apply import shift_images, sky_light, viewing_direction
 from ssad.scenarios.static.shifts.lidar import shift_points
 from ssad.scenarios.static.shifts.objects import transformed_boxes
-from ssad.scenarios.static.shifts.spec import SEVERITIES, SHIFTS, VERSION, Calibration, ShiftSpec, random_severity
+from ssad.scenarios.static.shifts.spec import (
+    SEVERITIES,
+    SHIFTS,
+    VERSION,
+    Calibration,
+    ShiftSpec,
+    dealt_severities,
+    random_severity,
+)
 
 __all__ = [
     "SEVERITIES",
@@ -14,6 +22,7 @@ __all__ = [
     "VERSION",
     "Calibration",
     "ShiftSpec",
+    "dealt_severities",
     "random_severity",
     "shift_images",
     "shift_points",

@@ -7,6 +7,7 @@ the world for all cameras and the LiDAR, object by object.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
@@ -81,3 +82,13 @@ def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:
     """
     scope = sample if spec.calibration == "paper" else scene
     return int(spec.generator("severity", scope).integers(1, 6))
+
+
+def dealt_severities(spec: ShiftSpec, scenes: Iterable[str]) -> dict[str, int]:
+    """Severity 1 to 5 of each scene, dealt: each severity as often as any other, give or take one.
+
+    Draws of one scene by itself (`random_severity`) make the mean severity of a few dozen scenes a matter of luck.
+    """
+    order = sorted(set(scenes), key=lambda scene: (spec.key("deal", scene), scene))
+    first = int(spec.generator("deal").integers(5))
+    return {scene: 1 + (first + place) % 5 for place, scene in enumerate(order)}
