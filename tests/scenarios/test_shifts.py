@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.boxes import cars
+from helpers.published_shifts import NAMES, picture, statistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -216,7 +218,7 @@ def test_stuck_pixels_stay_where_they_are() -> None:
 
 
 def test_noise_keeps_its_bits() -> None:
-    """Whole-number kernels: the same on every machine. A change of these needs a new VERSION."""
+    """Whole-number kernels: the same on every machine. A change of these needs new VERSIONS."""
     image = (np.arange(64 * 96 * 3) * 7 % 256).astype(np.uint8).reshape(64, 96, 3)
     found = {
         name: hashlib.sha256(shift_images(image, None, ShiftSpec(name, 3, 7))[0].tobytes()).hexdigest()[:16]
@@ -437,6 +439,56 @@ def test_dealt_severities_differ_by_shift_and_seed() -> None:
     assert len({tuple(sorted(dealt_severities(spec, scenes).items())) for spec in specs}) == 9
     first = {dealt_severities(ShiftSpec("fog", seed=seed), scenes)["scene-0"] for seed in range(60)}
     assert first == {1, 2, 3, 4, 5}
+
+
+# ---------------------------------------------------------------- the paper's calibration
+
+
+@pytest.mark.parametrize("name", ["snow", "rain", "fog"])
+def test_published_weather_looks_like_the_originals(name: str) -> None:
+    """Statistics of imagecorruptions' snow and fog and imgaug's rain as 3D_Corruptions_AD calls them
+    (`benchmarks/make_shift_reference.py`): mean, contrast, and structure by size, within what few pictures can tell."""
+    published = json.loads((Path(__file__).parents[1] / "data" / "shifts" / "published.json").read_text())
+    image, repeats = picture(), 6
+    for severity in (1, 3, 5):
+        specs = [ShiftSpec(name, severity, seed, "paper") for seed in range(repeats)]
+        rows = np.array([statistics(shift_images(image, None, spec)[0], image) for spec in specs])
+        for column, key in enumerate(NAMES):
+            mean, deviation = published["statistics"][f"{name} {severity}"][key]
+            error = np.hypot(deviation / published["repeats"] ** 0.5, rows[:, column].std(ddof=1) / repeats**0.5)
+            room = {"mean": 0.015, "contrast": 0.04}.get(key, 0.12) * mean + 3.5 * error
+            assert rows[:, column].mean() == pytest.approx(mean, abs=room), (severity, key)
+
+
+@pytest.mark.parametrize("name", ["snow", "rain", "fog", "sunlight"])
+def test_published_lengths_scale_with_the_picture(name: str) -> None:
+    """Of a picture of half the size: as if the large one had been made smaller."""
+    image, repeats = picture(), 5
+    small = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    specs = [ShiftSpec(name, 4, seed, "paper") for seed in range(repeats)]
+    large = [
+        cv2.resize(shift_images(image, None, s)[0], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for s in specs
+    ]
+    first = np.array([statistics(out, small) for out in large])
+    second = np.array([statistics(shift_images(small, None, spec)[0], small) for spec in specs])
+    error = np.hypot(first.std(0, ddof=1), second.std(0, ddof=1)) / repeats**0.5
+    room = np.array([0.01, 0.02, 0.12, 0.12, 0.12]) * np.abs(first.mean(0)) + 3.5 * error
+    assert (np.abs(first.mean(0) - second.mean(0)) <= room).all(), (first.mean(0), second.mean(0))
+
+
+def test_published_sun_is_white_in_the_middle_and_never_darkens() -> None:
+    image = picture()
+    for severity in (1, 5):
+        out, done = shift_images(image, None, ShiftSpec("sunlight", severity, 2, "paper"))
+        x, y, radius = (done[0].details[key] for key in ("x", "y", "radius_px"))
+        assert radius == table.PAPER_SUN[severity - 1]
+        assert (out[y, x] == 255).all()
+        away = np.hypot(np.arange(1600)[None] - x, np.arange(900)[:, None] - y)
+        assert (out[away < 0.85 * radius] >= 254).all()
+        lightness = [v.max(2).astype(int) + v.min(2) for v in (out, image)]
+        assert (lightness[0] >= lightness[1]).all()
+        changed = (out != image).any(2) & (away > 4 * radius)  # the faint disc
+        assert 0 < changed.sum() < 0.05 * changed.size
 
 
 # ---------------------------------------------------------------- objects

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ssad.errors import ConfigError
-from ssad.scenarios.static.shifts import SHIFTS, VERSION, Calibration, ShiftSpec
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, Calibration, ShiftSpec
 from ssad.version import __version__
 
 Labels = Literal["original", "transformed"]
@@ -113,6 +113,6 @@ class Shard:
             "lidar": options.lidar,
             "quality": options.quality,
             "subsampling": self.subsampling,
-            "shift_version": VERSION,
+            "shift_version": VERSIONS[options.calibration],
             "ssad": __version__,
         }

@@ -9,7 +9,7 @@ from ssad.scenarios.static.shifts.objects import transformed_boxes
 from ssad.scenarios.static.shifts.spec import (
     SEVERITIES,
     SHIFTS,
-    VERSION,
+    VERSIONS,
     Calibration,
     ShiftSpec,
     dealt_severities,
@@ -19,7 +19,7 @@ from ssad.scenarios.static.shifts.spec import (
 __all__ = [
     "SEVERITIES",
     "SHIFTS",
-    "VERSION",
+    "VERSIONS",
     "Calibration",
     "ShiftSpec",
     "dealt_severities",

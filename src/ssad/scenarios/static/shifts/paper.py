@@ -8,34 +8,30 @@ scale nothing, lengths in pixels hold at a width of 1600 and scale with the widt
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import NormalDist
-from typing import Any
+from typing import Any, Final
 
+import cv2
 import numpy as np
 import warp as wp
 
 from ssad.frames import Applied, Frame
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
-from ssad.scenarios.static.shifts.depth import grid_size
-from ssad.scenarios.static.shifts.kernels import layers, veil
+from ssad.scenarios.static.shifts.kernels import layers
 from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 Result = tuple[Batch, list[Applied]]
+WIDTH: Final = 1600  # pixels: what the published lengths hold at
+CLOUDS: Final = 2048  # side of the published clouds at that width, pixels
+GATE: Final = 32  # rows of the map that lets more rain through here than there
 
 
 def paper_shift(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
     """snow, rain, fog, sunlight or motion_blur as published."""
-    name = specs[0].name
-    if name == "motion_blur":
-        return _blur(batch, frames, specs)
-    if name == "fog":
-        return _fog(batch, frames, specs)
-    if name == "sunlight":
-        return _sun(batch, frames, specs)
-    return _falling(batch, frames, specs)
+    shown = {"snow": _snow, "rain": _rain, "fog": _fog, "sunlight": _sun, "motion_blur": _blur}
+    return shown[specs[0].name](batch, frames, specs)
 
 
 def _draws(spec: ShiftSpec, frame: Frame) -> np.random.Generator:
@@ -46,100 +42,136 @@ def _key(spec: ShiftSpec, frame: Frame) -> int:
     return spec.key("paper", frame.scene, frame.sample, frame.camera.channel)
 
 
-def _falling(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
-    """Snow: ImageNet-C's; rain: drops as imgaug's RainLayer; then 30 % grey and a darker image at any severity."""
-    rows: list[dict[str, float]] = []
-    done = []
-    for spec, frame in zip(specs, frames, strict=True):
+def _places(scale: float) -> int:
+    """Places along a side of each pixel whose mean a layer takes: a smaller picture averages what it shows."""
+    return max(1, round(1 / scale))
+
+
+def _numbers(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
+    kind = np.float32 if dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4) else np.int32
+    return on(batch, np.array(values, kind), dtype)
+
+
+def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
+    """ImageNet-C's snow, then 30 % grey and a darker image at any severity."""
+    scale = batch.width / WIDTH
+    rows = [table.PAPER_SNOW[spec.severity - 1] for spec in specs]
+    mean, deviation, zoom, threshold, radius, sigma, keep = zip(*rows, strict=True)
+    angle = np.array([_draws(s, f).uniform(-135, -45) for s, f in zip(specs, frames, strict=True)])
+    steps, shapes = [], []
+    for z in zoom:  # as scipy.ndimage.zoom aligns first and last cells with first and last pixels
+        count = [int(np.ceil(round(side / scale) / z)) for side in (batch.height, batch.width)]
+        steps.append([max(n - 1, 0) / max(round(n * z) - 1, 1) for n in count])
+        shapes.append([n + 1 for n in count])
+    small = (batch.count, *np.max(shapes, axis=0).tolist())
+    noise = wp.empty(small, dtype=float, device=batch.device)
+    keys = keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)])
+    inputs = [keys, _numbers(batch, mean), _numbers(batch, deviation), _numbers(batch, unit_normal())]
+    wp.launch(layers.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=batch.device)
+    # flakes fall steeply: half the rows lose nothing
+    half = (batch.count, -(-batch.height // 2))
+    field, layer = (wp.empty((*half, batch.width), dtype=float, device=batch.device) for _ in range(2))
+    inputs = [noise, _numbers(batch, steps, wp.vec2), _numbers(batch, threshold), scale, _places(scale)]
+    wp.launch(layers.flakes, dim=half, inputs=inputs, outputs=[field], device=batch.device)
+    # half a gaussian over 2 radius + 1 published pixels, where it is more than nothing
+    offsets, weights = [], []
+    for a, r, deviate in zip(np.radians(angle), radius, sigma, strict=True):
+        reach = np.arange(0, min(2 * r + 1, 3.5 * deviate) * scale, 2.0)
+        offsets.append(np.rint(np.outer(reach, [np.cos(a), -np.sin(a) / 2])))
+        weights.append(np.exp(-(reach**2) / (2 * (deviate * scale) ** 2)))
+    taps = max(len(w) for w in weights)
+    offset, weight = np.zeros((batch.count, taps, 2), np.int32), np.zeros((batch.count, taps), np.float32)
+    for b, (o, w) in enumerate(zip(offsets, weights, strict=True)):
+        offset[b, : len(o)], weight[b, : len(w)] = o, w / w.sum()
+    inputs = [field, on(batch, offset, wp.vec2i), on(batch, weight, wp.float32)]
+    wp.launch(layers.streaks, dim=half, inputs=inputs, outputs=[layer], device=batch.device)
+    dim = (batch.count, batch.height)
+    out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
+    inputs = [
+        batch.data, layer.flatten(), _numbers(batch, keep), table.PAPER_GREY, batch.height, batch.width, batch.stride,
+        highest,
+    ]  # fmt: skip
+    wp.launch(layers.blend_snow, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    _darken(out, highest)
+    return out, [Applied(True, {"angle_deg": round(float(a), 1)}) for a in angle]
+
+
+def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
+    """One layer of imgaug's rain, then 30 % grey and a darker image at any severity.
+
+    Streaks of 64 to 320 pixels, so faint that they make a veil: this is what the published parameters give at 1600.
+    """
+    scale = batch.width / WIDTH
+    gates = np.empty((batch.count, GATE, 2 * GATE), np.float32)
+    density, length, drawn, seen, first = [], [], [], [], []
+    for b, (spec, frame) in enumerate(zip(specs, frames, strict=True)):
         draws = _draws(spec, frame)
-        if spec.name == "snow":
-            mean, deviation, zoom, threshold, radius, sigma, keep = table.PAPER_SNOW[spec.severity - 1]
-            angle = np.radians(draws.uniform(-135, -45))
-            taps = radius + 1
-        else:
-            low, high = table.PAPER_RAIN[spec.severity - 1]
-            density = draws.uniform(low, high)
-            size = draws.uniform(0.4, 0.6)
-            speed = draws.uniform(0.04, 0.20)
-            # a share `density` of the cells is wet; a drop is as large as size says, its streak as long as speed says
-            mean, deviation, keep = 0.4, 0.2, 1.0
-            threshold = NormalDist(mean, deviation).inv_cdf(1 - density)
-            zoom, angle = 2.0 + 4.0 * (1.0 - size), np.radians(-90 + draws.uniform(-15, 15))
-            taps = max(4.0, speed * batch.height / 4)
-            sigma = taps / 2
-        scale = batch.width / 1600
-        rows.append(
-            {
-                "mean": mean, "deviation": deviation, "zoom": zoom, "threshold": threshold, "keep": keep,
-                "taps": max(2, round(taps * scale / 2) + 1), "sigma": max(sigma * scale / 2, 0.5),
-                "dx": np.cos(angle), "dy": -np.sin(angle),
-            }
-        )  # fmt: skip
-        done.append(Applied(True, {"angle_deg": round(float(np.degrees(angle)), 1)}))
+        density.append(draws.uniform(*table.PAPER_RAIN[spec.severity - 1]))
+        cells = 1.0 - draws.uniform(0.4, 0.6)  # cells a published pixel
+        angle = draws.uniform(-15, 15)
+        speed = draws.uniform(0.04, 0.20)
+        uneven = 1.0 - draws.uniform(0.8, 1.0)
+        rough = draws.beta(1.0, max(uneven, 1e-6), (8, 8)).astype(np.float32)
+        gates[b] = cv2.resize(rough, (2 * GATE, GATE), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+        lean = np.tan(np.radians(angle))
+        longest = speed * max(batch.height, batch.width) / scale
+        rows = max(2, round(longest * np.cos(np.radians(angle)) * cells))
+        height = int(batch.height / scale * cells) + 3 + rows
+        left = max(0.0, lean) * height + 1  # columns to the left of the picture, at its first row
+        length.append(rows)
+        across, along = (2 * GATE) * scale / (cells * batch.width), GATE * scale / (cells * batch.height)
+        drawn.append([across, lean * across, -left * across, along])
+        seen.append([cells / scale, -lean, left, 0.0])
+        first.append(rows)
+    inputs = [keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)]), _numbers(batch, density)]
+    most = 0.6 / scale
+    rows, columns = int(batch.height * most) + 3 + max(length), int(batch.width * most) + 4
+    shape = (batch.count, rows, columns + int(np.ceil(rows * np.tan(np.radians(15)))))
+    salt, layer = (wp.empty(shape, dtype=float, device=batch.device) for _ in range(2))
+    inputs += [_numbers(batch, drawn, wp.vec4), _numbers(batch, first), on(batch, gates, wp.float32)]
+    wp.launch(layers.drops, dim=shape[:2], inputs=inputs, outputs=[salt], device=batch.device)
+    sums = [wp.zeros((batch.count, shape[2]), dtype=float, device=batch.device) for _ in range(2)]
+    # the source enlarges with cubic splines and cuts off what is negative: so much more light in the mean (measured)
+    gain = [1.28 - 0.95 * d + 0.9 * d**2 for d in density]
+    inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), *sums]
+    dim = (batch.count, -(-shape[2] // 64))
+    wp.launch(layers.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
+    dim = (batch.count, batch.height)
+    out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
+    inputs = [
+        batch.data, layer, _numbers(batch, seen, wp.vec4), _numbers(batch, first), _places(scale), table.PAPER_GREY,
+        batch.width, batch.stride, highest,
+    ]  # fmt: skip
+    wp.launch(layers.blend_rain, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    _darken(out, highest)
+    told = zip(density, length, strict=True)
+    return out, [Applied(True, {"density": round(float(d), 3), "cells": int(n)}) for d, n in told]
 
-    def column(name: str) -> Any:
-        return on(batch, np.array([row[name] for row in rows], np.float32), wp.float32)
 
-    half = (batch.count, -(-batch.height // 2), -(-batch.width // 2))
-    least = min(row["zoom"] for row in rows)
-    small = (batch.count, int(batch.height / least) + 2, int(batch.width / least) + 2)
-    device = batch.device
-    noise, field, layer = (wp.empty(shape, dtype=float, device=device) for shape in (small, half, half))
-    numbers = [_key(s, f) for s, f in zip(specs, frames, strict=True)]
-    normal = on(batch, unit_normal().astype(np.float32), wp.float32)
-    inputs = [keys_on(batch, numbers), column("mean"), column("deviation"), normal]
-    wp.launch(layers.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=device)
-    inputs = [noise, column("zoom"), column("threshold")]
-    wp.launch(layers.enlarge, dim=half[:2], inputs=inputs, outputs=[field], device=device)
-    # at most 12 cells a streak: it is smooth along itself
-    every = np.arange(max(int(row["taps"]) for row in rows)).astype(float)
-    cells = every[:: -(-len(every) // 12)]
-    steps = np.array([[row["dx"], row["dy"]] for row in rows])
-    offsets = np.rint(steps[:, None] * cells[None, :, None]).astype(np.int32)
-    weights = np.stack(
-        [np.where(cells < row["taps"], np.exp(-(cells**2) / (2 * row["sigma"] ** 2)), 0) for row in rows]
-    )
-    weights /= weights.sum(1, keepdims=True)
-    inputs = [field, on(batch, offsets, wp.vec2i), on(batch, weights.astype(np.float32), wp.float32)]
-    wp.launch(layers.streaks, dim=half[:2], inputs=inputs, outputs=[layer], device=device)
-    out = batch.like()
-    highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
-    wp.launch(
-        layers.blend_layer,
-        dim=(batch.count, batch.height),
-        inputs=[batch.data, layer, column("keep"), table.PAPER_GREY, batch.height, batch.width, batch.stride, highest],
-        outputs=[out.data],
-        device=batch.device,
-    )
+def _darken(out: Batch, highest: Any) -> None:
+    """The brightest value becomes 0.7 of 256, the others in proportion, in place."""
     brightest = np.maximum(highest.numpy().max(1), 1)
-    gain = np.rint(table.PAPER_DARK * 255 / brightest * 256).astype(np.int32)
-    words = batch.stride // 4
-    chunk = max(256, batch.width * 3 // 4)
-    wp.launch(
-        layers.darken,
-        dim=(batch.count, -(-words // chunk)),
-        inputs=[on(batch, gain, wp.int32), words, chunk],
-        outputs=[out.words()],
-        device=batch.device,
-    )
-    return out, done
+    gain = np.rint(table.PAPER_DARK * 256 / brightest * 256).astype(np.int32)
+    words = out.stride // 4
+    chunk = max(256, out.width * 3 // 4)
+    dim = (out.count, -(-words // chunk))
+    inputs = [on(out, gain, wp.int32), words, chunk]
+    wp.launch(layers.darken, dim=dim, inputs=inputs, outputs=[out.words()], device=out.device)
 
 
 def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
-    """ImageNet-C's clouds without depth, then a share of grey."""
-    rows, columns = grid_size(batch)
-    clouds = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
-    amount, decay, grey = (
-        np.array(v, np.float32) for v in zip(*[table.PAPER_FOG[s.severity - 1] for s in specs], strict=True)
-    )
+    """ImageNet-C's clouds without depth, then a share of grey. The clouds lack what is under 4 published pixels."""
+    amount, decay, grey = zip(*[table.PAPER_FOG[s.severity - 1] for s in specs], strict=True)
     keys = keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)])
-    wp.launch(
-        layers.plasma,
-        dim=(batch.count, rows),
-        inputs=[keys, on(batch, decay, wp.float32)],
-        outputs=[clouds],
-        device=batch.device,
-    )
+    size = CLOUDS // 4
+    levels = size.bit_length() - 1
+    # the source multiplies its wibble with itself: an octave is 1 / decay ** 2 of the one before
+    wibble = _numbers(batch, [[float(d) ** (-2 * level) for level in range(levels)] for d in decay])
+    clouds = wp.zeros((batch.count, size, size), dtype=float, device=batch.device)
+    for level in range(levels):
+        for kernel in (layers.squares, layers.diamonds):
+            wide = (batch.count, 1 << level, 1 << level)
+            wp.launch(kernel, dim=wide, inputs=[keys, wibble, level], outputs=[clouds], device=batch.device)
     values = clouds.numpy().reshape(batch.count, -1)
     low, span = values.min(1), np.maximum(np.ptp(values, axis=1), 1e-6)
     highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
@@ -148,52 +180,35 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
     wp.launch(layers.brightest, dim=dim, inputs=inputs, outputs=[highest], device=batch.device)
     most = highest.numpy().max(1) / 255
     out = batch.like()
-    numbers = [on(batch, np.asarray(v, np.float32), wp.float32) for v in (low, span, amount, most, grey)]
-    wp.launch(
-        layers.blend_clouds,
-        dim=(batch.count, batch.height),
-        inputs=[batch.data, clouds, *numbers, batch.height, batch.width, batch.stride],
-        outputs=[out.data],
-        device=batch.device,
-    )
+    numbers = [_numbers(batch, v) for v in (low, span, amount, most, grey)]
+    inputs = [batch.data, clouds, *numbers, WIDTH / batch.width / 4, batch.width, batch.stride]
+    wp.launch(layers.blend_clouds, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
     return out, [Applied(True, {"amount": float(a), "decay": float(d)}) for a, d in zip(amount, decay, strict=True)]
 
 
 def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
-    """A white disc at a random place in every picture, and one circle of flare."""
-    rows, columns = grid_size(batch)
-    centre, radius = np.zeros((batch.count, 4), np.float32), np.zeros(batch.count, np.float32)
-    done = []
-    for b, (spec, frame) in enumerate(zip(specs, frames, strict=True)):
+    """A white disc at a random place in every picture, and one faint disc on the line through it and the middle."""
+    scale = batch.width / WIDTH
+    suns, flares, colours, strengths, done = [], [], [], [], []
+    for spec, frame in zip(specs, frames, strict=True):
         draws = _draws(spec, frame)
         x, y = draws.uniform(0.25, 0.75) * batch.width, draws.uniform(0.30, 0.45) * batch.height
-        far = draws.uniform(0.3, 0.9)
-        centre[b] = x, y, batch.width / 2 - (x - batch.width / 2) * far, batch.height / 2 - (y - batch.height / 2) * far
-        radius[b] = table.PAPER_SUN[spec.severity - 1] * batch.width / 1600
-        done.append(Applied(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(radius[b])}))
-    light = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
-    wp.launch(
-        layers.disc,
-        dim=light.shape,
-        inputs=[on(batch, centre, wp.vec4), on(batch, radius, wp.float32)],
-        outputs=[light],
-        device=batch.device,
-    )
-    out = batch.like()
-    wp.launch(
-        veil.blend_glare,
-        dim=(batch.count, batch.height),
-        inputs=[
-            batch.words(),
-            light,
-            on(batch, np.ones((batch.count, 3), np.float32), wp.vec3),
-            on(batch, np.ones(batch.count, np.float32), wp.float32),
-            batch.width,
-            batch.stride // 4,
-        ],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+        away = batch.width / 2 - x
+        slope = (batch.height / 2 - y) / (away if abs(away) > 1e-6 else 1e-6)
+        line = np.arange(0, batch.width, 10 * scale)
+        line = line[(slope * (line - x) + y > 0) & (slope * (line - x) + y < batch.height)]
+        share, strength, size = draws.uniform(), draws.uniform(0.2, 0.5), draws.uniform(1, max(batch.height / 15, 2))
+        colours.append(draws.integers(205, 255, 3))
+        strengths.append(strength)
+        flare = line[int(share * max(len(line) - 1, 1))] if len(line) else 0.0
+        flares.append([flare, slope * (flare - x) + y, size if len(line) else 0.0])
+        suns.append([x, y, table.PAPER_SUN[spec.severity - 1] * scale])
+        done.append(Applied(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(suns[-1][2])}))
+    out = batch.copy()
+    numbers = [_numbers(batch, values, wp.vec3) for values in (suns, flares, colours)]
+    inputs = [batch.data, *numbers, _numbers(batch, strengths), batch.width, batch.stride]
+    dim = (batch.count, batch.height)
+    wp.launch(layers.blend_sun, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
     return out, done
 
 

@@ -33,7 +33,7 @@ SHIFTS: Final[dict[str, tuple[Family, str]]] = {
 }
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
-VERSION: Final = 2
+VERSIONS: Final[dict[Calibration, int]] = {"physical": 2, "paper": 3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +68,11 @@ class ShiftSpec:
 
     def key(self, *scope: object) -> int:
         """64 bits for what the random numbers are for, such as ("air", scene)."""
-        return int(digest("shift", VERSION, self.name, self.calibration, self.seed, *scope)[:16], 16)
+        return int(digest("shift", VERSIONS[self.calibration], self.name, self.calibration, self.seed, *scope)[:16], 16)
 
     def generator(self, *scope: object) -> np.random.Generator:
         """A generator for what the random numbers are for."""
-        return generator("shift", VERSION, self.name, self.calibration, self.seed, *scope)
+        return generator("shift", VERSIONS[self.calibration], self.name, self.calibration, self.seed, *scope)
 
 
 def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:

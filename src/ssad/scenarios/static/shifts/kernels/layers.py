@@ -13,7 +13,7 @@ def specks(
     normal: wp.array(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Normal noise in [0, 1]: flakes or drops before they are enlarged, cut off and blurred.
+    """Normal noise: flakes before they are enlarged, cut off and blurred.
 
     normal: inverse distribution function at 65,536 midpoints; four cells a hash.
     """
@@ -25,7 +25,7 @@ def specks(
             x = 4 * q + k
             if x < columns:
                 u = int((bits >> wp.uint64(16 * k)) & wp.uint64(65535))
-                out[b, y, x] = wp.clamp(mean[b] + deviation[b] * normal[u], 0.0, 1.0)
+                out[b, y, x] = mean[b] + deviation[b] * normal[u]
 
 
 @wp.func
@@ -39,20 +39,42 @@ def sample(grid: wp.array3d(dtype=float), b: int, y: float, x: float) -> float:
 
 
 @wp.kernel
-def enlarge(
+def flakes(
     grid: wp.array3d(dtype=float),
-    zoom: wp.array(dtype=float),
+    step: wp.array(dtype=wp.vec2),
     threshold: wp.array(dtype=float),
+    scale: float,
+    places: int,
     out: wp.array3d(dtype=float),
 ):
-    """The noise at half resolution, enlarged, and 0 again under the threshold."""
+    """The noise enlarged, 0 under the threshold, at most 1; two rows of pixels in one, places x places in each pixel.
+
+    step: cells a published pixel along y and x; scale: pixels of the picture a published pixel.
+    """
     b, y = wp.tid()
-    factor = 2.0 / zoom[b]
+    share = 1.0 / float(places)
+    part = 0.5 * share * share
+    least = threshold[b]
     for x in range(out.shape[2]):
-        value = sample(grid, b, (float(y) + 0.5) * factor - 0.5, (float(x) + 0.5) * factor - 0.5)
-        if value < threshold[b]:
-            value = 0.0
-        out[b, y, x] = value
+        out[b, y, x] = 0.0
+    for j in range(2 * places):
+        fy = ((float(2 * y) + (float(j) + 0.5) * share) / scale - 0.5) * step[b][0]
+        row = int(wp.floor(fy))
+        fraction = fy - float(row)
+        column = int(-2)
+        left = float(0.0)
+        right = float(0.0)
+        for x in range(out.shape[2]):
+            for i in range(places):
+                fx = ((float(x) + (float(i) + 0.5) * share) / scale - 0.5) * step[b][1]
+                here = int(wp.floor(fx))
+                if here != column:
+                    column = here
+                    left = cell(grid, b, row, fraction, here)
+                    right = cell(grid, b, row, fraction, here + 1)
+                value = left + (right - left) * (fx - float(here))
+                if value >= least:
+                    out[b, y, x] = out[b, y, x] + part * wp.clamp(value, 0.0, 1.0)
 
 
 @wp.kernel
@@ -73,14 +95,20 @@ def streaks(
         if w > 0.0:
             py = wp.clamp(y + offsets[b, k][1], 0, rows - 1)
             dx = offsets[b, k][0]
-            for x in range(columns):
-                out[b, y, x] = out[b, y, x] + w * grid[b, py, wp.clamp(x + dx, 0, columns - 1)]
+            first = wp.clamp(-dx, 0, columns)
+            last = wp.clamp(columns - dx, 0, columns)
+            for x in range(first):
+                out[b, y, x] = out[b, y, x] + w * grid[b, py, 0]
+            for x in range(first, last):
+                out[b, y, x] = out[b, y, x] + w * grid[b, py, x + dx]
+            for x in range(last, columns):
+                out[b, y, x] = out[b, y, x] + w * grid[b, py, columns - 1]
 
 
 @wp.kernel
-def blend_layer(
+def blend_snow(
     image: wp.array(dtype=wp.uint8),
-    layer: wp.array3d(dtype=float),
+    layer: wp.array(dtype=float),
     keep: wp.array(dtype=float),
     grey: float,
     height: int,
@@ -91,36 +119,138 @@ def blend_layer(
 ):
     """Whitens, adds the layer and itself turned round, blends with grey; notes the brightest value of each row.
 
-    keep < 1: max(image, 1.5 * luminance + 0.5) takes the rest (ImageNet-C's snow).
+    layer: of half the rows. max(image, 1.5 * luminance + 0.5) takes what `keep` leaves (ImageNet-C's snow).
     """
     b, y = wp.tid()
     start = b * stride + y * width * 3
     part = int(keep[b] * 256.0 + 0.5)
     most = int(0)
-    last = layer.shape[2] - 1
     rest = int((1.0 - grey) * 1024.0)
     base = int(128.0 * grey * 1024.0) + 512
-    for q in range(layer.shape[2]):
-        add = int((layer[b, y / 2, q] + layer[b, (height - 1 - y) / 2, last - q]) * 255.0)
-        for k in range(2):
-            x = 2 * q + k
-            if x < width:
-                i = start + x * 3
-                r = int(image[i])
-                g = int(image[i + 1])
-                w = int(image[i + 2])
-                if part < 256:
-                    white = (((77 * r + 150 * g + 29 * w) * 3) >> 9) + 127
-                    r = (part * r + (256 - part) * wp.max(r, white)) >> 8
-                    g = (part * g + (256 - part) * wp.max(g, white)) >> 8
-                    w = (part * w + (256 - part) * wp.max(w, white)) >> 8
-                r = (wp.min(r + add, 255) * rest + base) >> 10
-                g = (wp.min(g + add, 255) * rest + base) >> 10
-                w = (wp.min(w + add, 255) * rest + base) >> 10
-                most = wp.max(most, wp.max(r, wp.max(g, w)))
-                out[i] = wp.uint8(r)
-                out[i + 1] = wp.uint8(g)
-                out[i + 2] = wp.uint8(w)
+    rows = (height + 1) / 2
+    here = (b * rows + y / 2) * width
+    turned = (b * rows + (height - 1 - y) / 2) * width + width - 1
+    for x in range(width):
+        add = int((layer[here + x] + layer[turned - x]) * 255.0)
+        i = start + x * 3
+        r = int(image[i])
+        g = int(image[i + 1])
+        w = int(image[i + 2])
+        white = (((77 * r + 150 * g + 29 * w) * 3) >> 9) + 127
+        r = (part * r + (256 - part) * wp.max(r, white)) >> 8
+        g = (part * g + (256 - part) * wp.max(g, white)) >> 8
+        w = (part * w + (256 - part) * wp.max(w, white)) >> 8
+        r = (wp.min(r + add, 255) * rest + base) >> 10
+        g = (wp.min(g + add, 255) * rest + base) >> 10
+        w = (wp.min(w + add, 255) * rest + base) >> 10
+        most = wp.max(most, wp.max(r, wp.max(g, w)))
+        out[i] = wp.uint8(r)
+        out[i + 1] = wp.uint8(g)
+        out[i + 2] = wp.uint8(w)
+    highest[b, y] = most
+
+
+@wp.kernel
+def drops(
+    keys: wp.array(dtype=wp.uint64),
+    density: wp.array(dtype=float),
+    place: wp.array(dtype=wp.vec4),
+    first: wp.array(dtype=float),
+    gate: wp.array3d(dtype=float),
+    out: wp.array3d(dtype=float),
+):
+    """Salt: a share of the cells is between a half and 1 (arcsine law), weakened by the gate where it lies.
+
+    The lattice leans with the rain. place: columns of the gate a cell, columns a row, column of the first cell; rows
+    of the gate a row. first: the row of the lattice where the picture begins.
+    """
+    b, y = wp.tid()
+    step = place[b]
+    for x in range(out.shape[2]):
+        bits = draw(keys[b], y * 8192 + x)
+        value = float(0.0)
+        if unit(bits, 0) < density[b]:
+            value = 0.5 + 0.5 * wp.abs(wp.cos(wp.pi * unit(bits, 16)))
+            column = float(x) * step[0] + float(y) * step[1] + step[2]
+            value *= sample(gate, b, (float(y) - first[b]) * step[3] - 0.5, column - 0.5)
+        out[b, y, x] = value
+
+
+@wp.kernel
+def fall(
+    grid: wp.array3d(dtype=float),
+    length: wp.array(dtype=int),
+    gain: wp.array(dtype=float),
+    box: wp.array2d(dtype=float),
+    wedge: wp.array2d(dtype=float),
+    out: wp.array3d(dtype=float),
+):
+    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums; 64
+    columns a thread. box, wedge: zeros."""
+    b, block = wp.tid()
+    k = length[b]
+    unit_weight = 2.0 * gain[b] / (float(k) * float(k + 1))
+    first = block * 64
+    last = wp.min(first + 64, grid.shape[2])
+    for y in range(grid.shape[1]):
+        for x in range(first, last):
+            value = grid[b, y, x]
+            slope = wedge[b, x] + float(k) * value - box[b, x]
+            total = box[b, x] + value
+            if y >= k:
+                total -= grid[b, y - k, x]
+            box[b, x] = total
+            wedge[b, x] = slope
+            out[b, y, x] = slope * unit_weight
+
+
+@wp.kernel
+def blend_rain(
+    image: wp.array(dtype=wp.uint8),
+    layer: wp.array3d(dtype=float),
+    place: wp.array(dtype=wp.vec4),
+    first: wp.array(dtype=float),
+    places: int,
+    grey: float,
+    width: int,
+    stride: int,
+    highest: wp.array2d(dtype=int),
+    out: wp.array(dtype=wp.uint8),
+):
+    """Drops of grey level 240 over the image by 1.3 times the layer, then grey; notes the brightest value of each row.
+
+    place: cells of the layer a pixel, columns a row, first column; first row.
+    """
+    b, y = wp.tid()
+    start = b * stride + y * width * 3
+    step = place[b]
+    share = 1.0 / float(places)
+    row = (float(y) + 0.5) * step[0] + first[b]
+    top = int(wp.floor(row))
+    begin = row * step[1] + step[2]
+    rest = int((1.0 - grey) * 1024.0)
+    base = int(128.0 * grey * 1024.0) + 512
+    most = int(0)
+    for x in range(width):
+        veil = float(0.0)
+        for k in range(places):
+            place_x = (float(x) + (float(k) + 0.5) * share) * step[0] + begin
+            column = int(wp.floor(place_x))
+            left = cell(layer, b, top, row - float(top), column)
+            right = cell(layer, b, top, row - float(top), column + 1)
+            veil += left + (right - left) * (place_x - float(column))
+        part = int(wp.min(1.3 * veil * share, 1.0) * 256.0 + 0.5)
+        i = start + x * 3
+        r = (((256 - part) * int(image[i]) + part * 240) >> 8) * rest + base
+        g = (((256 - part) * int(image[i + 1]) + part * 240) >> 8) * rest + base
+        w = (((256 - part) * int(image[i + 2]) + part * 240) >> 8) * rest + base
+        r = r >> 10
+        g = g >> 10
+        w = w >> 10
+        most = wp.max(most, wp.max(r, wp.max(g, w)))
+        out[i] = wp.uint8(r)
+        out[i + 1] = wp.uint8(g)
+        out[i + 2] = wp.uint8(w)
     highest[b, y] = most
 
 
@@ -153,29 +283,42 @@ def brightest(image: wp.array(dtype=wp.uint8), width: int, stride: int, highest:
 
 
 @wp.kernel
-def plasma(keys: wp.array(dtype=wp.uint64), decay: wp.array(dtype=float), out: wp.array3d(dtype=float)):
-    """Clouds: octaves of smooth noise from 1024 pixels down, each `decay` times weaker; about 0 to 1, not scaled."""
-    b, y = wp.tid()
-    for x in range(out.shape[2]):
-        total = float(0.0)
-        weight = float(1.0)
-        size = float(256.0)  # nodes of the quarter grid
-        for octave in range(8):
-            u = float(x) / size
-            v = float(y) / size
-            column = int(u)
-            row = int(v)
-            fx = u - float(column)
-            fy = v - float(row)
-            key = keys[b] + wp.uint64(octave)
-            a = unit(draw(key, row * 8192 + column), 0)
-            c = unit(draw(key, row * 8192 + column + 1), 0)
-            d = unit(draw(key, (row + 1) * 8192 + column), 0)
-            e = unit(draw(key, (row + 1) * 8192 + column + 1), 0)
-            total += weight * ((a + (c - a) * fx) * (1.0 - fy) + (d + (e - d) * fx) * fy - 0.5)
-            weight = weight / decay[b]
-            size = size * 0.5
-        out[b, y, x] = total
+def squares(keys: wp.array(dtype=wp.uint64), wibble: wp.array2d(dtype=float), level: int, out: wp.array3d(dtype=float)):
+    """Diamond-square (Fournier, Fussell and Carpenter 1982) on a torus: the middle of each square of corners."""
+    b, i, j = wp.tid()
+    size = out.shape[1]
+    step = size >> level
+    half = step / 2
+    y = i * step
+    x = j * step
+    down = (y + step) % size
+    right = (x + step) % size
+    mean = (out[b, y, x] + out[b, down, x] + out[b, y, right] + out[b, down, right]) * 0.25
+    noise = 2.0 * unit(draw(keys[b] + wp.uint64(3 * level), i * 8192 + j), 0) - 1.0
+    out[b, y + half, x + half] = mean + wibble[b, level] * noise
+
+
+@wp.kernel
+def diamonds(
+    keys: wp.array(dtype=wp.uint64), wibble: wp.array2d(dtype=float), level: int, out: wp.array3d(dtype=float)
+):
+    """Diamond-square: the middles of the edges, between two corners and two middles of squares."""
+    b, i, j = wp.tid()
+    size = out.shape[1]
+    step = size >> level
+    half = step / 2
+    y = i * step
+    x = j * step
+    up = (y + size - half) % size
+    left = (x + size - half) % size
+    corner = out[b, y, x]
+    middle = out[b, y + half, x + half]
+    mean = (corner + out[b, y, (x + step) % size] + middle + out[b, up, x + half]) * 0.25
+    noise = 2.0 * unit(draw(keys[b] + wp.uint64(3 * level + 1), i * 8192 + j), 0) - 1.0
+    out[b, y, x + half] = mean + wibble[b, level] * noise
+    mean = (corner + out[b, (y + step) % size, x] + middle + out[b, y + half, left]) * 0.25
+    noise = 2.0 * unit(draw(keys[b] + wp.uint64(3 * level + 2), i * 8192 + j), 0) - 1.0
+    out[b, y + half, x] = mean + wibble[b, level] * noise
 
 
 @wp.kernel
@@ -187,51 +330,95 @@ def blend_clouds(
     amount: wp.array(dtype=float),
     most: wp.array(dtype=float),
     grey: wp.array(dtype=float),
-    height: int,
+    step: float,
     width: int,
     stride: int,
     out: wp.array(dtype=wp.uint8),
 ):
-    """(image + amount * clouds) * most / (most + amount), then blended with grey (ImageNet-C's fog, 3DC's end)."""
+    """(image + amount * clouds) * most / (most + amount), then blended with grey (ImageNet-C's fog, 3DC's end).
+
+    grid: clouds on a torus, from low to low + span; step: cells a pixel.
+    """
     b, y = wp.tid()
-    fy = (float(y) + 0.5) * 0.25 - 0.5
-    row = int(wp.floor(fy))
+    size = grid.shape[1]
+    fy = float(y) * step
+    row = int(fy)
+    part = fy - float(row)
+    above = row % size
+    below = (row + 1) % size
     start = b * stride + y * width * 3
     scale = most[b] / (most[b] + amount[b]) * (1.0 - grey[b])
     add = amount[b] * 255.0 * scale / span[b]
     base = 128.0 * grey[b] - low[b] * add
-    left = cell(grid, b, row, fy - float(row), -1)
-    for q in range(-1, grid.shape[2]):
-        right = cell(grid, b, row, fy - float(row), q + 1)
-        for k in range(4):
-            x = q * 4 + 2 + k
-            if x >= 0 and x < width:
-                veil = (left + (right - left) * (float(k) + 0.5) * 0.25) * add + base
-                i = start + x * 3
-                out[i] = byte(float(image[i]) * scale + veil)
-                out[i + 1] = byte(float(image[i + 1]) * scale + veil)
-                out[i + 2] = byte(float(image[i + 2]) * scale + veil)
-        left = right
+    column = int(-1)
+    left = float(0.0)
+    right = float(0.0)
+    for x in range(width):
+        fx = float(x) * step
+        here = int(fx)
+        if here != column:
+            column = here
+            q = here % size
+            left = grid[b, above, q] * (1.0 - part) + grid[b, below, q] * part
+            q = (here + 1) % size
+            right = grid[b, above, q] * (1.0 - part) + grid[b, below, q] * part
+        veil = (left + (right - left) * (fx - float(here))) * add + base
+        i = start + x * 3
+        out[i] = byte(float(image[i]) * scale + veil)
+        out[i + 1] = byte(float(image[i + 1]) * scale + veil)
+        out[i + 2] = byte(float(image[i + 2]) * scale + veil)
+
+
+@wp.func
+def brighter(r: float, g: float, w: float, colour: wp.vec3, part: float) -> wp.vec3:
+    """A colour over a pixel by a share, unless that makes it darker (HLS lightness, whole grey levels)."""
+    over = wp.vec3(r, g, w) * (1.0 - part) + colour * part
+    before = int(wp.max(r, wp.max(g, w))) + int(wp.min(r, wp.min(g, w)))
+    after = int(wp.max(over[0], wp.max(over[1], over[2]))) + int(wp.min(over[0], wp.min(over[1], over[2])))
+    return wp.where(after > before, over, wp.vec3(r, g, w))
 
 
 @wp.kernel
-def disc(
-    centre: wp.array(dtype=wp.vec4),
-    radius: wp.array(dtype=float),
-    out: wp.array3d(dtype=float),
+def blend_sun(
+    image: wp.array(dtype=wp.uint8),
+    sun: wp.array(dtype=wp.vec3),
+    flare: wp.array(dtype=wp.vec3),
+    colour: wp.array(dtype=wp.vec3),
+    strength: wp.array(dtype=float),
+    width: int,
+    stride: int,
+    out: wp.array(dtype=wp.uint8),
 ):
-    """A bright disc with gaussian edges at centre (x, y) and a fainter ring at (z, w), grey levels."""
-    b, y, x = wp.tid()
-    px = (float(x) + 0.5) * 4.0 - 0.5
-    py = (float(y) + 0.5) * 4.0 - 0.5
-    place = centre[b]
-    r = radius[b]
-    near = ((px - place[0]) * (px - place[0]) + (py - place[1]) * (py - place[1])) / (r * r)
-    light = 255.0 * wp.exp(-0.5 * wp.max(near - 1.0, 0.0))
-    ring = wp.sqrt((px - place[2]) * (px - place[2]) + (py - place[3]) * (py - place[3]))
-    if ring < 0.6 * r:
-        light += 45.0
-    out[b, y, x] = light
+    """In place (out holds the image): a faint disc of a colour, then the white sun, both with gaussian edges.
+
+    sun, flare: x, y, deviation in pixels, 0 for none; strength: share of the colour in the disc.
+    """
+    b, y = wp.tid()
+    start = b * stride + y * width * 3
+    reach = wp.max(4.0 * sun[b][2], 4.5 * flare[b][2])
+    dy = float(y) - sun[b][1]
+    ey = float(y) - flare[b][1]
+    if wp.abs(dy) > reach and wp.abs(ey) > reach:
+        return
+    for x in range(width):
+        dx = float(x) - sun[b][0]
+        ex = float(x) - flare[b][0]
+        near = (dx * dx + dy * dy) / (sun[b][2] * sun[b][2])
+        far = float(100.0)
+        if flare[b][2] > 0.0:
+            far = (ex * ex + ey * ey) / (flare[b][2] * flare[b][2])
+        if near < 16.0 or far < 20.0:
+            i = start + x * 3
+            r = float(image[i])
+            g = float(image[i + 1])
+            w = float(image[i + 2])
+            part = wp.min(4.0 * wp.exp(-0.5 * far), 1.0) * strength[b]
+            mixed = brighter(r, g, w, colour[b], part)
+            part = wp.min(1.5 * wp.exp(-0.5 * near), 1.0)
+            mixed = brighter(mixed[0], mixed[1], mixed[2], wp.vec3(255.0, 255.0, 255.0), part)
+            out[i] = wp.uint8(wp.clamp(int(mixed[0]), 0, 255))
+            out[i + 1] = wp.uint8(wp.clamp(int(mixed[1]), 0, 255))
+            out[i + 2] = wp.uint8(wp.clamp(int(mixed[2]), 0, 255))
 
 
 @wp.kernel

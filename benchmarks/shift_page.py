@@ -1,0 +1,161 @@
+"""Write docs/results.md from the tables of `ssad run shifts` and `shifts-paper`: python benchmarks/shift_page.py
+
+benchmarks/results/shifts and shifts-paper hold what those runs wrote: DIR/tables/*.csv, and run.json without its cells.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from ssad.report.detection import title_of
+from ssad.report.paper import SHIFTS as PUBLISHED
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PAGE = ROOT / "docs" / "results.md"
+RUNS = ("shifts", "shifts-paper")  # the physical calibration, and the paper's
+NAMES = {"fcos3d-light": ("light FCOS3D", "FCOS3D"), "pgd-det-light": ("light PGD-Det", "PGD")}  # ours, the paper's
+PLACE = {"mAP": 0, "NDS": 1}
+SHIFTS = [shift for shift in PUBLISHED if shift]
+
+Key = tuple[str, ...]
+
+
+def header(run: str) -> dict[str, Any]:
+    """What a run says of itself."""
+    data: dict[str, Any] = json.loads((RESULTS / run / "run.json").read_text())
+    return data
+
+
+def read(run: str, table: str) -> dict[Key, tuple[float, ...]]:
+    """Our numbers of a table: what leads a row, then the column -> value, and ends of the interval if there is one."""
+    found = {}
+    with (RESULTS / run / f"{table}.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            if row.pop("source") == "ours":
+                numbers = [row.pop(name) for name in ("mean", "low", "high")]
+                key = tuple(value for name, value in row.items() if name not in ("n", "failed"))
+                found[key] = tuple(float(number) for number in numbers if number)
+    return found
+
+
+def shown(value: tuple[float, ...]) -> str:
+    """A number with its interval."""
+    return f"{value[0]:.1f}" + (f" [{value[1]:.1f}, {value[2]:.1f}]" if len(value) > 1 else "")
+
+
+def comparison(metric: str, *, left: bool) -> list[str]:
+    """Shift x detector: ours in both calibrations and the paper's; left: as a share of the clean score."""
+    tables = [
+        {(key[-2], key[-1]): value for key, value in read(run, "left" if left else "shifts").items()} for run in RUNS
+    ]
+    heads = [
+        f"{ours}, {how}" for ours, _ in NAMES.values() for how in ("physical", "paper's severities", "*published*")
+    ]
+    lines = ["| shift | " + " | ".join(heads) + " |", "|---|" + "---:|" * len(heads)]
+    for shift in SHIFTS if left else ["", *SHIFTS]:
+        cells = []
+        for detector, (_, theirs) in NAMES.items():
+            cells += [shown(table[title_of(shift), f"{detector} {metric}"]) for table in tables]
+            published = PUBLISHED[shift][theirs][PLACE[metric]]
+            clean = PUBLISHED[""][theirs][PLACE[metric]]
+            cells.append(f"*{100 * published / clean if left else published:.1f}*")
+        lines.append(f"| {title_of(shift)} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
+def severities(run: str) -> list[str]:
+    """mAP over severity."""
+    table = read(run, "severities")
+    lines = ["| shift | " + " | ".join(f"{ours} {s}" for ours, _ in NAMES.values() for s in range(1, 6)) + " |"]
+    lines.append("|---|" + "---:|" * 10)
+    for shift in SHIFTS:
+        cells = [table["mAP", name, title_of(shift), f"severity {s}"][0] for name in NAMES for s in range(1, 6)]
+        lines.append(f"| {title_of(shift)} | " + " | ".join(f"{cell:.1f}" for cell in cells) + " |")
+    return [*lines, ""]
+
+
+def robustness() -> list[str]:
+    """mCE and mRR."""
+    columns = ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)")
+    lines = ["| severities | detector | " + " | ".join(columns) + " |", "|---|---|" + "---:|" * len(columns)]
+    for run, how in zip(RUNS, ("physical", "paper's"), strict=True):
+        table = read(run, "robustness")
+        for name, (ours, _) in NAMES.items():
+            lines.append(f"| {how} | {ours} | " + " | ".join(shown(table[name, column]) for column in columns) + " |")
+    return [*lines, ""]
+
+
+def classes() -> list[str]:
+    """AP by class and the errors of what was found, on clean data."""
+    table = read(RUNS[0], "classes")
+    columns = list(dict.fromkeys(key[1] for key in table))
+    lines = ["| | " + " | ".join(NAMES[name][0] for name in NAMES) + " |", "|---|" + "---:|" * len(NAMES)]
+    for column in columns:
+        digits = 2 if column.startswith("m") and column.endswith(")") else 1
+        values = [f"{table[name, column][0]:.{digits}f}" for name in NAMES]
+        lines.append(f"| {column} | " + " | ".join(values) + " |")
+    return [*lines, ""]
+
+
+def page() -> str:
+    """The page."""
+    about = header(RUNS[0])
+    data, versions, weights = about["data"], about["versions"], about["weights"]
+    samples = next(iter(csv.DictReader((RESULTS / RUNS[0] / "shifts.csv").open(newline=""))))["n"]
+    towns = " and ".join(data["towns"])
+    return "\n".join([
+        "# What the shipped 3D detectors reach, and keep under the distribution shifts",
+        "",
+        "Made by `benchmarks/shift_page.py` from `benchmarks/results/shifts` and `shifts-paper`: the tables that",
+        "```",
+        "ssad run shifts --device cuda",
+        "ssad run shifts-paper --device cuda",
+        "```",
+        f"wrote ({data['scenes']} drives each in {towns}, towns that the detectors never saw: {samples} samples of six",
+        f"cameras, {data['width']} pixels wide; torch {versions['torch']}; weights",
+        ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + "). Intervals in brackets: 95 %,",
+        "bootstrap over drives. *Published*: the paper's, on nuScenes val with full-size detectors: other pictures and",
+        "other detectors, so levels cannot be compared; what is left of a detector's own clean score can.",
+        "",
+        "Physical: our default, strengths in units (metres of visibility, millimetres of rain an hour); a drive has",
+        "one severity from 1 to 5, each severity in as many drives. Paper's severities: the published tables of",
+        "3D_Corruptions_AD, picture by picture, drawn from 1 to 5 for each sample. See [shifts.md](shifts.md).",
+        "",
+        "## mAP, percent",
+        "",
+        *comparison("mAP", left=False),
+        "## What is left of the clean mAP, percent",
+        "",
+        *comparison("mAP", left=True),
+        "## NDS, percent",
+        "",
+        *comparison("NDS", left=False),
+        "## What is left of the clean NDS, percent",
+        "",
+        *comparison("NDS", left=True),
+        "## mAP by severity, physical",
+        "",
+        *severities(RUNS[0]),
+        "## mAP by severity, the paper's",
+        "",
+        *severities(RUNS[1]),
+        "## In one number",
+        "",
+        "mCE: errors relative to those of light FCOS3D, lower is better; mRR: share of the clean score that is left,",
+        "higher is better; over all shifts and severities, percent.",
+        "",
+        *robustness(),
+        "## Clean data",
+        "",
+        "AP in percent; mean errors of what was found as nuScenes defines them.",
+        "",
+        *classes(),
+    ])  # fmt: skip
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
