@@ -176,8 +176,8 @@ def scores() -> list[str]:
     ]
 
 
-def main() -> None:
-    """Write the page."""
+def page() -> str:
+    """The page."""
     lines = [
         "# Speed of the world",
         "",
@@ -189,8 +189,8 @@ def main() -> None:
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
     lines += shifts() + scores() + camera() + recorder() + detectors()
-    (ROOT / "docs" / "benchmarks.md").write_text("\n".join(lines))
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    main()
+    (ROOT / "docs" / "benchmarks.md").write_text(page())

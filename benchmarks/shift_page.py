@@ -10,6 +10,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ssad.report.detection import title_of
 from ssad.report.paper import SHIFTS as PUBLISHED
 
@@ -67,6 +69,22 @@ def comparison(metric: str, *, left: bool) -> list[str]:
     return [*lines, ""]
 
 
+def order() -> list[str]:
+    """How alike the order of the shifts is here and in the paper."""
+    lines = ["| rank correlation with the paper | " + " | ".join(ours for ours, _ in NAMES.values()) + " |"]
+    lines.append("|---|" + "---:|" * len(NAMES))
+    for run, how in zip(RUNS, ("physical", "paper's severities"), strict=True):
+        table = read(run, "left")
+        cells = []
+        for detector, (_, theirs) in NAMES.items():
+            here = [value[0] for key, value in table.items() if key[-1] == f"{detector} mAP"]
+            there = [PUBLISHED[shift][theirs][0] for shift in SHIFTS]
+            places = [np.argsort(np.argsort(values)) for values in (here, there)]
+            cells.append(f"{np.corrcoef(*places)[0, 1]:.2f}")
+        lines.append(f"| {how} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
 def severities(run: str) -> list[str]:
     """mAP over severity."""
     table = read(run, "severities")
@@ -105,7 +123,8 @@ def page() -> str:
     """The page."""
     about = header(RUNS[0])
     data, versions, weights = about["data"], about["versions"], about["weights"]
-    samples = next(iter(csv.DictReader((RESULTS / RUNS[0] / "shifts.csv").open(newline=""))))["n"]
+    with (RESULTS / RUNS[0] / "shifts.csv").open(newline="") as file:
+        samples = next(iter(csv.DictReader(file)))["n"]
     towns = " and ".join(data["towns"])
     return "\n".join([
         "# What the shipped 3D detectors reach, and keep under the distribution shifts",
@@ -131,6 +150,9 @@ def page() -> str:
         "## What is left of the clean mAP, percent",
         "",
         *comparison("mAP", left=True),
+        "Spearman's, over the 11 shifts, of what is left of mAP:",
+        "",
+        *order(),
         "## NDS, percent",
         "",
         *comparison("NDS", left=False),

@@ -1,0 +1,26 @@
+"""Pages of numbers are what the measurements in benchmarks/results say, of the weights that are shipped."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+from ssad.bench.component.run import state_hash
+from ssad.bench.component.work import detector_of
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize(("script", "name"), [("page", "benchmarks"), ("shift_page", "results")])
+def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
+    page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
+    assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python benchmarks/{script}.py"
+
+
+@pytest.mark.parametrize("run", ["shifts", "shifts-paper"])
+def test_results_are_those_of_the_shipped_weights(run: str) -> None:
+    told = json.loads((ROOT / "benchmarks" / "results" / run / "run.json").read_text())["weights"]
+    assert told == {name: state_hash(detector_of(name, "", "cpu")) for name in ("fcos3d-light", "pgd-det-light")}
