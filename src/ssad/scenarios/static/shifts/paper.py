@@ -88,10 +88,10 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     dim = (batch.count, batch.height)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     inputs = [
-        batch.data, layer.flatten(), _numbers(batch, keep), table.PAPER_GREY, batch.height, batch.width, batch.stride,
-        highest,
+        batch.words(), layer.flatten(), _numbers(batch, keep), table.PAPER_GREY, batch.height, batch.width,
+        batch.stride // 4, highest,
     ]  # fmt: skip
-    wp.launch(layers.blend_snow, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    wp.launch(layers.blend_snow, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
     _darken(out, highest)
     return out, [Applied(True, {"angle_deg": round(float(a), 1)}) for a in angle]
 
@@ -133,16 +133,22 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     sums = [wp.zeros((batch.count, shape[2]), dtype=float, device=batch.device) for _ in range(2)]
     # the source enlarges with cubic splines and cuts off what is negative: so much more light in the mean (measured)
     gain = [1.28 - 0.95 * d + 0.9 * d**2 for d in density]
-    inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), *sums]
-    dim = (batch.count, -(-shape[2] // 64))
+    block = (
+        64 if batch.device == "cpu" else 1
+    )  # columns a thread: neighbours in memory, or as many threads as there are
+    inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), block, *sums]
+    dim = (batch.count, -(-shape[2] // block))
     wp.launch(layers.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
     dim = (batch.count, batch.height)
+    hidden = wp.empty((*dim, batch.width), dtype=wp.uint8, device=batch.device)
+    inputs = [layer, _numbers(batch, seen, wp.vec4), _numbers(batch, first), _places(scale)]
+    wp.launch(layers.curtain, dim=dim, inputs=inputs, outputs=[hidden], device=batch.device)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
-    inputs = [
-        batch.data, layer, _numbers(batch, seen, wp.vec4), _numbers(batch, first), _places(scale), table.PAPER_GREY,
-        batch.width, batch.stride, highest,
-    ]  # fmt: skip
-    wp.launch(layers.blend_rain, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    size = batch.count * batch.stride // 12
+    parts = wp.array(ptr=hidden.ptr, dtype=wp.uint32, shape=size, device=batch.device)
+    parts._keep = hidden  # the memory belongs to the bytes
+    inputs = [batch.words(), parts, table.PAPER_GREY, batch.width, batch.stride // 4, highest]
+    wp.launch(layers.blend_rain, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
     _darken(out, highest)
     told = zip(density, length, strict=True)
     return out, [Applied(True, {"density": round(float(d), 3), "cells": int(n)}) for d, n in told]
@@ -172,11 +178,13 @@ def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
         for kernel in (layers.squares, layers.diamonds):
             wide = (batch.count, 1 << level, 1 << level)
             wp.launch(kernel, dim=wide, inputs=[keys, wibble, level], outputs=[clouds], device=batch.device)
-    values = clouds.numpy().reshape(batch.count, -1)
-    low, span = values.min(1), np.maximum(np.ptp(values, axis=1), 1e-6)
+    ends = [wp.empty((batch.count, size), dtype=float, device=batch.device) for _ in range(2)]
+    wp.launch(layers.extremes, dim=(batch.count, size), inputs=[clouds], outputs=ends, device=batch.device)
+    low, high = ends[0].numpy().min(1), ends[1].numpy().max(1)
+    span = np.maximum(high - low, 1e-6)
     highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
     dim = (batch.count, batch.height)
-    inputs = [batch.data, batch.width, batch.stride]
+    inputs = [batch.words(), batch.width * 3 // 4, batch.stride // 4]
     wp.launch(layers.brightest, dim=dim, inputs=inputs, outputs=[highest], device=batch.device)
     most = highest.numpy().max(1) / 255
     out = batch.like()

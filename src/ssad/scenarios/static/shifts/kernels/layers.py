@@ -2,7 +2,10 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import byte, cell, draw, unit
+from ssad.scenarios.static.shifts.kernels.shared import FIELDS, ONES, byte, cell, draw, gather, pixel_of, spread, unit
+
+OVER = wp.constant(wp.uint64(256 + (256 << 21) + (256 << 42)))
+WIDE = wp.constant(wp.uint64(1023 + (1023 << 21) + (1023 << 42)))
 
 
 @wp.kernel
@@ -105,48 +108,88 @@ def streaks(
                 out[b, y, x] = out[b, y, x] + w * grid[b, py, columns - 1]
 
 
+@wp.func
+def most_of(fields: wp.uint64, most: int) -> int:
+    """The largest of three fields of 8 bits, or `most` if that is larger: looked at only where one is."""
+    if ((fields + wp.uint64(255 - most) * ONES) & OVER) != wp.uint64(0):
+        p = gather(fields)
+        r = int(p & wp.uint32(255))
+        g = int((p >> wp.uint32(8)) & wp.uint32(255))
+        return wp.max(most, wp.max(r, wp.max(g, int(p >> wp.uint32(16)))))
+    return most
+
+
+@wp.func
+def greyed(fields: wp.uint64, rest: wp.uint64, base: wp.uint64) -> wp.uint64:
+    """(value * rest + base) / 1024, field by field."""
+    return ((fields * rest + base) >> wp.uint64(10)) & FIELDS
+
+
+@wp.func
+def snowed(pixel: wp.uint32, part: int, add: int) -> wp.uint64:
+    """A pixel whitened by 1 - part / 256 and made brighter by `add`, at most 255, as fields."""
+    r = int(pixel & wp.uint32(255))
+    g = int((pixel >> wp.uint32(8)) & wp.uint32(255))
+    w = int(pixel >> wp.uint32(16))
+    white = (((77 * r + 150 * g + 29 * w) * 3) >> 9) + 127
+    fields = spread(pixel)
+    light = wp.uint64(white) * ONES
+    if white < wp.max(r, wp.max(g, w)):
+        light = wp.uint64(wp.max(r, white)) | (wp.uint64(wp.max(g, white)) << wp.uint64(21))
+        light = light | (wp.uint64(wp.max(w, white)) << wp.uint64(42))
+    light = fields * wp.uint64(part) + light * wp.uint64(256 - part)
+    total = ((light >> wp.uint64(8)) & WIDE) + wp.uint64(add) * ONES
+    over = ((total >> wp.uint64(8)) | (total >> wp.uint64(9))) & ONES
+    return (total | (over * wp.uint64(255))) & FIELDS
+
+
 @wp.kernel
 def blend_snow(
-    image: wp.array(dtype=wp.uint8),
+    image: wp.array(dtype=wp.uint32),
     layer: wp.array(dtype=float),
     keep: wp.array(dtype=float),
     grey: float,
     height: int,
     width: int,
-    stride: int,
+    words: int,
     highest: wp.array2d(dtype=int),
-    out: wp.array(dtype=wp.uint8),
+    out: wp.array(dtype=wp.uint32),
 ):
     """Whitens, adds the layer and itself turned round, blends with grey; notes the brightest value of each row.
 
-    layer: of half the rows. max(image, 1.5 * luminance + 0.5) takes what `keep` leaves (ImageNet-C's snow).
+    layer: of half the rows. max(image, 1.5 * luminance + 0.5) takes what `keep` leaves (ImageNet-C's snow). Four pixels
+    are three words.
     """
     b, y = wp.tid()
-    start = b * stride + y * width * 3
     part = int(keep[b] * 256.0 + 0.5)
     most = int(0)
-    rest = int((1.0 - grey) * 1024.0)
-    base = int(128.0 * grey * 1024.0) + 512
+    rest = wp.uint64(int((1.0 - grey) * 1024.0))
+    base = wp.uint64(int(128.0 * grey * 1024.0) + 512) * ONES
     rows = (height + 1) / 2
     here = (b * rows + y / 2) * width
     turned = (b * rows + (height - 1 - y) / 2) * width + width - 1
-    for x in range(width):
-        add = int((layer[here + x] + layer[turned - x]) * 255.0)
-        i = start + x * 3
-        r = int(image[i])
-        g = int(image[i + 1])
-        w = int(image[i + 2])
-        white = (((77 * r + 150 * g + 29 * w) * 3) >> 9) + 127
-        r = (part * r + (256 - part) * wp.max(r, white)) >> 8
-        g = (part * g + (256 - part) * wp.max(g, white)) >> 8
-        w = (part * w + (256 - part) * wp.max(w, white)) >> 8
-        r = (wp.min(r + add, 255) * rest + base) >> 10
-        g = (wp.min(g + add, 255) * rest + base) >> 10
-        w = (wp.min(w + add, 255) * rest + base) >> 10
-        most = wp.max(most, wp.max(r, wp.max(g, w)))
-        out[i] = wp.uint8(r)
-        out[i + 1] = wp.uint8(g)
-        out[i + 2] = wp.uint8(w)
+    i = b * words + y * width * 3 / 4
+    for _q in range(width / 4):
+        w0 = image[i]
+        w1 = image[i + 1]
+        w2 = image[i + 2]
+        f0 = snowed(pixel_of(w0, w1, w2, 0), part, int((layer[here] + layer[turned]) * 255.0))
+        f1 = snowed(pixel_of(w0, w1, w2, 1), part, int((layer[here + 1] + layer[turned - 1]) * 255.0))
+        f2 = snowed(pixel_of(w0, w1, w2, 2), part, int((layer[here + 2] + layer[turned - 2]) * 255.0))
+        f3 = snowed(pixel_of(w0, w1, w2, 3), part, int((layer[here + 3] + layer[turned - 3]) * 255.0))
+        f0 = greyed(f0, rest, base)
+        f1 = greyed(f1, rest, base)
+        f2 = greyed(f2, rest, base)
+        f3 = greyed(f3, rest, base)
+        most = most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
+        p1 = gather(f1)
+        p2 = gather(f2)
+        out[i] = gather(f0) | (p1 << wp.uint32(24))
+        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+        out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+        i += 3
+        here += 4
+        turned -= 4
     highest[b, y] = most
 
 
@@ -181,17 +224,18 @@ def fall(
     grid: wp.array3d(dtype=float),
     length: wp.array(dtype=int),
     gain: wp.array(dtype=float),
+    columns: int,
     box: wp.array2d(dtype=float),
     wedge: wp.array2d(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums; 64
-    columns a thread. box, wedge: zeros."""
+    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums;
+    so many columns a thread. box, wedge: zeros."""
     b, block = wp.tid()
     k = length[b]
     unit_weight = 2.0 * gain[b] / (float(k) * float(k + 1))
-    first = block * 64
-    last = wp.min(first + 64, grid.shape[2])
+    first = block * columns
+    last = wp.min(first + columns, grid.shape[2])
     for y in range(grid.shape[1]):
         for x in range(first, last):
             value = grid[b, y, x]
@@ -204,53 +248,88 @@ def fall(
             out[b, y, x] = slope * unit_weight
 
 
+@wp.func
+def rained(pixel: wp.uint32, part: int) -> wp.uint64:
+    """A pixel behind grey level 240 by part / 256, as fields."""
+    total = spread(pixel) * wp.uint64(256 - part) + wp.uint64(240 * part) * ONES
+    return (total >> wp.uint64(8)) & FIELDS
+
+
 @wp.kernel
-def blend_rain(
-    image: wp.array(dtype=wp.uint8),
+def curtain(
     layer: wp.array3d(dtype=float),
     place: wp.array(dtype=wp.vec4),
     first: wp.array(dtype=float),
     places: int,
-    grey: float,
-    width: int,
-    stride: int,
-    highest: wp.array2d(dtype=int),
-    out: wp.array(dtype=wp.uint8),
+    out: wp.array3d(dtype=wp.uint8),
 ):
-    """Drops of grey level 240 over the image by 1.3 times the layer, then grey; notes the brightest value of each row.
+    """How much of each pixel the drops hide, of 255: 1.3 times the layer, the mean of `places` places.
 
     place: cells of the layer a pixel, columns a row, first column; first row.
     """
     b, y = wp.tid()
-    start = b * stride + y * width * 3
     step = place[b]
     share = 1.0 / float(places)
     row = (float(y) + 0.5) * step[0] + first[b]
     top = int(wp.floor(row))
+    fraction = row - float(top)
     begin = row * step[1] + step[2]
-    rest = int((1.0 - grey) * 1024.0)
-    base = int(128.0 * grey * 1024.0) + 512
-    most = int(0)
-    for x in range(width):
+    before = int(-2)
+    left = float(0.0)
+    right = float(0.0)
+    for x in range(out.shape[2]):
         veil = float(0.0)
         for k in range(places):
             place_x = (float(x) + (float(k) + 0.5) * share) * step[0] + begin
             column = int(wp.floor(place_x))
-            left = cell(layer, b, top, row - float(top), column)
-            right = cell(layer, b, top, row - float(top), column + 1)
+            if column != before:
+                left = right
+                if column != before + 1:
+                    left = cell(layer, b, top, fraction, column)
+                right = cell(layer, b, top, fraction, column + 1)
+                before = column
             veil += left + (right - left) * (place_x - float(column))
-        part = int(wp.min(1.3 * veil * share, 1.0) * 256.0 + 0.5)
-        i = start + x * 3
-        r = (((256 - part) * int(image[i]) + part * 240) >> 8) * rest + base
-        g = (((256 - part) * int(image[i + 1]) + part * 240) >> 8) * rest + base
-        w = (((256 - part) * int(image[i + 2]) + part * 240) >> 8) * rest + base
-        r = r >> 10
-        g = g >> 10
-        w = w >> 10
-        most = wp.max(most, wp.max(r, wp.max(g, w)))
-        out[i] = wp.uint8(r)
-        out[i + 1] = wp.uint8(g)
-        out[i + 2] = wp.uint8(w)
+        out[b, y, x] = wp.uint8(wp.min(int(wp.min(1.3 * veil * share, 1.0) * 256.0 + 0.5), 255))
+
+
+@wp.kernel
+def blend_rain(
+    image: wp.array(dtype=wp.uint32),
+    layer: wp.array(dtype=wp.uint32),
+    grey: float,
+    width: int,
+    words: int,
+    highest: wp.array2d(dtype=int),
+    out: wp.array(dtype=wp.uint32),
+):
+    """Drops of grey level 240 over the image, then grey; notes the brightest value of each row. layer: four pixels a
+    word; four pixels of the image are three."""
+    b, y = wp.tid()
+    rest = wp.uint64(int((1.0 - grey) * 1024.0))
+    base = wp.uint64(int(128.0 * grey * 1024.0) + 512) * ONES
+    most = int(0)
+    i = b * words + y * width * 3 / 4
+    j = b * (words / 3) + y * width / 4
+    for q in range(width / 4):
+        w0 = image[i]
+        w1 = image[i + 1]
+        w2 = image[i + 2]
+        hidden = layer[j + q]
+        f0 = rained(pixel_of(w0, w1, w2, 0), int(hidden & wp.uint32(255)))
+        f1 = rained(pixel_of(w0, w1, w2, 1), int((hidden >> wp.uint32(8)) & wp.uint32(255)))
+        f2 = rained(pixel_of(w0, w1, w2, 2), int((hidden >> wp.uint32(16)) & wp.uint32(255)))
+        f3 = rained(pixel_of(w0, w1, w2, 3), int(hidden >> wp.uint32(24)))
+        f0 = greyed(f0, rest, base)
+        f1 = greyed(f1, rest, base)
+        f2 = greyed(f2, rest, base)
+        f3 = greyed(f3, rest, base)
+        most = most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
+        p1 = gather(f1)
+        p2 = gather(f2)
+        out[i] = gather(f0) | (p1 << wp.uint32(24))
+        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+        out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+        i += 3
     highest[b, y] = most
 
 
@@ -272,13 +351,19 @@ def darken(gain: wp.array(dtype=int), words: int, chunk: int, data: wp.array(dty
 
 
 @wp.kernel
-def brightest(image: wp.array(dtype=wp.uint8), width: int, stride: int, highest: wp.array2d(dtype=int)):
-    """The largest value of each row."""
+def brightest(image: wp.array(dtype=wp.uint32), row: int, words: int, highest: wp.array2d(dtype=int)):
+    """The largest byte of each row of `row` words."""
     b, y = wp.tid()
     most = int(0)
-    start = b * stride + y * width * 3
-    for i in range(start, start + width * 3):
-        most = wp.max(most, int(image[i]))
+    pairs = wp.uint32(16711935)
+    start = b * words + y * row
+    for i in range(start, start + row):
+        word = image[i]
+        room = wp.uint32((255 - most) * 65537)
+        over = ((word & pairs) + room) | (((word >> wp.uint32(8)) & pairs) + room)
+        if (over & wp.uint32(16777472)) != wp.uint32(0):
+            for k in range(4):
+                most = wp.max(most, int((word >> wp.uint32(8 * k)) & wp.uint32(255)))
     highest[b, y] = most
 
 
@@ -319,6 +404,19 @@ def diamonds(
     mean = (corner + out[b, (y + step) % size, x] + middle + out[b, y + half, left]) * 0.25
     noise = 2.0 * unit(draw(keys[b] + wp.uint64(3 * level + 2), i * 8192 + j), 0) - 1.0
     out[b, y + half, x] = mean + wibble[b, level] * noise
+
+
+@wp.kernel
+def extremes(grid: wp.array3d(dtype=float), low: wp.array2d(dtype=float), high: wp.array2d(dtype=float)):
+    """The least and the largest value of each row."""
+    b, y = wp.tid()
+    least = grid[b, y, 0]
+    most = least
+    for x in range(1, grid.shape[2]):
+        least = wp.min(least, grid[b, y, x])
+        most = wp.max(most, grid[b, y, x])
+    low[b, y] = least
+    high[b, y] = most
 
 
 @wp.kernel
