@@ -79,12 +79,12 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         reach = np.arange(0, min(2 * r + 1, 3.5 * deviate) * scale, 2.0)
         offsets.append(np.rint(np.outer(reach, [np.cos(a), -np.sin(a) / 2])))
         weights.append(np.exp(-(reach**2) / (2 * (deviate * scale) ** 2)))
-    taps = max(len(w) for w in weights)
+    taps = -(-max(len(w) for w in weights) // 4) * 4
     offset, weight = np.zeros((batch.count, taps, 2), np.int32), np.zeros((batch.count, taps), np.float32)
     for b, (o, w) in enumerate(zip(offsets, weights, strict=True)):
         offset[b, : len(o)], weight[b, : len(w)] = o, w / w.sum()
-    inputs = [field, on(batch, offset, wp.vec2i), on(batch, weight, wp.float32)]
-    wp.launch(layers.streaks, dim=half, inputs=inputs, outputs=[layer], device=batch.device)
+    inputs = [field.flatten(), on(batch, offset, wp.vec2i), on(batch, weight, wp.float32), half[1], batch.width]
+    wp.launch(layers.streaks, dim=half, inputs=inputs, outputs=[layer.flatten()], device=batch.device)
     dim = (batch.count, batch.height)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     inputs = [

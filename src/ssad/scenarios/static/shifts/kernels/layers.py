@@ -80,32 +80,62 @@ def flakes(
                     out[b, y, x] = out[b, y, x] + part * wp.clamp(value, 0.0, 1.0)
 
 
+@wp.func
+def tap(grid: wp.array(dtype=float), row: int, columns: int, x: int) -> float:
+    """A cell of a row that begins at `row`, held at the border."""
+    return grid[row + wp.clamp(x, 0, columns - 1)]
+
+
 @wp.kernel
 def streaks(
-    grid: wp.array3d(dtype=float),
+    grid: wp.array(dtype=float),
     offsets: wp.array2d(dtype=wp.vec2i),
     weights: wp.array2d(dtype=float),
-    out: wp.array3d(dtype=float),
+    rows: int,
+    columns: int,
+    out: wp.array(dtype=float),
 ):
-    """Blurs along one direction: the weighted mean of cells at some offsets (x, y), held at the border."""
+    """Blurs along one direction: the weighted mean of cells at some offsets (x, y), held at the border.
+
+    Four offsets are taken at a time (their number is a multiple of four; the weight of those that fill up is 0).
+    """
     b, y = wp.tid()
-    rows = grid.shape[1]
-    columns = grid.shape[2]
+    here = (b * rows + y) * columns
     for x in range(columns):
-        out[b, y, x] = 0.0
-    for k in range(weights.shape[1]):
-        w = weights[b, k]
-        if w > 0.0:
-            py = wp.clamp(y + offsets[b, k][1], 0, rows - 1)
-            dx = offsets[b, k][0]
-            first = wp.clamp(-dx, 0, columns)
-            last = wp.clamp(columns - dx, 0, columns)
-            for x in range(first):
-                out[b, y, x] = out[b, y, x] + w * grid[b, py, 0]
+        out[here + x] = 0.0
+    for q in range(weights.shape[1] / 4):
+        w0 = weights[b, 4 * q]
+        w1 = weights[b, 4 * q + 1]
+        w2 = weights[b, 4 * q + 2]
+        w3 = weights[b, 4 * q + 3]
+        if w0 > 0.0:
+            o0 = offsets[b, 4 * q]
+            o1 = offsets[b, 4 * q + 1]
+            o2 = offsets[b, 4 * q + 2]
+            o3 = offsets[b, 4 * q + 3]
+            r0 = (b * rows + wp.clamp(y + o0[1], 0, rows - 1)) * columns
+            r1 = (b * rows + wp.clamp(y + o1[1], 0, rows - 1)) * columns
+            r2 = (b * rows + wp.clamp(y + o2[1], 0, rows - 1)) * columns
+            r3 = (b * rows + wp.clamp(y + o3[1], 0, rows - 1)) * columns
+            low = wp.min(wp.min(o0[0], o1[0]), wp.min(o2[0], o3[0]))
+            high = wp.max(wp.max(o0[0], o1[0]), wp.max(o2[0], o3[0]))
+            first = wp.clamp(-low, 0, columns)
+            last = wp.clamp(columns - high, first, columns)
+            r0 = r0 + o0[0]
+            r1 = r1 + o1[0]
+            r2 = r2 + o2[0]
+            r3 = r3 + o3[0]
             for x in range(first, last):
-                out[b, y, x] = out[b, y, x] + w * grid[b, py, x + dx]
-            for x in range(last, columns):
-                out[b, y, x] = out[b, y, x] + w * grid[b, py, columns - 1]
+                total = out[here + x] + w0 * grid[r0 + x]
+                total += w1 * grid[r1 + x]
+                total += w2 * grid[r2 + x]
+                out[here + x] = total + w3 * grid[r3 + x]
+            for k in range(first + columns - last):
+                x = wp.where(k < first, k, k - first + last)
+                total = out[here + x] + w0 * tap(grid, r0 - o0[0], columns, x + o0[0])
+                total += w1 * tap(grid, r1 - o1[0], columns, x + o1[0])
+                total += w2 * tap(grid, r2 - o2[0], columns, x + o2[0])
+                out[here + x] = total + w3 * tap(grid, r3 - o3[0], columns, x + o3[0])
 
 
 @wp.func
