@@ -2,12 +2,13 @@
 
     ENV/bin/python benchmarks/make_shift_reference.py
 
-in an environment of its own, as the originals are no longer kept up and need old packages:
-    uv venv ENV; uv pip install -p ENV "numpy<2" "setuptools<81" "scipy<1.13" "scikit-image<0.23" imgaug==0.4.0
-    imagecorruptions==1.1.2 opencv-python-headless
+in an environment of its own, as the originals are no longer kept up and need old packages (Python 3.11):
+    uv venv -p 3.11 ENV; uv pip install -p ENV "numpy<2" "setuptools<81" "scipy<1.13" "scikit-image<0.23" imgaug==0.4.0
+    imagecorruptions==1.1.2 "opencv-python-headless<4.12"
 
 Snow and fog: imagecorruptions (ImageNet-C); rain: imgaug's RainLayer; with the parameters, the grey and the darkening
-of 3D_Corruptions_AD (Dong et al., CVPR 2023).
+of 3D_Corruptions_AD (Dong et al., CVPR 2023; ImageAddSnow, ImageAddFog and ImageAddRain in
+TransFusion/mmdet3d/datasets/pipelines/Camera_corruptions.py at commit 0cdf2c1).
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from published_shifts import NAMES, picture, statistics  # noqa: E402
 OUT = ROOT / "tests" / "data" / "shifts" / "published.json"
 DENSITY = ((0.01, 0.06), (0.06, 0.10), (0.10, 0.15), (0.15, 0.20), (0.20, 0.25))
 GREY = {"snow": (0.3,) * 5, "rain": (0.3,) * 5, "fog": (0.1, 0.2, 0.3, 0.4, 0.5)}
-REPEATS = 24
+REPEATS = 64
 
 
 def published(name: str, severity: int, image: np.ndarray, seed: int) -> np.ndarray:

@@ -19,6 +19,7 @@ from ssad.bench.component.work import Unit, forget_failures, make_unit, read_uni
 from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.suite import load_suite
 from ssad.cli import app
+from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.errors import ConfigError, FormatError, SSADError
 from ssad.metrics.detection import score_detections
 from ssad.report import write_report
@@ -87,6 +88,10 @@ def test_random_is_put_together_from_the_severities(folder: Path, root: Path) ->
     tokens = [s["token"] for s in json.loads((root / "v1.0-ssad" / "scene.json").read_text())]
     assert drawn == {f"fog-{severity}" for severity in dealt_severities(ShiftSpec("fog"), tokens).values()}
     assert len(drawn) == len(tokens)
+    boxes = {Path(p).name: {f.stem for f in (folder / p).glob("*.npz")} for p in record["artefacts"]["detections"]}
+    with NuScenes(root) as data:
+        dealt = dealt_severities(ShiftSpec("fog"), tokens)
+        assert all(scene.name in boxes[f"fog-{dealt[scene.token]}"] for scene in data.scenes())
 
 
 def test_intervals_hold_the_value_and_replicates_are_paired(folder: Path) -> None:

@@ -109,6 +109,7 @@ def test_a_shift_changes_the_picture_the_same_way_each_time(name: str, calibrati
 @pytest.mark.parametrize("name", SHIFTS)
 def test_a_picture_does_not_depend_on_its_batch(name: str, calibration: Any, scenery: Any) -> None:
     image, frame = scenery
+    image, frame = (image[:-1], replace(frame, camera=replace(frame.camera, height=len(image) - 1)))  # an odd height
     images = np.stack([image, image[:, ::-1], 255 - image, image])
     frames = [replace(frame, sample=str(k), scene=f"scene {k % 2}", time=3.0 + k) for k in range(4)]
     specs = [ShiftSpec(name, severity, 1, calibration) for severity in (2, 5, 0, 4)]
@@ -449,14 +450,18 @@ def test_published_weather_looks_like_the_originals(name: str) -> None:
     """Statistics of imagecorruptions' snow and fog and imgaug's rain as 3D_Corruptions_AD calls them
     (`benchmarks/make_shift_reference.py`): mean, contrast, and structure by size, within what few pictures can tell."""
     published = json.loads((Path(__file__).parents[1] / "data" / "shifts" / "published.json").read_text())
-    image, repeats = picture(), 6
+    image, repeats = picture(), {"snow": 4, "rain": 12, "fog": 20}[name]
     for severity in (1, 3, 5):
         specs = [ShiftSpec(name, severity, seed, "paper") for seed in range(repeats)]
         rows = np.array([statistics(shift_images(image, None, spec)[0], image) for spec in specs])
         for column, key in enumerate(NAMES):
             mean, deviation = published["statistics"][f"{name} {severity}"][key]
-            error = np.hypot(deviation / published["repeats"] ** 0.5, rows[:, column].std(ddof=1) / repeats**0.5)
-            room = {"mean": 0.015, "contrast": 0.04}.get(key, 0.12) * mean + 3.5 * error
+            if key in ("fine", "middle", "coarse") and mean < np.log(0.5):  # grey levels: rounding
+                assert rows[:, column].max() < np.log(0.6), (severity, key)
+                continue
+            error = deviation * (1 / published["repeats"] + 1 / repeats) ** 0.5
+            room = {"mean": 1.0, "contrast": 0.01}.get(key, 0.06) + 3.5 * error
+            assert room < {"mean": 16, "contrast": 0.04}.get(key, 0.5), "no test"
             assert rows[:, column].mean() == pytest.approx(mean, abs=room), (severity, key)
 
 
@@ -471,9 +476,10 @@ def test_published_lengths_scale_with_the_picture(name: str) -> None:
     ]
     first = np.array([statistics(out, small) for out in large])
     second = np.array([statistics(shift_images(small, None, spec)[0], small) for spec in specs])
-    error = np.hypot(first.std(0, ddof=1), second.std(0, ddof=1)) / repeats**0.5
-    room = np.array([0.01, 0.02, 0.12, 0.12, 0.12]) * np.abs(first.mean(0)) + 3.5 * error
-    assert (np.abs(first.mean(0) - second.mean(0)) <= room).all(), (first.mean(0), second.mean(0))
+    error = (first - second).std(0, ddof=1) / repeats**0.5  # of pairs: the same draws in both
+    room = np.array([0.5, 0.01, 0.06, 0.06, 0.06]) + 3.5 * error
+    assert (np.abs(first - second).mean(0) <= room).all(), (first.mean(0), second.mean(0))
+    assert (room < [2, 0.03, 0.3, 0.3, 0.3]).all(), "no test"
 
 
 def test_published_sun_is_white_in_the_middle_and_never_darkens() -> None:

@@ -145,7 +145,7 @@ def main_table(run: DetectionRun) -> Table:
     elif run.suite["calibration"] == "paper":
         strength = "each sample at a severity drawn from 1 to 5"
     else:
-        strength = "each scene at one severity from 1 to 5, each severity in as many scenes"
+        strength = "each scene at one severity from 1 to 5, all five as often, give or take one"
     return Table(
         "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
         f"Percent; {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "

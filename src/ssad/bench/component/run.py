@@ -24,7 +24,7 @@ from ssad.bench.training_data import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.errors import ConfigError
-from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 from ssad.seeding import digest
 
 # a change in any of these may change a number
@@ -77,7 +77,8 @@ class Plan:
         ]  # fmt: skip
         return {
             "identity": digest("detection run", *[c["key"] for c in cells])[:16],
-            "suite": self.suite.model_dump(mode="json"), "versions": versions(self.device), "data": dict(self.data),
+            "suite": self.suite.model_dump(mode="json"), "data": dict(self.data),
+            "versions": versions(self.device) | {"shifts": str(VERSIONS[self.suite.calibration])},
             "weights": dict(self.weights), "cells": cells,
         }  # fmt: skip
 

@@ -34,9 +34,9 @@ class DetectionSuite(BaseModel):
 
     detectors: names, with weights of your own as NAME=FILE, or module:object; the first is the baseline of mCE; data:
     "recorded", or the root of a data set in the nuScenes schema, with version (default: the one that is there) and
-    split; shifts, severities: 1 to 5 or random (dealt to the scenes, each to as many; drawn by sample in the
-    calibration of the paper); replicates: of the bootstrap over scenes; reference: the published table shown beside
-    ours.
+    split; shifts, severities: 1 to 5 or random (dealt to the scenes, all as often, give or take one; drawn by
+    sample in the calibration of the paper); replicates: of the bootstrap over scenes; reference: the published table
+    shown beside ours.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)

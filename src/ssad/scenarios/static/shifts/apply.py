@@ -17,7 +17,6 @@ from ssad.scenarios.static.shifts.sun import add_sun
 from ssad.scenarios.static.shifts.weather import add_fog, add_precipitation
 from ssad.types import F32, U8
 
-_CHUNK = 64
 _ENOUGH = 100  # pixels of sky, of a picture looked at in 160 columns
 
 

@@ -1,8 +1,9 @@
 """The paper's calibration of weather, sun and motion blur: layers over a picture, with the published parameters.
 
-Each picture by itself: nothing agrees between cameras, and depth plays no part. Written from the published
-descriptions (Hendrycks and Dietterich 2019; Dong et al. 2023): equal in distribution, not in bits. Where the sources
-scale nothing, lengths in pixels hold at a width of 1600 and scale with the width.
+Each picture by itself: nothing agrees between cameras, and depth plays no part. Written from what the originals compute
+(ImageNet-C: Hendrycks and Dietterich 2019; imgaug's rain and a sun, as 3D_Corruptions_AD calls them: Dong et al. 2023).
+Snow, rain and fog have the originals' statistics, which a test holds them against; the sun follows its formula; motion
+blur its lengths. Lengths in pixels hold at a width of 1600 and scale with the width.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ def _places(scale: float) -> int:
 
 
 def _numbers(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
-    kind = np.float32 if dtype in (wp.float32, wp.vec2, wp.vec3, wp.vec4) else np.int32
-    return on(batch, np.array(values, kind), dtype)
+    """Values of each picture on the device of the batch: int32, else floats and vectors of them."""
+    return on(batch, np.array(values, np.int32 if dtype is wp.int32 else np.float32), dtype)
 
 
 def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
@@ -71,7 +72,7 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     # flakes fall steeply: half the rows lose nothing
     half = (batch.count, -(-batch.height // 2))
     field, layer = (wp.empty((*half, batch.width), dtype=float, device=batch.device) for _ in range(2))
-    inputs = [noise, _numbers(batch, steps, wp.vec2), _numbers(batch, threshold), scale, _places(scale)]
+    inputs = [noise, _numbers(batch, steps, wp.vec2), _numbers(batch, threshold), scale, _places(scale), batch.height]
     wp.launch(layers.flakes, dim=half, inputs=inputs, outputs=[field], device=batch.device)
     # half a gaussian over 2 radius + 1 published pixels, where it is more than nothing
     offsets, weights = [], []
@@ -103,7 +104,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     """
     scale = batch.width / WIDTH
     gates = np.empty((batch.count, GATE, 2 * GATE), np.float32)
-    density, length, drawn, seen, first = [], [], [], [], []
+    density, streaks, length, drawn, seen, first = [], [], [], [], [], []
     for b, (spec, frame) in enumerate(zip(specs, frames, strict=True)):
         draws = _draws(spec, frame)
         density.append(draws.uniform(*table.PAPER_RAIN[spec.severity - 1]))
@@ -114,14 +115,14 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         rough = draws.beta(1.0, max(uneven, 1e-6), (8, 8)).astype(np.float32)
         gates[b] = cv2.resize(rough, (2 * GATE, GATE), interpolation=cv2.INTER_CUBIC).clip(0, 1)
         lean = np.tan(np.radians(angle))
-        longest = speed * max(batch.height, batch.width) / scale
-        rows = max(2, round(longest * np.cos(np.radians(angle)) * cells))
+        streaks.append(speed * max(batch.height, batch.width))
+        rows = max(2, round(streaks[-1] / scale * np.cos(np.radians(angle)) * cells))
         height = int(batch.height / scale * cells) + 3 + rows
         left = max(0.0, lean) * height + 1  # columns to the left of the picture, at its first row
         length.append(rows)
         across, along = (2 * GATE) * scale / (cells * batch.width), GATE * scale / (cells * batch.height)
         drawn.append([across, lean * across, -left * across, along])
-        seen.append([cells / scale, -lean, left, 0.0])
+        seen.append([cells / scale, -lean, left])
         first.append(rows)
     inputs = [keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)]), _numbers(batch, density)]
     most = 0.6 / scale
@@ -133,15 +134,14 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     sums = [wp.zeros((batch.count, shape[2]), dtype=float, device=batch.device) for _ in range(2)]
     # the source enlarges with cubic splines and cuts off what is negative: so much more light in the mean (measured)
     gain = [1.28 - 0.95 * d + 0.9 * d**2 for d in density]
-    block = (
-        64 if batch.device == "cpu" else 1
-    )  # columns a thread: neighbours in memory, or as many threads as there are
+    # columns a thread: neighbours in memory, or as many threads as there can be
+    block = 64 if batch.device == "cpu" else 1
     inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), block, *sums]
     dim = (batch.count, -(-shape[2] // block))
     wp.launch(layers.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
     dim = (batch.count, batch.height)
     hidden = wp.empty((*dim, batch.width), dtype=wp.uint8, device=batch.device)
-    inputs = [layer, _numbers(batch, seen, wp.vec4), _numbers(batch, first), _places(scale)]
+    inputs = [layer, _numbers(batch, seen, wp.vec3), _numbers(batch, first), _places(scale)]
     wp.launch(layers.curtain, dim=dim, inputs=inputs, outputs=[hidden], device=batch.device)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
@@ -150,8 +150,8 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     inputs = [batch.words(), parts, table.PAPER_GREY, batch.width, batch.stride // 4, highest]
     wp.launch(layers.blend_rain, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
     _darken(out, highest)
-    told = zip(density, length, strict=True)
-    return out, [Applied(True, {"density": round(float(d), 3), "cells": int(n)}) for d, n in told]
+    told = zip(density, streaks, strict=True)
+    return out, [Applied(True, {"density": round(float(d), 3), "streak_px": round(float(n))}) for d, n in told]
 
 
 def _darken(out: Batch, highest: Any) -> None:

@@ -87,7 +87,8 @@ def random_severity(spec: ShiftSpec, scene: str, sample: str) -> int:
 def dealt_severities(spec: ShiftSpec, scenes: Iterable[str]) -> dict[str, int]:
     """Severity 1 to 5 of each scene, dealt: each severity as often as any other, give or take one.
 
-    Draws of one scene by itself (`random_severity`) make the mean severity of a few dozen scenes a matter of luck.
+    For the physical calibration, where a scene has one. Draws of one scene by itself (`random_severity`) make the mean
+    severity of a few dozen scenes a matter of luck; here it depends on which other scenes there are.
     """
     order = sorted(set(scenes), key=lambda scene: (spec.key("deal", scene), scene))
     first = int(spec.generator("deal").integers(5))

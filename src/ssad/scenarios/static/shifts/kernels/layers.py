@@ -2,10 +2,20 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import FIELDS, ONES, byte, cell, draw, gather, pixel_of, spread, unit
+from ssad.scenarios.static.shifts.kernels.shared import (
+    FIELDS,
+    ONES,
+    TENS,
+    byte,
+    cell,
+    draw,
+    gather,
+    pixel_of,
+    spread,
+    unit,
+)
 
 OVER = wp.constant(wp.uint64(256 + (256 << 21) + (256 << 42)))
-WIDE = wp.constant(wp.uint64(1023 + (1023 << 21) + (1023 << 42)))
 
 
 @wp.kernel
@@ -48,11 +58,13 @@ def flakes(
     threshold: wp.array(dtype=float),
     scale: float,
     places: int,
+    height: int,
     out: wp.array3d(dtype=float),
 ):
     """The noise enlarged, 0 under the threshold, at most 1; two rows of pixels in one, places x places in each pixel.
 
-    step: cells a published pixel along y and x; scale: pixels of the picture a published pixel.
+    height: of the picture, whose last row stands for one beyond it; step: cells a published pixel along y and x;
+    scale: pixels of the picture a published pixel.
     """
     b, y = wp.tid()
     share = 1.0 / float(places)
@@ -61,7 +73,8 @@ def flakes(
     for x in range(out.shape[2]):
         out[b, y, x] = 0.0
     for j in range(2 * places):
-        fy = ((float(2 * y) + (float(j) + 0.5) * share) / scale - 0.5) * step[b][0]
+        line = wp.min(2 * y + j / places, height - 1)
+        fy = ((float(line) + (float(j % places) + 0.5) * share) / scale - 0.5) * step[b][0]
         row = int(wp.floor(fy))
         fraction = fy - float(row)
         column = int(-2)
@@ -168,7 +181,7 @@ def snowed(pixel: wp.uint32, part: int, add: int) -> wp.uint64:
         light = wp.uint64(wp.max(r, white)) | (wp.uint64(wp.max(g, white)) << wp.uint64(21))
         light = light | (wp.uint64(wp.max(w, white)) << wp.uint64(42))
     light = fields * wp.uint64(part) + light * wp.uint64(256 - part)
-    total = ((light >> wp.uint64(8)) & WIDE) + wp.uint64(add) * ONES
+    total = ((light >> wp.uint64(8)) & TENS) + wp.uint64(add) * ONES
     over = ((total >> wp.uint64(8)) | (total >> wp.uint64(9))) & ONES
     return (total | (over * wp.uint64(255))) & FIELDS
 
@@ -259,8 +272,9 @@ def fall(
     wedge: wp.array2d(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums;
-    so many columns a thread. box, wedge: zeros."""
+    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums; so
+    many columns a thread. box, wedge: zeros.
+    """
     b, block = wp.tid()
     k = length[b]
     unit_weight = 2.0 * gain[b] / (float(k) * float(k + 1))
@@ -288,14 +302,14 @@ def rained(pixel: wp.uint32, part: int) -> wp.uint64:
 @wp.kernel
 def curtain(
     layer: wp.array3d(dtype=float),
-    place: wp.array(dtype=wp.vec4),
+    place: wp.array(dtype=wp.vec3),
     first: wp.array(dtype=float),
     places: int,
     out: wp.array3d(dtype=wp.uint8),
 ):
-    """How much of each pixel the drops hide, of 255: 1.3 times the layer, the mean of `places` places.
+    """How much of each pixel the drops hide, of 256, at most 255: 1.3 times the layer, the mean of `places` places.
 
-    place: cells of the layer a pixel, columns a row, first column; first row.
+    place: cells of the layer a pixel, columns a row, first column; first: row of the layer where the picture begins.
     """
     b, y = wp.tid()
     step = place[b]
@@ -332,8 +346,10 @@ def blend_rain(
     highest: wp.array2d(dtype=int),
     out: wp.array(dtype=wp.uint32),
 ):
-    """Drops of grey level 240 over the image, then grey; notes the brightest value of each row. layer: four pixels a
-    word; four pixels of the image are three."""
+    """Drops of grey level 240 over the image, then grey; notes the brightest value of each row.
+
+    layer: what the drops hide of each pixel, of 256, four pixels a word; four pixels of the image are three words.
+    """
     b, y = wp.tid()
     rest = wp.uint64(int((1.0 - grey) * 1024.0))
     base = wp.uint64(int(128.0 * grey * 1024.0) + 512) * ONES

@@ -77,6 +77,8 @@ def value_noise(key: wp.uint64, p: wp.vec3) -> float:
 FIELDS = wp.constant(wp.uint64(255 + (255 << 21) + (255 << 42)))
 HALF = wp.constant(wp.uint64(512 + (512 << 21) + (512 << 42)))
 ONES = wp.constant(wp.uint64(1 + (1 << 21) + (1 << 42)))
+# fields of ten bits
+TENS = wp.constant(wp.uint64(1023 + (1023 << 21) + (1023 << 42)))
 
 
 @wp.func

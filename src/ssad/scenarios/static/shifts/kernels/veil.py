@@ -6,6 +6,7 @@ from ssad.scenarios.static.shifts.kernels.shared import (
     FIELDS,
     HALF,
     ONES,
+    TENS,
     blend,
     cell,
     fields_of,
@@ -235,10 +236,6 @@ def lit(pixel: wp.uint32, gain: wp.uint64, tint: wp.uint64, light: float) -> wp.
     total = ((spread(pixel) * gain + tint * bright + HALF) >> wp.uint64(10)) & TENS
     over = ((total >> wp.uint64(8)) | (total >> wp.uint64(9))) & ONES
     return gather((total | (over * wp.uint64(255))) & FIELDS)
-
-
-# fields of ten bits
-TENS = wp.constant(wp.uint64(1023 + (1023 << 21) + (1023 << 42)))
 
 
 @wp.kernel
