@@ -18,7 +18,7 @@ import warp as wp
 from ssad.frames import Applied, Frame
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
-from ssad.scenarios.static.shifts.kernels import layers
+from ssad.scenarios.static.shifts.kernels import falling, layers
 from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
 from ssad.scenarios.static.shifts.spec import ShiftSpec
@@ -68,12 +68,12 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     noise = wp.empty(small, dtype=float, device=batch.device)
     keys = keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)])
     inputs = [keys, _numbers(batch, mean), _numbers(batch, deviation), _numbers(batch, unit_normal())]
-    wp.launch(layers.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=batch.device)
+    wp.launch(falling.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=batch.device)
     # flakes fall steeply: half the rows lose nothing
     half = (batch.count, -(-batch.height // 2))
     field, layer = (wp.empty((*half, batch.width), dtype=float, device=batch.device) for _ in range(2))
     inputs = [noise, _numbers(batch, steps, wp.vec2), _numbers(batch, threshold), scale, _places(scale), batch.height]
-    wp.launch(layers.flakes, dim=half, inputs=inputs, outputs=[field], device=batch.device)
+    wp.launch(falling.flakes, dim=half, inputs=inputs, outputs=[field], device=batch.device)
     # half a gaussian over 2 radius + 1 published pixels, where it is more than nothing
     offsets, weights = [], []
     for a, r, deviate in zip(np.radians(angle), radius, sigma, strict=True):
@@ -85,14 +85,14 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     for b, (o, w) in enumerate(zip(offsets, weights, strict=True)):
         offset[b, : len(o)], weight[b, : len(w)] = o, w / w.sum()
     inputs = [field.flatten(), on(batch, offset, wp.vec2i), on(batch, weight, wp.float32), half[1], batch.width]
-    wp.launch(layers.streaks, dim=half, inputs=inputs, outputs=[layer.flatten()], device=batch.device)
+    wp.launch(falling.streaks, dim=half, inputs=inputs, outputs=[layer.flatten()], device=batch.device)
     dim = (batch.count, batch.height)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     inputs = [
         batch.words(), layer.flatten(), _numbers(batch, keep), table.PAPER_GREY, batch.height, batch.width,
         batch.stride // 4, highest,
     ]  # fmt: skip
-    wp.launch(layers.blend_snow, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
+    wp.launch(falling.blend_snow, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
     _darken(out, highest)
     return out, [Applied(True, {"angle_deg": round(float(a), 1)}) for a in angle]
 
@@ -130,7 +130,7 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     shape = (batch.count, rows, columns + int(np.ceil(rows * np.tan(np.radians(15)))))
     salt, layer = (wp.empty(shape, dtype=float, device=batch.device) for _ in range(2))
     inputs += [_numbers(batch, drawn, wp.vec4), _numbers(batch, first), on(batch, gates, wp.float32)]
-    wp.launch(layers.drops, dim=shape[:2], inputs=inputs, outputs=[salt], device=batch.device)
+    wp.launch(falling.drops, dim=shape[:2], inputs=inputs, outputs=[salt], device=batch.device)
     sums = [wp.zeros((batch.count, shape[2]), dtype=float, device=batch.device) for _ in range(2)]
     # the source enlarges with cubic splines and cuts off what is negative: so much more light in the mean (measured)
     gain = [1.28 - 0.95 * d + 0.9 * d**2 for d in density]
@@ -138,17 +138,17 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     block = 64 if batch.device == "cpu" else 1
     inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), block, *sums]
     dim = (batch.count, -(-shape[2] // block))
-    wp.launch(layers.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
+    wp.launch(falling.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
     dim = (batch.count, batch.height)
     hidden = wp.empty((*dim, batch.width), dtype=wp.uint8, device=batch.device)
     inputs = [layer, _numbers(batch, seen, wp.vec3), _numbers(batch, first), _places(scale)]
-    wp.launch(layers.curtain, dim=dim, inputs=inputs, outputs=[hidden], device=batch.device)
+    wp.launch(falling.curtain, dim=dim, inputs=inputs, outputs=[hidden], device=batch.device)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
     parts = wp.array(ptr=hidden.ptr, dtype=wp.uint32, shape=size, device=batch.device)
     parts._keep = hidden  # the memory belongs to the bytes
     inputs = [batch.words(), parts, table.PAPER_GREY, batch.width, batch.stride // 4, highest]
-    wp.launch(layers.blend_rain, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
+    wp.launch(falling.blend_rain, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
     _darken(out, highest)
     told = zip(density, streaks, strict=True)
     return out, [Applied(True, {"density": round(float(d), 3), "streak_px": round(float(n))}) for d, n in told]
@@ -162,7 +162,7 @@ def _darken(out: Batch, highest: Any) -> None:
     chunk = max(256, out.width * 3 // 4)
     dim = (out.count, -(-words // chunk))
     inputs = [on(out, gain, wp.int32), words, chunk]
-    wp.launch(layers.darken, dim=dim, inputs=inputs, outputs=[out.words()], device=out.device)
+    wp.launch(falling.darken, dim=dim, inputs=inputs, outputs=[out.words()], device=out.device)
 
 
 def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
