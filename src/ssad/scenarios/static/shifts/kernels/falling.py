@@ -158,6 +158,19 @@ def greyed(fields: wp.uint64, rest: wp.uint64, base: wp.uint64) -> wp.uint64:
 
 
 @wp.func
+def put(
+    out: wp.array(dtype=wp.uint32), i: int, most: int, f0: wp.uint64, f1: wp.uint64, f2: wp.uint64, f3: wp.uint64
+) -> int:
+    """Writes four pixels, given as fields, to three words from i on; the largest value so far."""
+    p1 = gather(f1)
+    p2 = gather(f2)
+    out[i] = gather(f0) | (p1 << wp.uint32(24))
+    out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+    out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+    return most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
+
+
+@wp.func
 def snowed(pixel: wp.uint32, part: int, add: int) -> wp.uint64:
     """A pixel whitened by 1 - part / 256 and made brighter by `add`, at most 255, as fields."""
     r = int(pixel & wp.uint32(255))
@@ -213,12 +226,7 @@ def blend_snow(
         f1 = greyed(f1, rest, base)
         f2 = greyed(f2, rest, base)
         f3 = greyed(f3, rest, base)
-        most = most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
-        p1 = gather(f1)
-        p2 = gather(f2)
-        out[i] = gather(f0) | (p1 << wp.uint32(24))
-        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-        out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+        most = put(out, i, most, f0, f1, f2, f3)
         i += 3
         here += 4
         turned -= 4
@@ -358,12 +366,7 @@ def blend_rain(
         f1 = greyed(f1, rest, base)
         f2 = greyed(f2, rest, base)
         f3 = greyed(f3, rest, base)
-        most = most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
-        p1 = gather(f1)
-        p2 = gather(f2)
-        out[i] = gather(f0) | (p1 << wp.uint32(24))
-        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-        out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+        most = put(out, i, most, f0, f1, f2, f3)
         i += 3
     highest[b, y] = most
 
