@@ -21,14 +21,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import warp as wp
 
-from ssad.camera.bodies import draw_paint, make_body
+from ssad.assets.bodies import draw_paint, make_body
+from ssad.assets.street import build_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.stage import Stage, Thing
-from ssad.camera.street import build_street
+from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import apply_taps, taps_of, texture_gradient
-from ssad.frames import FORWARD, Camera
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.seeding import generator
 from ssad.roads import load_town
-from ssad.seeding import generator
 
 
 def place(x: float, y: float, yaw: float) -> Any:
@@ -39,12 +39,12 @@ def place(x: float, y: float, yaw: float) -> Any:
     return pose
 
 
-def scene(size: int, device: str) -> tuple[Stage, View]:
+def scene(size: int, device: str) -> tuple[Scene, View]:
     """A stage and a view with 30 vehicles on the lanes before the camera."""
     graph = load_town("Twinford")
     kinds = ["car"] * 7 + ["truck", "bus", "motorcycle"]
     meshes = [make_body(kind, generator=generator("camera speed", k)) for k, kind in enumerate(kinds)]
-    stage = Stage(build_street(graph, seed=0), meshes, device=device)
+    stage = Scene(build_street(graph, seed=0), meshes, device=device)
     lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == 1 and graph.junction[k] < 0]
     start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
     first = graph.offset[start] + 6

@@ -19,10 +19,10 @@ from typing import Any
 
 import torch
 
-from ssad.detections import CLASSES_3D, Solids, Truth
+from ssad.core.detections import CLASSES_3D, Solids, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors import make_detector
-from ssad.detectors.adapters.zoo import torchvision_detector
-from ssad.errors import ConfigError
+from ssad.detectors.adapters.torchvision_models import torchvision_detector
 
 CASES = {  # name -> height, width
     "fcos3d-light": (450, 800), "pgd-det-light": (450, 800), "fcos3d": (450, 800), "pgd-det": (450, 800),

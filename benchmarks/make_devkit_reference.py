@@ -20,7 +20,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.devkit_sets import SETS, SPLIT, VERSION, write_set  # noqa: E402
 
-from ssad.safeio import write_atomic  # noqa: E402
+from ssad.core.safeio import write_atomic  # noqa: E402
 
 
 def main() -> None:

@@ -29,15 +29,15 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.devkit_sets import PIXEL, SIZES, VERSION  # noqa: E402
 
+from ssad.core.safeio import write_atomic  # noqa: E402
+from ssad.core.seeding import digest, generator  # noqa: E402
 from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES  # noqa: E402
-from ssad.safeio import write_atomic  # noqa: E402
-from ssad.seeding import digest, generator  # noqa: E402
 
 # about the shares of the classes in nuScenes
 SHARE = np.array([0.43, 0.08, 0.015, 0.023, 0.013, 0.20, 0.011, 0.01, 0.09, 0.13])
 OURS = """
 import json, sys
-from ssad.bench.score import score_results
+from ssad.evaluation.score import score_results
 root, out = sys.argv[1:]
 found = score_results(root + "/results.json", dataroot=root, version="v1.0-mini", split="mini_val")
 json.dump(found, open(out, "w"))

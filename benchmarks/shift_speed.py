@@ -26,8 +26,8 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.datasets.nuscenes.files import decode_image, encode_jpeg
-from ssad.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, rotation_matrix
+from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, rotation_matrix
+from ssad.core.images import decode_image, encode_jpeg
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_images
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
 

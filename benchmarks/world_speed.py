@@ -19,9 +19,9 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ssad.core.types import Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.types import Controller
 from ssad.world.world import World
 
 

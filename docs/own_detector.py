@@ -1,4 +1,4 @@
-"""A detector of one's own: a small anchor-free network on cells of 8 pixels, held to `ssad.protocols.Detector`."""
+"""A detector of one's own: a small anchor-free network on cells of 8 pixels, held to `ssad.core.protocols.Detector`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot, pad, softplus
 from torchvision.ops import generalized_box_iou_loss, sigmoid_focal_loss
 
-from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums, suppress
-from ssad.errors import ConfigError
+from ssad.core.errors import ConfigError
 
 STRIDE = 8
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from ssad import cli
-from ssad.bench.toolbox.sheet import pick_frame
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.tiny import make_tiny
+from ssad.toolbox.contact_sheet import pick_frame
 
 
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str, str]:

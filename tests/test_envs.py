@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ssad.errors import UnknownNameError
+from ssad.core.errors import UnknownNameError
 
 ID = "ssad.envs:SSAD/Driving-v0"
 

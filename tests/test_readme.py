@@ -18,7 +18,7 @@ def block(language: str) -> str:
 
 
 def test_a_driving_system_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ssad.agents import make_system
+    from ssad.drivers import make_system
     from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
     from ssad.world.rollout import rollout

@@ -8,23 +8,23 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ssad.version import __version__
+from ssad.core.version import __version__
 
 if TYPE_CHECKING:
-    from ssad.agents import make_system as make_system
-    from ssad.errors import SSADError as SSADError
+    from ssad.core.errors import SSADError as SSADError
+    from ssad.core.protocols import DrivingSystem as DrivingSystem
+    from ssad.core.protocols import Observation as Observation
+    from ssad.core.types import Controller as Controller
+    from ssad.core.types import Episode as Episode
+    from ssad.core.types import EpisodeTrace as EpisodeTrace
+    from ssad.core.types import Scenario as Scenario
+    from ssad.drivers import make_system as make_system
     from ssad.metrics import aggregate as aggregate
     from ssad.metrics import episode_metrics as episode_metrics
-    from ssad.protocols import DrivingSystem as DrivingSystem
-    from ssad.protocols import View as View
     from ssad.roads import load_town as load_town
     from ssad.scenarios.dynamic import build_episode as build_episode
     from ssad.scenarios.dynamic import load_scenarios as load_scenarios
     from ssad.scenarios.dynamic import save_scenarios as save_scenarios
-    from ssad.types import Controller as Controller
-    from ssad.types import Episode as Episode
-    from ssad.types import EpisodeTrace as EpisodeTrace
-    from ssad.types import Scenario as Scenario
     from ssad.world.check import check_world as check_world
     from ssad.world.env import VectorEnv as VectorEnv
     from ssad.world.rollout import rollout as rollout
@@ -32,20 +32,20 @@ if TYPE_CHECKING:
     from ssad.world.world import World as World
 
 _WHERE = {
-    "make_system": "agents",
-    "SSADError": "errors",
+    "make_system": "drivers",
+    "SSADError": "core.errors",
     "aggregate": "metrics",
     "episode_metrics": "metrics",
-    "DrivingSystem": "protocols",
-    "View": "protocols",
+    "DrivingSystem": "core.protocols",
+    "Observation": "core.protocols",
     "load_town": "roads",
     "build_episode": "scenarios.dynamic",
     "load_scenarios": "scenarios.dynamic",
     "save_scenarios": "scenarios.dynamic",
-    "Controller": "types",
-    "Episode": "types",
-    "EpisodeTrace": "types",
-    "Scenario": "types",
+    "Controller": "core.types",
+    "Episode": "core.types",
+    "EpisodeTrace": "core.types",
+    "Scenario": "core.types",
     "check_world": "world.check",
     "VectorEnv": "world.env",
     "rollout": "world.rollout",

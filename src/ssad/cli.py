@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from ssad.errors import ConfigError, SSADError, unknown_name
+from ssad.core.errors import ConfigError, SSADError, unknown_name
 
 app = typer.Typer(
     help="SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?",
@@ -49,10 +49,11 @@ def run(
     from rich.console import Console
 
     from ssad.bench.pictures import make_pictures
-    from ssad.bench.run import pick_device, plan
+    from ssad.bench.run import plan
     from ssad.bench.run import run as run_plan
     from ssad.bench.suite import Suite, load_suite
     from ssad.bench.summary import name_of, shift_table, table
+    from ssad.jobs.machine import pick_device
 
     chosen = load_suite(suite, settings or [])
     folder = out or Path("runs") / chosen.name
@@ -89,7 +90,7 @@ def run(
 @app.command()
 def report(folder: Dir) -> None:
     """Write DIR/report.html and DIR/tables from the results in DIR."""
-    from ssad.bench.store import read_run
+    from ssad.jobs.store import read_run
     from ssad.report import write_report
 
     read_run(folder)
@@ -108,9 +109,9 @@ def replay(
     Exit code 1 when the two differ.
     """
     from ssad.bench.replay import replay as run_again
+    from ssad.core.safeio import make_folder
+    from ssad.core.traces import save_trace
     from ssad.report import write_video
-    from ssad.safeio import make_folder
-    from ssad.traces import save_trace
 
     found = run_again(folder, cell)
     target = make_folder(out or folder / "replays") / found.cell.key
@@ -165,7 +166,7 @@ def shift(
 
     Run the same command again to go on after a stop. Exit code 1: some files failed, or are not as the manifest says.
     """
-    from ssad.bench.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
+    from ssad.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
 
     if verify:
         raise typer.Exit(verify_folder(out))
@@ -218,8 +219,8 @@ def score(
     """
     from rich.console import Console
 
-    from ssad.bench.score import score_results, tables, write_summary
-    from ssad.bench.toolbox.commands import checked
+    from ssad.evaluation.score import score_results, tables, write_summary
+    from ssad.toolbox.commands import checked
 
     found = score_results(
         results, dataroot=dataroot, version=version, split=split, replicates=intervals, check=checked(dataroot)
@@ -259,8 +260,8 @@ def record(
     from rich.console import Console
     from rich.progress import Progress
 
-    from ssad.bench.record import Recording, record_nuscenes
-    from ssad.bench.run import pick_device
+    from ssad.jobs.machine import pick_device
+    from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -278,7 +279,7 @@ def record(
             bar.update(task, completed=done, total=of)
 
         if clips is not None:
-            from ssad.bench.clips import Clips, pair_images, record_clips
+            from ssad.recording.clip_recorder import Clips, pair_images, record_clips
 
             pairs = pair_images(names(towns), names(images))
             todo = Clips(
@@ -325,7 +326,7 @@ def train_detector(
     ] = None,
 ) -> None:
     """Train a detector; validates on towns that it does not learn from."""
-    from ssad.bench.train import Plan, parse_changes, run_training
+    from ssad.training.detector import Plan, parse_changes, run_training
 
     plan = Plan(
         recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
@@ -345,8 +346,8 @@ def _scenario_list() -> dict[str, str]:
 
 
 def _system_list() -> dict[str, str]:
-    from ssad.agents import SYSTEMS
-    from ssad.registry import names
+    from ssad.core.registry import names
+    from ssad.drivers import SYSTEMS
 
     return names("system", SYSTEMS) | {"module:object": "a driving system of your own, see README"}
 
@@ -383,7 +384,7 @@ def _detector_list() -> dict[str, str]:
 
 
 def _recipe_list() -> dict[str, str]:
-    from ssad.detectors.training.recipe import RECIPES
+    from ssad.training.recipe import RECIPES
 
     return {
         name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
@@ -432,9 +433,9 @@ def import_map(
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: that of the file]")] = None,
 ) -> None:
     """Turn an OpenDRIVE map into a town (needs the extra `carla`)."""
+    from ssad.core.safeio import home
     from ssad.roads import import_map as bake
     from ssad.roads import load_town, town_names
-    from ssad.safeio import home
 
     label = name or file.stem
     if town_names().get(label) == "built-in":
@@ -449,7 +450,7 @@ def import_routes(
     name: Annotated[str | None, typer.Option(help="Name of the set.  [default: that of the folder]")] = None,
 ) -> None:
     """Turn a folder of routes into a set of scenarios that suites can name."""
-    from ssad.safeio import home
+    from ssad.core.safeio import home
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
 
@@ -468,7 +469,7 @@ def import_routes(
 @app.command()
 def doctor() -> None:
     """Say what works on this machine and what is missing. Exit code 1 when nothing can run."""
-    from ssad.bench.doctor import examine
+    from ssad.doctor import examine
 
     broken = False
     for finding in examine():

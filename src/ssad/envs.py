@@ -19,7 +19,7 @@ from ssad.roads import LaneGraph, load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 
 if TYPE_CHECKING:
-    from ssad.types import Episode
+    from ssad.core.types import Episode
     from ssad.world.env import SingleEnv, VectorEnv
 
 ID = "SSAD/Driving-v0"

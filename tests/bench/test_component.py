@@ -16,19 +16,19 @@ from ssad.bench.component.pictures import draw_detections
 from ssad.bench.component.run import plan_detection, run_detection
 from ssad.bench.component.suite import SHIFTS, DetectionSuite
 from ssad.bench.component.work import Unit, forget_failures, make_unit, read_unit
-from ssad.bench.record import Recording, record_nuscenes
 from ssad.bench.suite import load_suite
 from ssad.cli import app
+from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.errors import ConfigError, FormatError, SSADError
 from ssad.metrics.detection import score_detections
+from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.report import write_report
 from ssad.report.detection import left_table, load_detection_run, main_table, robustness_table
 from ssad.report.load import load_header
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
 from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
-from ssad.seeding import generator
 
 ORACLE = "helpers.oracle3d:build"
 TOWNS = ["Larkhill", "Oldmarket"]
@@ -197,8 +197,8 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
 
 
 def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None:
-    from ssad.bench.detect import box_table
     from ssad.datasets.nuscenes.truth import read_truth
+    from ssad.evaluation.detection import box_table
     from ssad.metrics.detection_boxes import filter_boxes
 
     truth = read_truth(root, "v1.0-ssad")

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssad.bench.gallery import CLASSES, RIG, class_sheet, rig_camera
-from ssad.bench.onboard import BODY, above, body_of, moments, onboard_sheet, pick_trace, things_at
+from ssad.assets.bodies import BODIES
 from ssad.bench.pictures import make_pictures
-from ssad.camera.bodies import BODIES
+from ssad.camera.rig import RIG, rig_camera
 from ssad.datasets.nuscenes.schema import CLASSES as NUSCENES
+from ssad.recording.camera_sheets import CLASSES, class_sheet
+from ssad.recording.onboard import BODY, above, body_of, moments, onboard_sheet, pick_trace, things_at
 from ssad.roads import load_town
 from ssad.world.models import MODELS
 from ssad.world.rollout import rollout
@@ -44,7 +45,7 @@ def test_the_rig_is_that_of_nuscenes() -> None:
 
 
 def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
-    from ssad.agents import make_system
+    from ssad.drivers import make_system
     from ssad.scenarios.dynamic import build_episode, load_scenarios
 
     scenario = next(s for s in load_scenarios("precrash") if s.name == "StraightObstacle/00")

@@ -17,12 +17,12 @@ from rich.console import Console
 
 from ssad.bench.replay import replay
 from ssad.bench.run import plan, run
-from ssad.bench.store import read_lines
 from ssad.bench.suite import Suite
 from ssad.bench.summary import table
-from ssad.errors import ConfigError, RouteError, SSADError, StoreError
-from ssad.safeio import read_json
-from ssad.traces import load_trace, save_trace
+from ssad.core.errors import ConfigError, RouteError, SSADError, StoreError
+from ssad.core.safeio import read_json
+from ssad.core.traces import load_trace, save_trace
+from ssad.jobs.store import read_lines
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
 

@@ -11,7 +11,7 @@ from helpers.suites import fake_plan, fake_scenario
 
 from ssad.bench.cells import find_cell, make_cells
 from ssad.bench.suite import Suite, load_suite, suite_files
-from ssad.errors import ConfigError, SSADError, UnknownNameError
+from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 
 GOOD = "name: mine\nsystems: [blind]\nscenarios: [precrash]\n"
 

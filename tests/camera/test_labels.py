@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ssad.camera.bodies import make_body
+from ssad.assets.bodies import make_body
+from ssad.assets.mesh import Material, box
 from ssad.camera.labels import Labels, extents, label_picture, visibility_token, visible_share
-from ssad.camera.mesh import Material, box
 from ssad.camera.render import Picture, View, render
-from ssad.camera.stage import Stage, Thing
-from ssad.errors import ConfigError
-from ssad.frames import Camera
-from ssad.seeding import generator
+from ssad.camera.scene import Scene, Thing
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.seeding import generator
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 319.5], [0, FOCAL, 179.5], [0, 0, 1]]))
@@ -28,10 +28,10 @@ GREY = Material("grey", (0.5, 0.5, 0.5))
 
 
 @functools.cache
-def stage() -> Stage:
+def stage() -> Scene:
     """Mesh 0: a box 0.5 x 2 x 2 m about (0.25, 0, 1.5), its front at x = 0; then bodies."""
     slab = box((0.5, 2.0, 2.0), centre=(0.25, 0.0, 1.5), material=GREY)
-    return Stage(None, [slab, *(make_body(kind, generator=generator("labels", kind)) for kind in BODIES)])
+    return Scene(None, [slab, *(make_body(kind, generator=generator("labels", kind)) for kind in BODIES)])
 
 
 def at(x: float, y: float = 0.0, *, mesh: int = 0, tag: int = 1, yaw: float = 0.0) -> Thing:

@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.camera.bodies import make_body
+from ssad.assets.bodies import make_body
+from ssad.assets.mesh import Material, Mesh, box, build, sphere
+from ssad.assets.street.model import Street
 from ssad.camera.lidar import HDL32E, Lidar, points_in_boxes, sweep
-from ssad.camera.mesh import Material, Mesh, box, build, sphere
-from ssad.camera.stage import Stage, Thing
-from ssad.camera.street.model import Street
-from ssad.errors import ConfigError
-from ssad.frames import Boxes3D, rotation_matrix
-from ssad.seeding import generator
+from ssad.camera.scene import Scene, Thing
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Boxes3D, rotation_matrix
+from ssad.core.seeding import generator
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
 PAINT = Material("paint", (0.4, 0.4, 0.4), paint=True)
@@ -34,11 +34,11 @@ def plane() -> Mesh:
 
 
 @functools.cache
-def stage() -> Stage:
+def stage() -> Scene:
     meshes = [plane(), sphere(RADIUS, material=GREY, segments=256), box(SIZE, material=GREY)]
     meshes += [make_body("car", generator=generator("lidar"), detail=1), box(SIZE, material=PAINT)]
     meshes += [box((0.01, 60.0, 60.0), material=GLASS), box((1.0, 60.0, 60.0), material=GREY)]
-    return Stage(None, meshes)
+    return Scene(None, meshes)
 
 
 def at(x: float, y: float = 0.0, z: float = 0.0, *, mesh: int, tag: int = 1, yaw: float = 0.0) -> Thing:
@@ -171,7 +171,7 @@ def loose_street(count: int) -> Street:
 def test_a_street_equals_a_plain_search_over_its_triangles() -> None:
     street = loose_street(300)
     block = at(5.0, 0.0, 1.8, mesh=0)
-    town = Stage(street, [box(SIZE, material=GREY)])
+    town = Scene(street, [box(SIZE, material=GREY)])
     lidar = replace(COARSE, blind=0.0)
     points, tags = sweep(town, lidar, ego(), [block], key=(1,))
     a, b, c = np.moveaxis(street.vertices[street.faces[::2]].astype(np.float64), 1, 0)
@@ -262,7 +262,7 @@ def test_the_same_key_gives_the_same_bytes() -> None:
     first = sweep(stage(), lidar, ego(), things, key=(3, "a"))
     again = sweep(stage(), lidar, ego(), things[::-1], key=(3, "a"))
     other = sweep(stage(), lidar, ego(), things, key=(3, "b"))
-    fresh = Stage(None, [plane(), *[make_body("car", generator=generator("lidar"), detail=1)] * 3])
+    fresh = Scene(None, [plane(), *[make_body("car", generator=generator("lidar"), detail=1)] * 3])
     anew = sweep(fresh, lidar, ego(), [replace(t, mesh=min(t.mesh, 1)) for t in things], key=(3, "a"))
     for a, b, c in zip(first, again, anew, strict=True):
         assert a.tobytes() == b.tobytes() == c.tobytes()

@@ -11,14 +11,14 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.camera import mesh as meshes
+from ssad.assets import mesh as meshes
+from ssad.assets.mesh import Material, build
 from ssad.camera.kernels import raster
-from ssad.camera.mesh import Material, build
 from ssad.camera.render import View, Weather, light_of, render, response
-from ssad.camera.stage import Stage, Thing
+from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import apply_taps, levels_of, pyramid, pyramid_transpose, taps_of, texture_gradient
-from ssad.errors import ConfigError
-from ssad.frames import FORWARD, Camera
+from ssad.core.errors import ConfigError
+from ssad.core.frames import FORWARD, Camera
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
@@ -114,15 +114,15 @@ def place(x: float, y: float, z: float = 0.0) -> Any:
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
-    return Stage(None, [ground(), cube()])
+def stage() -> Scene:
+    return Scene(None, [ground(), cube()])
 
 
 def scene(*things: Thing, weather: Weather = NOON) -> View:
     return View(CAMERA, FORWARD, (Thing(0, np.eye(4)), *things), weather)
 
 
-def test_depth_tags_and_the_nuscenes_camera_model(stage: Stage) -> None:
+def test_depth_tags_and_the_nuscenes_camera_model(stage: Scene) -> None:
     picture = render(stage, [scene(Thing(1, place(12.0, 0.5), tag=7))], shadows=False)
     tag, depth = picture.tag[0], picture.depth[0]
     assert (tag[:10] == -1).all()
@@ -140,7 +140,7 @@ def test_depth_tags_and_the_nuscenes_camera_model(stage: Stage) -> None:
     assert np.median(depth[tag == 7]) == pytest.approx(z, rel=1e-4)
 
 
-def test_a_view_does_not_depend_on_its_batch(stage: Stage) -> None:
+def test_a_view_does_not_depend_on_its_batch(stage: Scene) -> None:
     views = [
         scene(
             Thing(1, place(9.0 + k, k - 1.0), (0.1 * k, 0.3, 0.2), tag=k + 1),
@@ -155,7 +155,7 @@ def test_a_view_does_not_depend_on_its_batch(stage: Stage) -> None:
         assert (alone.tag[0] == together.tag[k]).all()
 
 
-def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Stage) -> None:
+def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Scene) -> None:
     weather = Weather(sun_height=0.6, sun_heading=np.pi / 2, clouds=0.0)  # from the left: the shadow falls to the right
     with_box = render(stage, [scene(Thing(1, place(12.0, 0.0), tag=1), weather=weather)])
     without = render(stage, [scene(weather=weather)])
@@ -170,7 +170,7 @@ def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Stage) -> 
     assert light[0][1] > 0.8
 
 
-def test_coverage_is_averaged_over_samples(stage: Stage) -> None:
+def test_coverage_is_averaged_over_samples(stage: Scene) -> None:
     """The mean radiance hardly changes with the number of samples; edges get between values."""
     view = scene(Thing(1, place(9.0, 0.3), (0.9, 0.1, 0.1), tag=1))
     one, two, four = (render(stage, [view], scale=s, shadows=False).radiance[0] for s in (1, 2, 4))
@@ -178,7 +178,7 @@ def test_coverage_is_averaged_over_samples(stage: Stage) -> None:
     assert np.abs(two - four).mean() < np.abs(one - four).mean()
 
 
-def test_weather_and_hour_change_the_picture_as_they_should(stage: Stage) -> None:
+def test_weather_and_hour_change_the_picture_as_they_should(stage: Scene) -> None:
     view = scene(Thing(1, place(12.0, 0.0), (0.6, 0.1, 0.1), tag=1))
     clear = render(stage, [view])
     foggy = render(stage, [replace(view, weather=replace(NOON, fog=0.05))])
@@ -195,7 +195,7 @@ def test_weather_and_hour_change_the_picture_as_they_should(stage: Stage) -> Non
 # ---------------------------------------------------------------- textures
 
 
-def test_a_texture_of_one_colour_is_a_paint(stage: Stage) -> None:
+def test_a_texture_of_one_colour_is_a_paint(stage: Scene) -> None:
     colour = (0.7, 0.2, 0.4)
     painted = render(stage, [scene(Thing(1, place(8.0, 0.4), colour, tag=1))])
     textured = render(stage, [scene(Thing(1, place(8.0, 0.4), tag=1, texture=0))])
@@ -206,7 +206,7 @@ def test_a_texture_of_one_colour_is_a_paint(stage: Stage) -> None:
     assert out == pytest.approx(painted.radiance, rel=1e-4, abs=1e-5)
 
 
-def test_the_gradient_equals_finite_differences(stage: Stage) -> None:
+def test_the_gradient_equals_finite_differences(stage: Scene) -> None:
     rng = np.random.default_rng(0)
     picture = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
     for size in (16, 64, 256):
@@ -219,7 +219,7 @@ def test_the_gradient_equals_finite_differences(stage: Stage) -> None:
         assert (gradient * step).sum() == pytest.approx(expected, rel=1e-5)
 
 
-def test_small_textures_and_far_things_still_get_gradient(stage: Stage) -> None:
+def test_small_textures_and_far_things_still_get_gradient(stage: Scene) -> None:
     """Far away a pixel spans many texels: through the pyramid each of those that are seen gets its share."""
     shares = []
     for distance in (8.0, 40.0):
@@ -245,7 +245,7 @@ def test_the_pyramid_keeps_the_mean_and_its_transpose_is_one(power: int, seed: i
     assert (rows * other).sum() == pytest.approx((texture * pyramid_transpose(other, size)).sum())
 
 
-def test_a_patch_stays_in_its_rectangle(stage: Stage) -> None:
+def test_a_patch_stays_in_its_rectangle(stage: Scene) -> None:
     whole = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
     u0, v0, u1, v1 = cube().panel_rectangle("body")
     part = (u0, v0, u0 + 0.4 * (u1 - u0), v0 + 0.4 * (v1 - v0))
@@ -258,7 +258,7 @@ def test_a_patch_stays_in_its_rectangle(stage: Stage) -> None:
 # ---------------------------------------------------------------- bad input
 
 
-def test_wrong_use_is_refused_in_one_line(stage: Stage) -> None:
+def test_wrong_use_is_refused_in_one_line(stage: Scene) -> None:
     view = scene()
     nan = FORWARD.copy()
     nan[0, 3] = np.nan
@@ -273,7 +273,7 @@ def test_wrong_use_is_refused_in_one_line(stage: Stage) -> None:
             render(stage, views)
         assert "\n" not in str(error.value)
     with pytest.raises(ConfigError):
-        Stage(None, [])
+        Scene(None, [])
     picture = render(stage, [view])
     with pytest.raises(ConfigError, match="power of two"):
         taps_of(picture, 100)
@@ -281,7 +281,7 @@ def test_wrong_use_is_refused_in_one_line(stage: Stage) -> None:
         pyramid(np.zeros((8, 4, 3)))
 
 
-def test_an_empty_scene_is_sky(stage: Stage) -> None:
+def test_an_empty_scene_is_sky(stage: Scene) -> None:
     picture = render(stage, [View(CAMERA, FORWARD)])
     assert (picture.tag == -1).all()
     assert np.isinf(picture.depth).all()

@@ -8,24 +8,24 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.camera.bodies import make_body
-from ssad.camera.mesh import Material, build
+from ssad.assets.bodies import make_body
+from ssad.assets.mesh import Material, build
 from ssad.camera.render import Picture, View, Weather, render
-from ssad.camera.stage import Stage, Thing
+from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import apply_taps, taps_of, texture_gradient
 from ssad.camera.torch_texture import TorchTaps, develop, pyramid, retexture, to_linear
-from ssad.errors import ConfigError
-from ssad.frames import FORWARD, Camera
-from ssad.seeding import generator
+from ssad.core.errors import ConfigError
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.seeding import generator
 
 
 @pytest.fixture(scope="module")
-def stage() -> Stage:
+def stage() -> Scene:
     vertices = np.array([[-9, -9, 0], [40, -9, 0], [40, 9, 0], [-9, 9, 0]], float)
     ground = Material("ground", (0.2, 0.2, 0.2), gloss=0.1)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     floor = build(vertices, faces, materials=(ground,), uv=vertices[faces][..., :2])
-    return Stage(None, [floor, make_body("car", style="sedan", generator=generator("torch texture"))])
+    return Scene(None, [floor, make_body("car", style="sedan", generator=generator("torch texture"))])
 
 
 DAY = Weather(0.8, 2.0, 0.2)
@@ -40,7 +40,7 @@ def view(*, texture: int, weather: Weather = DAY) -> View:
 
 
 @pytest.fixture(scope="module")
-def picture(stage: Stage) -> Picture:
+def picture(stage: Scene) -> Picture:
     return render(stage, [view(texture=0)])
 
 
@@ -57,7 +57,7 @@ def test_torch_gives_what_numpy_gives_and_its_gradient(picture: Picture) -> None
     assert np.abs(leaf.grad.permute(1, 2, 0).numpy() - texture_gradient(taps, pull)).max() < 1e-10
 
 
-def test_the_developed_picture_is_that_of_the_renderer(stage: Stage, picture: Picture) -> None:
+def test_the_developed_picture_is_that_of_the_renderer(stage: Scene, picture: Picture) -> None:
     painted = render(stage, [view(texture=-1)])
     shown = develop(torch.tensor(painted.radiance), torch.tensor(painted.exposure)) * 255
     assert (shown[0].permute(1, 2, 0).numpy() - painted.image[0]).__abs__().max() < 1.2
@@ -94,7 +94,7 @@ def test_the_pyramid_keeps_the_mean_colour() -> None:
     assert start == len(rows)
 
 
-def test_noise_has_the_stated_deviation_and_no_bias(stage: Stage) -> None:
+def test_noise_has_the_stated_deviation_and_no_bias(stage: Scene) -> None:
     still = render(stage, [view(texture=-1)])
     noisy = render(stage, [replace(view(texture=-1), noise=0.03, seed=s) for s in range(24)])
     assert np.array_equal(render(stage, [replace(view(texture=-1), noise=0.03, seed=7)]).image[0], noisy.image[7])

@@ -19,14 +19,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.images import encode_jpeg, read_image
 from ssad.datasets.nuscenes import index
 from ssad.datasets.nuscenes.reader import (
     Annotations,
     NuScenes,
     SceneData,
-    encode_jpeg,
     points_bytes,
-    read_image,
     read_points,
     rotation_matrices,
     slerp,
@@ -34,7 +34,6 @@ from ssad.datasets.nuscenes.reader import (
 from ssad.datasets.nuscenes.schema import CAMERAS, TABLES
 from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
-from ssad.errors import ConfigError, FormatError, StoreError
 
 VERSION = "v1.0-mini"
 START = 1_000_000_000_000

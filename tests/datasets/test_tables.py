@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ssad.core.errors import FormatError
 from ssad.datasets.nuscenes.schema import EgoPose, Scene, Visibility
 from ssad.datasets.nuscenes.tables import read_table, stream, table_path
-from ssad.errors import FormatError
 
 text = st.text(st.characters(codec="utf-8"), max_size=30) | st.sampled_from(['},{"token":', '"}]', "\\", "}}", "[{"])
 records = st.lists(st.fixed_dictionaries({"token": text, "level": text, "description": text}), max_size=12)

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.datasets.nuscenes.reader import NuScenes, SceneData, SensorFrame, read_image, read_points, rotation_matrices
+from ssad.core.errors import StoreError
+from ssad.core.images import read_image
+from ssad.core.seeding import generator
+from ssad.datasets.nuscenes.reader import NuScenes, SceneData, SensorFrame, read_points, rotation_matrices
 from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.tiny import RIG, make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
-from ssad.errors import StoreError
-from ssad.seeding import generator
 
 LOADER = Path(__file__).parent.parent / "helpers" / "devkit_load.py"
 

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ssad.core.errors import FormatError, StoreError
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS, TABLES
 from ssad.datasets.nuscenes.tables import read_table
 from ssad.datasets.nuscenes.writer import CATEGORIES, NuScenesWriter
-from ssad.errors import FormatError, StoreError
 
 VERSION = "v1.0-mini"
 NOW = 1_500_000_000_000_000

@@ -12,14 +12,14 @@ import torch
 from helpers.mono3d import one_thread
 from torch import Tensor, nn
 
-from ssad.detections import Detections, Truth
+from ssad.core.detections import Detections, Truth
+from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.detectors import make_detector
+from ssad.detectors.adapters.torchvision_models import MODELS, torchvision_detector, wrap
 from ssad.detectors.adapters.two_stage import TwoStage
 from ssad.detectors.adapters.ultralytics import ultralytics_detector
-from ssad.detectors.adapters.zoo import MODELS, torchvision_detector, wrap
 from ssad.detectors.check import check_detector
 from ssad.detectors.checkpoints import Card, save_weights
-from ssad.errors import ConfigError, FormatError, UnknownNameError
 
 CLASSES = ("car", "person", "dog")
 SIZE = (80, 120)
@@ -265,7 +265,7 @@ def test_an_assignment_of_another_batch_is_one_line() -> None:
 
 
 def test_it_can_be_had_by_name() -> None:
-    name = "ssad.detectors.adapters.zoo:torchvision_detector"
+    name = "ssad.detectors.adapters.torchvision_models:torchvision_detector"
     detector = make_detector(name, model=LITE, classes=CLASSES)
     assert detector.name == f"torchvision:{LITE}"
     assert LITE in MODELS

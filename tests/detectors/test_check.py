@@ -10,8 +10,8 @@ import torch
 from helpers.mono3d import TINY, TINY_PGD, lively, one_thread
 from torch import Tensor
 
-from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.zoo import MODELS, torchvision_detector
+from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.detectors.adapters.torchvision_models import MODELS, torchvision_detector
 from ssad.detectors.check import DetectorCheckError, check_detector, find_faults
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.yolo.detector import Yolo

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.detectors.checkpoints import (
     Card,
     fit_state,
@@ -25,7 +26,6 @@ from ssad.detectors.checkpoints import (
     read_card,
     save_weights,
 )
-from ssad.errors import ConfigError, FormatError, SSADError
 
 CARD = Card(data="drawn", command="ssad train detector toy", seed=3, classes=("car",), metrics={"AP50": 0.5})
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.detectors.images import as_images
-from ssad.errors import ConfigError, FormatError, SSADError
 
 GREY = "greyscale repeated to three channels"
 

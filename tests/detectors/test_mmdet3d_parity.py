@@ -15,10 +15,10 @@ import pytest
 import torch
 from helpers import mono3d_case as case
 
-from ssad.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
 from ssad.detectors.mono3d.config import FCOS3D, PGD_DET
 from ssad.detectors.mono3d.detector import Mono3D
-from ssad.detectors.mono3d.merge import merge_cameras
+from ssad.detectors.mono3d.multi_camera import merge_cameras
 from ssad.detectors.official import infer, load
 
 TESTS = Path(__file__).resolve().parents[1]

@@ -10,15 +10,15 @@ import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, one_thread, some_truth, truth_of
 from torch import Tensor
 
-from ssad.detections import CLASSES_3D, Detections, Truth
+from ssad.core.detections import CLASSES_3D, Detections, Truth
+from ssad.core.errors import ConfigError
+from ssad.core.protocols import Detector
 from ssad.detectors import make_detector
 from ssad.detectors.fcos3d import fcos3d
+from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
 from ssad.detectors.mono3d.detector import Mono3D
-from ssad.detectors.mono3d.trunk import DeformConv
 from ssad.detectors.pgd_det import pgd_det
-from ssad.errors import ConfigError
-from ssad.protocols import Detector
 
 BOTH = pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
 SIZE = (70, 110)

@@ -9,10 +9,10 @@ import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, one_thread, perfect, some_truth
 from torch import Tensor
 
-from ssad.detections import Assignment, Dense, Solids, Truth
+from ssad.core.detections import Assignment, Dense, Solids, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.detector import Mono3D
-from ssad.errors import ConfigError
 
 FCOS = {"cls", "offset", "depth", "size", "rotsin", "velo", "dir", "attr", "centerness"}
 PGD = FCOS | {"bbox2d", "consistency"}

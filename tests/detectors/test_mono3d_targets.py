@@ -9,12 +9,12 @@ import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, one_thread, perfect, some_truth, truth_of
 from torch import Tensor
 
-from ssad.detections import Solids, Truth
+from ssad.core.detections import Solids, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
 from ssad.detectors.mono3d.decode import Places, corners, places_of, project, unproject
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.mono3d.targets import assign
-from ssad.errors import ConfigError
 
 SIZE = (256, 416)
 K = lens(300.0, SIZE)

@@ -11,10 +11,10 @@ import torch
 from helpers.mono3d import one_thread
 from helpers.training import CLASSES, RECIPE, bank
 
-from ssad.detections import Truth
+from ssad.core.detections import Truth
 from ssad.detectors import make_detector
 from ssad.detectors.check import check_detector
-from ssad.detectors.training.loop import train
+from ssad.training.loop import train
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "own_detector.py"
 

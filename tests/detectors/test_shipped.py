@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.clips import Clips, record_clips
-from ssad.bench.coco import CocoSet, read_coco
-from ssad.bench.detect import score_2d, score_3d
-from ssad.bench.record import Recording, record_nuscenes
-from ssad.bench.train import coco_items, coco_truth
-from ssad.datasets.nuscenes.files import read_image
+from ssad.core.errors import FormatError
+from ssad.core.images import read_image
+from ssad.datasets.coco import CocoSet, read_coco
 from ssad.detectors import SHIPPED, make_detector
 from ssad.detectors.checkpoints import read_card
-from ssad.detectors.training.batches import Bank, fill
-from ssad.errors import FormatError
+from ssad.evaluation.detection import score_2d, score_3d
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.training.batches import PictureSet, fill
+from ssad.training.detector import coco_items, coco_truth
 
 NAMES = sorted(path.stem for path in SHIPPED.glob("*.json"))
 TWO = [name for name in NAMES if name.startswith("yolo")]
@@ -25,13 +25,13 @@ THREE = [name for name in NAMES if not name.startswith("yolo")]
 
 
 @pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> tuple[CocoSet, Bank]:
+def clips(tmp_path_factory: pytest.TempPathFactory) -> tuple[CocoSet, PictureSet]:
     """Eight pictures from 20 m behind, in a held-out town and with a seed that no training had."""
     out = tmp_path_factory.mktemp("shipped") / "clips"
     record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=1)
     data = read_coco(out / "annotations" / "test.json")
     bank = fill(coco_items(out, "test")[1], threads=1)
-    return data, Bank(bank.pictures, tuple(coco_truth(data, target=True)))
+    return data, PictureSet(bank.pictures, tuple(coco_truth(data, target=True)))
 
 
 def test_some_are_shipped() -> None:
@@ -50,7 +50,7 @@ def test_cards_say_where_they_are_from(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TWO)
-def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, Bank]) -> None:
+def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, PictureSet]) -> None:
     data, bank = clips
     detector = make_detector(name)
     assert detector.classes == data.classes
@@ -93,7 +93,7 @@ def test_other_weights_under_a_shipped_card_are_refused(tmp_path: Path, monkeypa
         make_detector("yolov5n")
 
 
-def test_each_picture_has_one_target(clips: tuple[CocoSet, Bank]) -> None:
+def test_each_picture_has_one_target(clips: tuple[CocoSet, PictureSet]) -> None:
     data, bank = clips
     assert len(bank) == 8
     for image in data.images:

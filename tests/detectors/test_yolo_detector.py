@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 from torchvision.ops import nms
 
-from ssad.detections import Dense, Detections, Truth
+from ssad.core.detections import Dense, Detections, Truth
+from ssad.core.errors import ConfigError
+from ssad.core.protocols import Detector
 from ssad.detectors.yolo.decode import select
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.loss import BALANCE
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY
 from ssad.detectors.yolov5 import YOLOV5N
-from ssad.errors import ConfigError
 from ssad.metrics.detection2d import Boxes2D, average_precision
-from ssad.protocols import Detector
 
 CLASSES = ("car", "person")
 V5 = replace(YOLOV5N, width=0.125)

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors.yolo.darknet import convolutions, read_darknet, write_darknet
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.models import YoloSpec
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY, YOLOV3_TINY_OFFICIAL, yolov3, yolov3_tiny
 from ssad.detectors.yolov5 import HEADS, LAYERS, YOLOV5N, YOLOV5S, from_yolov5_keys
-from ssad.errors import ConfigError, FormatError
 
 NARROW_V3 = replace(YOLOV3, width=0.25)
 NARROW_TINY = replace(YOLOV3_TINY, width=0.5)

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 from torchvision.ops import complete_box_iou_loss
 
-from ssad.detections import Assignment, Dense, Truth
+from ssad.core.detections import Assignment, Dense, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.yolo.decode import Grid, decode, encode, make_grid
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.loss import BALANCE, ciou
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY
 from ssad.detectors.yolov5 import YOLOV5N
-from ssad.errors import ConfigError
 
 CLASSES = ("car", "person", "bus")
 V5 = Yolo(replace(YOLOV5N, width=0.125), CLASSES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssad.frames import Boxes3D
+from ssad.core.frames import Boxes3D
 
 
 def cars(*centres: tuple[float, float, float], velocity: tuple[float, float, float] = (0, 4, 0)) -> Boxes3D:

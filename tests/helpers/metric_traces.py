@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.types import EpisodeTrace
+from ssad.core.types import EpisodeTrace
 
 Body = tuple[Any, Any, Any, Any]
 """x, y, yaw, speed, each a number or one a step."""

@@ -10,11 +10,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from ssad.detections import Assignment, Dense, Solids, Truth
+from ssad.core.detections import Assignment, Dense, Solids, Truth
+from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, PGD_DET, Mono3DConfig
 from ssad.detectors.mono3d.decode import corners, hull, project
 from ssad.detectors.mono3d.detector import Mono3D
-from ssad.detectors.mono3d.trunk import DeformConv
 
 TINY = replace(FCOS3D, name="tiny", trunk=18, width=8, channels=32, strides=(8, 16, 32), ranges=(48.0, 96.0, 1e8))
 TINY_PGD = replace(TINY, name="tiny-pgd", pgd=True, threshold=0.01, code_weights=PGD_DET.code_weights)

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ssad.bench.training_data import nuscenes_items
-from ssad.detections import CLASSES_3D, Detections, Solids, Truth
-from ssad.detectors.training.batches import fill
+from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.training.batches import fill
+from ssad.training.data import nuscenes_items
 
 
 class Oracle:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ssad.bench.cells import make_cells
 from ssad.bench.run import Plan
 from ssad.bench.suite import Suite
-from ssad.types import Pose, Scenario
+from ssad.core.types import Pose, Scenario
 
 
 def fake_scenario(name: str) -> Scenario:

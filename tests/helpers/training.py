@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import distributed
 
-from ssad.detections import Truth
-from ssad.detectors.training.batches import Bank
-from ssad.detectors.training.loop import Share, train
-from ssad.detectors.training.recipe import Recipe
+from ssad.core.detections import Truth
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolov3 import YOLOV3_TINY
+from ssad.training.batches import PictureSet
+from ssad.training.loop import Share, train
+from ssad.training.recipe import Recipe
 
 CLASSES = ("car", "person")
 SPEC = replace(YOLOV3_TINY, width=0.125)
@@ -24,7 +24,7 @@ COLOURS = ((230, 30, 30), (30, 30, 230))  # of the classes
 RECIPE = Recipe("yolov3-tiny", 3, 4, 2e-3, warmup=2, zoom=(0.7, 1.4), average=0.9)
 
 
-def bank(count: int = 8, *, seed: int = 0) -> Bank:
+def bank(count: int = 8, *, seed: int = 0) -> PictureSet:
     """Grey pictures with one to three coloured squares side by side."""
     rng = np.random.default_rng(seed)
     pictures = np.full((count, *SIZE, 3), 114, np.uint8)
@@ -38,7 +38,7 @@ def bank(count: int = 8, *, seed: int = 0) -> Bank:
             picture[y : y + side, x : x + side] = COLOURS[labels[-1]]
             boxes.append([x, y, x + side, y + side])
         truth.append(Truth(torch.tensor(labels), torch.tensor(boxes, dtype=torch.float32)))
-    return Bank(torch.from_numpy(pictures), tuple(truth))
+    return PictureSet(torch.from_numpy(pictures), tuple(truth))
 
 
 def fresh() -> Yolo:
@@ -53,7 +53,7 @@ def learn(rank: int, world: int, port: int, out: str) -> None:
     distributed.init_process_group("gloo", rank=rank, world_size=world)
     try:
         whole = bank()
-        mine = Bank(whole.pictures[rank::world], whole.truth[rank::world])
+        mine = PictureSet(whole.pictures[rank::world], whole.truth[rank::world])
         detector = fresh()
         recipe = replace(RECIPE, epochs=2)
         # only the first process is out of time after an epoch: all must stop, and go on together

@@ -8,7 +8,7 @@ from helpers.metric_traces import make_trace, straight
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ssad.geometry import obb_distance, rotate
+from ssad.core.geometry import obb_distance, rotate
 from ssad.metrics.criticality import min_distance, min_ttc, post_encroachment_time, time_to_collision, ttc
 
 number = st.floats(-20, 20)

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.core.errors import FormatError
+from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.schema import CLASSES
-from ssad.errors import FormatError
 from ssad.metrics.detection import (
     CVPR_2019,
     BikeRacks,
@@ -23,7 +24,6 @@ from ssad.metrics.detection import (
     scene_intervals,
     score_detections,
 )
-from ssad.seeding import generator
 
 CAR, PEDESTRIAN, BICYCLE, CONE, BARRIER = (
     CLASSES.index(name) for name in ("car", "pedestrian", "bicycle", "traffic_cone", "barrier")

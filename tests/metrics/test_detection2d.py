@@ -9,8 +9,8 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
+from ssad.core.seeding import generator
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d, precision_recall
-from ssad.seeding import generator
 
 
 def coco_ap(truth: Boxes2D, found: Boxes2D, labels: int, threshold: float, most: int) -> np.ndarray:

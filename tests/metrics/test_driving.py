@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
+from ssad.core.types import Contact
 from ssad.metrics import EpisodeMetrics, episode_metrics, frea_score, overall_score
 from ssad.metrics.driving import (
     collision_events,
@@ -15,7 +16,6 @@ from ssad.metrics.driving import (
     normalised,
     off_road_distance,
 )
-from ssad.types import Contact
 
 
 def test_quiet_episode():

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from ssad.errors import ConfigError
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import generator
 from ssad.metrics.robustness import (
     area_over_severity,
     corruption_error,
@@ -17,7 +18,6 @@ from ssad.metrics.robustness import (
     page_trend,
     resilience_rate,
 )
-from ssad.seeding import generator
 
 OURS = {"fog": [0.4, 0.3, 0.2], "snow": [0.3, 0.2, 0.1]}
 BASE = {"snow": [0.2, 0.1, 0.1], "fog": [0.3, 0.3, 0.3]}

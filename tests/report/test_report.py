@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 import pytest
 
-from ssad import safeio
-from ssad.agents import make_system
 from ssad.bench.execute import plain
-from ssad.errors import ConfigError, FormatError, StoreError
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.traces import load_trace, save_trace
+from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
 from ssad.report import write_report, write_video
 from ssad.report.embed import SCALE, episode_data, origin, pack, unpack
@@ -24,9 +25,8 @@ from ssad.report.lanes import thin
 from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
 from ssad.report.tables import precrash_table, tex, to_csv, to_latex, to_markdown
-from ssad.roads import load_town
+from ssad.roads import load_town, save_graph
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.traces import load_trace, save_trace
 from ssad.world.rollout import rollout
 
 HOSTILE = "<script>alert(1)</script>"
@@ -39,6 +39,8 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names = ["StraightObstacle/00", "StraightObstacle/01", "RedlightRunning/00", "natural/Twinford_00/00"]
     scenarios = [load_scenarios(n)[0] for n in names]
     graphs = {s.town: load_town(s.town) for s in scenarios}
+    for name, graph in graphs.items():
+        save_graph(graph, folder / "towns" / f"{name}.npz")
     lines, episodes, cells = [], [], []
     for system in ("autopilot", "blind"):
         built = [build_episode(s, graphs[s.town], seed=1) for s in scenarios]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.geometry import corners, obb_distance, rotate, to_local, to_world, wrap_angle
+from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world, wrap_angle
 
 angle = st.floats(-50.0, 50.0)
 place = st.floats(-100.0, 100.0)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
-from ssad.errors import MapError
+from ssad.core.errors import MapError
+from ssad.core.lane_graph import equal
+from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, LaneQuery, load_graph, save_graph
-from ssad.roads.graph import equal
 from ssad.roads.query import DRIVABLE, MARGIN, segments
-from ssad.types import LaneType
 
 
 def brute(graph: LaneGraph, points: np.ndarray, types: tuple[LaneType, ...]) -> tuple[np.ndarray, ...]:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
-from ssad.errors import RouteError
-from ssad.geometry import wrap_angle
+from ssad.core.errors import RouteError
+from ssad.core.geometry import wrap_angle
+from ssad.core.seeding import generator
+from ssad.core.types import LaneType, Pose, Route
 from ssad.roads import LaneGraph, LaneQuery, random_route, route_along
-from ssad.seeding import generator
-from ssad.types import LaneType, Pose, Route
 
 TURN = 0.28  # rad a metre: the tightest turn has 8 m radius, the shortest lane change is 10 m
 

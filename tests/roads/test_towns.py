@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from roads.towns import BUILT_IN, built_in
 
-from ssad.errors import MapError, UnknownNameError
-from ssad.geometry import wrap_angle
+from ssad.core.errors import MapError, UnknownNameError
+from ssad.core.geometry import wrap_angle
+from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, bake, load_town, town_names
 from ssad.roads.generate import TOWNS, generate_town
 from ssad.roads.router import _across
-from ssad.types import LaneType
 
 
 def driving(graph: LaneGraph) -> list[int]:

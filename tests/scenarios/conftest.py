@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from ssad.roads.graph import LaneGraph
-from ssad.types import LaneType, Route
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import LaneType, Route
 
 LANE = 3.5
 HALF = 15.0  # the junction reaches this far from the centre

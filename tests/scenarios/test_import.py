@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.errors import FormatError
+from ssad.core.errors import FormatError
+from ssad.core.types import Pose
 from ssad.roads import bake
 from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios
-from ssad.types import Pose
 
 ROUTE = (
     '<routes><route id="0" town="T"><waypoint x="0" y="10" yaw="0" z="0"/>'

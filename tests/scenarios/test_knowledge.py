@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.errors import ConfigError, RouteError
-from ssad.roads.graph import LaneGraph
-from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, parameter_box, scenario_type
-from ssad.scenarios.dynamic.episode import forced_signals
-from ssad.scenarios.dynamic.knowledge._meeting import ego_times, time_to_cover
-from ssad.scenarios.dynamic.knowledge._placing import polyline_route
-from ssad.types import (
+from ssad.core.errors import ConfigError, RouteError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import (
     Actor,
     Condition,
     Controller,
@@ -27,6 +23,10 @@ from ssad.types import (
     SignalPlan,
     SignalState,
 )
+from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, parameter_box, scenario_type
+from ssad.scenarios.dynamic.episode import forced_signals
+from ssad.scenarios.dynamic.knowledge._meeting import ego_times, time_to_cover
+from ssad.scenarios.dynamic.knowledge._placing import polyline_route
 from ssad.world.models import model
 
 

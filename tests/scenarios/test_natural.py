@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.errors import RouteError
-from ssad.roads.graph import LaneGraph
+from ssad.core.errors import RouteError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Controller, EpisodeAgent, LaneType, Pose, Route, Scenario, TrafficPlan
 from ssad.scenarios.dynamic import scenario_type
 from ssad.scenarios.dynamic.knowledge import natural_junction as natural
-from ssad.types import Controller, EpisodeAgent, LaneType, Pose, Route, Scenario, TrafficPlan
 from ssad.world.models import model
 
 

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ssad.geometry import obb_distance
+from ssad.core.geometry import obb_distance
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Controller, Episode, LaneType, Scenario, SignalState
 from ssad.roads import LaneQuery, load_town
-from ssad.roads.graph import LaneGraph
 from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.make_sets import make
 from ssad.scenarios.dynamic.sets import DATA
-from ssad.types import Controller, Episode, LaneType, Scenario, SignalState
 from ssad.world.models import model
 from ssad.world.rollout import rollout
 

@@ -14,11 +14,12 @@ from helpers.boxes import cars
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.bench.toolbox.scene import SceneShifter
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world, rotation_matrix
+from ssad.core.seeding import generator
+from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.tiny import make_tiny
-from ssad.errors import ConfigError, UnknownNameError
-from ssad.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world, rotation_matrix
 from ssad.metrics.robustness import page_trend
 from ssad.scenarios.static.shifts import (
     SHIFTS,
@@ -33,8 +34,7 @@ from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
-from ssad.seeding import generator
-from ssad.types import U8
+from ssad.toolbox.scene_shifter import SceneShifter
 
 WIDTH, HEIGHT = 320, 180
 CAMERA = Camera.typical(WIDTH, HEIGHT)
@@ -340,7 +340,7 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
     scene = street.scene(street.scenes()[0].name)
     frames = [f for f in scene.frames if f.key_frame and f.modality == "camera"][:6]
     for share in (0.0, 0.4, 1.0):
-        monkeypatch.setattr("ssad.bench.toolbox.scene.free_sun", lambda *_, share=share: share)
+        monkeypatch.setattr("ssad.toolbox.scene_shifter.free_sun", lambda *_, share=share: share)
         shifter = SceneShifter(street.root, scene, ShiftSpec("sunlight", 5))
         found = [shifter.image(frame)[1] for frame in frames]
         front = [one for one in found if "the sun is not in front of this camera" not in one.skipped]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from helpers.boxes import cars
 
-from ssad.errors import ConfigError
-from ssad.frames import SceneContext, SweepFrame, rotation_matrix
+from ssad.core.errors import ConfigError
+from ssad.core.frames import SceneContext, SweepFrame, rotation_matrix
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_points, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.lidar import fog_response, inside

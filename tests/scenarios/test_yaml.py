@@ -9,7 +9,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssad.errors import ConfigError, SSADError, UnknownNameError
+from ssad.core.errors import ConfigError, SSADError, UnknownNameError
+from ssad.core.types import (
+    Actor,
+    Condition,
+    Limits,
+    Phase,
+    Pose,
+    Scenario,
+    SignalPlan,
+    TrafficPlan,
+)
 from ssad.scenarios.dynamic import (
     PRECRASH,
     SCENARIOS,
@@ -20,16 +30,6 @@ from ssad.scenarios.dynamic import (
     scenario_data,
     scenario_from,
     scenario_text,
-)
-from ssad.types import (
-    Actor,
-    Condition,
-    Limits,
-    Phase,
-    Pose,
-    Scenario,
-    SignalPlan,
-    TrafficPlan,
 )
 from ssad.world.models import MODELS
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ssad.core.types import Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.types import Controller
 from ssad.world.world import World
 
 STEPS = 1000

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ssad.errors import ConfigError
-from ssad.types import Limits
+from ssad.core.errors import ConfigError
+from ssad.core.types import Limits
 from ssad.world.env import SingleEnv, VectorEnv, to_controls
 from tests.world.test_world import bank
 from tests.world.worlds import GRAPHS, ego, episode

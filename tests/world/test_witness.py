@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssad.types import Condition, Controller, EpisodeAgent, Phase, Pose
+from ssad.core.types import Condition, Controller, EpisodeAgent, Phase, Pose
 from ssad.world.rollout import rollout
 from ssad.world.witness import _drive, find_witness, shifted
 from tests.world.worlds import GRAPHS, ego, episode, line_route

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.errors import ConfigError, UnknownNameError
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.types import Condition, Controller, EpisodeAgent, Limits, Phase, Pose
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.types import Condition, Controller, EpisodeAgent, Limits, Phase, Pose
 from ssad.world.check import check_world
 from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssad.roads.graph import LaneGraph
-from ssad.types import (
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import ssad
-from ssad import safeio
 from ssad.bench.suite import Suite
-from ssad.errors import ConfigError
-from ssad.seeding import digest, seed32
-from ssad.types import Scenario
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import digest, seed32
+from ssad.core.types import Scenario
 
 # a change in any of these may change a number, so it changes the key of every cell
-_CODE = ("agents", "metrics", "roads", "scenarios", "world", "geometry.py", "seeding.py", "types.py")
+_CODE = ("drivers", "metrics", "roads", "scenarios", "world", "core")
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def system_version(name: str) -> str:
 
     UnknownNameError or ConfigError when there is no such system.
     """
-    from ssad.agents import SYSTEMS
-    from ssad.registry import resolve
+    from ssad.core.registry import resolve
+    from ssad.drivers import SYSTEMS
 
     found = resolve("system", SYSTEMS, name)
     if name in SYSTEMS:

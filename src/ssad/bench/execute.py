@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,12 +10,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssad import safeio
-from ssad.traces import save_trace, trace_hash
-from ssad.types import Episode, EpisodeTrace
+from ssad.core import safeio
+from ssad.core.traces import save_trace, trace_hash
+from ssad.core.types import Episode, EpisodeTrace
+from ssad.jobs.machine import quiet_warp
 
 if TYPE_CHECKING:
-    from ssad.protocols import DrivingSystem
+    from ssad.core.protocols import DrivingSystem
     from ssad.roads import LaneGraph
 
 
@@ -31,36 +30,9 @@ def town(name: str) -> LaneGraph:
 
 @lru_cache(maxsize=4)
 def _system(name: str) -> DrivingSystem:
-    from ssad.agents import make_system
+    from ssad.drivers import make_system
 
     return make_system(name)
-
-
-def cuda_driver() -> bool:
-    """Whether this machine has NVIDIA's driver; asked before Warp is loaded, which warns when there is none."""
-    try:
-        ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return False
-    return True
-
-
-def quiet_warp() -> None:
-    """Start Warp and keep its banner and its notes about the kernel cache off the terminal."""
-    import warp
-
-    warp.config.log_level = warp.LOG_ERROR
-    if cuda_driver():
-        warp.init()
-        return
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:  # its native part warns of the missing driver on the descriptor itself
-        os.dup2(null, 2)
-        warp.init()
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
 
 
 def warm_up(settings: Mapping[str, Any]) -> None:
@@ -127,7 +99,7 @@ def witness(folder: Path, episode: Episode, speed: float | None, device: str) ->
 
     Searched once for an episode and speed, whichever systems collide in it.
     """
-    from ssad.seeding import digest
+    from ssad.core.seeding import digest
     from ssad.world.witness import find_witness
 
     if speed is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from ssad import safeio
+from ssad.core import safeio
 
 FOLDER, PAGE = "pictures", "pictures.json"
 
@@ -20,7 +20,7 @@ def make_pictures(names: list[str], folder: str | Path) -> None:
         if not all((target / name).is_file() for name in captions):
             _shifts(safeio.make_folder(target) / "shifts.jpg")
     if "camera" in names:
-        from ssad.bench.gallery import write_gallery
+        from ssad.recording.camera_sheets import write_gallery
 
         captions |= write_gallery(safeio.make_folder(target))
         captions |= _onboard(Path(folder), target)
@@ -30,11 +30,11 @@ def make_pictures(names: list[str], folder: str | Path) -> None:
 
 def _onboard(folder: Path, target: Path) -> dict[str, str]:
     """An episode of the run from the ego's camera and from above, if a recording is there."""
-    from ssad.bench.onboard import onboard_sheet, pick_trace
-    from ssad.bench.toolbox.sheet import save_picture
+    from ssad.core.images import save_picture
+    from ssad.core.lane_graph import load_graph
+    from ssad.core.traces import load_trace
+    from ssad.recording.onboard import onboard_sheet, pick_trace
     from ssad.roads import load_town
-    from ssad.roads.graph import load_graph
-    from ssad.traces import load_trace
 
     chosen = pick_trace(folder)
     if chosen is None:
@@ -49,8 +49,8 @@ def _onboard(folder: Path, target: Path) -> dict[str, str]:
 
 def _shifts(path: Path) -> None:
     """Contact sheets of a drawn street."""
-    from ssad.bench.toolbox.sheet import write_sheets
     from ssad.datasets.nuscenes.tiny import make_tiny
+    from ssad.toolbox.contact_sheet import write_sheets
 
     with tempfile.TemporaryDirectory() as temporary:
         write_sheets(make_tiny(Path(temporary) / "street", scenes=1, samples=2, sweeps=1, size=(960, 540)), path)

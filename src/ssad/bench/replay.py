@@ -7,11 +7,11 @@ from pathlib import Path
 
 from ssad.bench.cells import Cell, find_cell
 from ssad.bench.run import read_plan
-from ssad.bench.store import RESULTS, read_lines
-from ssad.errors import StoreError
+from ssad.core.errors import StoreError
+from ssad.core.traces import first_difference, load_trace
+from ssad.core.types import EpisodeTrace
+from ssad.jobs.store import RESULTS, read_lines
 from ssad.roads import LaneGraph
-from ssad.traces import first_difference, load_trace
-from ssad.types import EpisodeTrace
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ def replay(folder: str | Path, name: str) -> Replay:
 
     StoreError when it was not recorded; ConfigError when there is no such cell or the code has changed since.
     """
-    from ssad.bench.execute import drive, quiet_warp, town
+    from ssad.bench.execute import drive, town
+    from ssad.jobs.machine import quiet_warp
 
     quiet_warp()
     todo = read_plan(folder)

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-import ssad
 from ssad.bench.cells import Cell, code_version, make_cells, system_version, town_version
-from ssad.bench.progress import Live
-from ssad.bench.runner import EXECUTE, Runner
-from ssad.bench.store import Store, read_run
-from ssad.bench.suite import Suite, suite_scenarios
-from ssad.errors import ConfigError, SSADError
-from ssad.seeding import digest
+from ssad.bench.suite import Suite, command_of, suite_scenarios
+from ssad.core.errors import ConfigError, SSADError
+from ssad.core.seeding import digest
+from ssad.jobs.machine import default_workers, versions
+from ssad.jobs.progress import Live
+from ssad.jobs.runner import EXECUTE, Runner
+from ssad.jobs.store import Store, read_run
 
 
 @dataclass(frozen=True)
@@ -37,6 +34,7 @@ class Plan:
         return {
             "identity": digest("run", self.device, *[cell.key for cell in self.cells])[:16],
             "suite": self.suite.model_dump(mode="json"),
+            "command": command_of(self.suite.model_dump(mode="json")),
             "versions": versions(self.device),
             "code": code_version(),
             "towns": dict(self.towns),
@@ -47,36 +45,6 @@ class Plan:
                 for c in self.cells
             ],
         }
-
-
-def versions(device: str) -> dict[str, str]:
-    """Versions that a record carries."""
-    found = {"ssad": ssad.__version__, "python": platform.python_version(), "device": device}
-    for name in ("numpy", "warp-lang", "torch"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
-
-
-def pick_device(wanted: str) -> str:
-    """auto, cpu or cuda as a device of the world. ConfigError when it is not there."""
-    if wanted == "cpu":
-        return "cpu"
-    if wanted not in ("auto", "cuda"):
-        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
-    from ssad.bench.execute import cuda_driver, quiet_warp
-
-    if cuda_driver():
-        import warp
-
-        quiet_warp()
-        if warp.is_cuda_available():
-            return "cuda"
-    if wanted == "cuda":
-        raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
-    return "cpu"
 
 
 def plan(suite: Suite, *, device: str = "cpu", check: bool = True) -> Plan:
@@ -102,11 +70,6 @@ def _check(cell: Cell, build: Any) -> None:
     except SSADError as error:
         name = f"scenario {cell.scenario['name']}"
         raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None
-
-
-def default_workers() -> int:
-    """One worker a core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 import ssad
 from ssad.bench.component.suite import DetectionSuite
-from ssad.errors import ConfigError, UnknownNameError, unknown_name
-from ssad.safeio import Document, dotted, parse_yaml, read_yaml_document
-from ssad.types import Scenario
+from ssad.core.errors import ConfigError, UnknownNameError, unknown_name
+from ssad.core.safeio import Document, dotted, parse_yaml, read_yaml_document
+from ssad.core.types import Scenario
 
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
 
@@ -172,3 +173,21 @@ def suite_scenarios(suite: Suite) -> tuple[Scenario, ...]:
                     "rename one"
                 )
     return tuple(found.values())
+
+
+def command_of(suite: dict[str, Any]) -> str:
+    """The command that runs a suite again; only what differs from the suite of that name is spelt out."""
+    suite = dict(suite)
+    name = str(suite.pop("name", "quick"))
+    try:
+        stock = load_suite(name).model_dump(mode="json")
+    except ConfigError:  # a suite of the user's own, by its file
+        stock = suite
+    words = ["ssad", "run", name]
+    for key, value in suite.items():
+        if value != stock.get(key):
+            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
+            if isinstance(value, dict):
+                text = "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
+            words += ["--set", f"{key}={text}"]
+    return shlex.join(words)

@@ -17,9 +17,9 @@ import warp as wp
 from ssad.camera.kernels import raster
 from ssad.camera.kernels.labels import cover
 from ssad.camera.render import NEAR, Picture, View
-from ssad.camera.stage import Stage, Thing
-from ssad.errors import ConfigError
-from ssad.types import F64, I32
+from ssad.camera.scene import Scene, Thing
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, I32
 
 CROP = 64  # pixels a side of a crop
 BEYOND = 2.0  # what lies further outside than this many widths or heights of the picture does not count
@@ -27,7 +27,7 @@ BATCH = 256  # crops at a time
 LEVELS = ((0.4, "1"), (0.6, "2"), (0.8, "3"))
 
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
-_bounds: WeakKeyDictionary[Stage, dict[int, tuple[F64, F64]]] = WeakKeyDictionary()
+_bounds: WeakKeyDictionary[Scene, dict[int, tuple[F64, F64]]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Labels:
         return len(self.tag)
 
 
-def label_picture(stage: Stage, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> Labels:
+def label_picture(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> Labels:
     """Labels of picture `index`, which shows `view` of `stage`; scale: samples a pixel that it was rendered with.
 
     Things with tags below 1 get no label; things of one tag are one. ConfigError: the picture shows another view.
@@ -60,7 +60,7 @@ def label_picture(stage: Stage, view: View, picture: Picture, index: int = 0, *,
     return Labels(tag, box, pixels, share, inside)
 
 
-def visible_share(stage: Stage, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> dict[int, float]:
+def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> dict[int, float]:
     """Visible share in 0..1 for the tag (1 and more) of each thing of a view, 0 for what is not seen. ConfigError."""
     labels = label_picture(stage, view, picture, index, scale=scale)
     shares = dict.fromkeys(sorted({t.tag for t in view.things if t.tag > 0}), 0.0)
@@ -103,7 +103,7 @@ def _tags(view: View, picture: Picture, index: int) -> I32:
     return np.asarray(picture.tag[index], np.int32)
 
 
-def bounds(stage: Stage, mesh: int) -> tuple[F64, F64]:
+def bounds(stage: Scene, mesh: int) -> tuple[F64, F64]:
     """Smallest and largest corner of a mesh of a stage in its own frame, [3] each, m."""
     known = _bounds.setdefault(stage, {})
     if mesh not in known:
@@ -113,7 +113,7 @@ def bounds(stage: Stage, mesh: int) -> tuple[F64, F64]:
     return known[mesh]
 
 
-def _projected(stage: Stage, view: View, things: Sequence[Thing], inverse: F64) -> F64:
+def _projected(stage: Scene, view: View, things: Sequence[Thing], inverse: F64) -> F64:
     """x0, y0, x1, y1 at pixel edges [T, 4] of the boxes around things, cut at the near plane; NaN behind it."""
     span = np.array([bounds(stage, t.mesh) for t in things])
     corner = (np.arange(8)[:, None] >> np.arange(3)) & 1
@@ -133,7 +133,7 @@ def _projected(stage: Stage, view: View, things: Sequence[Thing], inverse: F64) 
     return np.concatenate([low, high], 1)
 
 
-def _amodal(stage: Stage, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
+def _amodal(stage: Scene, view: View, tags: I32, *, scale: int) -> tuple[F64, F64]:
     """Pixels that the things of each tag would cover alone in the picture [N], and their share inside it [N]."""
     if not len(tags):
         return np.zeros(0), np.zeros(0)
@@ -167,7 +167,7 @@ def _amodal(stage: Stage, view: View, tags: I32, *, scale: int) -> tuple[F64, F6
 
 
 def _alone(
-    stage: Stage, view: View, group: tuple[Sequence[Thing], Sequence[I32]], crops: F64, *, scale: int
+    stage: Scene, view: View, group: tuple[Sequence[Thing], Sequence[I32]], crops: F64, *, scale: int
 ) -> tuple[F64, F64]:
     """Pixels that things cover in crops [M, 4] without others, by the picture's rule and by area [M each]."""
     things, members = group

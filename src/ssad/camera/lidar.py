@@ -15,11 +15,11 @@ import numpy as np
 import warp as wp
 
 from ssad.camera.kernels import lidar as kernels
-from ssad.camera.stage import Stage, Thing
-from ssad.errors import ConfigError
-from ssad.frames import Boxes3D, rotation_matrix
-from ssad.seeding import generator
-from ssad.types import F32, F64, I32
+from ssad.camera.scene import Scene, Thing
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Boxes3D, rotation_matrix
+from ssad.core.seeding import generator
+from ssad.core.types import F32, F64, I32
 
 GLASS = 0.3  # share of beams that a pane returns
 FALL = 50.0  # m at which the intensity has halved
@@ -66,7 +66,7 @@ class _Scene:
     """Index of a stage for rays: the street at full detail once, each mesh at its first use. The faces of all are
     numbered through; `material` holds the material of each."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Scene) -> None:
         self.device = stage.device
         self.street: Any = None
         self.meshes: dict[int, tuple[Any, int, F64, float]] = {}
@@ -86,7 +86,7 @@ class _Scene:
             full = np.asarray(street.order[street.offset[0, 0] : street.offset[0, -1]], np.int32)
             self.street = self._mesh(stage, full)[0]
 
-    def _mesh(self, stage: Stage, listed: I32) -> tuple[Any, int, F64]:
+    def _mesh(self, stage: Scene, listed: I32) -> tuple[Any, int, F64]:
         """A mesh of these faces, the number of its first face, and its vertices; None without faces."""
         faces = stage.faces.numpy()[listed]
         used, index = np.unique(faces, return_inverse=True)
@@ -101,7 +101,7 @@ class _Scene:
         index = wp.array(index.reshape(-1).astype(np.int32), dtype=int, device=stage.device)
         return wp.Mesh(points=points, indices=index), first, points.numpy()
 
-    def body(self, stage: Stage, mesh: int) -> tuple[Any, int, F64, float]:
+    def body(self, stage: Scene, mesh: int) -> tuple[Any, int, F64, float]:
         """Mesh, number of its first face, middle [3] and radius of its bounding sphere in its own frame."""
         if mesh not in self.meshes:
             at = stage.first[mesh]
@@ -119,11 +119,11 @@ class _Scene:
         return self._on_device
 
 
-_scenes: WeakKeyDictionary[Stage, _Scene] = WeakKeyDictionary()
+_scenes: WeakKeyDictionary[Scene, _Scene] = WeakKeyDictionary()
 
 
 def sweep(
-    stage: Stage,
+    stage: Scene,
     lidar: Lidar,
     ego_to_world: F64,
     things: Sequence[Thing],
@@ -195,7 +195,7 @@ def sweep(
     return out, tag[keep].astype(np.int32)
 
 
-def _check(stage: Stage, lidar: Lidar, ego_to_world: F64, things: Sequence[Thing]) -> None:
+def _check(stage: Scene, lidar: Lidar, ego_to_world: F64, things: Sequence[Thing]) -> None:
     """ConfigError for what no sweep can be made of."""
     beams = np.asarray(lidar.beams)
     if beams.ndim != 1 or not beams.size or not np.isfinite(beams).all() or lidar.azimuths < 1:
@@ -236,7 +236,7 @@ def _velocities(things: Sequence[Thing], before: Sequence[Thing], period: float)
 
 
 def _targets(
-    stage: Stage, scene: _Scene, things: Sequence[Thing], eye: F64, velocities: F64
+    stage: Scene, scene: _Scene, things: Sequence[Thing], eye: F64, velocities: F64
 ) -> tuple[Any, tuple[F64, F64]]:
     """Rows of `Target` for things, and their bounding spheres: middle relative to the eye [T, 3], radius [T]."""
     rows: Any = np.zeros(len(things), kernels.Target.numpy_dtype())  # type: ignore[attr-defined]

@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 
 from ssad.camera.kernels import raster, shade
-from ssad.camera.stage import Draws, Stage, Thing
-from ssad.errors import ConfigError
-from ssad.frames import Camera
-from ssad.types import F32, F64, I32, U8
+from ssad.camera.scene import Draws, Scene, Thing
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.types import F32, F64, I32, U8
 
 NEAR = 0.15  # m
 FAR = 500.0
@@ -113,7 +113,7 @@ class _Pass:
     """One visibility pass over all views: draws, slots, samples."""
 
     def __init__(
-        self, stage: Stage, draws: Draws, lens: F32, *, ortho: bool, size: tuple[int, int], scale: int
+        self, stage: Scene, draws: Draws, lens: F32, *, ortho: bool, size: tuple[int, int], scale: int
     ) -> None:
         device = stage.device
         total = int(draws.counts.sum())
@@ -151,7 +151,7 @@ class _Pass:
 
 
 def render(
-    stage: Stage,
+    stage: Scene,
     views: Sequence[View],
     *,
     scale: int = 2,

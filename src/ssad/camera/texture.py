@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ssad.camera.render import Picture
-from ssad.errors import ConfigError
-from ssad.types import F64, I32
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, I32
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ssad.camera.texture import Taps, levels_of
-from ssad.errors import ConfigError
+from ssad.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ssad.registry import names, resolve
+from ssad.core.registry import names, resolve
 
 DETECTORS: dict[str, str] = {
     "fcos3d-light": "ssad.detectors.builders:fcos3d_light",
@@ -69,8 +69,8 @@ def _classes_of(path: Path) -> dict[str, Any]:
 
 def _check_hash(path: Path, state: dict[str, Any]) -> None:
     """FormatError: shipped weights that are not those of their card."""
+    from ssad.core.errors import FormatError
     from ssad.detectors.checkpoints import hash_state, read_card
-    from ssad.errors import FormatError
 
     if hash_state(state) != read_card(path).hash:
         raise FormatError(f"{path}: not the weights that their card describes (another hash); install SSAD anew")

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ssad.detections import ATTRIBUTES, Assignment, Detections, Solids, Truth
-from ssad.detectors.trial import BATCH, Trial, modules_of
-from ssad.errors import ConfigError
-from ssad.protocols import Detector
+from ssad.core.detections import ATTRIBUTES, Assignment, Detections, Solids, Truth
+from ssad.core.errors import ConfigError
+from ssad.core.protocols import Detector
+from ssad.detectors.check_cases import BATCH, CheckCase, modules_of
 
 RTOL = 2e-3
 FEW = 0.01  # share of places that may differ in a batch: choices between values that are equal but for rounding
@@ -22,7 +22,7 @@ class DetectorCheckError(AssertionError):
 
 
 def check_detector(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> None:
-    """Hold a detector to the protocol `ssad.protocols.Detector`; raises DetectorCheckError with every broken promise.
+    """Hold a detector to `ssad.core.protocols.Detector`; raises DetectorCheckError with every broken promise.
 
     size: height and width of the pictures that are tried, random ones (others follow); intrinsic [3, 3] of the camera
     for them, for detectors of task "3d" (default: a focal length of 0.8 times the width).
@@ -37,8 +37,8 @@ def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[i
     if not isinstance(detector, Detector):
         wanted = ("name", "task", "classes", "predict", "dense", "assign", "losses")
         missing = [name for name in wanted if not hasattr(detector, name)]
-        return [f"it lacks {', '.join(missing)} of ssad.protocols.Detector"]
-    trial = Trial(detector, size, intrinsic)
+        return [f"it lacks {', '.join(missing)} of ssad.core.protocols.Detector"]
+    trial = CheckCase(detector, size, intrinsic)
     for part in (
         _check_names, _check_dense, _check_gradient, _check_predict, _check_batch, _check_losses, _check_modes,
         _check_sizes, _check_refusals,
@@ -51,7 +51,7 @@ def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[i
 # ---------------------------------------------------------------- the promises
 
 
-def _check_names(trial: Trial) -> None:
+def _check_names(trial: CheckCase) -> None:
     detector, need = trial.detector, trial.need
     name: Any = detector.name
     need(isinstance(name, str) and name != "", "name is a text")
@@ -65,7 +65,7 @@ def _check_names(trial: Trial) -> None:
         need(not learning, f"parameters are frozen outside training; {learning[:1]} has requires_grad")
 
 
-def _check_dense(trial: Trial) -> None:
+def _check_dense(trial: CheckCase) -> None:
     need, images = trial.need, trial.images()
     dense = trial.dense(images)
     classes = len(trial.detector.classes)
@@ -91,7 +91,7 @@ def _check_dense(trial: Trial) -> None:
     need(heights == sorted(heights, reverse=True), "Dense.features are ordered finest first")
 
 
-def _check_gradient(trial: Trial) -> None:
+def _check_gradient(trial: CheckCase) -> None:
     names = ["logit", "box"] + (["quality"] if trial.dense(trial.images(1)).quality is not None else [])
     for name in names:
         images = trial.images(2).requires_grad_()
@@ -108,7 +108,7 @@ def _check_gradient(trial: Trial) -> None:
         trial.need(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
 
 
-def _usual(trial: Trial, images: Tensor) -> float:
+def _usual(trial: CheckCase, images: Tensor) -> float:
     """A threshold at which some 20 objects are found in each image."""
     with torch.no_grad():
         dense = trial.dense(images[:1])
@@ -126,7 +126,7 @@ def _usual(trial: Trial, images: Tensor) -> float:
     return 0.0
 
 
-def _check_predict(trial: Trial) -> None:
+def _check_predict(trial: CheckCase) -> None:
     need, images = trial.need, trial.images()
     need(len(trial.predict(images)) == BATCH, "predict answers for each image")
     least = _usual(trial, images)
@@ -174,10 +174,10 @@ def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
         yield finite or name == "velocity", f"Solids.{name} is finite"
     yield bool((solid.size > 0).all()), "sizes are above 0"
     inside = bool(((solid.attribute >= 0) & (solid.attribute < len(ATTRIBUTES))).all())
-    yield inside, "attributes are within ssad.detections.ATTRIBUTES"
+    yield inside, "attributes are within ssad.core.detections.ATTRIBUTES"
 
 
-def _check_batch(trial: Trial) -> None:
+def _check_batch(trial: CheckCase) -> None:
     images = trial.images()
     with torch.no_grad():
         together = trial.dense(images)
@@ -216,7 +216,7 @@ def _alike(a: Detections, b: Detections) -> bool:
     return float(match.any(1).double().mean()) > 0.6
 
 
-def _check_losses(trial: Trial) -> None:
+def _check_losses(trial: CheckCase) -> None:
     need, detector = trial.need, trial.detector
     images, truth = trial.images().requires_grad_(), trial.truth()
     dense = trial.dense(images)
@@ -264,7 +264,7 @@ def _check_losses(trial: Trial) -> None:
     need(all(bool(v.isfinite()) for v in kept.values()), "a frozen assignment serves other pictures of the same size")
 
 
-def _check_modes(trial: Trial) -> None:
+def _check_modes(trial: CheckCase) -> None:
     """In a mixture of modes, as training with frozen parts has it, predict changes nothing."""
     roots = modules_of(trial.detector)
     before = [(part, part.training) for root in roots for part in root.modules()]
@@ -278,7 +278,7 @@ def _check_modes(trial: Trial) -> None:
             part.training = mode
 
 
-def _check_sizes(trial: Trial) -> None:
+def _check_sizes(trial: CheckCase) -> None:
     for size in ((67, 91), (33, 40)):
         images = trial.images(1, size).requires_grad_()
         with trial.guarded(f"pictures of {size[0]} x {size[1]}"):
@@ -289,7 +289,7 @@ def _check_sizes(trial: Trial) -> None:
             trial.predict(images.detach())
 
 
-def _check_refusals(trial: Trial) -> None:
+def _check_refusals(trial: CheckCase) -> None:
     images, detector = trial.images(1), trial.detector
     lens = trial.lens(1)
     dense = trial.dense(images)

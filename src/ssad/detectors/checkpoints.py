@@ -22,10 +22,10 @@ from safetensors.torch import load as parse_safetensors
 from safetensors.torch import save as dump_safetensors
 from torch import Tensor, nn
 
+from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
+from ssad.core.version import __version__
 from ssad.detectors.pickled import MAX_BYTES, read_pickled
-from ssad.errors import ConfigError, FormatError, StoreError
-from ssad.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
-from ssad.version import __version__
 
 PICKLED = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 SHARD = re.compile(r"(?P<stem>.+)-(?P<number>\d{5})-of-(?P<count>\d{5})\.safetensors")

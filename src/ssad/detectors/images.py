@@ -15,8 +15,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ssad.errors import ConfigError, FormatError
-from ssad.safeio import MIB, read_bytes
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.safeio import MIB, read_bytes
 
 MAX_FILE = 256 * MIB
 MAX_PIXELS = 1 << 26

@@ -17,12 +17,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ssad.core.errors import ConfigError
+from ssad.core.types import U8
 from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.fcos3d import fcos3d
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.pgd_det import pgd_det
-from ssad.errors import ConfigError
-from ssad.types import U8
 
 _BUILDERS = {"fcos3d": fcos3d, "pgd": pgd_det, "pgd-det": pgd_det}
 _NAMES = ("cls_scores", "bbox_preds", "dir_cls_preds", "depth_cls_preds", "attr_preds", "centernesses")

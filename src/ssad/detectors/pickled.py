@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ssad.errors import FormatError
-from ssad.safeio import MIB, read_bytes
+from ssad.core.errors import FormatError
+from ssad.core.safeio import MIB, read_bytes
 
 MAX_BYTES = 4096 * MIB
 MAX_PICKLE = 256 * MIB

@@ -13,10 +13,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ssad.core.errors import FormatError
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.models import YoloSpec
-from ssad.errors import FormatError
 
 YOLOV5N = YoloSpec(
     name="yolov5n",

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from ssad.core.types import F64
 from ssad.metrics.driving import DIVISORS, WEIGHTS, EpisodeMetrics, overall_score
 from ssad.metrics.uncertainty import (
     Estimate,
@@ -23,7 +24,6 @@ from ssad.metrics.uncertainty import (
     resample_counts,
     wilson,
 )
-from ssad.types import F64
 
 AVERAGE = "Avg."
 

@@ -10,8 +10,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from ssad.geometry import obb_distance
-from ssad.types import F64, Bool, EpisodeTrace
+from ssad.core.geometry import obb_distance
+from ssad.core.types import F64, Bool, EpisodeTrace
 
 CAP = 10.0
 """Largest TTC and PET, s: nothing later counts as a conflict (the cap of FREA's PET)."""

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import FormatError
+from ssad.core.errors import FormatError
+from ssad.core.types import F64, I32
 from ssad.metrics.detection_boxes import (
     CVPR_2019,
     I64,
@@ -30,7 +31,6 @@ from ssad.metrics.detection_boxes import (
 )
 from ssad.metrics.detection_match import ClassMatches, match_class
 from ssad.metrics.uncertainty import percentile_interval
-from ssad.types import F64, I32
 
 __all__ = [
     "CVPR_2019",

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssad.core.types import F64, I32, Bool
 from ssad.metrics.detection_boxes import I64
 from ssad.metrics.detection_match import assign, pairs_of
-from ssad.types import F64, I32, Bool
 
 RECALL = np.linspace(0.0, 1.0, 101)
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import FormatError
-from ssad.types import F64, I32, Bool
+from ssad.core.errors import FormatError
+from ssad.core.types import F64, I32, Bool
 
 I8 = npt.NDArray[np.int8]
 I64 = npt.NDArray[np.int64]

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssad.errors import FormatError
+from ssad.core.errors import FormatError
+from ssad.core.types import F64, I32, Bool
 from ssad.metrics.detection_boxes import I64, BoxTable, DetectionConfig, yaw
-from ssad.types import F64, I32, Bool
 
 PAIRS = 1 << 16  # pairs looked at together: bounds the memory
 

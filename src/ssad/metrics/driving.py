@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ssad.geometry import wrap_angle
+from ssad.core.geometry import wrap_angle
+from ssad.core.types import F64, Bool, Contact, EpisodeTrace
 from ssad.metrics.criticality import min_distance, min_ttc, post_encroachment_time
-from ssad.types import F64, Bool, Contact, EpisodeTrace
 
 DIVISORS = {"CR": 1.0, "OR": 10.0, "DR": 5.0, "IR": 1.0, "TS": 30.0, "ACC": 8.0, "YV": 1.0}
 """What SafeBench divides a metric by (IR: incomplete route, 1 - RC; ACC and YV: FREA's, not part of the score)."""

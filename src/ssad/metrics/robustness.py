@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import ConfigError
-from ssad.types import F64
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64
 
 Scores = Mapping[str, Sequence[float | None]]  # None: not run, which is refused
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.seeding import generator
-from ssad.types import F64
+from ssad.core.seeding import generator
+from ssad.core.types import F64
 
 RESAMPLES = 2000
 LEVEL = 0.95

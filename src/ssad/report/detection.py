@@ -10,12 +10,12 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ssad import safeio
-from ssad.errors import ConfigError, StoreError
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, StoreError
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.report.load import read_records
-from ssad.report.pages import command_of, template
+from ssad.report.pages import template
 from ssad.report.paper import DETECTORS
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.report.tables import Cell, Row, Table, write_tables
@@ -348,7 +348,8 @@ def write_detection_report(folder: Path, header: Mapping[str, Any]) -> Path:
         run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, left=left,
         severities=severities, cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
         plot_map=curves(run, "mAP"),
-        command=command_of(dict(run.suite)), versions=header.get("versions", {}), pictures=_pictures(folder),
+        command=header.get("command", f"ssad run {run.suite['name']}"),
+        versions=header.get("versions", {}), pictures=_pictures(folder),
         samples=some.get("n", 0), scenes=some.get("scenes", 0),
         failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
     )  # fmt: skip

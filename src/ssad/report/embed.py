@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import EpisodeTrace, LaneType
 from ssad.report.lanes import LAYERS, junction_areas, strips, thin
-from ssad.roads.graph import LaneGraph
-from ssad.types import EpisodeTrace, LaneType
 
 SCALE = 0.03  # m
 SPEED = 0.01  # m/s

@@ -8,18 +8,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ssad import safeio
-from ssad.errors import SSADError
+from ssad.core import safeio
+from ssad.core.errors import SSADError, StoreError
+from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.traces import load_trace
+from ssad.core.types import EpisodeTrace
 from ssad.metrics import METRICS, aggregate
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
 from ssad.report.figures import interval_plot
 from ssad.report.load import Record, Run, load_header, load_run
-from ssad.report.pages import command_of, template
+from ssad.report.pages import template
 from ssad.report.paper import SCENARIOS
 from ssad.report.tables import Table, tables, write_tables
-from ssad.roads.graph import LaneGraph, load_graph
-from ssad.traces import load_trace
-from ssad.types import EpisodeTrace
 
 VERDICTS = {
     "harmless": "a blind driver at the system's speed stays clear",
@@ -59,7 +59,7 @@ def render(run: Run, found: list[Table]) -> str:
         suite=suite,
         title=suite.get("title") or suite.get("name", "SSAD"),
         versions=run.header.get("versions", {}),
-        command=command_of(run.header.get("suite", {})),
+        command=run.header.get("command", f"ssad run {suite.get('name', 'quick')}"),
         tiles=[_tile(run, system) for system in run.systems],
         precrash=named.get("precrash"),
         natural=named.get("natural"),
@@ -154,13 +154,11 @@ def _witness(run: Run) -> dict[str, Any] | None:
 
 
 def _graph(run: Run, town: str) -> LaneGraph:
-    """The town as the run saw it, if the folder keeps it, else by name."""
+    """The town as the run saw it. StoreError: the folder has lost it."""
     own = run.folder / "towns" / f"{town}.npz"
     if own.is_file():
         return load_graph(own)
-    from ssad.roads import load_town
-
-    return load_town(town)
+    raise StoreError(f"towns/{town}.npz is missing: this run folder is not complete")
 
 
 def replay_data(run: Run) -> dict[str, Any]:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ssad.roads.graph import LaneGraph
-from ssad.types import F64, LaneType
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F64, LaneType
 
 # drawing order and colour class: sidewalks under shoulders under lanes
 LAYERS = {

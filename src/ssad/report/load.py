@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ssad import safeio
-from ssad.errors import StoreError
+from ssad.core import safeio
+from ssad.core.errors import StoreError
 from ssad.metrics import EpisodeMetrics
 from ssad.report.paper import SCENARIOS
 

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import math
-import shlex
-from typing import Any
 
 import jinja2
 
-from ssad.bench.suite import load_suite
-from ssad.errors import SSADError
 from ssad.metrics import METRICS
 from ssad.report.tables import Cell
 
@@ -36,21 +32,3 @@ def heat(cell: Cell, symbol: str) -> str:
     share = min(max(cell.mean / scale, 0.0), 1.0)
     bad = share if metric.better == "lower" else 1.0 - share
     return f"--bad:{100 * bad:.0f}%"
-
-
-def command_of(suite: dict[str, Any]) -> str:
-    """The command that runs a suite again; only what differs from the suite of that name is spelt out."""
-    suite = dict(suite)
-    name = str(suite.pop("name", "quick"))
-    try:
-        stock = load_suite(name).model_dump(mode="json")
-    except SSADError:  # a suite of the user's own, by its file
-        stock = suite
-    words = ["ssad", "run", name]
-    for key, value in suite.items():
-        if value != stock.get(key):
-            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
-            if isinstance(value, dict):
-                text = "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
-            words += ["--set", f"{key}={text}"]
-    return shlex.join(words)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssad import safeio
+from ssad.core import safeio
 from ssad.metrics import METRICS, Estimate, GroupRow, aggregate, aggregate_groups
 from ssad.metrics.driving import DIVISORS, normalised
 from ssad.report.load import Run

@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from ssad.errors import ConfigError
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.safeio import atomic_path
+from ssad.core.types import AgentKind, EpisodeTrace, LaneType
 from ssad.report.lanes import LAYERS, junction_areas, strips
-from ssad.roads.graph import LaneGraph
-from ssad.safeio import atomic_path
-from ssad.types import AgentKind, EpisodeTrace, LaneType
 
 Frame = npt.NDArray[np.uint8]
 GROUND, ROAD, WALK, EDGE = (231, 236, 226), (82, 86, 96), (196, 198, 194), (236, 236, 236)

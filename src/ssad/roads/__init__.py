@@ -1,7 +1,7 @@
 """Roads: the lane graph of a town, its router, and nearest-lane and off-road queries."""
 
+from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.roads.bake import bake, import_map
-from ssad.roads.graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.roads.library import load_town, town_names
 from ssad.roads.query import LaneQuery, Nearest
 from ssad.roads.router import random_route, route_along

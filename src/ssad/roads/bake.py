@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import MapError
-from ssad.roads.graph import LaneGraph, Marking, save_graph
+from ssad.core.errors import MapError
+from ssad.core.lane_graph import LaneGraph, Marking, save_graph
+from ssad.core.types import F64, I32, LaneType
 from ssad.roads.signals import Approaches, place_signals
 from ssad.roads.xodr import Connection, Lane, Link, Network, Road, read_network
-from ssad.types import F64, I32, LaneType
 
 TIMEOUT = 120.0  # s; Town05 takes about 3
 STEP = 2.0  # m, most between two points of a lane

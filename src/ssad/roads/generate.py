@@ -7,17 +7,17 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
-from ssad.errors import unknown_name
+from ssad.core.errors import unknown_name
+from ssad.core.lane_graph import save_graph
+from ssad.core.safeio import write_atomic
 from ssad.roads.bake import bake
-from ssad.roads.graph import save_graph
 from ssad.roads.library import BUILT_IN
-from ssad.roads.writer import Point, Street, Town, write_town
-from ssad.safeio import write_atomic
+from ssad.roads.writer import Point, RoadSpec, Town, write_town
 
 __all__ = ["TOWNS", "generate_town"]
 
 
-def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], Street]) -> list[Street]:
+def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], RoadSpec]) -> list[RoadSpec]:
     """Streets from stop to stop."""
     return [make((a, b)) for a, b in pairwise(stops)]
 
@@ -25,8 +25,8 @@ def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], Street]) -> l
 def twinford() -> Town:
     """Two-lane streets and T-junctions, about 240 x 220 m, in the spirit of CARLA's Town02."""
 
-    def street(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=1, width=3.75, shoulder=0.5, sidewalk=3.0, limit=25.0, radius=18.0)
+    def street(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.75, shoulder=0.5, sidewalk=3.0, limit=25.0, radius=18.0)
 
     w, m, e = 0.0, 120.0, 240.0
     streets = [
@@ -47,11 +47,11 @@ def twinford() -> Town:
 def crossgate() -> Town:
     """Streets of 2 + 2 lanes, four signalled crossroads inside an outer ring, 400 x 400 m; like CARLA's Town05."""
 
-    def street(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=35.0, radius=30.0)
+    def street(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=35.0, radius=30.0)
 
-    def ring(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=2, width=3.5, shoulder=1.5, sidewalk=2.0, limit=45.0, radius=40.0)
+    def ring(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=2, width=3.5, shoulder=1.5, sidewalk=2.0, limit=45.0, radius=40.0)
 
     size, xs, ys = 400.0, (125.0, 270.0), (140.0, 275.0)
     streets = [
@@ -79,8 +79,8 @@ def proving_ground() -> Town:
     straight, bends north, and comes back at (600, 400).
     """
 
-    def street(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=40.0, radius=40.0)
+    def street(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=2, width=3.5, shoulder=0.5, sidewalk=3.0, limit=40.0, radius=40.0)
 
     step = (0.0, 200.0, 400.0, 600.0)
     low, a, b, high = step
@@ -98,7 +98,7 @@ def proving_ground() -> Town:
         streets += _chain([(at, y) for y in step], street)
         streets += _chain([(x, at) for x in step], street)
     country = ((high, a), (high + 260.0, a), (high + 260.0, b), (high, b))
-    streets.append(Street(country, lanes=1, width=3.5, shoulder=1.5, sidewalk=0.0, limit=40.0, radius=40.0))
+    streets.append(RoadSpec(country, lanes=1, width=3.5, shoulder=1.5, sidewalk=0.0, limit=40.0, radius=40.0))
     inner = tuple((x, y) for x in (a, b) for y in (a, b))
     return Town("ProvingGround", tuple(streets), signalled=(*inner, (a, low), (b, high), (high, a), (low, b)))
 
@@ -124,11 +124,11 @@ def oldmarket() -> Town:
     Junctions lie off the grid by some metres, so that no street is straight for long. The market is the large block.
     """
 
-    def street(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=22.0)
+    def street(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=22.0)
 
-    def crescent(points: tuple[Point, ...]) -> Street:
-        return Street(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=48.0)
+    def crescent(points: tuple[Point, ...]) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.25, shoulder=0.5, sidewalk=2.2, limit=20.0, radius=48.0)
 
     # rows from south to north, junctions from west to east
     south: list[Point] = [(80.0, 0.0), (146.0, -6.0), (212.0, 2.0)]
@@ -161,13 +161,13 @@ def oldmarket() -> Town:
 def larkhill() -> Town:
     """A suburb of two-lane roads that wind, with T-junctions and cul-de-sacs that end in a loop; 470 x 450 m."""
 
-    def road(*points: Point) -> Street:
-        return Street(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=25.0, radius=34.0)
+    def road(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=25.0, radius=34.0)
 
-    def close(*points: Point) -> Street:
-        return Street(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=20.0, radius=13.0)
+    def close(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=1.8, limit=20.0, radius=13.0)
 
-    def loop(head: Point, ahead: Point, aside: float) -> Street:
+    def loop(head: Point, ahead: Point, aside: float) -> RoadSpec:
         """A street that leaves `head` sideways, runs round and comes back; ahead: m east and north to its far side."""
         (x, y), (u, v) = head, ahead
         a, b = (0.0, aside) if u else (aside, 0.0)

@@ -6,10 +6,10 @@ from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from ssad.errors import MapError, unknown_name
+from ssad.core.errors import MapError, unknown_name
+from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.safeio import home
 from ssad.roads.bake import bake
-from ssad.roads.graph import LaneGraph, load_graph
-from ssad.safeio import home
 
 BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.roads.graph import LaneGraph
-from ssad.types import F32, F64, I32, Bool, LaneType
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F32, F64, I32, Bool, LaneType
 
 CELL = 2.0  # m; smaller cells list fewer segments, larger ones need less memory
 MARGIN = 3.0  # m outside a lane's edge up to which its cell still answers

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ssad.errors import RouteError
-from ssad.roads.graph import LaneGraph
+from ssad.core.errors import RouteError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F64, I32, LaneType, Pose, Route
 from ssad.roads.query import nearest_all
-from ssad.types import F64, I32, LaneType, Pose, Route
 
 CHANGE = 20.0  # m of road that a lane change takes
 CHANGE_COST = 15.0  # m of detour that one lane change is worth

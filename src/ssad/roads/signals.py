@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.types import F64, LaneType
 from ssad.roads.xodr import Network
-from ssad.types import F64, LaneType
 
 ARMS = 3  # a junction with fewer arms needs no signal
 SETBACK = 1.0  # m from the stop line to a crosswalk

@@ -14,7 +14,7 @@ CROSSWALK_END = 1.0  # m between a crosswalk and the end of its street
 
 
 @dataclass(frozen=True)
-class Street:
+class RoadSpec:
     """A road of equal halves along a polyline whose inner corners are rounded with `radius` m.
 
     lanes a side of `width` m, then a shoulder and a sidewalk (m, 0: none); `limit` in mph; signals and crosswalks
@@ -35,7 +35,7 @@ class Town:
     """Streets whose ends meet at junctions; arms leave a junction along the axes. signalled: junction places."""
 
     name: str
-    streets: tuple[Street, ...]
+    streets: tuple[RoadSpec, ...]
     signalled: tuple[Point, ...] = ()
 
 
@@ -55,7 +55,7 @@ class _Arm:
     """The end of a street at a junction. heading: outwards from the junction; at_end: the street ends here."""
 
     road: int
-    street: Street
+    street: RoadSpec
     heading: float
     at_end: bool
 
@@ -118,7 +118,7 @@ def _junctions(town: Town) -> list[_Junction]:
     return list(found.values())
 
 
-def _plan(street: Street, start: float, end: float) -> list[_Piece]:
+def _plan(street: RoadSpec, start: float, end: float) -> list[_Piece]:
     """Reference line of a street between the ends of its arms: lines, and arcs at its corners."""
     points = list(street.points)
     heads = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in pairwise(points)]
@@ -159,7 +159,7 @@ def _turn(start: Point, heading: float, end: Point, turn: float) -> list[_Piece]
     return pieces
 
 
-def _street(number: int, street: Street, pieces: list[_Piece], ends: tuple[_Junction, _Junction]) -> Element:
+def _street(number: int, street: RoadSpec, pieces: list[_Piece], ends: tuple[_Junction, _Junction]) -> Element:
     road = _road(f"street {number}", number, -1, pieces)
     link = road.find("link")
     assert link is not None
@@ -196,7 +196,7 @@ def _street(number: int, street: Street, pieces: list[_Piece], ends: tuple[_Junc
     return road
 
 
-def _crosswalk(objects: Element, number: int, k: int, s: float, street: Street) -> None:
+def _crosswalk(objects: Element, number: int, k: int, s: float, street: RoadSpec) -> None:
     half = street.lanes * street.width + street.shoulder
     name = {"id": str(100 * number + k), "name": "crosswalk", "type": "crosswalk", "orientation": "none"}
     place = {"s": _f(s), "t": "0", "zOffset": "0", "hdg": "0"}

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from ssad.errors import FormatError, MapError
-from ssad.roads.graph import Marking
-from ssad.safeio import MIB, read_xml
-from ssad.types import LaneType
+from ssad.core.errors import FormatError, MapError
+from ssad.core.lane_graph import Marking
+from ssad.core.safeio import MIB, read_xml
+from ssad.core.types import LaneType
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

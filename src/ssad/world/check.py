@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import ConfigError
-from ssad.protocols import World
-from ssad.seeding import generator
+from ssad.core.errors import ConfigError
+from ssad.core.protocols import Simulator
+from ssad.core.seeding import generator
 
-MakeWorld = Callable[[Sequence[int]], World]
+MakeWorld = Callable[[Sequence[int]], Simulator]
 
 
 class WorldCheckError(AssertionError):
@@ -23,7 +23,7 @@ def _need(ok: bool, promise: str) -> None:
         raise WorldCheckError(promise)
 
 
-def _actions(world: World, seeds: Sequence[int], step: int) -> npt.NDArray[np.float32]:
+def _actions(world: Simulator, seeds: Sequence[int], step: int) -> npt.NDArray[np.float32]:
     """Controls [B, 3] that depend on the scene's seed and the step alone."""
     rows = [generator("check_world", seed, step).random(3) for seed in seeds]
     out = np.array(rows, np.float32)
@@ -32,7 +32,7 @@ def _actions(world: World, seeds: Sequence[int], step: int) -> npt.NDArray[np.fl
     return out
 
 
-def _run(world: World, seeds: Sequence[int], steps: int, first: int = 0) -> list[list[str]]:
+def _run(world: Simulator, seeds: Sequence[int], steps: int, first: int = 0) -> list[list[str]]:
     """Hashes after each step: [steps][B]."""
     out = []
     for step in range(first, first + steps):
@@ -48,7 +48,7 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
     """
     order = list(range(min(episodes, 6)))
     world = make(order)
-    _need(isinstance(world, World), "it has the methods and attributes of ssad.protocols.World")
+    _need(isinstance(world, Simulator), "it has the methods and attributes of ssad.core.protocols.Simulator")
     _need(world.batch == len(order), "its batch is as long as the assignment")
     start = world.hashes()
     told = _run(world, order, steps)
@@ -88,7 +88,7 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
     _check_bad_actions(make(order))
 
 
-def _check_physics(world: World, order: Sequence[int], steps: int) -> None:
+def _check_physics(world: Simulator, order: Sequence[int], steps: int) -> None:
     last = world.array("pose").copy()
     for step in range(steps):
         ended = world.ended() != 0
@@ -105,7 +105,7 @@ def _check_physics(world: World, order: Sequence[int], steps: int) -> None:
         last = pose.copy()
 
 
-def _check_bad_actions(world: World) -> None:
+def _check_bad_actions(world: Simulator) -> None:
     bad: list[npt.ArrayLike] = [
         np.zeros((world.batch + 1, 3)),
         np.zeros((world.batch, 2)),

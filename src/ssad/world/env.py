@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
-from ssad.errors import ConfigError
-from ssad.roads.graph import LaneGraph
-from ssad.types import Controller, Episode
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Controller, Episode
 from ssad.world.world import ENDS, World
 
 Observation = Literal["safebench", "frea"]

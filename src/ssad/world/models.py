@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ssad.errors import unknown_name
-from ssad.types import AgentKind, Model
+from ssad.core.errors import unknown_name
+from ssad.core.types import AgentKind, Model
 
 # CARLA's cars turn their front wheels by up to 70 degrees at steer = 1; ported controllers rely on that scale.
 _STEER = math.radians(70.0)

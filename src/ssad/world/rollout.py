@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import ConfigError
-from ssad.protocols import DrivingSystem
-from ssad.roads.graph import LaneGraph
-from ssad.types import Controller, Episode, EpisodeTrace
-from ssad.world.view import make_view
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.protocols import DrivingSystem
+from ssad.core.types import Controller, Episode, EpisodeTrace
+from ssad.world.observation import make_observation
 from ssad.world.world import ENDS, World, signal_states
 
 _AGENT = ("x", "y", "yaw", "speed", "active")
@@ -80,7 +80,7 @@ def rollout(
     limit = min(most, int(max(e.limits.max_time for e in episodes) / world.dt) + 1)
     for step in range(1, limit + 1):
         if external:
-            given = np.asarray(system.act(make_view(world)), np.float32)
+            given = np.asarray(system.act(make_observation(world)), np.float32)
             if given.ndim != 2 or given.shape[0] != world.batch or given.shape[1] not in (3, 4):
                 raise ConfigError(
                     f"system {system.name}: act returned shape {given.shape}, expected ({world.batch}, 3): "

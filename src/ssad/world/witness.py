@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ssad.roads.graph import LaneGraph
-from ssad.types import Condition, Controller, Episode, EpisodeAgent, Phase, Route
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Condition, Controller, Episode, EpisodeAgent, Phase, Route
 from ssad.world.world import ENDS, World
 
 Verdict = Literal["harmless", "avoidable", "anticipation", "autopilot", "unavoidable"]

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ssad.errors import ConfigError
-from ssad.roads.graph import LaneGraph
-from ssad.types import Controller, Episode, SignalState
-from ssad.world.bank import agent_kinds, build, signal_programs
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Controller, Episode, SignalState
+from ssad.world.episode_arrays import agent_kinds, build, signal_programs
 from ssad.world.kernels.data import HORIZON, Ego, State, Work
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.look import look

@@ -9,21 +9,21 @@ import cv2
 import numpy as np
 import torch
 
-from ssad import safeio
 from ssad.bench.component.run import Plan
 from ssad.bench.component.work import Job, Unit, Watched, detector_of, shifter_of
-from ssad.bench.detect import to_images
-from ssad.bench.execute import quiet_warp
 from ssad.bench.pictures import FOLDER, PAGE
-from ssad.bench.toolbox.sheet import save_picture
-from ssad.bench.training_data import camera_truth, scenes_of
-from ssad.datasets.nuscenes.reader import NuScenes, read_image
+from ssad.core import safeio
+from ssad.core.detections import Solids
+from ssad.core.errors import FormatError
+from ssad.core.images import read_image, save_picture
+from ssad.core.types import F64, U8
+from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
-from ssad.detections import Solids
 from ssad.detectors.mono3d.decode import corners
-from ssad.errors import FormatError
+from ssad.evaluation.camera_truth import camera_truth, scenes_of
+from ssad.evaluation.detection import to_images
+from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts import SHIFTS
-from ssad.types import F64, U8
 
 WIDTH, COLUMNS, LEAST, STRONG = 640, 3, 0.3, 3
 EDGES = tuple((a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit)  # corners that differ in one axis

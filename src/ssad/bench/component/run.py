@@ -11,36 +11,35 @@ from typing import Any
 
 from rich.console import Console
 
-from ssad import safeio
 from ssad.bench.cells import source_version
 from ssad.bench.component.suite import RECORDED, DetectionSuite
 from ssad.bench.component.work import Cell, Job, Made, Scored, Unit, detector_of, forget_failures, make_unit, score_cell
-from ssad.bench.pool import Crew, visible_gpus
-from ssad.bench.progress import Live
-from ssad.bench.record import Recording, record_nuscenes
-from ssad.bench.run import default_workers, versions
-from ssad.bench.store import Store
-from ssad.bench.training_data import scenes_of
+from ssad.bench.suite import command_of
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
-from ssad.errors import ConfigError
+from ssad.evaluation.camera_truth import scenes_of
+from ssad.jobs.machine import default_workers, versions, visible_gpus
+from ssad.jobs.pool import Crew
+from ssad.jobs.progress import Live
+from ssad.jobs.store import Store
+from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
-from ssad.seeding import digest
 
 # a change in any of these may change a number
 _CODE = (
-    "detections.py",
+    "core",
     "detectors",
     "scenarios/static/shifts",
     "metrics",
     "datasets",
-    "geometry.py",
-    "frames.py",
-    "bench/toolbox/scene.py",
-    "bench/detect.py",
+    "toolbox",
+    "evaluation",
     "bench/component/work.py",
 )
-_WORLD = ("camera", "world", "roads", "agents", "bench/record.py", "bench/drives.py", "bench/cast.py")
+_WORLD = ("camera", "assets", "world", "roads", "drivers", "recording")
 # processes that share a GPU: planning a shift and reading pictures is work for the host; and memory of each, bytes
 GPU_WORKERS, GPU_SHARE = 14, 4 << 30
 
@@ -77,6 +76,7 @@ class Plan:
         ]  # fmt: skip
         return {
             "identity": digest("detection run", *[c["key"] for c in cells])[:16],
+            "command": command_of(self.suite.model_dump(mode="json")),
             "suite": self.suite.model_dump(mode="json"), "data": dict(self.data),
             "versions": versions(self.device) | {"shifts": str(VERSIONS[self.suite.calibration])},
             "weights": dict(self.weights), "cells": cells,

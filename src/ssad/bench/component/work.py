@@ -16,22 +16,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssad import safeio
-from ssad.bench.detect import SampleBoxes, detect_with, match_boxes, numbers, to_host
-from ssad.bench.execute import quiet_warp
-from ssad.bench.toolbox.scene import SceneShifter
+from ssad.core import safeio
+from ssad.core.detections import Detections, Solids
+from ssad.core.errors import FormatError, SSADError
+from ssad.core.seeding import generator
+from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detections import Detections, Solids
 from ssad.detectors import make_detector
 from ssad.detectors.check import promises
-from ssad.detectors.mono3d.merge import WorldBoxes
-from ssad.errors import FormatError, SSADError
+from ssad.detectors.mono3d.multi_camera import WorldBoxes
+from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.jobs.machine import quiet_warp
 from ssad.metrics.uncertainty import percentile_interval
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
-from ssad.seeding import generator
-from ssad.types import U8
+from ssad.toolbox.scene_shifter import SceneShifter
 
 FOLDER = "detections"
 _COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label")

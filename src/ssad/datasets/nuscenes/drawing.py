@@ -1,7 +1,7 @@
 """Pictures and LiDAR sweeps of a street of blocks: painter's order, near-plane clipping, rays against boxes.
 
 Cameras stand upright (no pitch or roll), so that the horizon is the row of the principal point. All geometry is in
-the street frame of `ssad.datasets.nuscenes.street`.
+the street frame of `ssad.datasets.nuscenes.block_street`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from ssad.datasets.nuscenes.street import BLOCK, HALF, PIXEL, Colour, Part, Thing, ground_texture
-from ssad.types import F32, F64, U8
+from ssad.core.types import F32, F64, U8
+from ssad.datasets.nuscenes.block_street import BLOCK, HALF, PIXEL, BlockObject, Colour, Part, ground_texture
 
 NEAR = 0.15  # m
 FAR = 250.0
@@ -26,7 +26,7 @@ _LEVELS = 6
 
 
 @dataclass(frozen=True)
-class View:
+class BlockView:
     """A camera in the street frame: place x, y, z, yaw of its optical axis, focal length and principal point (px)."""
 
     x: float
@@ -60,11 +60,11 @@ class Light:
     strength: float
 
 
-class Street:
+class BlockStreet:
     """What is drawn: objects, buildings, ground and light. The textures are made once."""
 
     def __init__(
-        self, things: Sequence[Thing], buildings: Sequence[Thing], light: Light, random: np.random.Generator
+        self, things: Sequence[BlockObject], buildings: Sequence[BlockObject], light: Light, random: np.random.Generator
     ) -> None:
         self.things, self.buildings, self.light = tuple(things), tuple(buildings), light
         ground = ground_texture(random)
@@ -79,7 +79,7 @@ class Street:
         """Brightness of the ground texture, 0 to 1."""
         return np.asarray(self._ground[1].mean(axis=2) / 255.0, np.float32)
 
-    def picture(self, view: View, seconds: float) -> tuple[U8, list[tuple[int, int]]]:
+    def picture(self, view: BlockView, seconds: float) -> tuple[U8, list[tuple[int, int]]]:
         """The image uint8 [H, W, 3] RGB, and for each object the pixels seen and those of its whole outline in it."""
         image = np.empty((view.height, view.width, 3), np.uint8)
         self._draw_sky(image, view)
@@ -100,7 +100,7 @@ class Street:
         image = cv2.subtract(cv2.add(image, grain), (6, 6, 6, 0))
         return image, [(int(counts[i + 1]), outlines[i]) for i in range(len(self.things))]
 
-    def _draw_sky(self, image: U8, view: View) -> None:
+    def _draw_sky(self, image: U8, view: BlockView) -> None:
         rows = min(max(math.ceil(view.cy), 0), view.height)
         u, v = np.meshgrid(np.arange(view.width, dtype=np.float32), np.arange(rows, dtype=np.float32))
         right, up = (u - view.cx) / view.focal, (view.cy - v) / view.focal
@@ -116,7 +116,7 @@ class Street:
         base += (cloud * np.clip(above * 6.0, 0.0, 1.0))[..., None] * (244.0 - base)
         image[:rows] = base.astype(np.uint8)
 
-    def _draw_ground(self, image: U8, view: View) -> None:
+    def _draw_ground(self, image: U8, view: BlockView) -> None:
         """Bands of rows, each from the texture whose pixels have about their size on the ground."""
         haze = np.array(self.light.haze, np.float32)
         first = min(max(math.ceil(view.cy), 0), view.height)
@@ -148,7 +148,7 @@ class Street:
         tint = (1.0 - np.exp(-distance / _HAZE_LENGTH)).astype(np.float32)[:, None, None] * haze
         image[rows[0] :] = np.clip(image[rows[0] :] * clear + tint, 0, 255).astype(np.uint8)
 
-    def _draw_shadows(self, image: U8, view: View, seconds: float) -> None:
+    def _draw_shadows(self, image: U8, view: BlockView, seconds: float) -> None:
         for thing in self.things:
             x, y, yaw = thing.at(seconds)
             width, length, _ = thing.size
@@ -167,7 +167,7 @@ class Street:
             _fill(mask, pixels - (left, top), 1)
             area[mask > 0] = (area[mask > 0] * 0.5).astype(np.uint8)
 
-    def _draw(self, image: U8, view: View, thing: Thing, place: tuple[float, float, float]) -> list[F64]:
+    def _draw(self, image: U8, view: BlockView, thing: BlockObject, place: tuple[float, float, float]) -> list[F64]:
         """Draw a thing; the pixels of the faces that were drawn."""
         x, y, yaw = place
         reach = math.hypot(thing.size[0], thing.size[1]) / 2

@@ -18,11 +18,11 @@ from typing import Any, Final, Protocol, TypeVar
 
 import msgspec
 
-from ssad.datasets.nuscenes.schema import TABLES, Record
+from ssad.core.errors import FormatError, StoreError
+from ssad.core.safeio import atomic_path, home
+from ssad.core.seeding import digest
+from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 from ssad.datasets.nuscenes.tables import stream, table_path
-from ssad.errors import FormatError, StoreError
-from ssad.safeio import atomic_path, home
-from ssad.seeding import digest
 
 SMALL = 32 << 20  # bytes of all tables; below it an index in memory is quicker than a file
 LAYOUT = 1
@@ -30,7 +30,7 @@ PARENT: Final = {"sample": "scene_token", "sample_data": "sample_token", "sample
 _NAME: Final = {kind: name for name, kind in TABLES.items()}
 _BATCH = 500
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound=TableRecord)
 
 
 class Index(Protocol):
@@ -148,7 +148,7 @@ def _twice(path: Path, token: str) -> FormatError:
 
 
 @cache
-def _decoder(kind: type[Record]) -> Any:
+def _decoder(kind: type[TableRecord]) -> Any:
     """A typed decoder of the row as a list of its fields."""
     fields = tuple(field.type for field in msgspec.structs.fields(kind))
     return msgspec.msgpack.Decoder(tuple.__class_getitem__(fields))
@@ -158,11 +158,11 @@ class MemoryIndex:
     """An index of dictionaries."""
 
     def __init__(self, root: Path, version: str) -> None:
-        self._rows: dict[str, dict[str, Record]] = {}
-        self._children: dict[str, dict[str, list[Record]]] = {name: {} for name in PARENT}
+        self._rows: dict[str, dict[str, TableRecord]] = {}
+        self._children: dict[str, dict[str, list[TableRecord]]] = {name: {} for name in PARENT}
         for name, kind in TABLES.items():
             path = table_path(root, version, name)
-            table: dict[str, Record] = {}
+            table: dict[str, TableRecord] = {}
             parent, below = PARENT.get(name), self._children.get(name, {})
             for block in stream(path, kind):
                 for record in block:

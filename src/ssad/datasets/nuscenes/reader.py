@@ -14,13 +14,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ssad.datasets.nuscenes.files import (
-    decode_image,
-    encode_jpeg,
-    points_bytes,
-    read_image,
-    read_points,
-)
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.images import decode_image, encode_jpeg, read_image
+from ssad.core.types import F64, I32
+from ssad.datasets.nuscenes.files import points_bytes, read_points
 from ssad.datasets.nuscenes.index import Index, open_index
 from ssad.datasets.nuscenes.scene import (
     Annotations,
@@ -39,16 +36,14 @@ from ssad.datasets.nuscenes.schema import (
     EgoPose,
     Instance,
     Log,
-    Record,
     Sample,
     SampleAnnotation,
     SampleData,
     Scene,
     Sensor,
+    TableRecord,
 )
 from ssad.datasets.nuscenes.tables import table_path
-from ssad.errors import ConfigError, FormatError
-from ssad.types import F64, I32
 
 __all__ = [
     "Annotations",
@@ -64,7 +59,7 @@ __all__ = [
     "slerp",
 ]
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound=TableRecord)
 
 
 class NuScenes:
@@ -128,10 +123,10 @@ class NuScenes:
         log = self._index.get(Log, [record.log_token]).get(record.log_token)
         return SceneData(record, log, samples, self._frames(record, tokens), self._boxes(samples))
 
-    def _path(self, kind: type[Record]) -> Path:
+    def _path(self, kind: type[TableRecord]) -> Path:
         return table_path(self.root, self.version, next(name for name, known in TABLES.items() if known is kind))
 
-    def _need(self, kind: type[R], tokens: Iterable[str], source: type[Record]) -> dict[str, R]:
+    def _need(self, kind: type[R], tokens: Iterable[str], source: type[TableRecord]) -> dict[str, R]:
         """Rows by token, all of them. FormatError naming the table that names an absent one."""
         wanted = list(dict.fromkeys(tokens))
         found = self._index.get(kind, wanted)
@@ -140,7 +135,7 @@ class NuScenes:
                 raise self._dangling(source, kind, token)
         return found
 
-    def _dangling(self, source: type[Record], kind: type[Record], token: str) -> FormatError:
+    def _dangling(self, source: type[TableRecord], kind: type[TableRecord], token: str) -> FormatError:
         table = self._path(kind).name
         return FormatError(f"{self._path(source)}: it names token '{token}', which {table} does not have")
 

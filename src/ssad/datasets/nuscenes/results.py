@@ -21,10 +21,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.errors import FormatError
+from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.schema import ATTRIBUTES, CLASSES
-from ssad.errors import FormatError
 from ssad.metrics.detection_boxes import BoxTable
-from ssad.types import F64, I32
 
 BLOCK: Final = 4 << 20
 MAX_BOXES: Final = 500

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.schema import Log, Sample, Scene
-from ssad.errors import ConfigError
-from ssad.types import F64, I32
 
 MAX_TIME_DIFF = 1.5  # s between key frames, beyond it no velocity is given
 

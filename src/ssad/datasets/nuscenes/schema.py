@@ -55,20 +55,20 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 
-class Record(msgspec.Struct, frozen=True, gc=False):
+class TableRecord(msgspec.Struct, frozen=True, gc=False):
     """A row of a table."""
 
     token: str
 
 
-class Attribute(Record, frozen=True, gc=False):
+class Attribute(TableRecord, frozen=True, gc=False):
     """A property of an instance that may change, such as vehicle.parked."""
 
     name: str
     description: str = ""
 
 
-class CalibratedSensor(Record, frozen=True, gc=False):
+class CalibratedSensor(TableRecord, frozen=True, gc=False):
     """Pose of a sensor on the ego; `camera_intrinsic` is 3 x 3, empty for other sensors."""
 
     sensor_token: str
@@ -77,14 +77,14 @@ class CalibratedSensor(Record, frozen=True, gc=False):
     camera_intrinsic: tuple[tuple[float, ...], ...]
 
 
-class Category(Record, frozen=True, gc=False):
+class Category(TableRecord, frozen=True, gc=False):
     """An object category such as vehicle.car."""
 
     name: str
     description: str = ""
 
 
-class EgoPose(Record, frozen=True, gc=False):
+class EgoPose(TableRecord, frozen=True, gc=False):
     """Pose of the ego in the global frame."""
 
     translation: Vector
@@ -92,7 +92,7 @@ class EgoPose(Record, frozen=True, gc=False):
     timestamp: int
 
 
-class Instance(Record, frozen=True, gc=False):
+class Instance(TableRecord, frozen=True, gc=False):
     """An object followed over a scene."""
 
     category_token: str
@@ -101,7 +101,7 @@ class Instance(Record, frozen=True, gc=False):
     last_annotation_token: str = ""
 
 
-class Log(Record, frozen=True, gc=False):
+class Log(TableRecord, frozen=True, gc=False):
     """A drive that scenes were cut from."""
 
     logfile: str = ""
@@ -110,7 +110,7 @@ class Log(Record, frozen=True, gc=False):
     location: str = ""
 
 
-class Map(Record, frozen=True, gc=False):
+class Map(TableRecord, frozen=True, gc=False):
     """A top view of a place, shared by logs."""
 
     log_tokens: tuple[str, ...] = ()
@@ -118,7 +118,7 @@ class Map(Record, frozen=True, gc=False):
     filename: str = ""
 
 
-class Sample(Record, frozen=True, gc=False):
+class Sample(TableRecord, frozen=True, gc=False):
     """A key frame: annotated, twice a second."""
 
     timestamp: int
@@ -127,7 +127,7 @@ class Sample(Record, frozen=True, gc=False):
     next: str = ""
 
 
-class SampleAnnotation(Record, frozen=True, gc=False):
+class SampleAnnotation(TableRecord, frozen=True, gc=False):
     """A 3D box of an instance in a sample, in the global frame."""
 
     sample_token: str
@@ -143,7 +143,7 @@ class SampleAnnotation(Record, frozen=True, gc=False):
     next: str = ""
 
 
-class SampleData(Record, frozen=True, gc=False):
+class SampleData(TableRecord, frozen=True, gc=False):
     """A file of a sensor; those between key frames (sweeps) carry the token of the sample that follows."""
 
     sample_token: str
@@ -159,7 +159,7 @@ class SampleData(Record, frozen=True, gc=False):
     next: str = ""
 
 
-class Scene(Record, frozen=True, gc=False):
+class Scene(TableRecord, frozen=True, gc=False):
     """A stretch of about 20 s."""
 
     name: str
@@ -170,21 +170,21 @@ class Scene(Record, frozen=True, gc=False):
     last_sample_token: str = ""
 
 
-class Sensor(Record, frozen=True, gc=False):
+class Sensor(TableRecord, frozen=True, gc=False):
     """A sensor: channel such as CAM_FRONT, modality camera, lidar or radar."""
 
     channel: str
     modality: str
 
 
-class Visibility(Record, frozen=True, gc=False):
+class Visibility(TableRecord, frozen=True, gc=False):
     """Fraction of an object seen over all six cameras: tokens '1' (0-40 %) to '4' (80-100 %)."""
 
     level: str
     description: str = ""
 
 
-TABLES: Final[dict[str, type[Record]]] = {
+TABLES: Final[dict[str, type[TableRecord]]] = {
     "attribute": Attribute,
     "calibrated_sensor": CalibratedSensor,
     "category": Category,

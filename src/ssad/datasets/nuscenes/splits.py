@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from ssad import safeio
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, FormatError
 from ssad.datasets.nuscenes.schema import Scene
 from ssad.datasets.nuscenes.tables import stream, table_path
-from ssad.errors import ConfigError, FormatError
 
 
 @cache

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 import msgspec
 
-from ssad.datasets.nuscenes.schema import TABLES, Record
-from ssad.errors import FormatError
+from ssad.core.errors import FormatError
+from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 
 BLOCK = 4 << 20
 LIMIT = 16 * BLOCK  # no record is longer
@@ -112,6 +112,6 @@ def table_path(root: Path, version: str, name: str) -> Path:
     return root / version / f"{name}.json"
 
 
-def read_table(root: Path, version: str, name: str) -> list[Record]:
+def read_table(root: Path, version: str, name: str) -> list[TableRecord]:
     """A whole table; for the small ones."""
     return [record for block in stream(table_path(root, version, name), TABLES[name]) for record in block]

@@ -13,13 +13,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssad.datasets.nuscenes.drawing import Light, Street, View
-from ssad.datasets.nuscenes.files import encode_jpeg, points_bytes
+from ssad.core.images import encode_jpeg
+from ssad.core.seeding import generator
+from ssad.core.types import F32
+from ssad.datasets.nuscenes.block_street import BlockObject, ego_place, make_street
+from ssad.datasets.nuscenes.drawing import BlockStreet, BlockView, Light
+from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.schema import CAMERAS, Quaternion, Vector
-from ssad.datasets.nuscenes.street import Thing, ego_place, make_street
 from ssad.datasets.nuscenes.writer import NuScenesWriter
-from ssad.seeding import generator
-from ssad.types import F32
 
 # place on the ego (m), yaw (degrees), focal length and principal point at 1600 x 900: about those of the real cars
 RIG: Final[dict[str, tuple[Vector, float, float, float, float]]] = {
@@ -69,7 +70,7 @@ class _Drive:
     """A scene being written: its street, and the street's place in the global frame."""
 
     writer: NuScenesWriter
-    street: Street
+    street: BlockStreet
     scene: str
     start_us: int
     origin: tuple[float, float]
@@ -124,7 +125,7 @@ def _write_scene(
     scene = writer.add_scene(description=f"A drawn street with {len(things)} objects")
     _mount(writer, scene, size)
     instances = {thing.key: writer.add_instance(scene, thing.key, category=thing.category) for thing in things}
-    street = Street(things, buildings, _light(random), random)
+    street = BlockStreet(things, buildings, _light(random), random)
     drive = _Drive(writer, street, scene, _START_US + number * 3_600_000_000, origin, heading)
     for tick in range((samples - 1) * (sweeps + 1) + 1):
         offset = tick * STEP_US // (sweeps + 1)
@@ -152,7 +153,7 @@ def _mount(writer: NuScenesWriter, scene: str, size: tuple[int, int]) -> None:
     writer.add_sensor(scene, LIDAR, modality="lidar", translation=LIDAR_PLACE, rotation=turn)
 
 
-def _count_inside(points: F32, thing: Thing, seconds: float) -> int:
+def _count_inside(points: F32, thing: BlockObject, seconds: float) -> int:
     """Points of a sweep within the box of a thing."""
     ex, ey, eyaw = ego_place(seconds)
     x, y, yaw = thing.at(seconds)
@@ -167,12 +168,12 @@ def _count_inside(points: F32, thing: Thing, seconds: float) -> int:
     return int(np.count_nonzero(inside))
 
 
-def _view(channel: str, seconds: float, size: tuple[int, int]) -> View:
+def _view(channel: str, seconds: float, size: tuple[int, int]) -> BlockView:
     """A camera of the rig in the street frame."""
     (forward, left, up), degrees, focal, cx, cy = RIG[channel]
     x, y, yaw = ego_place(seconds)
     share = size[0] / 1600.0
-    return View(
+    return BlockView(
         x=x + math.cos(yaw) * forward - math.sin(yaw) * left,
         y=y + math.sin(yaw) * forward + math.cos(yaw) * left,
         z=up,
@@ -185,7 +186,7 @@ def _view(channel: str, seconds: float, size: tuple[int, int]) -> View:
     )
 
 
-def _sweep(street: Street, seconds: float) -> F32:
+def _sweep(street: BlockStreet, seconds: float) -> F32:
     x, y, yaw = ego_place(seconds)
     forward, _, up = LIDAR_PLACE
     origin = (x + math.cos(yaw) * forward, y + math.sin(yaw) * forward, up)

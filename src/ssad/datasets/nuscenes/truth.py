@@ -15,6 +15,8 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.results import uncollected, with_ego
 from ssad.datasets.nuscenes.schema import (
     ATTRIBUTES,
@@ -29,9 +31,7 @@ from ssad.datasets.nuscenes.schema import (
     Vector,
 )
 from ssad.datasets.nuscenes.tables import stream, table_path
-from ssad.errors import ConfigError, FormatError
 from ssad.metrics.detection_boxes import I8, I64, BikeRacks, BoxTable
-from ssad.types import F64, I32
 
 CHANNEL: Final = "LIDAR_TOP"  # the sensor whose ego pose is that of the sample
 RACK: Final = "static_object.bicycle_rack"

@@ -20,6 +20,9 @@ import cv2
 import msgspec
 import numpy as np
 
+from ssad.core.errors import FormatError
+from ssad.core.safeio import atomic_path, dump_json, make_folder, write_atomic
+from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.schema import (
     ATTRIBUTES,
     CATEGORY_TO_CLASS,
@@ -32,19 +35,16 @@ from ssad.datasets.nuscenes.schema import (
     Log,
     Map,
     Quaternion,
-    Record,
     Sample,
     SampleAnnotation,
     SampleData,
     Scene,
     Sensor,
+    TableRecord,
     Vector,
     Visibility,
 )
 from ssad.datasets.nuscenes.tables import table_path
-from ssad.errors import FormatError
-from ssad.safeio import atomic_path, dump_json, make_folder, write_atomic
-from ssad.seeding import digest
 
 CATEGORIES: Final = (
     *CATEGORY_TO_CLASS,
@@ -64,7 +64,7 @@ _LEVELS: Final = ("v0-40", "v40-60", "v60-80", "v80-100")
 _FORMATS: Final = {"camera": (".jpg", "jpg"), "lidar": (".pcd.bin", "pcd"), "radar": (".pcd", "pcd")}
 _FIRST_FREE = 9001
 
-R = TypeVar("R", bound=Record)
+R = TypeVar("R", bound=TableRecord)
 IDENTITY: Final[Quaternion] = (1.0, 0.0, 0.0, 0.0)
 
 
@@ -87,7 +87,7 @@ class NuScenesWriter:
     def __init__(self, root: Path, version: str = "v1.0-mini") -> None:
         self.root, self.version = Path(root), version
         make_folder(self.root / version)
-        self._rows: dict[type[Record], dict[str, Any]] = {kind: {} for kind in TABLES.values()}
+        self._rows: dict[type[TableRecord], dict[str, Any]] = {kind: {} for kind in TABLES.values()}
         self._frames: dict[str, _Frame] = {}
         self._mounted: dict[tuple[str, str], tuple[str, str]] = {}
         self._instance_scene: dict[str, str] = {}
@@ -264,7 +264,7 @@ class NuScenesWriter:
         splits = self._splits or {split: members for split, members in default.items() if members}
         write_atomic(self.root / self.version / "splits.json", dump_json(splits, indent=1) + "\n")
 
-    def _add(self, record: Record) -> str:
+    def _add(self, record: TableRecord) -> str:
         table = self._rows[type(record)]
         if record.token in table:
             raise ValueError(f"a {type(record).__name__} with the same key was added before: {record.token}")
@@ -284,7 +284,7 @@ class NuScenesWriter:
             self._add(kind(token, name=name))
         return token
 
-    def _link(self, kind: type[Record], rows: Sequence[Any]) -> None:
+    def _link(self, kind: type[TableRecord], rows: Sequence[Any]) -> None:
         """Store rows of one chain, in time order, with prev and next."""
         for number, row in enumerate(rows):
             before = rows[number - 1].token if number else ""
@@ -380,7 +380,7 @@ def _place(path: Path, data: bytes | Path) -> None:
         shutil.copyfile(source, temporary)
 
 
-def _write_table(path: Path, rows: Iterable[Record]) -> None:
+def _write_table(path: Path, rows: Iterable[TableRecord]) -> None:
     """A JSON list, one record a line, atomically. StoreError."""
     encoder = msgspec.json.Encoder()
     with atomic_path(path) as temporary, temporary.open("wb") as file:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torchvision.ops import batched_nms
 
-from ssad.detections import Dense, Detections, Truth
-from ssad.detectors.modes import evaluating
+from ssad.core.detections import Dense, Detections, Truth
+from ssad.core.errors import ConfigError
+from ssad.detectors.eval_mode import evaluating
 from ssad.detectors.yolo.assign import Targets, pad_truth
-from ssad.errors import ConfigError
 
 
 class Adapter(nn.Module, ABC):
@@ -33,7 +33,7 @@ class Adapter(nn.Module, ABC):
 
     @abstractmethod
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs; see `ssad.protocols.Detector`."""
+        """Raw outputs; see `ssad.core.protocols.Detector`."""
 
     @torch.no_grad()
     def predict(

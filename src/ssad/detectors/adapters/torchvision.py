@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.nn import functional
 from torchvision.ops import box_iou, generalized_box_iou_loss, sigmoid_focal_loss
 
-from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, sums, suppress
 from ssad.detectors.yolo.assign import Targets
-from ssad.errors import ConfigError
 
 
 class OneStage(Adapter):

@@ -22,11 +22,11 @@ from torch.nn import functional
 from torchvision.models.detection.rpn import concat_box_prediction_layers
 from torchvision.ops import box_iou
 
-from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, suppress
 from ssad.detectors.adapters.torchvision import full, scale_of
 from ssad.detectors.yolo.assign import Targets
-from ssad.errors import ConfigError
 
 NONE = -30.0  # the logit of a place that is not filled
 SMALLEST = 1e-2

@@ -28,14 +28,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.detections import Assignment, Dense, Detections, Truth
+from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.adapters.common import Adapter, check_images, check_truth, sums
 from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import select
 from ssad.detectors.yolo.loss import ciou
-from ssad.errors import ConfigError
 
 GREY = 114 / 255
 NMS_IOU, MOST, THRESHOLD = 0.7, 300, 0.25  # its published defaults for predictions

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ssad.errors import ConfigError
+from ssad.core.errors import ConfigError
 
 # mean and deviation of depth (m), and mean length, height, width (m), in the order of CLASSES_3D. The bicycle
 # has the size of the construction vehicle: the published weights were trained with these numbers.

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.detections import CLASSES_3D, Assignment, Dense, Detections, Solids, Truth
-from ssad.detectors.modes import evaluating
+from ssad.core.detections import CLASSES_3D, Assignment, Dense, Detections, Solids, Truth
+from ssad.core.errors import ConfigError
+from ssad.detectors.eval_mode import evaluating
+from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (
     Flat,
@@ -28,8 +30,6 @@ from ssad.detectors.mono3d.head import Head
 from ssad.detectors.mono3d.losses import losses
 from ssad.detectors.mono3d.nms import rotated_nms
 from ssad.detectors.mono3d.targets import assign
-from ssad.detectors.mono3d.trunk import Neck, Trunk
-from ssad.errors import ConfigError
 
 MULTIPLE = 32
 
@@ -52,7 +52,7 @@ class Mono3D(nn.Module):
         self.classes = CLASSES_3D
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            self.backbone = Trunk(config.trunk, width=config.width)
+            self.backbone = Backbone(config.trunk, width=config.width)
             self.neck = Neck(self.backbone.out_channels, config.channels, len(config.strides))
             self.bbox_head = Head(config)
         self.register_buffer("mean", torch.tensor(config.mean)[:, None, None], persistent=False)

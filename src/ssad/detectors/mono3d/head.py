@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.detections import ATTRIBUTES, CLASSES_3D
+from ssad.core.detections import ATTRIBUTES, CLASSES_3D
+from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
-from ssad.detectors.mono3d.trunk import DeformConv
 
 BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
 

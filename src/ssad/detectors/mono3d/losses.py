@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ssad.detections import Assignment
+from ssad.core.detections import Assignment
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ssad.detections import ATTRIBUTES, CLASSES_3D, Assignment, Truth
+from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Assignment, Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import Places, project
-from ssad.errors import ConfigError
 
 FAR = 1e8
 

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ssad.detections import Truth
+from ssad.core.detections import Truth
+from ssad.core.errors import ConfigError
 from ssad.detectors.yolo.decode import Grid
-from ssad.errors import ConfigError
 
 IGNORE_IOU = 0.5
 MAX_RATIO = 4.0

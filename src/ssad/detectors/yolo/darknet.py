@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.safeio import MIB, read_bytes, write_atomic
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.layers import ConvUnit
 from ssad.detectors.yolo.models import CSPNetwork
-from ssad.errors import ConfigError, FormatError
-from ssad.safeio import MIB, read_bytes, write_atomic
 
 VERSION = (0, 2, 5)
 MAX_BYTES = 1024 * MIB

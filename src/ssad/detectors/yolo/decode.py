@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torchvision.ops import batched_nms
 
-from ssad.detections import Detections
+from ssad.core.detections import Detections
 
 MAX_LOG_SIZE = math.log(1000.0)
 MAX_CANDIDATES = 30_000

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.modes import evaluating
+from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.core.errors import ConfigError
+from ssad.detectors.eval_mode import evaluating
 from ssad.detectors.yolo.assign import label_places, match_best, match_near, pad_truth
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import Grid, decode, flatten, make_grid, select
 from ssad.detectors.yolo.loss import Answers, Reduction, losses_v3, losses_v5
 from ssad.detectors.yolo.models import YoloSpec, build_network
-from ssad.errors import ConfigError
 
 MULTIPLE = 32
 

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import seed32
 from ssad.detectors.yolo.layers import C3, SPPF, ConvUnit, Residual, pool_same, upsample
-from ssad.errors import ConfigError
-from ssad.seeding import seed32
 
 Maps = tuple[Tensor, ...]
 

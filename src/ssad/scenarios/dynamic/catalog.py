@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from ssad.errors import ConfigError
-from ssad.registry import resolve
+from ssad.core.errors import ConfigError
+from ssad.core.registry import resolve
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 
 _HERE = "ssad.scenarios.dynamic.knowledge"

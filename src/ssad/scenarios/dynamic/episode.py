@@ -7,15 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssad.errors import RouteError
-from ssad.geometry import obb_distance
-from ssad.roads.graph import LaneGraph
-from ssad.safeio import dump_json
-from ssad.scenarios.dynamic.catalog import scenario_type
-from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
-from ssad.scenarios.dynamic.schema import check, scenario_data
-from ssad.seeding import digest, generator
-from ssad.types import (
+from ssad.core.errors import RouteError
+from ssad.core.geometry import obb_distance
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.safeio import dump_json
+from ssad.core.seeding import digest, generator
+from ssad.core.types import (
     Controller,
     Episode,
     EpisodeAgent,
@@ -26,6 +23,9 @@ from ssad.types import (
     SignalPlan,
     SignalState,
 )
+from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
+from ssad.scenarios.dynamic.schema import check, scenario_data
 from ssad.world.models import model
 
 EGO_MODEL = "car"

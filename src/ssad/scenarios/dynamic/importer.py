@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ssad.errors import FormatError
-from ssad.safeio import dotted, read_json, read_xml
+from ssad.core.errors import FormatError
+from ssad.core.safeio import dotted, read_json, read_xml
+from ssad.core.types import Pose, Scenario
 from ssad.scenarios.dynamic.catalog import PRECRASH
 from ssad.scenarios.dynamic.schema import problems
-from ssad.types import Pose, Scenario
 
 NATURAL_ID = 9
 _TYPES: dict[int, str] = {**dict(enumerate(PRECRASH, start=1)), NATURAL_ID: "NaturalJunction"}

@@ -16,17 +16,17 @@ from typing import Literal
 
 import numpy as np
 
-from ssad.errors import RouteError
+from ssad.core.errors import RouteError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.safeio import write_atomic
+from ssad.core.types import F64, LaneType, Pose, Scenario
 from ssad.roads import load_town
-from ssad.roads.graph import LaneGraph
-from ssad.safeio import write_atomic
 from ssad.scenarios.dynamic.catalog import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
 from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
-from ssad.types import F64, LaneType, Pose, Scenario
 
 PRECRASH_TOWN = "ProvingGround"
 NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 7, "Crossgate": 8}

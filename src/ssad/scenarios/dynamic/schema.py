@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from ssad.errors import ConfigError
-from ssad.safeio import Document, Location, dotted
+from ssad.core.errors import ConfigError
+from ssad.core.safeio import Document, Location, dotted
+from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Scenario, SignalPlan, TrafficPlan
 from ssad.scenarios.dynamic.catalog import CUSTOM, scenario_type
-from ssad.types import Actor, Condition, Limits, Phase, Pose, Scenario, SignalPlan, TrafficPlan
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def _adapter() -> TypeAdapter[Scenario]:
     from pydantic import ConfigDict, TypeAdapter
 
     for kind in _DATA:
-        # pydantic reads this attribute of a plain dataclass; set here so that ssad.types needs no pydantic
+        # pydantic reads this attribute of a plain dataclass; set here so that ssad.core.types needs no pydantic
         setattr(kind, "__pydantic_config__", ConfigDict(extra="forbid", allow_inf_nan=False))  # noqa: B010
     return TypeAdapter(Scenario)
 

@@ -6,11 +6,11 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
-from ssad.errors import ConfigError, unknown_name
-from ssad.safeio import home
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.safeio import home
+from ssad.core.types import Scenario
 from ssad.scenarios.dynamic.catalog import SCENARIOS
 from ssad.scenarios.dynamic.yamlio import read_scenarios
-from ssad.types import Scenario
 
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")

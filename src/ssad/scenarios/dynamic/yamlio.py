@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from ssad.errors import ConfigError
-from ssad.safeio import dump_yaml, read_yaml_document, write_atomic
+from ssad.core.errors import ConfigError
+from ssad.core.safeio import dump_yaml, read_yaml_document, write_atomic
+from ssad.core.types import Scenario
 from ssad.scenarios.dynamic.schema import check, scenario_data, scenario_from
-from ssad.types import Scenario
 
 
 def read_scenarios(path: str | Path) -> tuple[Scenario, ...]:

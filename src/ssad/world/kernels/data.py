@@ -10,7 +10,7 @@ FAR = wp.constant(1.0e6)
 
 
 @wp.struct
-class Bank:
+class EpisodeArrays:
     """What does not change while an episode runs; scenes refer to it by episode number."""
 
     model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot

@@ -5,7 +5,7 @@ The Autopilot is the background traffic and the ego baseline alike; how it react
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Bank, Roads, State
+from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, State
 from ssad.world.kernels.shared import C_AUTOPILOT, IDM_ACCEL, KIND_WALKER, wrap
 
 C_NONE = wp.constant(0)
@@ -41,7 +41,7 @@ def condition_holds(state: State, b: int, i: int, when: wp.vec3, time: float) ->
 
 
 @wp.func
-def steer_on_route(bank: Bank, roads: Roads, state: State, b: int, i: int, e: int, v: float) -> float:
+def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, e: int, v: float) -> float:
     """Steering in [-1, 1]: curvature of the route a moment ahead, corrected critically damped in distance."""
     route = bank.route[e, i]
     at = state.progress[b, i]
@@ -69,7 +69,7 @@ def steer_on_route(bank: Bank, roads: Roads, state: State, b: int, i: int, e: in
 
 
 @wp.kernel(enable_backward=False)
-def drive(bank: Bank, roads: Roads, state: State, dt: float):
+def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, i = wp.tid()
     if state.end[b] != 0 or state.active[b, i] == 0:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import Bank, Ego, Roads, State
+from ssad.world.kernels.data import Ego, EpisodeArrays, Roads, State
 from ssad.world.kernels.shared import wrap
 
 
@@ -29,7 +29,7 @@ def put(
 
 @wp.func
 def put_agent(
-    bank: Bank,
+    bank: EpisodeArrays,
     state: State,
     out: wp.array2d(dtype=wp.float32),
     b: int,
@@ -53,7 +53,7 @@ def put_agent(
 
 
 @wp.kernel(enable_backward=False)
-def look(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, out: wp.array2d(dtype=wp.float32)):
+def look(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: int, out: wp.array2d(dtype=wp.float32)):
     """Write observation rows [B, 28]: 4 of SafeBench, then ego, two nearest vehicles within 25 m, and route (FREA).
 
     SafeBench: lateral offset (left positive) to the route point about 4 m ahead, heading error there, speed, 1 if a

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FORECAST, STRIDE, Bank, Roads, State
+from ssad.world.kernels.data import FORECAST, STRIDE, EpisodeArrays, Roads, State
 from ssad.world.kernels.shared import C_AUTOPILOT, KIND_WALKER, lane_under, route_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME
 
@@ -70,7 +70,7 @@ def bicycle(
 
 
 @wp.kernel(enable_backward=False)
-def move(bank: Bank, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int):
+def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int):
     """Advance every agent by dt with its control (external ones with the action) and look where it is now."""
     b, i = wp.tid()
     if state.end[b] != 0 or state.active[b, i] == 0:

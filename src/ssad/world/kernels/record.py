@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Bank, Ego, Roads, State, Work
+from ssad.world.kernels.data import FAR, Ego, EpisodeArrays, Roads, State, Work
 from ssad.world.kernels.shared import RED, boxes_touch, signal_state, wrap
 
 END_RUNNING = wp.constant(0)
@@ -24,7 +24,7 @@ def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.kernel(enable_backward=False)
-def contact(bank: Bank, state: State, work: Work, agents: int):
+def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
     """Which agents each agent touches, at the end of the step and half-way through it; wakes sleeping traffic."""
     b, i = wp.tid()
     if b == 0 and i == 0:
@@ -73,7 +73,7 @@ def contact_kind(kind: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: float):
+def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: int, dt: float):
     """One row of the ego's record, the SafeBench reward, and the end of the episode; one thread a scene."""
     b = wp.tid()
     if state.end[b] != 0:
@@ -209,7 +209,7 @@ def record(bank: Bank, roads: Roads, state: State, ego: Ego, agents: int, dt: fl
 
 
 @wp.kernel(enable_backward=False)
-def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
+def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
     """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
     b, i = wp.tid()
     go = mask[b] == 1
@@ -251,7 +251,9 @@ def restart(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dty
 
 
 @wp.kernel(enable_backward=False)
-def restart_record(bank: Bank, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
+def restart_record(
+    bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int
+):
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
     go = mask[b] == 1

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Bank, Roads
+from ssad.world.kernels.data import FAR, EpisodeArrays, Roads
 
 C_AUTOPILOT = wp.constant(2)
 KIND_WALKER = wp.constant(6)
@@ -45,7 +45,7 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
 
 
 @wp.func
-def signal_state(bank: Bank, roads: Roads, e: int, index: int, time: float) -> int:
+def signal_state(bank: EpisodeArrays, roads: Roads, e: int, index: int, time: float) -> int:
     """State of signal `index` of the episode's town at `time`: forced by the episode, else its fixed programme."""
     forced = bank.signal[e, index]
     if forced >= 0 and time < bank.limits[e][3]:

@@ -7,7 +7,7 @@ predicted conflict that it must yield to (here).
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, FORECAST, STRIDE, Bank, Roads, State, Work
+from ssad.world.kernels.data import FAR, FORECAST, STRIDE, EpisodeArrays, Roads, State, Work
 from ssad.world.kernels.shared import (
     C_AUTOPILOT,
     IDM_ACCEL,
@@ -94,7 +94,7 @@ def lead_gap(
 
 
 @wp.func
-def has_priority(bank: Bank, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
+def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
     """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
 
     Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
@@ -197,7 +197,7 @@ def apart(
 
 
 @wp.kernel(enable_backward=False)
-def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: float):
+def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, dt: float):
     """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
 
     The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
@@ -288,7 +288,7 @@ def sight(bank: Bank, roads: Roads, state: State, work: Work, agents: int, dt: f
 
 
 @wp.kernel(enable_backward=False)
-def meet(bank: Bank, roads: Roads, state: State, work: Work, agents: int, workers: int):
+def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, workers: int):
     """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
     tid = wp.tid()
     total = work.count[0]

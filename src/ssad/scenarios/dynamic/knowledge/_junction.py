@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ssad.core.types import EpisodeAgent, Phase, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._meeting import meeting_place
 from ssad.scenarios.dynamic.knowledge._placing import (
@@ -15,10 +16,9 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     scripted,
     shifted,
 )
-from ssad.types import EpisodeAgent, Phase, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 FROM_LEFT = -math.pi / 2.0
 FROM_RIGHT = math.pi / 2.0

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from ssad.errors import ConfigError
-from ssad.types import EpisodeAgent, Route, Scenario, SignalPlan, TrafficPlan
+from ssad.core.errors import ConfigError
+from ssad.core.types import EpisodeAgent, Route, Scenario, SignalPlan, TrafficPlan
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 
 @dataclass(frozen=True)

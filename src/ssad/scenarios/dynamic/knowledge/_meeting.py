@@ -1,4 +1,4 @@
-"""Where an actor must stand so that it meets the ego in a junction. Units as in `ssad.types`."""
+"""Where an actor must stand so that it meets the ego in a junction. Units as in `ssad.core.types`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.errors import RouteError
+from ssad.core.errors import RouteError
+from ssad.core.types import F64, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._placing import (
     Place,
     junction_span,
@@ -17,11 +18,10 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     turn_of,
     wrap,
 )
-from ssad.types import F64, LaneType, Route, Scenario
 from ssad.world.models import model
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 EGO_SPEED = 9.0
 """Speed (m/s) that the ego is taken to keep when an actor is placed to meet it.

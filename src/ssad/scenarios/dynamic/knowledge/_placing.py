@@ -1,4 +1,4 @@
-"""Where actors stand: arithmetic on lanes that the scenario classes share. Units as in `ssad.types`."""
+"""Where actors stand: arithmetic on lanes that the scenario classes share. Units as in `ssad.core.types`."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.errors import RouteError
-from ssad.geometry import wrap_angle
-from ssad.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
+from ssad.core.errors import RouteError
+from ssad.core.geometry import wrap_angle
+from ssad.core.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 DEFAULT_TRIGGER = 30.0
 """Where on the route a scenario without a trigger has it, m from the start: as in SafeBench's routes."""

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssad.core.types import EpisodeAgent, Route, Scenario, SignalPlan
 from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, box, meeting_car
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import go_when_ego_moves
-from ssad.types import EpisodeAgent, Route, Scenario, SignalPlan
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssad.roads.graph import LaneGraph
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import AgentKind, Controller, EpisodeAgent, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route
-from ssad.types import AgentKind, Controller, EpisodeAgent, Route, Scenario
 from ssad.world.models import model
 
 

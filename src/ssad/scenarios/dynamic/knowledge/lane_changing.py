@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.errors import RouteError
+from ssad.core.errors import RouteError
+from ssad.core.types import Condition, EpisodeAgent, Phase, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
@@ -20,10 +21,9 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     scripted,
     trigger_place,
 )
-from ssad.types import Condition, EpisodeAgent, Phase, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:

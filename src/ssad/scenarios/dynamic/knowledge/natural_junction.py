@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.errors import RouteError
-from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import Place, pose_at
-from ssad.types import (
+from ssad.core.errors import RouteError
+from ssad.core.types import (
     Controller,
     EpisodeAgent,
     LaneType,
@@ -28,10 +26,12 @@ from ssad.types import (
     SignalPlan,
     TrafficPlan,
 )
+from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._placing import Place, pose_at
 from ssad.world.models import model
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 NEAR_START = 20.0
 NEAR_JUNCTION = 50.0

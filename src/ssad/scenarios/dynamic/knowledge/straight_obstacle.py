@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssad.core.types import EpisodeAgent, LaneType, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
@@ -23,10 +24,9 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     width_at,
     wrap,
 )
-from ssad.types import EpisodeAgent, LaneType, Pose, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 _PER_LANE = 1.5  # m further on for each lane between the ego's and the kerb
 _BLOCKER = 0.9  # the vending machine stands at this share of the line from the trigger to the walker

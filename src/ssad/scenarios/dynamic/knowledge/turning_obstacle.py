@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssad.core.types import EpisodeAgent, LaneType, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
@@ -22,10 +23,9 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     to_outermost,
     width_at,
 )
-from ssad.types import EpisodeAgent, LaneType, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 _PER_LANE = 1.0  # m further on for each lane crossed on the way to the kerb
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.errors import RouteError
+from ssad.core.errors import RouteError
+from ssad.core.types import EpisodeAgent, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
@@ -21,10 +22,9 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     standing,
     trigger_place,
 )
-from ssad.types import EpisodeAgent, Route, Scenario
 
 if TYPE_CHECKING:
-    from ssad.roads.graph import LaneGraph
+    from ssad.core.lane_graph import LaneGraph
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:

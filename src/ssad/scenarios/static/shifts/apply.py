@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ssad.errors import ConfigError
-from ssad.frames import Applied, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Applied, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.types import F32, U8
 from ssad.scenarios.static.shifts.batch import Batch, check_batch, like_input, to_batch
 from ssad.scenarios.static.shifts.noise import add_impulses, add_noise
 from ssad.scenarios.static.shifts.objects import move_objects
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.scenarios.static.shifts.sun import add_sun
 from ssad.scenarios.static.shifts.weather import add_fog, add_precipitation
-from ssad.types import F32, U8
 
 _ENOUGH = 100  # pixels of sky, of a picture looked at in 160 columns
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.errors import ConfigError
-from ssad.types import U8
+from ssad.core.errors import ConfigError
+from ssad.core.types import U8
 
 wp.config.log_level = wp.LOG_ERROR
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.frames import Frame, camera_to_world, rotation_matrix
+from ssad.core.frames import Frame, camera_to_world, rotation_matrix
+from ssad.core.types import F32
 from ssad.scenarios.static.shifts.batch import Batch
-from ssad.types import F32
 
 FARTHEST = 1000.0
 _ROAD_WEIGHT, _SKY_WEIGHT = 0.02, 0.002

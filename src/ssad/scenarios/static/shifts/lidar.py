@@ -11,14 +11,14 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from ssad.errors import ConfigError
-from ssad.frames import Applied, SceneContext, SweepFrame
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Applied, SceneContext, SweepFrame
+from ssad.core.types import F32, F64, Bool
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import affine, deformed
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
-from ssad.types import F32, F64, Bool
 
 FARTHEST = 70.0  # m at which a dark target (intensity 1) is just seen in clear air by the 32-beam sensor of nuScenes
 _BETA_0 = 1e-6 / np.pi  # reflectivity constant of Hahner et al. 2021

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ssad.frames import Applied, Frame
+from ssad.core.frames import Applied, Frame
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
 from ssad.scenarios.static.shifts.kernels import noise as kernels
 from ssad.scenarios.static.shifts.parameters import GAUSSIAN, IMPULSE, STUCK, UNIFORM

@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.frames import Applied, Boxes3D, Frame, camera_to_world, rotation_matrix
+from ssad.core.frames import Applied, Boxes3D, Frame, camera_to_world, rotation_matrix
+from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, on, structs
 from ssad.scenarios.static.shifts.depth import lens
 from ssad.scenarios.static.shifts.kernels import objects as kernels
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.types import F64
 
 LEAST_VISIBLE = 0.4  # objects less visible than this (nuScenes: token 1) have no pixels worth moving
 LEAST_PIXELS = 6.0

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.frames import Applied, Frame
+from ssad.core.frames import Applied, Frame
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
 from ssad.scenarios.static.shifts.kernels import falling, layers

@@ -13,8 +13,8 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from ssad.errors import ConfigError, unknown_name
-from ssad.seeding import digest, generator
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.seeding import digest, generator
 
 Calibration = Literal["physical", "paper"]
 Family = Literal["environment", "sensor", "object"]

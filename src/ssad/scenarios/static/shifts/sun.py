@@ -8,13 +8,13 @@ from itertools import count, islice
 import numpy as np
 import warp as wp
 
-from ssad.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.types import F32, F64, U8
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, on
 from ssad.scenarios.static.shifts.depth import depth_of, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.types import F32, F64, U8
 
 AT_NIGHT, HIDDEN = "it is night", "the sun is behind something"
 NO_SUN = frozenset({AT_NIGHT, HIDDEN})  # reasons for which a whole drive may be left as it is

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Applied, Frame, SceneContext, camera_to_world
+from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
 from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import particles, veil
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-from ssad.types import F64
 
 # period of the particle fields, metres; drops per m^3 follow from the size distributions
 RAIN_TILE, SNOW_TILE = (6.0, 6.0, 5.0), (8.0, 8.0, 6.0)

@@ -1,0 +1,1 @@
+"""Procedural bodies and streets: what the camera sees."""

@@ -1,0 +1,229 @@
+"""What stands at the roadside: cones, barriers, signal heads, street lamps and signs. Faces look along +x."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ssad.assets.bodies.parts import STEEL, TRIM, Chart, crate, finish, side_charts, sided
+from ssad.assets.mesh import F64, Material, Mesh, Point, lathe, merge, prism, tube
+
+STYLES = {
+    "traffic_cone": ("cone", "tall", "drum"),
+    "barrier": ("jersey", "fence", "board", "water"),
+    "traffic_signal": ("post", "mast", "walker"),
+    "street_lamp": ("curved", "straight"),
+    "sign": ("stop", "yield", "limit", "warning", "direction"),
+}
+ORANGE = Material("orange", (0.75, 0.12, 0.01), specular=0.04, gloss=0.3)
+WHITE = Material("reflective", (0.78, 0.78, 0.78), specular=0.1, gloss=0.6)
+RED = Material("red", (0.52, 0.015, 0.02), specular=0.06, gloss=0.5)
+CONCRETE = Material("concrete", (0.36, 0.35, 0.33), specular=0.02, gloss=0.05)
+POLE = Material("pole", (0.22, 0.23, 0.23), specular=0.15, gloss=0.4)
+LAMPS = (
+    Material("lamp_red", (0.28, 0.015, 0.012), gloss=0.7),
+    Material("lamp_yellow", (0.30, 0.19, 0.012), gloss=0.7),
+    Material("lamp_green", (0.015, 0.22, 0.11), gloss=0.7),
+)
+STREET_LIGHT = Material("street_light", (0.80, 0.78, 0.70), emission=0.0)
+SIGN_FACE = Material("sign_face", (0.75, 0.75, 0.75), specular=0.08, gloss=0.5)
+SIGN_INK = Material("sign_ink", (0.02, 0.02, 0.022), specular=0.08, gloss=0.5)
+SIGN_BLUE = Material("sign_blue", (0.02, 0.09, 0.38), specular=0.08, gloss=0.5)
+SIGN_BACK = Material("sign_back", (0.30, 0.31, 0.31), specular=0.1, gloss=0.3)
+
+
+def traffic_cone(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A traffic cone, a tall slim one or a drum that fills its size, m."""
+    n = (6, 10, 20)[detail]
+    shade = replace(ORANGE, colour=(0.75, float(generator.uniform(0.09, 0.17)), 0.01))
+    rows: dict[str, list[tuple[float, float]]] = {
+        "cone": [(0.36, 0.06), (0.31, 0.20), (0.275, 0.36), (0.22, 0.50), (0.185, 0.66), (0.14, 0.80), (0.09, 1.0)],
+        "tall": [(0.22, 0.06), (0.19, 0.30), (0.175, 0.45), (0.16, 0.55), (0.145, 0.70), (0.13, 0.82), (0.10, 1.0)],
+        "drum": [(0.48, 0.06), (0.48, 0.24), (0.45, 0.40), (0.45, 0.56), (0.42, 0.72), (0.42, 0.86), (0.38, 1.0)],
+    }
+    parts = []
+    for k, (a, b) in enumerate(zip(rows[style][:-1], rows[style][1:], strict=True)):
+        parts.append(lathe([a, b], material=WHITE if k % 2 else shade, segments=n))
+    base = TRIM if style == "drum" else shade
+    if style == "drum":
+        parts.append(lathe([(0.5, 0.0), (0.5, 0.06)], material=base, segments=n))
+    else:
+        parts.append(crate((-0.5, -0.5, 0.0), (0.5, 0.5, 0.06), base))
+    return finish(parts, [], size)
+
+
+def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A barrier across x (its long side along y, as nuScenes labels it) that fills its size, m."""
+    length, width, height = size
+    half, deep = 0.5 * width, 0.5 * length
+    first = bool(generator.random() < 0.5)
+    charts = side_charts("face", (-deep, -half, 0.0), (deep, half, height))
+    parts: list[Mesh] = []
+    if style in ("jersey", "water"):
+        side = [(1.0, 0.0), (1.0, 0.10), (0.58, 0.36), (0.36, 1.0)]
+        outline = [(deep * x, height * z) for x, z in side] + [(-deep * x, height * z) for x, z in side[::-1]]
+        pieces = 1 if style == "jersey" else 2
+        cuts = np.linspace(-half, half, pieces + 1)
+        for k in range(pieces):
+            look = CONCRETE if style == "jersey" else RED if (k % 2 == 0) == first else WHITE
+            parts.append(sided(_across(outline, float(cuts[k]), float(cuts[k + 1]), look), "face"))
+    elif style == "fence":
+        rail = [[(0.0, -half + 0.03, z * height), (0.0, half - 0.03, z * height)] for z in (0.16, 0.97)]
+        ends = [[(0.0, s * (half - 0.03), 0.05), (0.0, s * (half - 0.03), 0.98 * height)] for s in (-1.0, 1.0)]
+        bars = (5, 9, 15)[detail]
+        thin = [[(0.0, y, 0.16 * height), (0.0, y, 0.97 * height)] for y in np.linspace(-half + 0.1, half - 0.1, bars)]
+        n = 3 if detail == 0 else 6
+        parts += [tube(p, 0.02, material=STEEL, segments=n) for p in rail + ends]
+        parts += [tube(p, 0.009, material=STEEL, segments=3 if detail < 2 else 5) for p in thin]
+        parts += [
+            crate((-deep, s * (half - 0.06) - 0.03, 0.0), (deep, s * (half - 0.06) + 0.03, 0.03), STEEL)
+            for s in (-1.0, 1.0)
+        ]
+    else:
+        stripes = 8
+        edges = np.linspace(-half, half, stripes + 1)
+        for k in range(stripes):
+            slant = 0.18 * width / stripes
+            for low, high in ((0.68, 0.98), (0.28, 0.50)) if detail else ((0.68, 0.98),):
+                y0, y1 = float(edges[k]), float(edges[k + 1])
+                quad = [
+                    (y0, low * height),
+                    (y1, low * height),
+                    (min(y1 + slant, half), high * height),
+                    (min(y0 + slant, half) if k else -half, high * height),
+                ]
+                parts.append(
+                    sided(
+                        prism(
+                            quad, (-0.03, 0.03), axis=0, material=RED if (k % 2 == 0) == first else WHITE, smooth=0.0
+                        ),
+                        "face",
+                    )
+                )
+        for s in (-1.0, 1.0):
+            y = s * 0.82 * half
+            for e in (-1.0, 1.0):
+                parts.append(
+                    tube([(e * deep * 0.9, y, 0.02), (e * 0.04, y, 0.98 * height)], 0.025, material=TRIM, segments=4)
+                )
+            parts.append(crate((-deep, y - 0.05, 0.0), (deep, y + 0.05, 0.05), TRIM))
+        parts.append(
+            lathe(
+                [(0.06, 0.98 * height), (0.06, height)],
+                material=Material("beacon", (0.6, 0.3, 0.02), emission=0.2),
+                segments=6,
+            )
+        )
+    return finish(parts, charts, size)
+
+
+def _across(outline: list[tuple[float, float]], y0: float, y1: float, material: Material) -> Mesh:
+    """An outline of (x, z) drawn out along y."""
+    return prism(outline, (y0, y1), axis=1, material=material, smooth=0.2)
+
+
+def signal_head(*, lamps: tuple[Material, ...] = LAMPS, detail: int = 2) -> Mesh:
+    """A signal head that looks along +x, its base at the origin: 0.30 m wide, 0.32 m for each lamp.
+
+    Its materials lamp_red, lamp_yellow and lamp_green have no emission: `Mesh.relit` turns one on.
+    """
+    n = (6, 8, 14)[detail]
+    high = 0.32 * len(lamps)
+    parts = [crate((-0.12, -0.16, 0.0), (0.10, 0.16, high + 0.04), TRIM)]
+    if detail:
+        parts.append(crate((-0.02, -0.24, -0.08), (0.0, 0.24, high + 0.12), TRIM))
+    for k, lamp in enumerate(lamps):
+        z = high - 0.32 * (k + 0.5) + 0.02
+        disc = lathe([(0.12, 0.0), (0.12, 0.015), (0.06, 0.035)], material=lamp, segments=n, axis=0)
+        parts.append(disc.moved(0.10, 0.0, z))
+        if detail == 2:
+            angle = np.linspace(0.15 * np.pi, 0.85 * np.pi, 7)
+            arc = np.stack([0.14 * np.cos(angle), 0.14 * np.sin(angle)], 1)
+            outline = np.concatenate([arc, 0.93 * arc[::-1]])
+            parts.append(prism(outline, (0.10, 0.27), axis=0, material=TRIM).moved(z=z))
+    return merge(parts)
+
+
+def traffic_signal(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A signal on a post, on a mast with an arm over the road (to +y), or for walkers; it fills its size, m."""
+    del generator
+    _, width, height = size
+    n = (4, 6, 10)[detail]
+    if style == "mast":
+        reach = width
+        pole = tube([(0.0, 0.0, 0.0), (0.0, 0.0, height)], [0.13, 0.09], material=POLE, segments=n)
+        arm = tube([(0.0, 0.0, height - 0.3), (0.0, reach, height - 0.15)], [0.08, 0.05], material=POLE, segments=n)
+        heads = [signal_head(detail=detail).moved(0.15, y, z) for y, z in ((reach - 0.3, height - 1.25), (0.0, 2.4))]
+        return finish([pole, arm, *heads], [], size)
+    lamps = LAMPS if style == "post" else (LAMPS[0], LAMPS[2])
+    head = signal_head(lamps=lamps, detail=detail)
+    top = height - float(head.bounds()[1][2])
+    pole = tube([(-0.18, 0.0, 0.0), (-0.18, 0.0, height - 0.1)], 0.07, material=POLE, segments=n)
+    bracket = crate((-0.18, -0.03, top + 0.2), (0.0, 0.03, top + 0.26), POLE)
+    return finish([pole, bracket, head.moved(z=top)], [], size)
+
+
+def street_lamp(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A street lamp whose arm reaches along +x over the road; it fills its size, m. Material street_light lights."""
+    del generator
+    reach, _, height = size
+    n = (4, 6, 10)[detail]
+    if style == "curved":
+        turn = np.linspace(0.0, 0.5 * np.pi, (3, 4, 8)[detail])
+        bow = [(0.7 * reach * (1.0 - np.cos(a)), 0.0, height - 1.2 + 1.15 * np.sin(a)) for a in turn]
+        path: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0), *[(float(x), y, float(z)) for x, y, z in bow]]
+    else:
+        path = [(0.0, 0.0, 0.0), (0.0, 0.0, height - 0.6), (0.7 * reach, 0.0, height - 0.08)]
+    pole = tube(path, np.linspace(0.11, 0.05, len(path)), material=POLE, segments=n)
+    x = path[-1][0]
+    head = crate((x - 0.05, -0.5 * size[1], height - 0.12), (x + 0.3 * reach, 0.5 * size[1], height), POLE)
+    glow = crate((x, -0.4 * size[1], height - 0.15), (x + 0.27 * reach, 0.4 * size[1], height - 0.11), STREET_LIGHT)
+    return finish([pole, head, glow], [], size)
+
+
+def sign(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A traffic sign on a post that looks along +x and fills its size, m; its face is the panel `face`."""
+    digits = int(generator.integers(0, 3))
+    _, width, height = size
+    r = 0.5 * width
+    z = height - r
+    pole = tube([(-0.05, 0.0, 0.0), (-0.05, 0.0, height - 0.2 * r)], 0.03, material=POLE, segments=(4, 5, 8)[detail])
+    n = (8, 12, 24)[detail]
+
+    def polygon(count: int, start: float, radius: float) -> F64:
+        angle = start + np.arange(count) * (2.0 * np.pi / count)
+        return np.stack([radius * np.cos(angle), z + radius * np.sin(angle)], 1)
+
+    octagon = polygon(8, np.pi / 8, r / np.cos(np.pi / 8))
+    triangle = polygon(3, np.pi / 2 if style == "warning" else -np.pi / 2, 1.15 * r)
+    layers: list[tuple[F64, Material]]
+    if style == "stop":
+        layers = [(octagon, WHITE), ((octagon - [0.0, z]) * 0.93 + [0.0, z], RED)]
+        layers += [(_bar(y * r, z, 0.11 * r, 0.30 * r), WHITE) for y in (-0.51, -0.17, 0.17, 0.51)]
+    elif style in ("yield", "warning"):
+        layers = [(triangle, RED), ((triangle - [0.0, z]) * 0.66 + [0.0, z], WHITE)]
+        if style == "warning":
+            layers += [
+                (_bar(0.0, z + 0.05 * r, 0.06 * r, 0.22 * r), SIGN_INK),
+                (_bar(0.0, z - 0.28 * r, 0.06 * r, 0.05 * r), SIGN_INK),
+            ]
+    elif style == "limit":
+        layers = [(polygon(n, 0.0, r), RED), (polygon(n, 0.0, 0.80 * r), WHITE)]
+        layers += [(_bar(y * r, z, (0.06 + 0.03 * digits) * r, 0.38 * r), SIGN_INK) for y in (-0.28, 0.24)]
+    else:
+        layers = [(_bar(0.0, z + 0.4 * r, r, 0.6 * r), WHITE), (_bar(0.0, z + 0.4 * r, 0.95 * r, 0.54 * r), SIGN_BLUE)]
+        layers += [(_bar(-0.2 * r, z + (0.4 + s) * r, 0.55 * r, 0.07 * r), WHITE) for s in (0.25, -0.15)]
+    parts = [pole, prism(layers[0][0], (-0.025, -0.004), axis=0, material=SIGN_BACK)]
+    for k, (outline, look) in enumerate(layers if detail else layers[:2]):
+        depth = 0.004 * min(k, 2)
+        plate = prism(outline, (depth - 0.003, depth), axis=0, material=look, smooth=0.0)
+        parts.append(plate.with_panel("face"))
+    chart = Chart("face", "front", (-0.1, -r, height - 2.0 * r - 0.2), (0.1, r, height))
+    return finish(parts, [chart], size)
+
+
+def _bar(y: float, z: float, half_width: float, half_height: float) -> F64:
+    """A rectangle [4, 2] in (y, z)."""
+    w, h = half_width, half_height
+    return np.array([(y - w, z - h), (y + w, z - h), (y + w, z + h), (y - w, z + h)])

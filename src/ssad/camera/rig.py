@@ -1,0 +1,39 @@
+"""The camera rig of nuScenes, and poses of what stands upright."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.types import F64
+
+# rig of nuScenes: channel -> place on the ego (m), heading (degrees), focal length at a width of 1600
+RIG = {
+    "CAM_FRONT_LEFT": ((1.52, 0.49, 1.51), 55.0, 1272.6),
+    "CAM_FRONT": ((1.70, 0.02, 1.51), 0.0, 1266.4),
+    "CAM_FRONT_RIGHT": ((1.55, -0.49, 1.50), -55.5, 1260.8),
+    "CAM_BACK_LEFT": ((1.04, 0.48, 1.56), 110.0, 1256.7),
+    "CAM_BACK": ((0.03, 0.00, 1.57), 180.0, 809.2),
+    "CAM_BACK_RIGHT": ((1.01, -0.48, 1.56), -110.0, 1259.5),
+}
+
+
+def place(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
+    """Pose [4, 4] of something upright."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def rig_camera(channel: str, width: int) -> Camera:
+    """A camera of the nuScenes rig, its picture scaled to `width` pixels (16:9)."""
+    at, heading, focal = RIG[channel]
+    to_ego = place(at[0], at[1], np.radians(heading), at[2])
+    to_ego[:3, :3] = to_ego[:3, :3] @ FORWARD[:3, :3]
+    f = focal * width / 1600
+    height = width * 9 // 16
+    matrix = np.array(
+        [[f, 0, (816.3 + 0.5) * width / 1600 - 0.5], [0, f, (491.5 + 0.5) * width / 1600 - 0.5], [0, 0, 1]]
+    )
+    return Camera(width, height, matrix, to_ego, channel)

@@ -1,0 +1,193 @@
+"""What can be seen: the triangles of a street and of bodies on a device, and what stands where in a view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ssad.assets.mesh import Material, Mesh
+from ssad.assets.street.model import Street
+from ssad.camera.kernels import shade as kernels
+from ssad.core.errors import ConfigError
+from ssad.core.types import F32, F64, I32
+
+# pattern of a material by its name; others are plain
+PATTERNS = {
+    "asphalt": kernels.GRAIN, "asphalt_patch": kernels.GRAIN, "asphalt_worn": kernels.GRAIN, "driveway": kernels.GRAIN,
+    "kerb": kernels.GRAIN, "stone": kernels.GRAIN, "plaster": kernels.GRAIN, "soil": kernels.GRAIN,
+    "roofing_felt": kernels.GRAIN, "cobbles": kernels.SLAB, "paving": kernels.SLAB, "brick": kernels.BRICK,
+    "grass": kernels.LEAF, "dry_grass": kernels.LEAF, "lawn": kernels.LEAF, "meadow": kernels.LEAF,
+    "hedge": kernels.LEAF, "forest": kernels.LEAF, "hills": kernels.LEAF, "leaves_round": kernels.LEAF,
+    "leaves_tall": kernels.LEAF, "leaves_birch": kernels.LEAF, "leaves_conifer": kernels.LEAF, "bark": kernels.GRAIN,
+    "roof_tiles": kernels.TILE, "boards": kernels.TILE, "window": kernels.GLASS, "shop_window": kernels.GLASS,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """A body in a view: index of its mesh in the stage, pose (object to world) [4, 4], paint (linear RGB), tag that
+    masks and boxes name it by. texture: which texture it wears (-1: none) on what lies in `rectangle` (u0, v0, u1, v1)
+    of its atlas; faces outside of all panels (windows, lamps, tyres) never wear one."""
+
+    mesh: int
+    pose: F64
+    paint: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    tag: int = 0
+    texture: int = -1
+    rectangle: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """N ranges of listed faces, each under one matrix (object to camera) in one view."""
+
+    firsts: I32
+    counts: I32
+    views: I32
+    matrices: F32
+    paints: F32
+    tags: I32
+    textures: I32
+    rectangles: F32
+
+
+class Scene:
+    """Triangles of a street (or none) and of meshes, on a device."""
+
+    def __init__(self, street: Street | None, meshes: Sequence[Mesh], *, device: str = "cpu") -> None:
+        self.street, self.device = street, device
+        if street is not None:
+            x, y = np.meshgrid(np.arange(street.nx), np.arange(street.ny))
+            self.low = np.stack([street.origin[0] + street.tile * x, street.origin[1] + street.tile * y], -1).reshape(
+                -1, 2
+            )
+        parts: list[Any] = [street] if street is not None else []
+        parts += meshes
+        if not parts:
+            raise ConfigError("a stage needs a street or a mesh")
+        vertices, faces, normals, uvs, material, surfaces = [], [], [], [], [], []
+        listed = [street.order.astype(np.int32)] if street is not None else []
+        self.first, self.count, self.centre, self.radius = [], [], [], []
+        base_v = base_f = base_m = 0
+        place = len(listed[0]) if listed else 0
+        for number, part in enumerate(parts):
+            vertices.append(part.vertices)
+            faces.append(part.faces + base_v)
+            normals.append(part.normals)
+            uvs.append(part.uv)
+            material.append(part.material + base_m)
+            surfaces += [surface(m) for m in part.materials]
+            if street is None or number > 0:
+                listed.append(np.arange(base_f, base_f + len(part.faces), dtype=np.int32))
+                self.first.append(place)
+                self.count.append(len(part.faces))
+                low, high = part.bounds()
+                self.centre.append((low + high) / 2)
+                self.radius.append(float(np.linalg.norm(high - low) / 2))
+                place += len(part.faces)
+            base_v, base_f, base_m = base_v + len(part.vertices), base_f + len(part.faces), base_m + len(part.materials)
+
+        def on(values: Any, dtype: Any) -> Any:
+            return wp.array(values, dtype=dtype, device=device)
+
+        self.vertices = on(np.concatenate(vertices), wp.vec3)
+        self.faces = on(np.concatenate(faces).astype(np.int32), wp.int32)
+        self.normals = on(np.concatenate(normals), wp.vec3)
+        self.uvs = on(np.concatenate(uvs), wp.vec2)
+        self.material = on(np.concatenate(material).astype(np.int32), wp.int32)
+        worn = [p.panel >= 0 if isinstance(p, Mesh) else np.zeros(len(p.faces), bool) for p in parts]
+        self.wearable = on(np.concatenate(worn).astype(np.int32), wp.int32)
+        rows: Any = np.array(surfaces, dtype=kernels.Surface.numpy_dtype())  # type: ignore[attr-defined]
+        self.surfaces = on(rows, kernels.Surface)
+        self.listed = on(np.concatenate(listed), wp.int32)
+
+    def tiles(
+        self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
+    ) -> tuple[I32, I32, I32]:
+        """First and count in the list of the street's tiles that B views need, and whose view it is.
+
+        eyes [B, 3]; axes [B, 3] viewing directions: what lies wholly behind is left out (None: all around); reach:
+        distances up to which tiles are drawn in full and without small things; far [B]: beyond it not at all;
+        horizon: whether the far ground belongs to it.
+        """
+        street = self.street
+        if street is None:
+            return (np.zeros(0, np.int32),) * 3
+        gap = np.maximum(np.maximum(self.low - eyes[:, None, :2], eyes[:, None, :2] - self.low - street.tile), 0.0)
+        away = np.hypot(gap[..., 0], gap[..., 1])
+        keep = away <= far[:, None]
+        if axes is not None:
+            middle = self.low + street.tile / 2 - eyes[:, None, :2]
+            ahead = np.einsum("btk,bk->bt", middle, axes[:, :2]) > -0.75 * street.tile
+            keep &= ahead | (np.abs(axes[:, 2:3]) > 0.7)
+        level = (away > reach[0]).astype(int) + (away > reach[1])
+        view, tile = np.nonzero(keep)
+        levels = level[keep]
+        if horizon:
+            view = np.concatenate([view, np.arange(len(eyes))])
+            tile = np.concatenate([tile, np.full(len(eyes), street.nx * street.ny)])
+            levels = np.concatenate([levels, np.zeros(len(eyes), int)])
+        start = street.offset[levels, tile]
+        count = street.offset[levels, tile + 1] - start
+        some = count > 0
+        return start[some].astype(np.int32), count[some].astype(np.int32), view[some].astype(np.int32)
+
+    def gather(
+        self,
+        inverses: F64,
+        things: Sequence[Sequence[Thing]],
+        *,
+        eyes: F64,
+        axes: F64 | None,
+        reach: tuple[float, float],
+        far: F64,
+        horizon: bool = True,
+    ) -> Draws:
+        """What B views need: tiles of the street, and things that are neither wholly behind them nor beyond `far` [B].
+
+        inverses [B, 4, 4]: world to camera. Other arguments as for `tiles`.
+        """
+        first, count, view = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
+        tiles = len(first)
+        matrices = inverses[view]
+        flat = [t for row in things for t in row]
+        if flat:
+            mesh = np.array([t.mesh for t in flat])
+            owner = np.repeat(np.arange(len(things)), [len(row) for row in things])
+            moved = inverses[owner] @ np.stack([t.pose for t in flat])
+            middle, radius = np.array(self.centre)[mesh], np.array(self.radius)[mesh]
+            local = np.einsum("nij,nj->ni", moved[:, :3, :3], middle) + moved[:, :3, 3]
+            limit = far[owner]
+            if axes is not None:
+                keep = (local[:, 2] > -radius) & (local[:, 2] < limit)
+            else:
+                keep = np.abs(local[:, :2]).max(1) < limit
+            mesh, owner = mesh[keep], owner[keep]
+            flat = [t for t, k in zip(flat, keep, strict=True) if k]
+            first = np.concatenate([first, np.array(self.first, np.int32)[mesh]])
+            count = np.concatenate([count, np.array(self.count, np.int32)[mesh]])
+            view = np.concatenate([view, owner.astype(np.int32)])
+            matrices = np.concatenate([matrices, moved[keep]])
+        if not len(first):  # nothing but sky: one range without faces
+            first, count, view, matrices = *(np.zeros(1, np.int32) for _ in range(3)), np.eye(4)[None]
+            tiles = 1
+        n = len(first)
+        paints, rectangles = np.zeros((n, 3), np.float32), np.tile(np.array([0, 0, 1, 1], np.float32), (n, 1))
+        tags, textures = np.zeros(n, np.int32), np.full(n, -1, np.int32)
+        if flat:
+            paints[tiles:] = [t.paint for t in flat]
+            tags[tiles:] = [t.tag for t in flat]
+            textures[tiles:] = [t.texture for t in flat]
+            if (textures >= 0).any():
+                rectangles[tiles:] = [t.rectangle for t in flat]
+        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, textures, rectangles)
+
+
+def surface(material: Material) -> tuple[Any, ...]:
+    """A material as the kernels want it."""
+    pattern = PATTERNS.get(material.name, kernels.PLAIN)
+    return (material.colour, material.specular, material.gloss, material.emission, int(material.paint), int(pattern))

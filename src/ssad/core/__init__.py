@@ -1,0 +1,1 @@
+"""Data types, protocols and small tools that every other package may use."""

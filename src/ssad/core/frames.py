@@ -1,0 +1,149 @@
+"""What a camera or LiDAR delivers at one moment, and what is known about that moment.
+
+Frames of reference: world (x east, y north, z up), ego (x forward, y left, z up), camera (x right, y down, z forward).
+A pose `a_to_b` is a 4 x 4 matrix that takes homogeneous points of a into b. Pixel (0, 0) is the centre of the first
+pixel. N boxes, P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssad.core.types import F32, F64
+
+# camera looking forward, upright, 1.5 m above the road: x right = -y, y down = -z, z forward = x
+FORWARD: F64 = np.array([[0.0, 0, 1, 1.7], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """A pinhole camera on the ego: `intrinsic` [3, 3] for `width` x `height` pixels, `to_ego` [4, 4]."""
+
+    width: int
+    height: int
+    intrinsic: F64
+    to_ego: F64 = field(default_factory=FORWARD.copy)
+    channel: str = "CAM"
+
+    @staticmethod
+    def typical(width: int, height: int, *, channel: str = "CAM") -> Camera:
+        """What is assumed of an unknown camera: that of nuScenes, focal length 0.79 of the width, level, 1.5 m up."""
+        focal = 0.79 * width
+        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        return Camera(width, height, matrix, channel=channel)
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes3D:
+    """3D boxes in the world frame, columns of N rows.
+
+    instance: who it is, over time and sensors; centre [N, 3]; size [N, 3] (width, length, height); rotation [N, 4]
+    quaternions (w, x, y, z); velocity [N, 3] m/s, NaN where unknown; visible [N] least fraction that is seen over all
+    cameras, 1 where unknown.
+    """
+
+    instance: tuple[str, ...]
+    centre: F64
+    size: F64
+    rotation: F64
+    velocity: F64
+    visible: F64
+
+    def __len__(self) -> int:
+        return len(self.instance)
+
+    @staticmethod
+    def empty() -> Boxes3D:
+        """No boxes."""
+        return Boxes3D((), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One exposure of one camera, without its pixels.
+
+    scene, sample: keys of randomness (weather is drawn once a scene, sensor noise once a file); time s;
+    ego_to_world [4, 4]; ego_velocity [3] m/s in the world frame; depth [h, w] metres along the optical axis, in any
+    resolution (0: unknown, inf: sky); points [P, 3] LiDAR returns in the camera frame, from which depth is filled in
+    where `depth` is None; sun: the share of the sun's disc that is free, where another camera of the moment sees it
+    (None: not known; each picture is then judged by itself).
+    """
+
+    camera: Camera
+    scene: str = ""
+    sample: str = ""
+    time: float = 0.0
+    ego_to_world: F64 = field(default_factory=lambda: np.eye(4))
+    ego_velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    boxes: Boxes3D = field(default_factory=Boxes3D.empty)
+    depth: F32 | None = None
+    points: F32 | None = None
+    sun: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFrame:
+    """One turn of a LiDAR, without its points: keys, time s, poses [4, 4], velocity m/s (world), boxes."""
+
+    scene: str = ""
+    sample: str = ""
+    time: float = 0.0
+    to_ego: F64 = field(default_factory=lambda: np.eye(4))
+    ego_to_world: F64 = field(default_factory=lambda: np.eye(4))
+    ego_velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    boxes: Boxes3D = field(default_factory=Boxes3D.empty)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneContext:
+    """What is constant over a scene and drawn or measured once: the key, brightness, where it goes.
+
+    light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); heading: of the ego in the world at
+    the start of the scene, radians; start: its first time, s; sun: unit vector towards it in the world, where it was
+    chosen so that it is seen (None: drawn).
+    """
+
+    scene: str = ""
+    light: float = 0.8
+    heading: float = 0.0
+    start: float = 0.0
+    sun: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Applied:
+    """What a shift did to one file: applied or not, how (plain data), and what was skipped and why."""
+
+    applied: bool
+    details: Mapping[str, Any] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
+
+
+def rotation_matrix(quaternion: F64) -> F64:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (w, x, y, z); they are normalised first."""
+    q = np.asarray(quaternion, np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def pose_matrix(translation: F64, quaternion: F64) -> F64:
+    """4 x 4 matrix of a translation [3] and a quaternion [4] (w, x, y, z)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrix(quaternion)
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def camera_to_world(frame: Frame) -> F64:
+    """4 x 4 pose of the camera of a frame in the world."""
+    return np.asarray(frame.ego_to_world @ frame.camera.to_ego, np.float64)

@@ -1,0 +1,247 @@
+"""The lane graph of a town: frozen arrays, checked, stored as one small .npz without pickle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssad.core.errors import FormatError, MapError
+from ssad.core.safeio import load_npz, save_npz
+from ssad.core.types import F32, I32, U8, Bool, LaneType
+
+FORMAT = 1  # of the .npz file
+MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
+
+
+class Marking(IntEnum):
+    """What is painted between a lane and its neighbour. Only BROKEN may be crossed."""
+
+    NONE = 0  # nothing painted or nothing known
+    BROKEN = 1
+    SOLID = 2
+    DOUBLE = 3
+    CURB = 4
+    OTHER = 5
+
+
+@dataclass(frozen=True)
+class LaneGraph:
+    """Lanes of a town as polylines that run in the direction of traffic. Arrays are read-only.
+
+    L lanes, P points, E links, S signals, K stop lines, C crosswalks; metres, radians, m/s, world frame.
+    A lane is one lane of one OpenDRIVE lane section; sidewalks and shoulders run as the driving lanes beside
+    them.
+
+    xy [P, 2], z, yaw, width, s [P]: centre line, its heading, the lane's width, arc length from the lane's
+    start. offset [L+1]: points of lane i are offset[i]:offset[i+1] (at least two). kind [L]: `LaneType`.
+    road, section, lane_id [L]: OpenDRIVE ids. junction [L]: junction the lane crosses, -1 none.
+    speed_limit [L]. left, right [L]: lane beside it as seen in its own direction (any kind, any direction),
+    -1 none. left_marking, right_marking [L]: `Marking` towards it. succ_offset [L+1], succ [E]: lanes that
+    follow. signal_xy [S, 2], signal_yaw [S] (direction of the traffic it faces), signal_junction [S];
+    signal_phase [S]: signals of a junction with equal phase are green together; signal_virtual [S]: not in
+    the map, off unless forced. stop_signal, stop_lane, stop_s [K]: signal that controls a lane at arc length
+    stop_s (near the lane's end). crosswalk_offset [C+1], crosswalk_xy [., 2]: corners of the crosswalks.
+    """
+
+    name: str
+    xy: F32
+    z: F32
+    yaw: F32
+    width: F32
+    s: F32
+    offset: I32
+    kind: U8
+    road: I32
+    section: I32
+    lane_id: I32
+    junction: I32
+    speed_limit: F32
+    left: I32
+    right: I32
+    left_marking: U8
+    right_marking: U8
+    succ_offset: I32
+    succ: I32
+    signal_xy: F32
+    signal_yaw: F32
+    signal_junction: I32
+    signal_phase: I32
+    signal_virtual: Bool
+    stop_signal: I32
+    stop_lane: I32
+    stop_s: F32
+    crosswalk_offset: I32
+    crosswalk_xy: F32
+    length: F32 = field(init=False)
+    pred_offset: I32 = field(init=False)
+    pred: I32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        for name, dtype in _DTYPES.items():
+            value = np.ascontiguousarray(getattr(self, name), dtype)
+            if value is getattr(self, name) and value.flags.writeable:
+                value = value.copy()
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        _check(self)
+        length = self.s[self.offset[1:] - 1]
+        source = np.repeat(np.arange(self.lanes, dtype=np.int32), np.diff(self.succ_offset))
+        order = np.argsort(self.succ, kind="stable")
+        count = np.bincount(self.succ, minlength=self.lanes)
+        before = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+        for name, value in (("length", length), ("pred", source[order]), ("pred_offset", before)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @property
+    def lanes(self) -> int:
+        """Number of lanes L."""
+        return len(self.kind)
+
+    def points(self, lane: int) -> slice:
+        """The slice of the point arrays that holds a lane's centre line."""
+        return slice(int(self.offset[lane]), int(self.offset[lane + 1]))
+
+    def successors(self, lane: int) -> I32:
+        """Lanes that traffic can enter from the end of a lane."""
+        return self.succ[self.succ_offset[lane] : self.succ_offset[lane + 1]]
+
+    def predecessors(self, lane: int) -> I32:
+        """Lanes from which traffic enters a lane."""
+        return self.pred[self.pred_offset[lane] : self.pred_offset[lane + 1]]
+
+    def crosswalk(self, index: int) -> F32:
+        """Corners [., 2] of a crosswalk."""
+        return self.crosswalk_xy[self.crosswalk_offset[index] : self.crosswalk_offset[index + 1]]
+
+    def at(self, lane: int, s: float) -> tuple[float, float, float, float]:
+        """x, y, yaw and width at arc length s of a lane (s is held inside the lane)."""
+        part = self.points(lane)
+        along = self.s[part]
+        i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(along) - 2))
+        t = float(np.clip((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0, 1.0))
+        i += part.start
+        x, y = (1.0 - t) * self.xy[i] + t * self.xy[i + 1]
+        turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi
+        width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
+        return float(x), float(y), float(self.yaw[i]) + t * turn, width
+
+    def same_direction(self, lane: int, other: int) -> bool:
+        """Whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
+        return bool(self.lane_id[lane] * self.lane_id[other] > 0 and self.road[lane] == self.road[other])
+
+
+_DTYPES: dict[str, Any] = {
+    "xy": np.float32, "z": np.float32, "yaw": np.float32, "width": np.float32, "s": np.float32,
+    "offset": np.int32, "kind": np.uint8, "road": np.int32, "section": np.int32, "lane_id": np.int32,
+    "junction": np.int32, "speed_limit": np.float32, "left": np.int32, "right": np.int32,
+    "left_marking": np.uint8, "right_marking": np.uint8, "succ_offset": np.int32, "succ": np.int32,
+    "signal_xy": np.float32, "signal_yaw": np.float32, "signal_junction": np.int32, "signal_phase": np.int32,
+    "signal_virtual": np.bool_, "stop_signal": np.int32, "stop_lane": np.int32, "stop_s": np.float32,
+    "crosswalk_offset": np.int32, "crosswalk_xy": np.float32,
+}  # fmt: skip
+_PER = {
+    "P": ("z", "yaw", "width", "s"),
+    "L": (
+        "road",
+        "section",
+        "lane_id",
+        "junction",
+        "speed_limit",
+        "left",
+        "right",
+        "left_marking",
+        "right_marking",
+    ),
+    "S": ("signal_yaw", "signal_junction", "signal_phase", "signal_virtual"),
+    "K": ("stop_signal", "stop_lane", "stop_s"),
+}
+
+
+def _check(graph: LaneGraph) -> None:
+    """Refuse arrays that contradict each other; MapError names the first that does."""
+
+    def require(ok: bool, what: str) -> None:
+        if not ok:
+            raise MapError(f"town '{graph.name}': {what}; bake the map again with ssad import map")
+
+    for name in ("xy", "signal_xy", "crosswalk_xy"):
+        value = getattr(graph, name)
+        require(value.ndim == 2 and value.shape[1] == 2, f"{name} is not [n, 2]")
+    size = {"P": len(graph.xy), "L": len(graph.kind), "S": len(graph.signal_xy), "K": len(graph.stop_signal)}
+    for letter, names in _PER.items():
+        for name in names:
+            require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")
+    for name in (
+        "xy",
+        "z",
+        "yaw",
+        "width",
+        "s",
+        "speed_limit",
+        "signal_xy",
+        "signal_yaw",
+        "stop_s",
+        "crosswalk_xy",
+    ):
+        require(bool(np.isfinite(getattr(graph, name)).all()), f"{name} holds a number that is not finite")
+    for name, rows, total in (
+        ("offset", size["L"], size["P"]),
+        ("succ_offset", size["L"], len(graph.succ)),
+        ("crosswalk_offset", len(graph.crosswalk_offset) - 1, len(graph.crosswalk_xy)),
+    ):
+        value = getattr(graph, name)
+        good = value.shape == (rows + 1,) and len(value) > 0 and value[0] == 0 and value[-1] == total
+        require(bool(good and (np.diff(value) >= 0).all()), f"{name} does not partition its rows")
+    require(size["L"] > 0, "it has no lane")
+    require(bool((np.diff(graph.offset) >= 2).all()), "a lane has fewer than two points")
+    for name, low, high in (
+        ("left", -1, size["L"]),
+        ("right", -1, size["L"]),
+        ("succ", 0, size["L"]),
+        ("stop_lane", 0, size["L"]),
+        ("stop_signal", 0, size["S"]),
+        ("kind", 0, len(LaneType)),
+    ):
+        value = getattr(graph, name)
+        require(bool(((value >= low) & (value < high)).all()), f"{name} points outside the table")
+    inner = np.ones(size["P"] - 1, bool)
+    inner[graph.offset[1:-1] - 1] = False
+    require(bool((np.diff(graph.s)[inner] > 0).all()), "s does not grow along a lane")
+    require(bool((graph.kind == LaneType.DRIVING).any()), "it has no drivable lane")
+
+
+def save_graph(graph: LaneGraph, path: Path | str) -> None:
+    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes. StoreError."""
+    header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
+    save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
+
+
+def load_graph(path: Path | str) -> LaneGraph:
+    """Read what `save_graph` wrote. MapError: missing, broken, too large, or not a lane graph."""
+    source, mend = Path(path), "bake the map again with ssad import map"
+    try:
+        arrays = load_npz(source, limit=MAX_FILE)
+    except FormatError as error:
+        raise MapError(f"{error}; {mend}") from None
+    header = arrays.pop("header", None)
+    if header is None or header.shape != (2,) or str(header[0]) != f"ssad-lane-graph {FORMAT}":
+        raise MapError(f"{source}: not a baked town of format {FORMAT}; {mend}")
+    if set(arrays) != set(_DTYPES):
+        wrong = ", ".join(sorted(set(arrays) ^ set(_DTYPES)))
+        raise MapError(f"{source}: missing or unknown arrays: {wrong}; {mend}")
+    for name, dtype in _DTYPES.items():
+        if arrays[name].dtype != np.dtype(dtype):
+            raise MapError(f"{source}: array {name} is {arrays[name].dtype}; {mend}")
+    return LaneGraph(name=str(header[1]), **arrays)
+
+
+def equal(a: LaneGraph, b: LaneGraph) -> bool:
+    """Whether two graphs hold the same numbers."""
+    return a.name == b.name and all(
+        np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(LaneGraph) if f.name != "name"
+    )

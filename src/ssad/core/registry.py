@@ -1,0 +1,77 @@
+"""Names to objects: a built-in table, entry points of other packages, or "module:object" by the user."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import sys
+import traceback
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from ssad.core.errors import ConfigError, unknown_name
+
+
+def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
+    """The object behind `name`.
+
+    kind: singular noun for messages and the entry-point group ("system" -> group `ssad.systems`);
+    table: built-in names -> "module:object". A name with a colon is imported, the working folder on the path.
+    UnknownNameError shows the three closest names; ConfigError says why a module of the user does not import.
+    """
+    if name in table:
+        module, _, attribute = table[name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
+    plugins = {point.name: point for point in entry_points(group=f"ssad.{kind}s")}
+    if name in plugins:
+        return _import(kind, name, plugins[name].value)
+    if ":" in name:
+        return _import(kind, name, name)
+    raise unknown_name(kind, name, [*table, *plugins])
+
+
+def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
+    """All names of a kind -> where they come from ("module:object"), built-in ones first."""
+    return dict(table) | {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+
+
+def _import(kind: str, name: str, target: str) -> Any:
+    module_name, _, attribute = target.partition(":")
+    attribute = attribute.split("[")[0].strip()
+    if not module_name or not all(part.isidentifier() for part in module_name.split(".")) or not attribute:
+        raise ConfigError(f"{kind} '{name}': expected module:object, such as my_driver:MyDriver")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        value: Any = importlib.import_module(module_name)
+    except Exception as error:
+        why = describe(error) + _hint(error, module_name, here)
+        raise ConfigError(f"{kind} '{name}': importing {module_name} failed: {why}") from error
+    for part in attribute.split("."):
+        try:
+            value = getattr(value, part)
+        except AttributeError:
+            close = difflib.get_close_matches(part, [n for n in dir(value) if n[0] != "_"], n=3, cutoff=0.3)
+            hint = f"; closest: {', '.join(close)}" if close else ""
+            raise ConfigError(f"{kind} '{name}': {module_name} has no '{part}'{hint}") from None
+    return value
+
+
+def describe(error: BaseException) -> str:
+    """One line: the kind of error, its text, and the innermost file and line of it."""
+    if isinstance(error, SyntaxError):
+        return f"{type(error).__name__}: {error.msg} ({error.filename}:{error.lineno})"
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
+    own = [f for f in frames if f.filename not in (__file__, importlib.__file__)]
+    where = f" ({own[-1].filename}:{own[-1].lineno})" if own else ""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}{f': {text}' if text else ''}{where}"
+
+
+def _hint(error: BaseException, module: str, here: str) -> str:
+    if isinstance(error, ModuleNotFoundError) and error.name == module.split(".", maxsplit=1)[0]:
+        return f"; looked in {here} and the installed packages"
+    return ""

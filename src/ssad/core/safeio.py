@@ -1,0 +1,404 @@
+"""The only door for files that people hand to SSAD, and for files that SSAD writes.
+
+Readers refuse what is hostile (YAML bombs, XML entities, pickles, zip bombs) and say file and line. Writers
+are atomic: a reader sees the old file or the whole new one. Every error is an `ssad.core.errors.SSADError`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.errors import ConfigError, FormatError, StoreError
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+MIB = 1 << 20
+MAX_DEPTH = 64
+MAX_ALIASED_NODES = 10_000
+
+Location = Sequence[str | int]
+
+
+def home() -> Path:
+    """Folder of imported towns and scenarios: $SSAD_HOME, else ~/.local/share/ssad (it need not exist)."""
+    named = os.environ.get("SSAD_HOME")
+    return Path(named).expanduser() if named else Path.home() / ".local" / "share" / "ssad"
+
+
+def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
+    """The whole file, refused beyond `limit` bytes. FormatError."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read(limit + 1)
+    except FileNotFoundError:
+        raise FormatError(f"{path}: no such file") from None
+    except OSError as error:
+        raise FormatError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if len(data) > limit:
+        raise FormatError(f"{path}: larger than the limit of {limit / MIB:g} MiB")
+    return data
+
+
+def read_text(path: str | Path, *, limit: int = 64 * MIB) -> str:
+    """The whole file as UTF-8 text. FormatError."""
+    try:
+        return read_bytes(path, limit=limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: not UTF-8 text (byte {error.start})") from None
+
+
+# ---------------------------------------------------------------- YAML
+
+# YAML 1.2 core: `1e-3` is a number, `no` and `on` are words, `1:30` is text (PyYAML's default is YAML 1.1)
+_RESOLVERS: tuple[tuple[str, str, str], ...] = (
+    ("tag:yaml.org,2002:null", r"^(?:~|null|Null|NULL|)$", "~nN"),
+    ("tag:yaml.org,2002:bool", r"^(?:true|True|TRUE|false|False|FALSE)$", "tTfF"),
+    ("tag:yaml.org,2002:int", r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$", "-+0123456789"),
+    (
+        "tag:yaml.org,2002:float",
+        r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$",
+        "-+.0123456789",
+    ),
+    ("tag:yaml.org,2002:merge", r"^<<$", "<"),
+)
+
+
+def _with_resolvers(base: type) -> Any:
+    """A loader or dumper class with the YAML 1.2 rules of what a plain scalar is."""
+    table: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
+    for tag, pattern, first in _RESOLVERS:
+        for letter in [*first, *([""] if tag.endswith("null") else [])]:
+            table.setdefault(letter, []).append((tag, re.compile(pattern)))
+    return type(base.__name__, (base,), {"yaml_implicit_resolvers": table})
+
+
+@dataclass(frozen=True)
+class Document:
+    """A parsed YAML text: plain data, and the line of every key and item."""
+
+    name: str
+    data: Any
+    lines: Mapping[tuple[str | int, ...], int] = field(default_factory=dict)
+
+    def line(self, location: Location = ()) -> int:
+        """Line (from 1) of a key or item such as ("scenarios", 3, "town"), or of what holds it."""
+        place = tuple(location)
+        while place and place not in self.lines:
+            place = place[:-1]
+        return self.lines.get(place, 1)
+
+    def error(self, location: Location, message: str) -> ConfigError:
+        """A ConfigError that says file, line and key."""
+        key = dotted(location)
+        return ConfigError(f"{self.name}:{self.line(location)}: {f'{key}: ' if key else ''}{message}")
+
+
+def dotted(location: Location) -> str:
+    """("a", 0, "b") as `a[0].b`."""
+    text = ""
+    for part in location:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return text
+
+
+class _Builder:
+    """Turns YAML nodes into plain data; refuses duplicate keys, tags, loops and expansion bombs."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.lines: dict[tuple[str | int, ...], int] = {}
+        self.seen: set[int] = set()
+        self.open: set[int] = set()
+        self.aliased = 0
+
+    def fail(self, node: Any, message: str) -> FormatError:
+        return FormatError(f"{self.name}:{node.start_mark.line + 1}: {message}")
+
+    def build(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> Any:
+        repeated = repeated or id(node) in self.seen
+        if repeated:
+            self.aliased += 1
+            if self.aliased > MAX_ALIASED_NODES:
+                raise self.fail(node, f"aliases expand to more than {MAX_ALIASED_NODES} values (a YAML bomb?)")
+        if id(node) in self.open:
+            raise self.fail(node, "an alias refers to the value that contains it")
+        if len(place) > MAX_DEPTH:
+            raise self.fail(node, f"nested deeper than {MAX_DEPTH} levels")
+        self.seen.add(id(node))
+        self.lines.setdefault(place, node.start_mark.line + 1)
+        if node.id == "scalar":
+            return self.scalar(node)
+        self.open.add(id(node))
+        try:
+            if node.id == "sequence":
+                if node.tag != "tag:yaml.org,2002:seq":
+                    raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+                return [self.build(child, (*place, i), repeated) for i, child in enumerate(node.value)]
+            return self.mapping(node, place, repeated)
+        finally:
+            self.open.discard(id(node))
+
+    def mapping(self, node: Any, place: tuple[str | int, ...], repeated: bool) -> dict[str, Any]:
+        if node.tag != "tag:yaml.org,2002:map":
+            raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+        result: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            if key_node.id != "scalar":
+                raise self.fail(key_node, "a key must be a single word or text")
+            if key_node.tag.endswith(":merge"):
+                raise self.fail(key_node, "merge keys (<<) are not supported; write the keys out")
+            key = str(key_node.value)
+            if key in result:
+                raise self.fail(key_node, f"key '{key}' appears twice")
+            self.lines.setdefault((*place, key), key_node.start_mark.line + 1)
+            result[key] = self.build(value_node, (*place, key), repeated)
+        return result
+
+    def scalar(self, node: Any) -> Any:
+        text: str = node.value
+        kind = node.tag.removeprefix("tag:yaml.org,2002:")
+        try:
+            if kind == "null":
+                return None
+            if kind == "bool" and text.lower() in ("true", "false"):
+                return text.lower() == "true"
+            if kind == "int":
+                return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+            if kind == "float":
+                value = float(re.sub(r"\.(?=[in])", "", text.lower()))  # .inf and .nan have a leading dot
+                if math.isnan(value):
+                    raise self.fail(node, "NaN is not a value")
+                return value
+        except ValueError:
+            raise self.fail(node, f"'{text[:40]}' is not a valid {kind}") from None
+        if kind in ("str", "merge"):
+            return text
+        raise self.fail(node, f"tag {node.tag} is not allowed; use plain YAML")
+
+
+def parse_yaml_document(text: str, name: str = "<text>") -> Document:
+    """Parse one YAML document; `name` is what errors call it. FormatError with line."""
+    import yaml
+
+    loader = _with_resolvers(getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    depth = 0
+
+    try:
+        for event in yaml.parse(text, Loader=loader):  # before the composer, which recurses in C
+            if isinstance(event, (yaml.SequenceStartEvent, yaml.MappingStartEvent)):
+                depth += 1
+                if depth > MAX_DEPTH:
+                    line = getattr(event.start_mark, "line", 0) + 1
+                    raise FormatError(f"{name}:{line}: nested deeper than {MAX_DEPTH} levels")
+            elif isinstance(event, (yaml.SequenceEndEvent, yaml.MappingEndEvent)):
+                depth -= 1
+        node = yaml.compose(text, Loader=loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark if error.problem_mark is not None else error.context_mark
+        line = None if mark is None else mark.line
+        where = name if line is None else f"{name}:{line + 1}"
+        raise FormatError(f"{where}: not valid YAML: {error.problem or error.context}") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise FormatError(f"{name}: not valid YAML: {error}") from None
+    if node is None:
+        return Document(name, None)
+    builder = _Builder(name)
+    return Document(name, builder.build(node, (), False), builder.lines)
+
+
+def parse_yaml(text: str, name: str = "<text>") -> Any:
+    """Plain data of one YAML document. FormatError with line."""
+    return parse_yaml_document(text, name).data
+
+
+def read_yaml_document(path: str | Path, *, limit: int = 16 * MIB) -> Document:
+    """Parse a YAML file and keep line numbers for later errors (`Document.error`). FormatError."""
+    return parse_yaml_document(read_text(path, limit=limit), str(path))
+
+
+def read_yaml(path: str | Path, *, limit: int = 16 * MIB) -> Any:
+    """Plain data of a YAML file. FormatError."""
+    return read_yaml_document(path, limit=limit).data
+
+
+def dump_yaml(data: Any) -> str:
+    """YAML text that `parse_yaml` reads back to equal data; keys keep their order."""
+    import yaml
+
+    dumper = _with_resolvers(yaml.SafeDumper)
+    dumper.ignore_aliases = lambda self, data: True
+    return str(yaml.dump(data, Dumper=dumper, sort_keys=False, allow_unicode=True, width=110, default_flow_style=None))
+
+
+# ---------------------------------------------------------------- JSON, XML
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"key '{twice}' appears twice")
+    return result
+
+
+def _no_constant(text: str) -> float:
+    raise ValueError(f"{text} is not a JSON number")
+
+
+def parse_json(text: str | bytes, name: str = "<text>") -> Any:
+    """Plain data of a JSON text; duplicate keys and NaN are refused. FormatError with line."""
+    try:
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
+    except json.JSONDecodeError as error:
+        raise FormatError(f"{name}:{error.lineno}: not valid JSON: {error.msg}") from None
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{name}: not valid JSON: {error}") from None
+
+
+def read_json(path: str | Path, *, limit: int = 256 * MIB) -> Any:
+    """Plain data of a JSON file. FormatError."""
+    return parse_json(read_text(path, limit=limit), str(path))
+
+
+def dump_json(data: Any, *, indent: int | None = None) -> str:
+    """Canonical JSON: sorted keys, no spaces (unless `indent`), no NaN. ValueError for other values."""
+    separators = (",", ":") if indent is None else (",", ": ")
+    return json.dumps(data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
+
+
+def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
+    """Root element of an XML text; DTDs, entities and external data are refused. FormatError with line."""
+    from xml.etree.ElementTree import ParseError
+
+    import defusedxml
+    import defusedxml.ElementTree as safe
+
+    try:
+        root: Element = safe.fromstring(text, forbid_dtd=True)
+    except defusedxml.DefusedXmlException as error:
+        reason = type(error).__name__
+        raise FormatError(f"{name}: refused: it declares a DTD, entities or external data ({reason})") from None
+    except ParseError as error:
+        line = error.position[0]
+        raise FormatError(f"{name}:{line}: not valid XML: {error}") from None
+    except (ValueError, LookupError, RecursionError) as error:
+        raise FormatError(f"{name}: not valid XML: {error}") from None
+    return root
+
+
+def read_xml(path: str | Path, *, limit: int = 256 * MIB) -> Element:
+    """Root element of an XML file, safely. FormatError."""
+    return parse_xml(read_bytes(path, limit=limit), str(path))
+
+
+# ---------------------------------------------------------------- npz
+
+
+def npz_bytes(arrays: Mapping[str, npt.ArrayLike]) -> bytes:
+    """A compressed npz with the same bytes for the same arrays (fixed time stamps, order as given)."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
+        for name, value in arrays.items():
+            array = np.asarray(value)
+            if array.dtype.hasobject:
+                raise TypeError(f"array '{name}' holds Python objects")
+            info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.create_system = 3
+            info.external_attr = 0o644 << 16
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.ascontiguousarray(array).reshape(array.shape), allow_pickle=False)
+            archive.writestr(info, member.getvalue())
+    return buffer.getvalue()
+
+
+def save_npz(path: str | Path, arrays: Mapping[str, npt.ArrayLike]) -> None:
+    """Write a deterministic compressed npz, atomically. StoreError."""
+    write_atomic(path, npz_bytes(arrays))
+
+
+def load_npz(path: str | Path, *, limit: int = 2048 * MIB) -> dict[str, npt.NDArray[Any]]:
+    """Arrays of an npz; pickles, and members larger than they say, are refused. FormatError."""
+    data = read_bytes(path, limit=limit)
+    arrays: dict[str, npt.NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if sum(member.file_size for member in members) > limit:
+                raise FormatError(f"{path}: unpacks to more than the limit of {limit / MIB:g} MiB")
+            for member in members:
+                arrays[member.filename.removesuffix(".npy")] = _read_npy(archive.read(member))
+    except FormatError:
+        raise
+    except Exception as error:  # zipfile and numpy raise many kinds for broken bytes
+        raise FormatError(f"{path}: not a readable npz file: {error}") from None
+    return arrays
+
+
+def _read_npy(data: bytes) -> npt.NDArray[Any]:
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects (a pickle)")
+    count = math.prod(shape)
+    if count * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError("an array is cut short")
+    flat = np.frombuffer(data, dtype=dtype, count=count, offset=stream.tell())
+    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+
+
+# ---------------------------------------------------------------- writing
+
+
+def make_folder(path: str | Path) -> Path:
+    """The folder, made with its parents, and checked to be writable. StoreError."""
+    folder = Path(path)
+    probe = folder / f".probe-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot write there: {error.strerror or error}; choose another folder") from None
+    return folder
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) that replaces it when the block ends well. StoreError."""
+    target = Path(path)
+    temporary = target.with_name(f".{target.stem}-{os.getpid()}-{os.urandom(4).hex()}.tmp{target.suffix}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        raise StoreError(f"{target}: cannot be written: {error.strerror or error}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_atomic(path: str | Path, data: str | bytes) -> None:
+    """Write the whole file or nothing: temporary file in the same folder, fsync, rename. StoreError."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data.encode() if isinstance(data, str) else data)

@@ -1,0 +1,110 @@
+"""torchvision's detection models by name, with fresh weights or a file's; nothing is downloaded."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torchvision import models
+from torchvision.models import detection
+from torchvision.models.detection.transform import GeneralizedRCNNTransform
+
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.detectors.adapters.torchvision import OneStage
+from ssad.detectors.adapters.two_stage import TwoStage
+from ssad.detectors.checkpoints import COUNTER, fit_state, load_weights
+
+MODELS = (
+    "fasterrcnn_mobilenet_v3_large_320_fpn", "fasterrcnn_mobilenet_v3_large_fpn", "fasterrcnn_resnet50_fpn",
+    "fasterrcnn_resnet50_fpn_v2", "fcos_resnet50_fpn", "retinanet_resnet50_fpn", "retinanet_resnet50_fpn_v2",
+    "ssd300_vgg16", "ssdlite320_mobilenet_v3_large",
+)  # fmt: skip
+# their published weights were trained with norms that add nothing to the variance
+NO_EPS = ("fasterrcnn_resnet50_fpn", "retinanet_resnet50_fpn")
+
+
+def torchvision_detector(
+    model: str,
+    *,
+    classes: Sequence[str] | None = None,
+    weights: str | Path | None = None,
+    threshold: float | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> OneStage | TwoStage:
+    """A detection model of torchvision (`MODELS`), frozen and in eval mode.
+
+    classes: of the weights, without background (default: the 80 of COCO in torchvision's 91 columns); weights: a file
+    as `load_weights` takes it, such as torchvision's own .pth files, default fresh ones from `seed`; options: of
+    torchvision's builder, such as min_size and max_size, the size inside. UnknownNameError, ConfigError, FormatError.
+    """
+    if model not in MODELS:
+        raise unknown_name("torchvision detector", model, MODELS)
+    if classes is None:
+        named = list(models.get_model_weights(model).DEFAULT.meta["categories"])
+        columns = [k for k, name in enumerate(named) if name not in ("__background__", "N/A")]
+        count = len(named)
+        classes = [named[k] for k in columns]
+    else:
+        if not classes or len(set(classes)) != len(classes) or isinstance(classes, str):
+            raise ConfigError(f"{model}: classes must be distinct names, at least one")
+        columns, count = list(range(1, len(classes) + 1)), len(classes) + 1
+    _check_options(model, options)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            built = getattr(detection, model)(weights=None, weights_backbone=None, num_classes=count, **options)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"torchvision:{model}: {' '.join(str(error).split())}") from None
+    detector = wrap(built, classes, columns, name=f"torchvision:{model}", threshold=threshold)
+    if weights is not None:
+        fit_torchvision(detector, load_weights(weights), weights)
+    return detector
+
+
+def _check_options(model: str, options: Iterable[str]) -> None:
+    """ConfigError: an option that torchvision's builder would let pass without a word."""
+    owners = {"fasterrcnn": detection.FasterRCNN, "fcos": detection.FCOS, "retinanet": detection.RetinaNet}
+    owner = owners.get(model.split("_", maxsplit=1)[0], detection.ssd.SSD)
+    known = {n for f in (getattr(detection, model), owner, GeneralizedRCNNTransform) for n in signature(f).parameters}
+    for key in options:
+        if key not in known:
+            close = difflib.get_close_matches(key, sorted(known), n=3, cutoff=0.3)
+            hint = f"; closest: {', '.join(close)}" if close else ""
+            raise ConfigError(f"torchvision:{model}: no option '{key}'{hint}")
+
+
+def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where: str | Path) -> None:
+    """Copy weights with torchvision's own names into the detector. FormatError."""
+    frozen = not any(key.endswith(COUNTER) for key in state)
+    if frozen and detector.name.removeprefix("torchvision:") in NO_EPS:
+        for part in detector.model.modules():
+            if isinstance(part, nn.BatchNorm2d):
+                part.eps = 0.0
+    if not any(key.startswith("model.") for key in state):
+        state = {f"model.{key}": value for key, value in state.items()}
+    fit_state(detector, state, where)
+
+
+def wrap(
+    model: nn.Module,
+    classes: Sequence[str],
+    columns: Sequence[int] | None = None,
+    *,
+    name: str = "torchvision",
+    threshold: float | None = None,
+) -> OneStage | TwoStage:
+    """A model of torchvision's classes FCOS, RetinaNet, SSD or FasterRCNN that you built yourself, as a detector.
+
+    classes: without background; columns: of the head, which belong to them (default 1, 2, ...). ConfigError: a model
+    of another class.
+    """
+    columns = list(range(1, len(classes) + 1)) if columns is None else list(columns)
+    if isinstance(model, detection.FasterRCNN):
+        return TwoStage(model, classes, columns, name=name, threshold=threshold)
+    return OneStage(model, classes, columns, name=name, threshold=threshold)

@@ -1,0 +1,156 @@
+"""Trunks: ResNet in caffe style with modulated deformable convolutions, and a light one of basic blocks.
+
+Sources: He et al. 2016 (caffe style: the stride sits on the first 1 x 1 convolution); Zhu et al. 2019 (DCNv2).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torchvision.ops import deform_conv2d
+
+BLOCKS = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
+
+
+class DeformConv(nn.Module):
+    """Modulated deformable 3 x 3 convolution: `conv_offset` gives 9 vertical, 9 horizontal shifts (interleaved as
+    y, x) and 9 masks a place. Starts as an ordinary convolution at half weight."""
+
+    def __init__(self, inside: int, outside: int, *, stride: int = 1, bias: bool = False) -> None:
+        super().__init__()
+        self.stride = stride
+        self.weight = nn.Parameter(torch.empty(outside, inside, 3, 3))
+        self.bias = nn.Parameter(torch.zeros(outside)) if bias else None
+        self.conv_offset = nn.Conv2d(inside, 27, 3, stride, 1)
+        nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
+        nn.init.zeros_(self.conv_offset.weight)
+        nn.init.zeros_(self.conv_offset.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, O, H / stride, W / stride]."""
+        with torch.autocast(x.device.type, enabled=False):
+            if x.dtype in {torch.float16, torch.bfloat16}:
+                x = x.float()
+            shift = self.conv_offset(x)
+            result: Tensor = deform_conv2d(
+                x, shift[:, :18].contiguous(), self.weight, self.bias, self.stride, 1, 1, shift[:, 18:].sigmoid()
+            )
+        return result
+
+
+class Bottleneck(nn.Module):
+    """1 x 1 (with the stride), 3 x 3 (deformable or not), 1 x 1."""
+
+    def __init__(self, inside: int, width: int, *, stride: int, deformable: bool, fit: bool) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inside, width, 1, stride, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2: nn.Module = (
+            DeformConv(width, width) if deformable else nn.Conv2d(width, width, 3, padding=1, bias=False)
+        )
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, 4 * width, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(4 * width)
+        self.downsample: nn.Module | None = None
+        if fit:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(inside, 4 * width, 1, stride, bias=False), nn.BatchNorm2d(4 * width)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, 4 width, H / stride, W / stride]."""
+        kept = x if self.downsample is None else self.downsample(x)
+        x = functional.relu(self.bn1(self.conv1(x)))
+        x = functional.relu(self.bn2(self.conv2(x)))
+        return functional.relu(self.bn3(self.conv3(x)) + kept)
+
+
+class Basic(nn.Module):
+    """Two 3 x 3 convolutions."""
+
+    def __init__(self, inside: int, width: int, *, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inside, width, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample: nn.Module | None = None
+        if stride > 1 or inside != width:
+            self.downsample = nn.Sequential(nn.Conv2d(inside, width, 1, stride, bias=False), nn.BatchNorm2d(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, width, H / stride, W / stride]."""
+        kept = x if self.downsample is None else self.downsample(x)
+        x = functional.relu(self.bn1(self.conv1(x)))
+        return functional.relu(self.bn2(self.conv2(x)) + kept)
+
+
+class Backbone(nn.Module):
+    """Images [B, 3, H, W] -> maps at strides 8, 16, 32; `out_channels` says how many channels each has."""
+
+    def __init__(self, depth: int, *, width: int = 64) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        inside = width
+        for stage in range(4):
+            narrow = width << stage
+            blocks: list[nn.Module] = []
+            for k in range(BLOCKS[depth][stage] if depth in BLOCKS else 2):
+                stride = 2 if stage and not k else 1
+                if depth in BLOCKS:
+                    blocks.append(Bottleneck(inside, narrow, stride=stride, deformable=stage >= 2, fit=not k))
+                    inside = 4 * narrow
+                else:
+                    blocks.append(Basic(inside, narrow, stride=stride))
+                    inside = narrow
+            self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
+        wide = 4 if depth in BLOCKS else 1
+        self.out_channels = tuple(wide * (width << stage) for stage in (1, 2, 3))
+        for part in self.modules():
+            if isinstance(part, nn.Conv2d) and part.bias is None:
+                nn.init.kaiming_normal_(part.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """Maps of the last three stages."""
+        x = functional.max_pool2d(functional.relu(self.bn1(self.conv1(x))), 3, 2, 1)
+        maps = []
+        for stage in range(1, 5):
+            x = self.get_submodule(f"layer{stage}")(x)
+            maps.append(x)
+        return maps[1:]
+
+
+class Conv(nn.Module):
+    """A convolution under the name `conv`, as the neck's weights are called."""
+
+    def __init__(self, inside: int, outside: int, size: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inside, outside, size, stride, size // 2)
+        nn.init.xavier_uniform_(self.conv.weight)
+        nn.init.zeros_(self.conv.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[B, C, H, W] -> [B, O, H / stride, W / stride]."""
+        result: Tensor = self.conv(x)
+        return result
+
+
+class Neck(nn.Module):
+    """Feature pyramid (Lin et al. 2017) over three maps; further levels from the last output, with a ReLU between."""
+
+    def __init__(self, inside: tuple[int, ...], channels: int, levels: int) -> None:
+        super().__init__()
+        self.lateral_convs = nn.ModuleList(Conv(c, channels, 1) for c in inside)
+        self.fpn_convs = nn.ModuleList(Conv(channels, channels, 3, 1 if k < 3 else 2) for k in range(levels))
+
+    def forward(self, maps: list[Tensor]) -> list[Tensor]:
+        """One map a level, finest first."""
+        sides = [side(x) for side, x in zip(self.lateral_convs, maps, strict=True)]
+        for k in (1, 0):
+            sides[k] = sides[k] + functional.interpolate(sides[k + 1], sides[k].shape[2:], mode="nearest")
+        found = [conv(x) for conv, x in zip(self.fpn_convs, sides, strict=False)]
+        for k in range(3, len(self.fpn_convs)):
+            found.append(self.fpn_convs[k](found[-1] if k == 3 else functional.relu(found[-1])))
+        return found

@@ -1,0 +1,134 @@
+"""From the cameras of one moment to boxes in the world: the second suppression of the nuScenes export."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Detections
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, I32
+from ssad.detectors.mono3d.nms import rotated_nms
+
+# m from the ego within which a class is reported, in the order of CLASSES_3D (the evaluation's ranges)
+RANGES = np.array([50.0, 50.0, 50.0, 50.0, 50.0, 40.0, 40.0, 40.0, 30.0, 30.0])
+OVERLAP, LEAST, MOST = 0.05, 0.01, 500
+_CYCLES, _VEHICLES = (5, 6), (0, 1, 2, 3, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class WorldBoxes:
+    """Boxes of one moment in the world: translation [N, 3]; size [N, 3] width, length, height; rotation [N, 4]
+    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into CLASSES_3D; attribute names ("": none)."""
+
+    translation: F64
+    size: F64
+    rotation: F64
+    velocity: F64
+    score: F64
+    label: I32
+    attribute: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.score)
+
+
+def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]) -> WorldBoxes:
+    """Detections of the cameras of one moment as boxes in the world, by class and falling score.
+
+    As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are taken
+    to the camera that looks ahead (upright there); of those of a class that overlap by 5 % or more on its ground the
+    best stays; at most 500, then the best. cam_to_ego, ego_to_global [4, 4] at each camera's own time; with one pose
+    for all cameras the result is mmdetection3d 1.4's. ConfigError: not one pose a camera.
+    """
+    if not len(found) == len(cam_to_ego) == len(ego_to_global):
+        raise ConfigError(f"merge_cameras: {len(found)} cameras with {len(cam_to_ego)} and {len(ego_to_global)} poses")
+    if not len(found):
+        return _empty()
+    columns = []
+    for one, to_ego, to_world in zip(found, cam_to_ego, ego_to_global, strict=True):
+        if one.solid is None:
+            raise ConfigError("merge_cameras: detections without 3D boxes")
+        solid = one.solid
+        centre, size, yaw, velocity = (
+            v.detach().cpu().double().numpy() for v in (solid.centre, solid.size, solid.yaw, solid.velocity)
+        )
+        score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
+        near = (score > LEAST) & (_distance(centre, to_ego) <= RANGES[label])
+        pose = to_world @ to_ego
+        rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ _upright(yaw),
+                _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
+        columns.append(tuple(r[near] for r in rows))
+    world, size, axes, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
+    ahead = int(np.argmax([pose[0, 2] for pose in cam_to_ego]))  # its optical axis points along the ego's x
+    pose = ego_to_global[ahead] @ cam_to_ego[ahead]
+    centre = (world - pose[:3, 3]) @ pose[:3, :3]
+    turned = pose[:3, :3].T @ axes
+    yaw = np.arctan2(turned[:, 0, 1], turned[:, 0, 0])
+    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= RANGES[label])
+    ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[near])
+    kept = rotated_nms(ground, torch.from_numpy(score[near]), torch.from_numpy(label[near]), threshold=OVERLAP)
+    rows = near[kept.numpy()]
+    if len(rows) > MOST:
+        rows = rows[np.argsort(-score[rows], kind="stable")[:MOST]]
+    moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
+    names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
+    return WorldBoxes(
+        world[rows], size[rows][:, [2, 0, 1]], _quaternions(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
+        score[rows], label[rows].astype(np.int32), names,
+    )  # fmt: skip
+
+
+def _empty() -> WorldBoxes:
+    none = np.zeros((0, 3))
+    return WorldBoxes(none, none, np.zeros((0, 4)), none[:, :2], none[:, 0], np.zeros(0, np.int32), ())
+
+
+def _distance(centre: F64, to_ego: F64) -> F64:
+    """Distances [N] on the ground from the ego to points [N, 3] of a camera's frame."""
+    return np.asarray(np.linalg.norm((centre @ to_ego[:3, :3].T + to_ego[:3, 3])[:, :2], axis=1))
+
+
+def _flat(velocity: F64) -> F64:
+    """Velocities [N, 3] of x and z [N, 2] in a camera's frame."""
+    return np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1)
+
+
+def _upright(yaw: F64) -> F64:
+    """Axes [N, 3, 3] (forward, left, up) of boxes in the camera frame, as columns."""
+    cos, sin, none = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    return np.stack(
+        [np.stack([cos, none, -sin], -1), np.stack([sin, none, cos], -1), np.tile([0.0, -1.0, 0.0], (len(yaw), 1))],
+        -1,
+    )
+
+
+def _quaternions(m: F64) -> F64:
+    """Unit quaternions [N, 4] (w, x, y, z; w at least 0) of rotation matrices [N, 3, 3]."""
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    four = np.empty((len(m), 4, 4))  # 4 q q^T: its largest column is q times its largest part
+    four[:, 0, 0] = 1 + trace
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        four[:, i + 1, i + 1] = 1 + 2 * m[:, i, i] - trace
+        four[:, 0, i + 1] = four[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
+        four[:, j + 1, k + 1] = four[:, k + 1, j + 1] = m[:, j, k] + m[:, k, j]
+    largest = np.einsum("nii->ni", four).argmax(1)
+    q = four[np.arange(len(m)), largest]
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(np.where(q[:, :1] < 0, -q, q), np.float64)
+
+
+def _attribute(label: int, attribute: int) -> str:
+    """The attribute's name where it fits the class, else the class's usual one."""
+    name = ATTRIBUTES[attribute]
+    if label in _VEHICLES:
+        usual = "vehicle.moving" if CLASSES_3D[label] == "bus" else "vehicle.parked"
+        return name if name.startswith("vehicle.") else usual
+    if label in _CYCLES:
+        return name if name.startswith("cycle.") else "cycle.without_rider"
+    if CLASSES_3D[label] == "pedestrian":
+        return name if name.startswith("pedestrian.") else "pedestrian.moving"
+    return ""

@@ -1,0 +1,42 @@
+"""Driving systems: what is put to the test."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from ssad.core.errors import ConfigError
+from ssad.core.protocols import DrivingSystem
+from ssad.core.types import Controller
+
+SYSTEMS: dict[str, str] = {
+    "autopilot": "ssad.drivers.builtin:Autopilot",
+    "blind": "ssad.drivers.builtin:Blind",
+}
+
+
+def make_system(name: str) -> DrivingSystem:
+    """A driving system by name, entry point or "module:object"; a class is called without arguments.
+
+    Raises UnknownNameError, or ConfigError if the object is not a DrivingSystem.
+    """
+    from ssad.core.registry import resolve
+
+    found = resolve("system", SYSTEMS, name)
+    system = found() if isinstance(found, type) else found
+    controller = getattr(system, "controller", Controller.EXTERNAL)
+    if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):
+        raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")
+    if not isinstance(controller, Controller):
+        raise ConfigError(f"system '{name}': controller must be a ssad.core.types.Controller, not {controller!r}")
+    return _Named(name, controller, cast(DrivingSystem, system))
+
+
+class _Named:
+    """A system under the name it was asked for; fills in what a short user class leaves out."""
+
+    def __init__(self, name: str, controller: Controller, system: DrivingSystem) -> None:
+        self.name = name
+        self.controller = controller
+        self.target_speed: float | None = getattr(system, "target_speed", None)
+        self.reset = system.reset
+        self.act = system.act

@@ -1,0 +1,1 @@
+"""Detectors on data sets: from pictures to boxes in the world and their scores."""

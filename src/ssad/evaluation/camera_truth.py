@@ -1,0 +1,84 @@
+"""What a camera of a data set should find: the true boxes of a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Solids, Truth
+from ssad.core.errors import ConfigError
+from ssad.core.frames import rotation_matrix
+from ssad.core.types import F64, Bool
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import Annotations, SensorFrame
+from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
+from ssad.datasets.nuscenes.splits import scenes_of_split
+
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+NEAR = 0.1  # m in front of the camera at which boxes are cut
+
+
+def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
+    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
+    there = {scene.name for scene in data.scenes()}
+    found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
+    if not found:
+        raise ConfigError(f"{data.root / data.version}: none of its {len(there)} scenes is in the split '{split}'")
+    return found
+
+
+def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) -> Truth:
+    """What a camera should find of a sample's boxes: those of the ten classes whose middle is in the picture.
+
+    hit: only those with a LiDAR point (what nobody can see is not learned). Boxes as `ssad.core.detections`
+    defines them; velocity in the camera's x and z; box: hull of the projected corners, cut at the picture's border.
+    """
+    if frame.intrinsic is None:
+        raise ConfigError(f"{frame.channel} is no camera")
+    wanted = np.array([CATEGORY_TO_CLASS.get(c) in CLASSES_3D for c in found.category], bool)
+    if hit and len(found):
+        wanted &= found.lidar_points > 0
+    turn: F64 = np.asarray(np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego), np.float64)
+    centre = found.centre @ turn[:3, :3].T + turn[:3, 3]
+    flat = centre @ frame.intrinsic.T
+    with np.errstate(all="ignore"):
+        middle = flat[:, :2] / flat[:, 2:]
+    wanted &= (flat[:, 2] > NEAR) & (middle >= -0.5).all(1)
+    wanted &= (middle[:, 0] < frame.width - 0.5) & (middle[:, 1] < frame.height - 0.5)
+    box, seen = _hulls(frame, found, turn)
+    rows = np.flatnonzero(wanted & seen)
+    ahead = turn[:3, :3] @ rotation_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
+    speed = found.velocity[rows] @ turn[:3, :3].T
+    label = [CLASSES_3D.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
+    attribute = [_attribute(found.attributes[r]) for r in rows]
+
+    def floats(values: F64) -> torch.Tensor:
+        return torch.from_numpy(np.array(values, np.float32))
+
+    solid = Solids(
+        floats(centre[rows]), floats(found.size[rows][:, [1, 2, 0]]), floats(np.arctan2(-ahead[2], ahead[0])),
+        floats(speed[:, [0, 2]]), torch.tensor(attribute, dtype=torch.int64),
+    )  # fmt: skip
+    return Truth(torch.tensor(label, dtype=torch.int64), floats(box[rows]), solid, floats(frame.intrinsic))
+
+
+def _attribute(names: Sequence[str]) -> int:
+    return ATTRIBUTES.index(names[0]) if names and names[0] in ATTRIBUTES else len(ATTRIBUTES) - 1
+
+
+def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
+    """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
+    corners = CORNERS * found.size[:, None, [1, 0, 2]]
+    world = np.einsum("nij,nkj->nki", rotation_matrix(found.rotation), corners) + found.centre[:, None]
+    local = world @ turn[:3, :3].T + turn[:3, 3]
+    local[..., 2] = np.maximum(local[..., 2], NEAR)
+    assert frame.intrinsic is not None
+    flat = local @ frame.intrinsic.T
+    place = flat[..., :2] / flat[..., 2:] + 0.5
+    limit = np.array([frame.width, frame.height])
+    box = np.concatenate([np.clip(place.min(1), 0, limit), np.clip(place.max(1), 0, limit)], 1)
+    return box, ((box[:, 2:] - box[:, :2]) > 1.0).all(1)

@@ -1,0 +1,1 @@
+"""How work is done anywhere: worker processes, stores that survive a kill, progress."""

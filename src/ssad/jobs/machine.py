@@ -1,0 +1,81 @@
+"""What this machine has: devices, cores, versions; and how Warp is started quietly."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from ssad.core.errors import ConfigError
+from ssad.core.version import __version__
+
+
+def cuda_driver() -> bool:
+    """Whether this machine has NVIDIA's driver; asked before Warp is loaded, which warns when there is none."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def quiet_warp() -> None:
+    """Start Warp and keep its banner and its notes about the kernel cache off the terminal."""
+    import warp
+
+    warp.config.log_level = warp.LOG_ERROR
+    if cuda_driver():
+        warp.init()
+        return
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:  # its native part warns of the missing driver on the descriptor itself
+        os.dup2(null, 2)
+        warp.init()
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
+
+
+def pick_device(wanted: str) -> str:
+    """auto, cpu or cuda as a device of the world. ConfigError when it is not there."""
+    if wanted == "cpu":
+        return "cpu"
+    if wanted not in ("auto", "cuda"):
+        raise ConfigError(f"--device {wanted}: expected auto, cpu or cuda")
+    if cuda_driver():
+        import warp
+
+        quiet_warp()
+        if warp.is_cuda_available():
+            return "cuda"
+    if wanted == "cuda":
+        raise ConfigError("--device cuda: no CUDA device is usable here (see: ssad doctor); use --device cpu")
+    return "cpu"
+
+
+def default_workers() -> int:
+    """One worker a core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def versions(device: str) -> dict[str, str]:
+    """Versions that a record carries."""
+    found = {"ssad": __version__, "python": platform.python_version(), "device": device}
+    for name in ("numpy", "warp-lang", "torch"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def visible_gpus() -> list[str]:
+    """The CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name.strip() for name in given.split(",") if name.strip()]
+    import torch
+
+    return [str(k) for k in range(torch.cuda.device_count())]

@@ -1,0 +1,191 @@
+"""The results folder: append-only, safe against kill -9, never a line lost or doubled.
+
+DIR/run.json says what runs; DIR/episodes.jsonl and DIR/results.jsonl get one line a cell, the latter last: a cell is
+finished when its line in results.jsonl is whole. What was cut off in the middle is dropped on the next start; what
+failed goes when it is to be tried again.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from ssad.core import safeio
+from ssad.core.errors import FormatError, StoreError
+
+RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
+
+
+def read_run(folder: str | Path) -> dict[str, Any]:
+    """run.json of a results folder. StoreError when the folder holds no run."""
+    path = Path(folder) / RUN
+    if not path.is_file():
+        raise StoreError(f"{folder}: not a results folder (it has no {RUN}); make one with: ssad run SUITE --out DIR")
+    data = safeio.read_json(path)
+    if not isinstance(data, dict) or "identity" not in data:
+        raise StoreError(f"{path}: not written by ssad run")
+    return data
+
+
+def read_lines(path: str | Path) -> list[dict[str, Any]]:
+    """Whole lines of a JSONL file; a torn last line is left out. StoreError for a broken line elsewhere."""
+    return _scan(Path(path))[0]
+
+
+def _scan(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
+    """Records, and the offset at which each of them ends."""
+    records: list[dict[str, Any]] = []
+    ends: list[int] = []
+    if not path.exists():
+        return records, ends
+    lines = safeio.read_bytes(path, limit=1 << 34).split(b"\n")
+    whole, offset = lines[:-1], 0
+    for number, line in enumerate(whole, 1):
+        offset += len(line) + 1
+        try:
+            record = safeio.parse_json(line.decode(), f"{path}:{number}")
+            if not isinstance(record, dict) or "key" not in record:
+                raise FormatError(f"{path}:{number}: not a record")
+        except (FormatError, UnicodeDecodeError):
+            if number == len(whole):  # the last line may be torn even if it ends (blocks lost in a power cut)
+                break
+            raise StoreError(f"{path}:{number}: this line is broken; mend or remove it, then run again") from None
+        records.append(record)
+        ends.append(offset)
+    return records, ends
+
+
+class Store:
+    """One results folder, held by one process (`with Store.open(...) as store`)."""
+
+    def __init__(self, folder: Path, lock: int) -> None:
+        self.folder = folder
+        self._lock = lock
+        self._files: dict[str, int] = {}
+        self.results: dict[str, dict[str, Any]] = {}
+
+    @classmethod
+    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
+        """Take the folder for this run: a new one, or one of the same run to go on with.
+
+        run: what run.json shall say; its "identity" must equal that of a run already there. retry: cells that failed
+        are as if they had never run. StoreError when the folder cannot be written, is in use, or belongs to another
+        run; nothing is changed then.
+        """
+        path = Path(folder)
+        _check_content(path, run)
+        safeio.make_folder(path)
+        store = cls(path, _lock(path))
+        try:
+            _check_content(path, run)  # again: another process may have begun meanwhile
+            store._begin(run, retry=retry)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    def _begin(self, run: Mapping[str, Any], *, retry: bool) -> None:
+        if not (self.folder / RUN).exists():
+            safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
+        results, ends = _scan(self.folder / RESULTS)
+        _cut(self.folder / RESULTS, ends[-1] if ends else 0)
+        for record in results:
+            if record["key"] in self.results:
+                raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
+            self.results[record["key"]] = record
+        if retry and any(_failed(record) for record in results):
+            self.results = {key: record for key, record in self.results.items() if not _failed(record)}
+            lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
+            safeio.write_atomic(self.folder / RESULTS, "".join(lines))
+        episodes, ends = _scan(self.folder / EPISODES)
+        while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
+            episodes.pop()
+            ends.pop()
+        _cut(self.folder / EPISODES, ends[-1] if ends else 0)
+        for name in (RESULTS, EPISODES):
+            self._files[name] = _open_append(self.folder / name)
+        (self.folder / "traces").mkdir(exist_ok=True)
+
+    def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
+        """Add one finished cell; durable when this returns. A key that is already there raises ValueError."""
+        key = str(result["key"])
+        if key in self.results:
+            raise ValueError(f"cell {key} is already in the store")
+        if episode is not None:
+            self._write(EPISODES, episode)
+        self._write(RESULTS, result)
+        self.results[key] = dict(result)
+
+    def _write(self, name: str, record: Mapping[str, Any]) -> None:
+        data = (safeio.dump_json(dict(record)) + "\n").encode()
+        try:
+            written = os.write(self._files[name], data)
+            while written < len(data):  # a full disk or a signal can cut a write short
+                written += os.write(self._files[name], data[written:])
+            os.fsync(self._files[name])
+        except OSError as error:
+            path = self.folder / name
+            raise StoreError(f"{path}: cannot be written: {error.strerror}; make room and run again") from None
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        for descriptor in (*self._files.values(), self._lock):
+            os.close(descriptor)
+        self._files, self._lock = {}, -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _failed(record: Mapping[str, Any]) -> bool:
+    return bool(record.get("status", "ok") != "ok")
+
+
+def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
+    """Refuse a folder that belongs to something else."""
+    if folder.exists() and not folder.is_dir():
+        raise StoreError(f"{folder}: is a file; choose a folder with --out")
+    if not (folder / RUN).exists():
+        if (folder / RESULTS).exists():
+            raise StoreError(f"{folder}: has {RESULTS} but no {RUN}; choose another folder with --out")
+        return
+    before = read_run(folder)
+    if before["identity"] == run["identity"]:
+        return
+    old, new = before.get("suite", {}), run.get("suite", {})
+    changed = sorted(k for k in {*old, *new} if old.get(k) != new.get(k)) or ["the code, a system or a town"]
+    raise StoreError(
+        f"{folder}: holds another run (suite {old.get('name')}; differs in {', '.join(changed)}); "
+        "choose another folder with --out or remove this one"
+    )
+
+
+def _lock(folder: Path) -> int:
+    descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise StoreError(f"{folder}: another ssad run is writing there; wait for it or use --out") from None
+    return descriptor
+
+
+def _cut(path: Path, size: int) -> None:
+    if path.exists() and path.stat().st_size > size:
+        os.truncate(path, size)
+
+
+def _open_append(path: Path) -> int:
+    try:
+        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror}") from None

@@ -1,0 +1,1 @@
+"""Drives and clips from the world into data sets."""

@@ -1,0 +1,326 @@
+"""`ssad record --clips`: pictures of a target car for 2D detection, with COCO annotations.
+
+drive: a camera follows the driving target on its own way, 20 m behind, as in the paper; orbit: views of a target on the
+road over distance, azimuth, elevation and weather. Recorded in parts as drives are: pictures are written
+to their places, a page of each part to OUT/.parts, the annotations when all parts are there. So any number of processes
+gives the same bytes, and a run that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+
+from ssad.assets.bodies import BODIES, draw_paint, draw_size, draw_style, make_body
+from ssad.camera.labels import label_picture
+from ssad.camera.render import Picture, View, render
+from ssad.camera.scene import Scene, Thing
+from ssad.core import safeio
+from ssad.core.detections import CLASSES_3D
+from ssad.core.errors import ConfigError, StoreError
+from ssad.core.frames import Camera
+from ssad.core.images import encode_jpeg
+from ssad.core.seeding import digest, generator
+from ssad.core.types import U8, EpisodeTrace
+from ssad.datasets.coco import coco_data
+from ssad.jobs.machine import quiet_warp
+from ssad.recording.drives import check_streets, drive_street, make_drive
+from ssad.recording.nuscenes_recorder import HELD_OUT, NOISE, draw_weather, drive, run_parts
+from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
+from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
+from ssad.roads import load_town, town_names
+
+CLASSES: Final = CLASSES_3D  # category ids are 1 and more in this order
+_LABEL = {"construction": "construction_vehicle"}
+IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
+EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
+DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
+TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
+TARGETS: Final = 5  # bodies that an orbit shows in turn
+SECONDS: Final = 24.0  # of a drive
+TARGET: Final = 1_000_000  # its tag
+FOCAL: Final = 1.1  # focal length in widths of the picture: 49 degrees across
+SMALL, HIDDEN = 8.0, 0.25  # px of a side, visible share: below, an object is crowd
+SEEN: Final = 0.6  # least visible share of the target, and least share of it inside the picture
+NEAR: Final = 0.2  # largest share of the picture that something right before the camera may cover
+
+
+@dataclass(frozen=True, slots=True)
+class Clips:
+    """What to record. images: town -> how many pictures; mode; size: pixels a side; style: of the target car (None:
+    any); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of the orbit;
+    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`. ConfigError for what
+    cannot be."""
+
+    out: Path
+    images: tuple[tuple[str, int], ...] = tuple(IMAGES.items())
+    held_out: tuple[str, ...] = HELD_OUT
+    mode: Literal["drive", "orbit"] = "drive"
+    size: int = 640
+    style: str | None = None
+    behind: float = 20.0
+    height: float = 2.0
+    distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
+    azimuths: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
+    elevations: tuple[float, ...] = (0.0, 15.0, 30.0)
+    seed: int = 0
+    quality: int = 92
+    device: str = "cpu"
+    streets: str = "town"
+
+    def __post_init__(self) -> None:
+        for town in (*(t for t, _ in self.images), *self.held_out):
+            if town not in town_names():
+                raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
+        check_streets(self.streets)
+        if not self.images or self.mode not in ("drive", "orbit"):
+            raise ConfigError("name a town to record, and drive or orbit")
+        for town, count in self.images:
+            if count < 1:
+                raise ConfigError(f"{town}: {count} pictures; ask for one or more")
+            if sum(t == town for t, _ in self.images) > 1:
+                raise ConfigError(f"{town} is named twice; name each town once")
+        if self.style is not None and self.style not in BODIES["car"].styles:
+            raise ConfigError(f"no car of style '{self.style}'; choose from: {', '.join(BODIES['car'].styles)}")
+        if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
+            raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
+        if not (self.distances and self.azimuths and self.elevations):
+            raise ConfigError("an orbit needs distances, azimuths and elevations")
+        if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
+            raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
+        if not np.isfinite(self.azimuths).all():
+            raise ConfigError("azimuths: finite numbers of degrees")
+        far = self.behind if self.mode == "drive" else max(self.distances)
+        if not FOCAL * self.size * 1.35 / far >= SMALL or self.size > 4096:
+            least = int(np.ceil(SMALL * far / FOCAL / 1.35))
+            raise ConfigError(
+                f"pictures of {self.size} pixels: a car {far:g} m away needs {least}, and 4096 is the most"
+            )
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the bytes."""
+        found = asdict(replace(self, out=Path())) | {"clips": self.mode, "images": [list(pair) for pair in self.images]}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in ("out", "mode")}
+
+
+def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    """Towns with their numbers of pictures; one number stands for all. ConfigError."""
+    try:
+        counts = [int(text) for text in images]
+    except ValueError:
+        raise ConfigError(f"--images {','.join(images)}: expected whole numbers with commas between them") from None
+    counts = counts * len(towns) if len(counts) == 1 else counts
+    if len(counts) != len(towns):
+        raise ConfigError(f"--images: {len(counts)} numbers for {len(towns)} towns; give one for each, or one for all")
+    return tuple(zip(towns, counts, strict=True))
+
+
+@dataclass(frozen=True, slots=True)
+class _Set:
+    """A drive to take pictures of: its trace, who is there, the bodies that play the target in turn."""
+
+    clips: Clips
+    key: tuple[object, ...]
+    trace: EpisodeTrace
+    cast: SceneObjects
+    stage: Scene
+    targets: tuple[ObjectBody, ...]
+
+
+def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
+    graph = load_town(town)
+    street = drive_street(graph, clips.streets, key=("clips", *key))
+    trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
+    cast = place_objects(trace, graph, street, key=key)
+    count = TARGETS if clips.mode == "orbit" else 1
+    targets = tuple(_target(cast, clips.style, generator("clips target", *key, n)) for n in range(count))
+    return _Set(clips, key, trace, cast, Scene(street, cast.meshes, device=clips.device), targets)
+
+
+def _target(cast: SceneObjects, style: str | None, draws: np.random.Generator) -> ObjectBody:
+    """A car in the place of the ego, with its mesh in the cast."""
+    style = style or draw_style("car", generator=draws)
+    drawn = draw_size("car", style, generator=draws)
+    size = min(drawn[0], 4.9), min(drawn[1], 2.06), drawn[2]
+    mesh = cast.mesh(make_body("car", style=style, size=size, generator=draws))
+    paint, nowhere = draw_paint(draws), np.zeros((1, 4))
+    return ObjectBody(TARGET, "car", style, size, paint, (mesh,), nowhere, np.ones(1, bool), np.zeros(1))
+
+
+def batch_size(device: str) -> int:
+    """Views rendered at once: on the CPU one is as fast as many."""
+    return 1 if device == "cpu" else 32
+
+
+def _rounds(
+    made: _Set, town: str, slots: range, attempt: int, missing: Callable[[], list[int]]
+) -> Iterator[list[tuple[int, Viewpoint]]]:
+    """Again and again shots for what is missing (numbers from 0 in the part), until this drive has no more."""
+    clips, key = made.clips, made.key
+    draws = generator("clips shots", *key)
+    if clips.mode == "drive":
+        weather = draw_weather(("clips", *key))
+        left = iter(
+            follow(made.trace, weather, behind=clips.behind, height=clips.height, count=len(slots), draws=draws)
+        )
+        while todo := list(zip(missing(), left, strict=False)):
+            yield todo
+        return
+    grid = [(d, a, e) for d in clips.distances for a in clips.azimuths for e in clips.elevations]
+    wanted = turn_of(slots, len(grid), key=(clips.seed, town))
+    if attempt >= 3:
+        wanted = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
+    for turn, tries in enumerate(TRIES):
+        proposed: list[tuple[int, Viewpoint]] = []
+        for n in missing():
+            weather = draw_weather(("clips", *key, turn, n))
+            proposed += [(n, s) for s in islice(orbit(made.trace, weather, grid[wanted[n]], draws), tries)]
+        clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device))
+        first = dict(reversed([pair for pair, ok in zip(proposed, clear, strict=True) if ok]))
+        yield sorted(first.items())
+
+
+def _part(task: tuple[Clips, str, int, int, str]) -> str:
+    """Takes `count` pictures, of one drive if it can be; the part's name. What is there is left alone. ConfigError."""
+    clips, town, number, count, name = task
+    page = clips.out / ".parts" / name / "part.json"
+    if page.is_file():
+        return name
+    quiet_warp()
+    cv2.setNumThreads(1)
+    rows: dict[int, dict[str, Any]] = {}
+    skipped: Counter[str] = Counter()
+    slots = range(number * EACH, number * EACH + count)
+
+    def missing() -> list[int]:
+        return [n for n in range(count) if n not in rows]
+
+    for attempt in range(DRIVES):
+        made = _prepare(clips, town, (clips.seed, clips.mode, town, number, attempt))
+        for shots in _rounds(made, town, slots, attempt, missing):
+            for n, row, image in _take(made, shots, skipped):
+                file = f"{name}-{n:03d}.jpg"
+                safeio.write_atomic(clips.out / "images" / file, encode_jpeg(image, clips.quality, "420"))
+                rows[n] = {"file_name": file, "town": town, "drive": made.trace.key} | row
+        if not missing():
+            break
+    else:
+        why = ", ".join(f"{v} {k}" for k, v in sorted(skipped.items())) or "the drives are too short"
+        raise ConfigError(
+            f"{town}: {len(rows)} of {count} pictures in {DRIVES} drives ({why}); choose smaller distances"
+        )
+    safeio.write_atomic(page, safeio.dump_json({"images": [rows[n] for n in range(count)], "skipped": skipped}) + "\n")
+    return name
+
+
+def _take(
+    made: _Set, shots: Sequence[tuple[int, Viewpoint]], skipped: Counter[str]
+) -> Iterator[tuple[int, dict[str, Any], U8]]:
+    """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
+    clips = made.clips
+    middle, focal = (clips.size - 1) / 2, FOCAL * clips.size
+    camera = Camera(clips.size, clips.size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
+    ready: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
+    for n, shot in shots:
+        target = made.targets[n % len(made.targets)]
+        around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
+        if not has_room(target, shot, around):
+            skipped["crowded"] += 1
+            continue
+        own = Thing(target.meshes[0], shot.target, target.paint, TARGET)
+        noise = int(digest("clips noise", *made.key, n)[:7], 16)
+        things = (own, *(s.thing for s in around))
+        around.append(PlacedObject(target, shot.target, 0.0, own))
+        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise), around))
+    size = batch_size(clips.device)
+    for k in range(0, len(ready), size):
+        picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)
+        for index, (n, shot, view, around) in enumerate(ready[k : k + size]):
+            objects, fault = _annotate(made.stage, view, picture, index, around)
+            if fault:
+                skipped[fault] += 1
+                continue
+            target = around[-1].body
+            row = {
+                "width": clips.size, "height": clips.size, "time": round(shot.time, 3),
+                "weather": weather_name(shot.weather), "light": asdict(shot.weather),
+                "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.round(5).tolist(),
+                "target_pose": shot.target.round(5).tolist(), "target_style": target.style,
+                "target_size": [round(v, 3) for v in target.size], "objects": objects,
+            }  # fmt: skip
+            yield n, row | shot.about, picture.image[index]
+
+
+def _annotate(
+    stage: Scene, view: View, picture: Picture, index: int, around: Sequence[PlacedObject]
+) -> tuple[list[dict[str, Any]], str]:
+    """What is seen in a picture, the target among it; and why the picture is of no use (else '')."""
+    labels = label_picture(stage, view, picture, index)
+    at = {s.body.tag: s for s in around}
+    own = labels.tag == TARGET
+    side = labels.box[:, 2:] - labels.box[:, :2]
+    if not own.any() or labels.share[own][0] < SEEN:
+        return [], "hidden"
+    if labels.inside[own][0] < SEEN or side[own].min() < SMALL:
+        return [], "cut or small"
+    away = float(np.linalg.norm(at[TARGET].pose[:3, 3] - view.pose[:3, 3]))
+    if near_share(view, picture.depth[index], picture.tag[index], within=max(2.0, away / 3)) > NEAR:
+        return [], "blocked"
+    crowd = (side.min(1) < SMALL) | (labels.share < HIDDEN)
+    objects = []
+    for n, tag in enumerate(labels.tag.tolist()):
+        who = at[tag]
+        if who.body.kind:
+            middle = who.pose[:3, 3] + [0.0, 0.0, who.body.size[2] / 2]
+            objects.append(
+                {"label": CLASSES.index(_LABEL.get(who.body.kind, who.body.kind)), "box": labels.box[n].tolist(),
+                 "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
+                 "visible": round(float(labels.share[n]), 3),
+                 "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}
+            )  # fmt: skip
+    return objects, ""
+
+
+def record_clips(
+    clips: Clips, *, workers: int | None = None, progress: Callable[[int, int], None] | None = None
+) -> Path:
+    """Takes all pictures and writes annotations/{train,test,all}.json; the folder. Run again to go on.
+
+    Each file's `info` says what was recorded, how many objects there are of each class, and how many pictures were
+    taken elsewhere instead, and why. StoreError, ConfigError.
+    """
+    out, identity, tasks = clips.out, clips.identity(), []
+    finished = out / "annotations" / "all.json"
+    if finished.is_file() and not (out / ".parts").is_dir():
+        data = safeio.read_json(finished)
+        info = data.get("info") if isinstance(data, dict) else None
+        if not isinstance(info, dict) or info.get("recording") != identity:
+            raise StoreError(f"{out}: holds another recording; choose another folder")
+    for town, count in clips.images:
+        for number, start in enumerate(range(0, count, EACH)):
+            tasks.append((clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}"))
+    run_parts(out, identity, _part, tasks, workers=workers, progress=progress)
+    splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
+              "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
+    for split, members in splits.items():
+        rows: list[dict[str, Any]] = []
+        skipped: Counter[str] = Counter()
+        for task in members:
+            part = safeio.read_json(out / ".parts" / task[4] / "part.json")
+            rows += part["images"]
+            skipped.update(part["skipped"])
+        counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
+        about = {
+            "recording": identity, "split": split, "towns": sorted({t[1] for t in members}), "images": len(rows),
+            "objects": counts, "weathers": Counter(row["weather"] for row in rows), "skipped": skipped,
+        }  # fmt: skip
+        page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
+        safeio.write_atomic(out / "annotations" / f"{split}.json", page)
+    return out

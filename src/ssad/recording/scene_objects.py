@@ -1,0 +1,346 @@
+"""Who is in a recorded drive: bodies of the agents, trailers, parked vehicles, walkers, building sites; where each is
+at any moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
+from ssad.assets.mesh import Material, Mesh, box
+from ssad.assets.street.model import Street
+from ssad.camera.rig import place
+from ssad.camera.scene import Thing
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.seeding import generator
+from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
+from ssad.recording.drives import thinned
+from ssad.world.models import MODELS
+
+Size = tuple[float, float, float]  # length, width, height
+KERB = 0.12  # m, height of sidewalks
+PHASES = 8  # meshes of one walking cycle
+STRIDE = 1.45  # m walked in one cycle
+ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
+WALKERS = 10  # people of a cast; many walk in more than one place
+# model of the world -> kind of body and its styles; a trailer truck is driven as a bus
+STYLES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "car": ("car", ("sedan", "estate", "sedan", "suv")), "suv": ("car", ("suv",)),
+    "coupe": ("car", ("sedan", "hatchback")), "compact": ("car", ("hatchback",)), "van": ("car", ("van", "pickup")),
+    "truck": ("truck", ("box", "flatbed", "tipper", "box")), "bus": ("bus", ("city", "coach")),
+    "motorcycle": ("motorcycle", ("ridden",)), "bicycle": ("bicycle", ("ridden",)),
+    "walker": ("pedestrian", ("adult",)),
+    "cone": ("traffic_cone", ("cone",)), "barrier": ("barrier", ("board",)),
+}  # fmt: skip
+# what stands at the kerb, how often, and how much of the kerb it takes, m
+PARKED = {
+    "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
+    "motorcycle": (1.4, 3.0), "bicycle": (1.6, 2.6),
+}  # fmt: skip
+AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
+LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectBody:
+    """Somebody or something: kind, size, paint, tag (1 and more), meshes (one, or those of a cycle of `STRIDE` m),
+    track [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it stands still; active [T]; driven [T] m so far;
+    style tells what its attribute is."""
+
+    tag: int
+    kind: str
+    style: str
+    size: Size
+    paint: tuple[float, float, float]
+    meshes: tuple[int, ...]
+    track: F64
+    active: Bool
+    driven: F64
+    parked: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedObject:
+    """A body at a moment: pose [4, 4], speed m/s, the thing to draw."""
+
+    body: ObjectBody
+    pose: F64
+    speed: float
+    thing: Thing
+
+
+@dataclass(slots=True)
+class SceneObjects:
+    """All meshes and bodies of a drive. dt: a step of the tracks, s; key: of what is drawn; detail: of the meshes."""
+
+    dt: float
+    key: tuple[object, ...] = ()
+    detail: int = 1
+    meshes: list[Mesh] = field(default_factory=list)
+    bodies: list[ObjectBody] = field(default_factory=list)
+
+    def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
+        """Who is within reach (m) of a place [2] at a time (s), between steps in between."""
+        found = []
+        for body in self.bodies:
+            last = len(body.track) - 1
+            exact = min(max(time / self.dt, 0.0), float(last))
+            low = min(int(exact), max(last - 1, 0))
+            high, part = min(low + 1, last), exact - low
+            if not (body.active[min(low, len(body.active) - 1)] and body.active[min(high, len(body.active) - 1)]):
+                continue
+            a, b = body.track[low], body.track[high]
+            turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
+            x, y, yaw, z = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn, a[3]
+            if np.hypot(x - around[0], y - around[1]) > reach:
+                continue
+            speed = float(np.hypot(b[0] - a[0], b[1] - a[1])) / self.dt if high > low else 0.0
+            walked = float(body.driven[low] + part * (body.driven[high] - body.driven[low]))
+            mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
+            pose = place(float(x), float(y), float(yaw), float(z))
+            found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag)))
+        return found
+
+    def add(
+        self, who: tuple[str, str, Size, tuple[int, ...]], track: F64, *, active: Bool | None = None,
+        parked: bool = False,
+    ) -> None:  # fmt: skip
+        """Another body: kind, style, size, meshes, and where it is. Its paint is drawn."""
+        tag = len(self.bodies) + 1
+        steps = np.hypot(*np.diff(track[:, :2], axis=0).T) if len(track) > 1 else np.zeros(0)
+        driven = np.concatenate([[0.0], np.cumsum(steps)]) + generator("stride", *self.key, tag).uniform(0, STRIDE)
+        present = np.ones(len(track), bool) if active is None else active
+        paint = draw_paint(generator("paint", *self.key, tag))
+        kind, style, size, meshes = who
+        self.bodies.append(ObjectBody(tag, kind, style, size, paint, meshes, track, present, driven, parked))
+
+    def make(
+        self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
+    ) -> tuple[str, str, Size, tuple[int, ...]]:
+        """New meshes of one body in `phases` places of its cycle; what `add` wants to know of it."""
+        name = name or (len(self.meshes),)
+        numbers = []
+        for k in range(phases):
+            draws = generator("record mesh", *self.key, *name)
+            phase = 2 * np.pi * k / phases if phases > 1 else None
+            numbers.append(
+                self.mesh(make_body(kind, style=style, size=size, generator=draws, detail=self.detail, phase=phase))
+            )
+        return kind, style, size, tuple(numbers)
+
+    def mesh(self, made: Mesh) -> int:
+        """The number of a new mesh."""
+        self.meshes.append(made)
+        return len(self.meshes) - 1
+
+
+class Clear:
+    """Where a street has nothing that stands up: squares of half a metre with a vertex from knee to head."""
+
+    def __init__(self, street: Street) -> None:
+        vertices = street.vertices
+        upright = vertices[(vertices[:, 2] > 0.35) & (vertices[:, 2] < 2.4)]
+        self.taken = {(int(x), int(y)) for x, y in np.unique(np.floor(upright[:, :2] * 2).astype(int), axis=0)}
+
+    def footprint(self, x: float, y: float, yaw: float, length: float, width: float) -> bool:
+        """Whether a rectangle is free."""
+        a, b = np.meshgrid(np.arange(-length / 2, length / 2 + 0.4, 0.45), np.arange(-width / 2, width / 2 + 0.4, 0.45))
+        px = np.floor(2 * (x + a * np.cos(yaw) - b * np.sin(yaw))).astype(int)
+        py = np.floor(2 * (y + a * np.sin(yaw) + b * np.cos(yaw))).astype(int)
+        return not any(q in self.taken for q in zip(px.ravel().tolist(), py.ravel().tolist(), strict=True))
+
+    def take(self, x: float, y: float, yaw: float, length: float, width: float) -> None:
+        """Something stands there now."""
+        for da in np.arange(-length / 2, length / 2 + 0.4, 0.45):
+            for db in np.arange(-width / 2, width / 2 + 0.4, 0.45):
+                px, py = x + da * np.cos(yaw) - db * np.sin(yaw), y + da * np.sin(yaw) + db * np.cos(yaw)
+                self.taken.add((int(np.floor(2 * px)), int(np.floor(2 * py))))
+
+
+def place_objects(
+    trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1,
+    streets: str = "town",
+) -> SceneObjects:  # fmt: skip
+    """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way; streets:
+    see `ssad.recording.drives.thinned`."""
+    cast = SceneObjects(trace.dt, key, detail)
+    _agents(cast, trace)
+    way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
+    clear = Clear(street)
+    _kerb(cast, graph, street, way, clear, thinned({kind: PARKED[kind][0] for kind in PARKED}, streets))
+    _sidewalks(cast, graph, way, clear, len(trace.x))
+    return cast
+
+
+def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
+    """The agents of the world as their traces say; some buses are a tractor with its trailer."""
+    for a in range(1, len(trace.models)):
+        own = generator("record body", *cast.key, a)
+        model = MODELS[trace.models[a]]
+        track = np.stack([trace.x[:, a], trace.y[:, a], trace.yaw[:, a], 0 * trace.x[:, a]], -1).astype(np.float64)
+        active = trace.active[:, a]
+        full = model.length, model.width, model.height
+        if trace.models[a] not in STYLES:
+            sheet = Material("sheet", (0.5, 0.08, 0.06), gloss=0.4)
+            number = cast.mesh(box(full, material=sheet, centre=(0, 0, full[2] / 2)))
+            cast.add(("", "", full, (number,)), track, active=active)
+            continue
+        kind, styles = STYLES[trace.models[a]]
+        style = styles[int(own.integers(len(styles)))]
+        if kind == "bus" and own.random() < 0.45:
+            _tractor(cast, track, active, own)
+            continue
+        if kind == "truck" and own.random() < 0.3:
+            kind, style = "construction", draw_style("construction", generator=own)
+        drawn = draw_size(kind, style, generator=own)
+        size = (min(drawn[0], full[0]), min(drawn[1], full[1]), drawn[2])
+        phases = PHASES if kind in ("pedestrian", "bicycle") else 1
+        cast.add(cast.make(kind, style, size, phases=phases), track, active=active)
+
+
+def _tractor(cast: SceneObjects, track: F64, active: Bool, own: np.random.Generator) -> None:
+    """A tractor on the front half of the agent, a trailer that follows its hitch."""
+    height = float(own.uniform(3.2, 3.8))
+    sizes: tuple[Size, Size] = ((5.6, 2.5, height), (7.4, 2.5, float(own.uniform(3.3, 3.9))))
+    ahead = track.copy()
+    ahead[:, 0] += 2.3 * np.cos(track[:, 2])
+    ahead[:, 1] += 2.3 * np.sin(track[:, 2])
+    hitch = track[:, :2] + 0.7 * np.stack([np.cos(track[:, 2]), np.sin(track[:, 2])], -1)
+    trailer = track.copy()
+    yaw = float(track[0, 2])
+    for t in range(len(track)):
+        if t:  # the axle, 5.6 m behind the hitch, rolls along its own heading
+            move = hitch[t] - hitch[t - 1]
+            yaw += (-np.sin(yaw) * move[0] + np.cos(yaw) * move[1]) / 5.6
+        trailer[t, :3] = hitch[t, 0] - 3.1 * np.cos(yaw), hitch[t, 1] - 3.1 * np.sin(yaw), yaw
+    style = ("box", "tank", "flatbed")[int(own.integers(3))]
+    cast.add(cast.make("truck", "tractor", sizes[0]), ahead, active=active)
+    cast.add(cast.make("trailer", style, sizes[1]), trailer, active=active)
+
+
+def _still(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
+    return np.array([[x, y, yaw, z]])
+
+
+def _kerb(  # noqa: PLR0917
+    cast: SceneObjects, graph: LaneGraph, street: Street, way: F64, clear: Clear, shares: Mapping[str, float]
+) -> None:
+    """Vehicles parked at the kerb and on parking places; building sites of cones and barriers round machines."""
+    draws = generator("record kerb", *cast.key)
+    busy = float(draws.uniform(0.25, 0.75))
+    kinds, share = list(shares), np.array(list(shares.values()))
+    lots = [(float(x), float(y), float(yaw), 0.0) for x, y, yaw in np.asarray(street.parking, float)]
+    kerbs = []
+    for lane in np.flatnonzero(graph.kind == LaneType.SHOULDER):
+        walk = int(graph.right[lane])
+        if walk < 0 or graph.kind[walk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
+            continue
+        s = 9.0 + float(draws.uniform(0, 3))
+        while s < float(graph.length[lane]) - 9.0:
+            x, y, yaw, width = graph.at(int(lane), s)  # the edge of the driving lane:
+            kerbs.append((x - width / 2 * np.sin(yaw), y + width / 2 * np.cos(yaw), yaw, KERB if width < 1 else 0.0))
+            s += 6.5
+    spots = []
+    for spot, at in enumerate([*lots, *kerbs]):
+        if np.hypot(way[:, 0] - at[0], way[:, 1] - at[1]).min() > 55.0 or draws.random() > busy:
+            continue
+        kind = str(draws.choice(kinds, p=share))
+        long = PARKED[kind][1] > LONG
+        spots.append((not long, spot, "car" if long and spot < len(lots) else kind, at))
+    for _, spot, kind, (edge_x, edge_y, yaw, z) in sorted(spots):
+        number = len(cast.meshes)
+        own = generator("record prop", *cast.key, number)
+        style = "parked" if kind in ("motorcycle", "bicycle") else draw_style(kind, generator=own)
+        size = draw_size(kind, style, generator=own)
+        size = (min(size[0], PARKED[kind][1] - 0.9), min(size[1], 2.55), size[2])
+        aside = size[1] / 2 + 0.08 if spot >= len(lots) else 0.0
+        x, y = edge_x + aside * np.sin(yaw), edge_y - aside * np.cos(yaw)
+        if not clear.footprint(x, y, yaw, PARKED[kind][1], size[1]):
+            continue
+        clear.take(x, y, yaw, PARKED[kind][1], size[1])
+        against = 0.5 if spot < len(lots) else AGAINST.get(kind, 0.0)
+        facing = yaw + (np.pi if own.random() < against else 0.0)
+        cast.add(cast.make(kind, style, size), _still(x, y, facing, z), parked=True)
+        if kind == "construction" or (kind == "truck" and own.random() < 0.3):
+            _site(cast, (x, y, yaw, z), size, own, clear)
+
+
+def _site(
+    cast: SceneObjects, at: tuple[float, float, float, float], size: Size, own: np.random.Generator, clear: Clear
+) -> None:
+    """Cones or barriers along the road side of a machine, barriers across both ends."""
+    x, y, yaw, z = at
+    cos, sin = np.cos(yaw), np.sin(yaw)
+
+    def put(kind: str, forward: float, left: float, turn: float) -> None:
+        style = draw_style(kind, generator=own)
+        drawn = draw_size(kind, style, generator=own)
+        px, py = x + forward * cos - left * sin, y + forward * sin + left * cos
+        cast.add(cast.make(kind, style, drawn), _still(px, py, yaw + turn + float(own.normal(0.0, ASKEW)), z))
+
+    if own.random() < 0.5:
+        for k in range(int(own.integers(3, 7))):
+            put("traffic_cone", -size[0] / 2 - 1.0 + k * (size[0] + 2.0) / 5.0, size[1] / 2 + 0.35, 0.0)
+    else:
+        for k in range(int((size[0] + 2.0) / 2.8) + 1):
+            put("barrier", -size[0] / 2 + 0.4 + 2.8 * k, size[1] / 2 + 0.45, np.pi / 2)
+    for end in (-1, 1):
+        for k in range(int(own.integers(1, 3))):
+            put("barrier", end * (size[0] / 2 + 1.2 + 1.3 * k), 0.0, 0.0)
+    clear.take(x, y, yaw, size[0] + 6.0, size[1])
+
+
+def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, steps: int) -> None:
+    """People who walk along sidewalks or stand, groups of cones, rows of barriers."""
+    draws = generator("record sidewalks", *cast.key)
+    people, standing = [], []
+    for k in range(WALKERS):
+        style = "child" if k % 6 == 5 else "adult"
+        size = draw_size("pedestrian", style, generator=draws)
+        people.append(cast.make("pedestrian", style, size, name=("walker", k), phases=PHASES))
+    for _ in range(4):
+        standing.append(cast.make("pedestrian", "standing", draw_size("pedestrian", "standing", generator=draws)))
+    crowd = float(draws.uniform(0.1, 0.4))
+    for lane in np.flatnonzero(graph.kind == LaneType.SIDEWALK):
+        length = float(graph.length[lane])
+        for s in np.arange(3.0, length - 3.0, 8.0):
+            x, y, yaw, width = graph.at(int(lane), float(s))
+            if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > 45.0:
+                continue
+            pick = draws.random()
+            aside = float(draws.uniform(-0.3, 0.3)) * width
+            px, py = x - aside * np.sin(yaw), y + aside * np.cos(yaw)
+            if pick < crowd:
+                who = people[int(draws.integers(len(people)))]
+                speed = float(draws.uniform(0.7, 1.6)) * (1 if draws.random() < 0.5 else -1)
+                cast.add(who, _walk(graph, int(lane), s0=float(s), speed=speed, aside=aside, steps=steps, dt=cast.dt))
+            elif pick < crowd + 0.06:
+                who = standing[int(draws.integers(len(standing)))]
+                turned = yaw + float(draws.uniform(-3, 3))
+                if clear.footprint(px, py, 0.0, 0.6, 0.6):
+                    cast.add(who, _still(px, py, turned, KERB))
+            elif pick < crowd + 0.13:
+                kind = "traffic_cone" if draws.random() < 0.5 else "barrier"
+                along = draws.random() < 0.6  # else barriers stand one behind the other, across the walk
+                for k in range(int(draws.integers(1, 5))):
+                    style = draw_style(kind, generator=draws)
+                    size = draw_size(kind, style, generator=draws)
+                    gap = (1.6 if kind == "traffic_cone" else 2.8) * k
+                    qx, qy, turn, _ = graph.at(int(lane), min(float(s) + gap, length))
+                    if clear.footprint(qx, qy, 0.0, 0.5, 0.5):
+                        turn += (np.pi / 2 if kind == "barrier" and along else 0.0) + float(draws.normal(0.0, ASKEW))
+                        cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
+
+
+def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:
+    """Track of somebody who walks along a sidewalk, back and forth."""
+    length = float(graph.length[lane]) - 2.0
+    along = np.abs((s0 - 1.0 + speed * dt * np.arange(steps)) % (2 * length))
+    there = along <= length
+    places = 1.0 + np.where(there, along, 2 * length - along)
+    rows = np.array([graph.at(lane, float(q))[:3] for q in places], np.float64)
+    back = there == (speed < 0)
+    return np.stack([rows[:, 0] - aside * np.sin(rows[:, 2]), rows[:, 1] + aside * np.cos(rows[:, 2]),
+                     rows[:, 2] + np.pi * back, np.full(steps, KERB)], -1)  # fmt: skip

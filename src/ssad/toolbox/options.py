@@ -1,0 +1,118 @@
+"""What `ssad shift` is asked for, and the pieces of work it falls into."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from ssad.core.errors import ConfigError
+from ssad.core.version import __version__
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, Calibration, ShiftSpec
+
+Labels = Literal["original", "transformed"]
+Strength = int | Literal["random"]
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What to write.
+
+    source: a nuScenes root; out: folder that gets one root a shift and severity; shifts and severities: all pairs of
+    them; scenes: names, empty for all; sweeps, lidar: whether files between key frames and LiDAR files are shifted
+    too (else they are linked); labels: which boxes sample_annotation.json holds (the other set lies beside it);
+    a file in which nothing changes is linked, so that severity 0 gives the dataset itself; quality, subsampling: of
+    JPEG files ("auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420).
+    """
+
+    source: Path
+    out: Path
+    version: str
+    shifts: tuple[str, ...]
+    severities: tuple[Strength, ...] = ("random",)
+    seed: int = 0
+    calibration: Calibration = "physical"
+    labels: Labels = "original"
+    scenes: tuple[str, ...] = ()
+    sweeps: bool = True
+    lidar: bool = True
+    quality: int = 95
+    subsampling: str = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("shifts", "severities", "scenes"):  # asked for twice: written once
+            object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
+        if not self.shifts or not self.severities:
+            raise ConfigError("no shift or no severity to apply")
+        if self.labels not in ("original", "transformed"):
+            raise ConfigError(f"labels '{self.labels}': expected original or transformed")
+        if self.subsampling not in ("auto", "444", "422", "420"):
+            raise ConfigError(f"subsampling '{self.subsampling}': expected auto, 444, 422 or 420")
+        if not 1 <= self.quality <= 100:
+            raise ConfigError(f"quality {self.quality}: expected 1 to 100")
+        for shard in self.shards(("",)):
+            shard.spec()
+        out, source = self.out.resolve(), self.source.resolve()
+        if out == source or source in out.parents or out in source.parents:
+            raise ConfigError(
+                f"{self.out}: the output must lie outside of the dataset {self.source}, and not around it"
+            )
+
+    def shards(self, scenes: tuple[str, ...]) -> list[Shard]:
+        """One piece of work a shift, severity and scene."""
+        return [
+            Shard(self, shift, severity, s) for shift in self.shifts for severity in self.severities for s in scenes
+        ]
+
+    def root(self, shift: str, severity: Strength) -> Path:
+        """The nuScenes root of a shift and severity."""
+        return self.out / f"{shift}-{severity}"
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """One scene under one shift: what a worker is given. severity as asked for."""
+
+    options: Options = field(repr=False)
+    shift: str
+    severity: Strength
+    scene: str
+
+    @property
+    def root(self) -> Path:
+        """The nuScenes root it belongs to."""
+        return self.options.root(self.shift, self.severity)
+
+    @property
+    def random(self) -> bool:
+        """Whether the severity is drawn."""
+        return self.severity == "random"
+
+    @property
+    def subsampling(self) -> str:
+        """Of its JPEG files."""
+        if self.options.subsampling != "auto":
+            return self.options.subsampling
+        return "444" if SHIFTS[self.shift][0] == "sensor" else "420"
+
+    def spec(self) -> ShiftSpec:
+        """The shift; severity 1 stands for a random one until it is drawn."""
+        severity = 1 if self.severity == "random" else self.severity
+        return ShiftSpec(self.shift, severity, self.options.seed, self.options.calibration)
+
+    def identity(self) -> Mapping[str, Any]:
+        """What decides the bytes of its files: two shards of one identity and source are equal."""
+        options = self.options
+        return {
+            "shift": self.shift,
+            "severity": self.severity,
+            "seed": options.seed,
+            "calibration": options.calibration,
+            "sweeps": options.sweeps,
+            "lidar": options.lidar,
+            "quality": options.quality,
+            "subsampling": self.subsampling,
+            "shift_version": VERSIONS[options.calibration],
+            "ssad": __version__,
+        }

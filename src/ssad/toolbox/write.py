@@ -1,0 +1,266 @@
+"""`ssad shift`: plans the shards, hands them to processes or to Ray, and finishes each root."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, FormatError, SSADError, StoreError
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.schema import TABLES
+from ssad.datasets.nuscenes.tables import stream, table_path
+from ssad.jobs.pool import spread
+from ssad.scenarios.static.shifts.sun import NO_SUN
+from ssad.toolbox.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
+from ssad.toolbox.options import Options, Shard, Strength
+from ssad.toolbox.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A root as it stands: how many files were shifted, linked, failed; share of the images that changed; why files
+    failed. With a failed file it has no manifest.json and is not complete."""
+
+    root: Path
+    shifted: int
+    linked: int
+    failed: int
+    applied: float
+    reasons: tuple[str, ...]
+
+
+def materialise(
+    options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress | None = None
+) -> list[Written]:
+    """Writes one nuScenes root a shift and severity. Run again to resume: what stands is kept.
+
+    workers: processes (None: one a core); ray: address of a cluster that sees the same folders. The bytes do not
+    depend on either. ConfigError, FormatError, StoreError; StoreError also when a shift changed no image at all.
+    """
+    if workers is not None and workers < 1:
+        raise ConfigError(f"{workers} workers: expected 1 or more")
+    if (options.source / FOLDER / "identity.json").exists():
+        raise ConfigError(f"{options.source}: shifted already; give the clean dataset")
+    data = NuScenes(options.source, options.version)
+    names = tuple(record.name for record in data.scenes())
+    unknown = sorted(set(options.scenes) - set(names))
+    if unknown:
+        raise ConfigError(f"{options.source}: no scene {', '.join(unknown[:5])} in {options.version}")
+    chosen = options.scenes or names
+    if not chosen:
+        raise ConfigError(f"{options.source}: {options.version} has no scenes")
+    data.scene(chosen[0])  # broken tables are found before anything is written; builds the index once
+    data.close()
+    roots = [(shift, severity) for shift in options.shifts for severity in options.severities]
+    source = {"root": str(options.source.resolve()), "version": options.version, "tables": _tables(options)}
+    safeio.make_folder(options.out)
+    with _locked(options.out):
+        for shift, severity in roots:
+            _begin(options, shift, severity, source)
+        shards = options.shards(chosen)
+        for count, _ in enumerate(_work(shards, workers=workers, ray=ray), 1):
+            if progress is not None:
+                progress(count, len(shards))
+        written, problems = [], []
+        for shift, severity in roots:
+            try:
+                written.append(_finish(options, shift, severity, source=source, scenes=chosen, known=names))
+            except StoreError as error:  # the other roots are finished nevertheless
+                problems.append(error)
+        if problems:
+            raise StoreError(" | ".join(map(str, problems)))
+        return written
+
+
+def _tables(options: Options) -> dict[str, str]:
+    """Hashes of the tables: a shifted root belongs to one dataset."""
+    return {name: digest_file(table_path(options.source, options.version, name)) for name in sorted(TABLES)}
+
+
+class _locked:
+    """One `ssad shift` a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / ".lock"
+
+    def __enter__(self) -> None:
+        import fcntl
+
+        try:
+            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+        try:
+            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self.descriptor)
+            raise StoreError(f"{self.path.parent}: another ssad shift is writing there; wait for its end") from None
+        except OSError as error:
+            os.close(self.descriptor)
+            raise StoreError(f"{self.path}: cannot be locked: {error.strerror or error}") from None
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self.descriptor)
+
+
+def _begin(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
+    """A new root, or one of the same identity to go on with. StoreError for another's."""
+    root = options.root(shift, severity)
+    check_folders(root, ("", FOLDER, options.version, UNFINISHED), options.source)
+    safeio.make_folder(root / FOLDER)
+    identity = {"identity": dict(Shard(options, shift, severity, "").identity()), "source": source}
+    path = root / FOLDER / "identity.json"
+    if path.exists():
+        if _read_identity(path) != identity:
+            raise StoreError(f"{root}: holds a shift of other data or options; choose another folder")
+    else:
+        safeio.write_atomic(path, safeio.dump_json(identity, indent=1) + "\n")
+    try:
+        (root / PAGE).unlink(missing_ok=True)  # not complete until it is again
+        _clear(root, options.version)
+    except OSError as error:
+        raise StoreError(f"{root}: cannot be written: {error.strerror or error}") from None
+    for entry in sorted(options.source.iterdir()):
+        if entry.name in ("samples", "sweeps", PAGE, FOLDER) or entry.name.startswith(("v1.0-", ".")):
+            continue
+        link(root, entry, root / entry.name)
+    own = {f"{TABLE}.json", f"{TABLE}.original.json", f"{TABLE}.transformed.json"}
+    for table in sorted((options.source / options.version).glob("*.json")):
+        if table.name not in own:
+            link(root, table, root / options.version / table.name)
+
+
+def _read_identity(path: Path) -> Any:
+    """What a root says that it holds; None when that is damaged."""
+    try:
+        return safeio.read_json(path)
+    except FormatError:
+        return None
+
+
+def _clear(root: Path, version: str) -> None:
+    """Removes what a killed run left half written."""
+    if (root / UNFINISHED).exists():
+        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+    for folder in (root.parent, root, root / FOLDER, root / version):
+        for path in folder.glob(".*") if folder.is_dir() else ():
+            if re.fullmatch(r"\.probe-\d+|\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?", path.name):
+                path.unlink(missing_ok=True)
+
+
+def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> Iterator[dict[str, int]]:
+    """Runs the shards; results as they come."""
+    if ray is not None:
+        yield from _on_ray(shards, ray)
+        return
+    yield from spread(make_shard, shards, workers)
+
+
+def _on_ray(shards: Sequence[Shard], address: str) -> Iterator[dict[str, int]]:
+    """Runs the shards on a Ray cluster; "local" starts one for as long as it takes."""
+    try:
+        import ray
+    except ImportError:
+        raise ConfigError("--ray needs the extra `ray`: pip install 'ssad-testbed[ray]'") from None
+    own = not ray.is_initialized()
+    try:
+        if own:
+            ray.init(address="local" if address == "local" else address, log_to_driver=False)
+    except Exception as error:
+        raise ConfigError(f"no Ray cluster at '{address}': {error}") from None
+    task = ray.remote(make_shard)
+    # workers have a folder of their own: names as seen from here
+    waiting = [
+        task.remote(
+            replace(s, options=replace(s.options, source=s.options.source.absolute(), out=s.root.parent.absolute()))
+        )
+        for s in shards
+    ]
+    try:
+        while waiting:
+            ready, waiting = ray.wait(waiting)
+            yield ray.get(ready[0])
+    except ray.exceptions.RayTaskError as error:
+        cause = error.cause
+        raise cause if isinstance(cause, SSADError) else StoreError(f"a Ray task failed: {cause}") from None
+    except ray.exceptions.RayError as error:
+        raise StoreError(f"a Ray worker died: {error}; run the same command again to go on") from None
+    finally:
+        for left in waiting:
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.cancel(left)
+        if own:
+            ray.shutdown()
+
+
+def _finish(
+    options: Options,
+    shift: str,
+    severity: Strength,
+    *,
+    source: dict[str, Any],
+    scenes: Sequence[str],
+    known: Sequence[str],
+) -> Written:
+    """Labels, the manifest's page, and the check that something changed.
+
+    The page covers the scenes of earlier runs as well, if they are whole: scenes may be spread over runs.
+    """
+    root = options.root(shift, severity)
+    tally, labels = Tally(), dict[str, msgspec.Raw]()
+    for scene in known:
+        made = finished(root, scene)
+        if made is None and scene in scenes:
+            raise StoreError(f"{root}: the lines of {scene} are gone; run the same ssad shift again")
+        lines = read_lines(shard_path(root, scene)).values() if made is not None else ()
+        if made is None or (scene not in scenes and any(r["state"] == "failed" for r in lines)):
+            continue
+        tally.add(scene, lines)
+        labels |= made.boxes
+    transformed = _write_labels(options, root, labels)
+    changed = tally.changed if tally.images else tally.states["shifted"]
+    if not tally.reasons and severity != 0 and not changed and not (tally.skipped.keys() & NO_SUN):
+        why = "; ".join(f"{reason} ({count})" for reason, count in sorted(tally.skipped.items()))
+        raise StoreError(f"{root}: {shift} changed none of {tally.images} images: {why or 'no reason was given'}")
+    shutil.rmtree(root / UNFINISHED, ignore_errors=True)
+    if not tally.reasons:
+        identity = Shard(options, shift, severity, "").identity()
+        found = page(identity, source, tally, labels=options.labels, transformed=transformed)
+        safeio.write_atomic(root / PAGE, safeio.dump_json(found, indent=1) + "\n")
+    states = tally.states
+    return Written(
+        root, states["shifted"], states["linked"], states["failed"], tally.applied, tuple(sorted(tally.reasons))
+    )
+
+
+def _write_labels(options: Options, root: Path, labels: dict[str, msgspec.Raw]) -> str:
+    """sample_annotation.json as asked for; both sets of boxes beside it. One pass, a block at a time.
+
+    The hash of the transformed ones.
+    """
+    original = table_path(options.source, options.version, TABLE)
+    folder = table_path(root, options.version, TABLE).parent
+    moved = folder / f"{TABLE}.transformed.json"
+    encoder = msgspec.json.Encoder()
+    with safeio.atomic_path(moved) as temporary, open(temporary, "wb") as file:
+        separator = b"[\n"
+        for block in stream(original, dict[str, Any]):
+            for row in block:
+                new = labels.get(row.get("token", ""))
+                file.write(separator + encoder.encode(row if new is None else row | msgspec.json.decode(new)))
+                separator = b",\n"
+        file.write(b"\n]\n" if separator == b",\n" else b"[\n]\n")
+    link(root, original, folder / f"{TABLE}.original.json")
+    link(root, original if options.labels == "original" else moved, folder / f"{TABLE}.json")
+    return digest_file(moved)

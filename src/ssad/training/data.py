@@ -1,0 +1,24 @@
+"""Pictures and truth for training and evaluation of detectors, from data sets on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from ssad.core.images import read_image
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.evaluation.camera_truth import camera_truth, scenes_of
+from ssad.training.batches import Item
+
+
+def nuscenes_items(root: Path, version: str | None, split: str, *, limit: int | None = None) -> Iterator[Item]:
+    """Every key picture of every camera of a split; limit: of so many scenes. ConfigError: an unknown split."""
+    with NuScenes(root, version) as data:
+        names = scenes_of(data, split)
+        for name in names[:limit]:
+            scene = data.scene(name)
+            for frame in scene.frames:
+                if frame.modality == "camera" and frame.key_frame:
+                    truth = camera_truth(frame, scene.annotations(frame.sample_token))
+                    yield Item(partial(read_image, root / frame.filename), truth)

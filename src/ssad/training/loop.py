@@ -1,0 +1,261 @@
+"""The training loop: one process a device, resumable, logged a line an epoch."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+
+from ssad.core import safeio
+from ssad.core.detections import Truth
+from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.training.batches import PictureSet, make_batch, order, repeats
+from ssad.training.recipe import Recipe, recipe_data
+
+LOG = "log.jsonl"
+LAST = "last.pt"
+
+
+class Step(nn.Module):
+    """From a batch to its losses, as one module, so that gradients can be shared between devices."""
+
+    def __init__(self, detector: Any, *, amp: bool) -> None:
+        super().__init__()
+        self.detector = detector
+        self.amp = amp
+
+    def forward(self, images: Tensor, truth: list[Truth]) -> dict[str, Tensor]:
+        """Losses by name."""
+        with torch.autocast("cuda", torch.bfloat16) if self.amp and images.is_cuda else nullcontext():
+            lens = None
+            if self.detector.task == "3d":
+                lens = torch.stack([t.intrinsic for t in truth if t.intrinsic is not None])
+            dense = self.detector.dense(images, lens)
+        assignment = self.detector.assign(dense, truth)
+        return dict(self.detector.losses(dense, assignment))
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """Which of `world` processes this is."""
+
+    rank: int = 0
+    world: int = 1
+
+
+def train(
+    detector: Any,
+    bank: PictureSet,
+    recipe: Recipe,
+    *,
+    out: Path,
+    device: str = "cpu",
+    validate: Callable[[Any], dict[str, float]] | None = None,
+    say: Callable[[str], None] = lambda line: None,
+    share: Share = Share(),
+    seconds: float | None = None,
+    about: str = "",
+) -> Any:
+    """Trains a detector on a bank and gives back the one to use (the average of the weights, if one is kept).
+
+    OUT/last.pt holds all that is needed to go on after a stop; OUT/log.jsonl a line an epoch. validate: metrics of a
+    detector, every `recipe.validate` epochs but the last. seconds: stop after the epoch in which this time is over (to
+    be gone on with). about: what else the result depends on (data, first weights), to be the same when it goes on.
+    FormatError: last.pt is of another recipe, of other data or broken; StoreError; ConfigError: the loss is not finite.
+    """
+    where = torch.device(device)
+    detector.to(where)
+    layout = torch.channels_last if where.type == "cuda" else torch.contiguous_format
+    detector.to(memory_format=layout)
+    _unfreeze(detector, recipe)
+    step_of = Step(detector, amp=recipe.amp)
+    shared: Any = step_of
+    if share.world > 1:
+        ids = [where.index or 0] if where.type == "cuda" else None
+        shared = nn.parallel.DistributedDataParallel(step_of, device_ids=ids)
+    optimizer = _optimizer(detector, recipe)
+    average = copy.deepcopy(detector).requires_grad_(False).eval() if recipe.average else None
+    batch = max(recipe.batch // share.world, 1)
+    often = repeats(bank.truth, recipe.rare)
+    per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
+    total = per_epoch * recipe.epochs
+    epoch, step = _resume(out / LAST, detector, average, optimizer, recipe, about)
+    start = time.monotonic()
+    while epoch < recipe.epochs:
+        _training_mode(detector, recipe)
+        sums: dict[str, Tensor] = {}
+        began = time.monotonic()
+        rate = recipe.lr
+        seed = recipe.seed * 1000 + share.rank
+        for number, indices in enumerate(order(len(bank), batch, seed=seed, epoch=epoch, often=often)[:per_epoch]):
+            rate = recipe.rate(step, total, per_epoch)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            key = (recipe.seed, epoch, number, share.rank)
+            images, truth = make_batch(bank, indices, recipe, key=key, device=where)
+            losses = shared(images.contiguous(memory_format=layout), truth)
+            loss = torch.stack(list(losses.values())).sum()
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            if recipe.clip:
+                nn.utils.clip_grad_norm_([p for p in detector.parameters() if p.requires_grad], recipe.clip)
+            optimizer.step()
+            if average is not None:
+                _follow(average, detector, min(recipe.average, (1 + step) / (10 + step)))
+            for name, value in losses.items():
+                sums[name] = sums.get(name, torch.zeros((), device=where)) + value.detach()
+            step += 1
+        epoch += 1
+        shown = per_epoch * batch * share.world
+        row: dict[str, Any] = {
+            "epoch": epoch, "lr": rate, "images_s": round(shown / (time.monotonic() - began), 1),
+            **{f"loss_{name}": round(float(value) / per_epoch, 5) for name, value in sums.items()},
+        }  # fmt: skip
+        if not all(math.isfinite(v) for v in row.values()):
+            raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
+        if share.rank == 0:
+            final = average if average is not None else detector
+            _save(out, {"model": detector.state_dict(), "average": None if average is None else average.state_dict(),
+                        "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step, "about": about,
+                        "recipe": safeio.dump_json(recipe_data(recipe))}, row)  # fmt: skip
+            if validate is not None and epoch % recipe.validate == 0 and epoch < recipe.epochs:
+                row |= validate(final.eval())
+                write_row(out, row)
+            say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+        if seconds is not None and _over(time.monotonic() - start > seconds, share, where):
+            break
+    best = average if average is not None else detector
+    return best.requires_grad_(False).eval()
+
+
+def _same(count: int, share: Share, where: torch.device) -> int:
+    """The least of all processes' counts: their shares of the data differ, their numbers of steps must not."""
+    if share.world == 1:
+        return count
+    least = torch.tensor(float(count), device=where)
+    distributed.all_reduce(least, distributed.ReduceOp.MIN)
+    return int(least)
+
+
+def _over(mine: bool, share: Share, where: torch.device) -> bool:
+    """Whether time is over, as the first process says: all must stop after the same epoch."""
+    if share.world == 1:
+        return mine
+    flag = torch.tensor(float(mine), device=where)
+    distributed.broadcast(flag, 0)
+    return bool(flag)
+
+
+def _unfreeze(detector: Any, recipe: Recipe) -> None:
+    """Everything learns but what the recipe holds. ConfigError: it holds what there is not."""
+    names = [name for name, _ in detector.named_parameters()]
+    for prefix in recipe.freeze:
+        if not any(name.startswith(prefix) for name in names):
+            raise ConfigError(f"recipe {recipe.detector}: freeze: no parameter's name starts with '{prefix}'")
+    for name, value in detector.named_parameters():
+        value.requires_grad_(not name.startswith(recipe.freeze) if recipe.freeze else True)
+
+
+def _training_mode(detector: Any, recipe: Recipe) -> None:
+    detector.train()
+    if recipe.norm_eval:
+        for part in detector.modules():
+            if isinstance(part, nn.modules.batchnorm._BatchNorm):
+                part.eval()
+
+
+def _optimizer(detector: Any, recipe: Recipe) -> torch.optim.Optimizer:
+    """Weight decay on matrices and kernels only."""
+    learning = [p for p in detector.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in learning if p.ndim > 1], "weight_decay": recipe.weight_decay},
+        {"params": [p for p in learning if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    if recipe.optimizer == "sgd":
+        return torch.optim.SGD(groups, lr=recipe.lr, momentum=recipe.momentum)
+    fused = all(p.is_cuda for p in learning)
+    return torch.optim.AdamW(groups, lr=recipe.lr, betas=(recipe.momentum, 0.999), fused=fused)
+
+
+@torch.no_grad()
+def _follow(average: Any, detector: Any, decay: float) -> None:
+    """The moving average of weights and statistics; counters are taken as they are."""
+    kept, fresh = average.state_dict(), detector.state_dict()
+    floats = [name for name, value in kept.items() if value.is_floating_point()]
+    torch._foreach_lerp_([kept[n] for n in floats], [fresh[n] for n in floats], 1.0 - decay)
+    for name, value in kept.items():
+        if not value.is_floating_point():
+            value.copy_(fresh[name])
+
+
+def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:
+    safeio.make_folder(out)
+    try:
+        with safeio.atomic_path(out / LAST) as path:
+            torch.save(state, path)
+    except OSError as error:
+        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
+    write_row(out, row)
+
+
+def read_rows(out: Path) -> list[dict[str, Any]]:
+    """The lines of OUT/log.jsonl, an epoch each."""
+    return [safeio.parse_json(line) for line in safeio.read_text(out / LOG).splitlines()]
+
+
+def write_row(out: Path, row: dict[str, Any]) -> None:
+    """Writes the line of an epoch; lines of this epoch and of later ones go. StoreError."""
+    try:
+        rows = read_rows(out) if (out / LOG).is_file() else []
+        kept = [one for one in rows if one["epoch"] < row["epoch"]]
+        safeio.write_atomic(out / LOG, "".join(safeio.dump_json(one) + "\n" for one in [*kept, row]))
+    except OSError as error:
+        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from None
+
+
+def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
+    """What a training left to go on with, None if there is nothing. FormatError: broken, of another recipe, of other
+    data or first weights."""
+    if not path.is_file():
+        return None
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise FormatError(f"{path}: not a checkpoint of a training ({type(error).__name__}); delete it") from None
+    if not isinstance(state, dict) or "recipe" not in state:
+        raise FormatError(f"{path}: not a checkpoint of a training; delete it")
+    if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
+        raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
+    if state.get("about", "") != about:
+        raise FormatError(
+            f"{path}: of other data, other first weights or another number of GPUs; choose another folder, or delete it"
+        )
+    return state
+
+
+def _resume(  # noqa: PLR0917
+    path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, about: str
+) -> tuple[int, int]:
+    """Epoch and step to go on with."""
+    state = read_last(path, recipe, about)
+    if state is None:
+        return 0, 0
+    try:
+        detector.load_state_dict(state["model"])
+        if average is not None:
+            average.load_state_dict(state["average"])
+        optimizer.load_state_dict(state["optimizer"])
+        return int(state["epoch"]), int(state["step"])
+    except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
+        why = type(error).__name__
+        raise FormatError(
+            f"{path}: of another detector or data set, or broken ({why}); choose another folder"
+        ) from None

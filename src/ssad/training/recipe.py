@@ -1,0 +1,137 @@
+"""How a detector is trained: everything that decides the result but the data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, fields, replace
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from ssad.core.errors import ConfigError, unknown_name
+
+Whole = Annotated[int, Field(ge=1)]
+FromNone = Annotated[int, Field(ge=0)]
+Above = Annotated[float, Field(gt=0.0)]
+Least = Annotated[float, Field(ge=0.0)]
+Part = Annotated[float, Field(ge=0.0, le=1.0)]
+Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, allow_inf_nan=False))
+class Recipe:
+    """A training run. Learning rates are for one step on `batch` images over all devices.
+
+    optimizer, lr, momentum (of SGD, or beta 1 of AdamW), weight_decay (not on norms and biases), clip: norm of the
+    gradient, 0 none; schedule: "cosine" or "linear" from lr to lr * last, or "step": a tenth after each of `steps`
+    (epochs); warmup: iterations from a third of lr; average: decay of the weights' moving average, 0 none; amp:
+    bfloat16 on a GPU; freeze: prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
+    flip: chance of a mirror image; zoom: range of the scale of a random crop; jitter: of brightness, contrast,
+    saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop, 2D
+    only (a 3D box stays while its middle is in sight). rare: pictures with a class that fewer than this share of them
+    show are repeated (see `batches.repeats`), 0 none. validate: epochs from one validation to the next.
+    """
+
+    detector: str
+    epochs: Whole
+    batch: Whole
+    lr: Above
+    optimizer: Literal["sgd", "adamw"] = "adamw"
+    momentum: Decay = 0.9
+    weight_decay: Least = 0.01
+    schedule: Literal["cosine", "linear", "step"] = "cosine"
+    last: Part = 0.02
+    steps: tuple[int, ...] = ()
+    warmup: FromNone = 200
+    clip: Least = 10.0
+    average: Decay = 0.998
+    amp: bool = True
+    freeze: tuple[str, ...] = ()
+    norm_eval: bool = False
+    flip: Part = 0.5
+    zoom: tuple[Above, Above] = (1.0, 1.0)
+    jitter: Part = 0.3
+    noise: Part = 0.02
+    keep: Part = 0.0
+    rare: Part = 0.0
+    validate: Whole = 5
+    seed: FromNone = 0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.zoom[0] > self.zoom[1]:
+            raise ValueError("zoom: needs low <= high")
+        if self.keep and self.three:
+            raise ValueError("keep: is for 2D detectors; a 3D box stays while its middle is in sight")
+        return self
+
+    @property
+    def three(self) -> bool:
+        """Whether the detector is a 3D one."""
+        return self.detector.startswith(("fcos3d", "pgd"))
+
+    def rate(self, step: int, total: int, per_epoch: int) -> float:
+        """Learning rate of a step out of `total`."""
+        if self.schedule == "step":
+            factor = 0.1 ** sum(step // max(per_epoch, 1) >= s for s in self.steps)
+        else:
+            done = min(step / max(total - 1, 1), 1.0)
+            falls = done if self.schedule == "linear" else 0.5 - 0.5 * math.cos(math.pi * done)
+            factor = 1.0 - (1.0 - self.last) * falls
+        if step < self.warmup:
+            factor *= 1 / 3 + 2 / 3 * step / self.warmup
+        return self.lr * factor
+
+
+def _official(detector: str, lr: float, **changes: Any) -> Recipe:
+    """As mmdetection3d 1.4 trains its nuScenes models, 1x: SGD, 12 epochs, a tenth after 8 and 11."""
+    base = Recipe(
+        detector, 12, 16, lr, optimizer="sgd", weight_decay=1e-4, schedule="step", steps=(8, 11), warmup=500, clip=35.0,
+        average=0.0, amp=False, freeze=("backbone.conv1", "backbone.bn1", "backbone.layer1"), norm_eval=True,
+        jitter=0.0, noise=0.0,
+    )  # fmt: skip
+    return replace(base, **changes)
+
+
+# The paper: SGD, momentum 0.99, weight decay 4e-4, from 0.01 to 0.001, from COCO weights
+_PAPER_YOLO = Recipe(
+    "yolov3", 100, 16, 0.01, optimizer="sgd", momentum=0.99, weight_decay=4e-4, schedule="linear", last=0.1, clip=10.0,
+    zoom=(0.6, 1.4), keep=0.3,
+)  # fmt: skip
+_LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, rare=0.1)
+_LIGHT_2D = Recipe("yolov5n", 60, 32, 2e-3, zoom=(0.4, 1.6), weight_decay=0.02, validate=20, keep=0.3)
+
+RECIPES: dict[str, Recipe] = {
+    "fcos3d-light": _LIGHT_3D,
+    "pgd-det-light": replace(_LIGHT_3D, detector="pgd-det-light"),
+    "yolov3-tiny": replace(_LIGHT_2D, detector="yolov3-tiny"),
+    "yolov5n": _LIGHT_2D,
+    "yolov5s": replace(_LIGHT_2D, detector="yolov5s"),
+    "yolov3": _PAPER_YOLO,
+    "yolov5s-paper": replace(_PAPER_YOLO, detector="yolov5s"),
+    "fcos3d": _official("fcos3d", 0.002),
+    "pgd-det": _official("pgd-det", 0.004),
+}
+
+
+def find_recipe(name: str, **changes: Any) -> Recipe:
+    """A recipe by name with some of its values changed. UnknownNameError, ConfigError."""
+    if name not in RECIPES:
+        raise unknown_name("recipe", name, RECIPES)
+    known = sorted(f.name for f in fields(Recipe) if f.name != "detector")
+    for key in changes:
+        if key not in known:
+            raise ConfigError(f"a recipe has no value '{key}'; it has {', '.join(known)}")
+    try:
+        return replace(RECIPES[name], **changes)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key = str(problem["loc"][0]) if problem["loc"] else ""
+        text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it is written with --set
+        raise ConfigError(f"recipe {name}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
+
+
+def recipe_data(recipe: Recipe) -> dict[str, Any]:
+    """A recipe as plain data."""
+    return asdict(recipe)

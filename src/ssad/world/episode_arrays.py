@@ -1,0 +1,319 @@
+"""From episodes and lane graphs to the arrays that the kernels read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Route
+from ssad.roads.query import LaneQuery
+from ssad.world.kernels.data import EpisodeArrays, Roads
+from ssad.world.models import MODELS, model
+
+FAR = 1.0e6
+MAX_AGENTS = 63  # contacts are kept as one bit an agent
+LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
+SLOW_DOWN = 2.0  # m/s^2 at which a route's speed profile falls towards a bend
+GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
+TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
+WHEN = {"always": 0, "ego_distance": 1, "ego_speed": 2, "travelled": 3, "time": 4}
+
+
+@dataclass(frozen=True)
+class PathTable:
+    """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
+    line, m to the next junction (0 inside), turn rank there (0 straight, 1 right, 2 left); signal [N] or -1; bend [N] m
+    that the next 64 m leave the straight line along the point's heading."""
+
+    path: F32
+    rule: F32
+    signal: npt.NDArray[np.int32]
+    bend: F32
+
+
+def _bend(route: Route) -> F32:
+    """[N] greatest lateral distance of the next 64 m of path from the line through each point along its heading."""
+    n = len(route.xy)
+    ahead = np.minimum(np.arange(n)[:, None] + np.arange(1, 65), n - 1)
+    d = route.xy[ahead] - route.xy[:, None]
+    c, s = np.cos(route.yaw)[:, None], np.sin(route.yaw)[:, None]
+    out: F32 = np.abs(d[..., 1] * c - d[..., 0] * s).max(1).astype(np.float32)
+    return out
+
+
+def path_table(route: Route, graph: LaneGraph) -> PathTable:
+    """Curvature, speed profile, stop lines and junctions along a route of at least two points."""
+    n = len(route.xy)
+    yaw = np.unwrap(route.yaw.astype(np.float64))
+    kappa = np.gradient(yaw, route.spacing) if n > 2 else np.zeros(n)
+    kernel = np.ones(3) / 3.0
+    smooth = np.convolve(np.pad(kappa, 1, mode="edge"), kernel, mode="valid")
+    cap = np.minimum(route.speed_limit, np.sqrt(LATERAL_COMFORT / np.maximum(np.abs(smooth), 1e-4)))
+    # v^2 may fall by 2 a a metre: the least over all points ahead, in one sweep
+    fall = 2.0 * SLOW_DOWN * route.spacing * np.arange(n)
+    cap = np.sqrt(np.minimum.accumulate((cap.astype(np.float64) ** 2 + fall)[::-1])[::-1] - fall)
+    stop = np.full(n, FAR)
+    signal = np.full(n, -1, np.int32)
+    _stop_lines(route, graph, stop, signal)
+    entry, rank = _junctions(route, graph, yaw)
+    path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
+    return PathTable(
+        path.astype(np.float32),
+        np.stack([cap, stop, entry, rank], 1).astype(np.float32),
+        signal,
+        _bend(route),
+    )
+
+
+def _stop_lines(route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]) -> None:
+    """Fill `stop` (m ahead) and `signal` for every route point from the graph's stop lines on the route's lanes."""
+    marks: list[tuple[float, int]] = []
+    for k in np.flatnonzero(np.isin(graph.stop_lane, route.lane)).tolist():
+        lane = int(graph.stop_lane[k])
+        on = np.flatnonzero(route.lane == lane)
+        a, b = int(graph.offset[lane]), int(graph.offset[lane + 1])
+        at = [np.interp(graph.stop_s[k], graph.s[a:b], graph.xy[a:b, d]) for d in (0, 1)]
+        i = int(on[np.argmin(np.hypot(*(route.xy[on] - at).T))])
+        c, s = np.cos(route.yaw[i]), np.sin(route.yaw[i])
+        ahead = (at[0] - route.xy[i, 0]) * c + (at[1] - route.xy[i, 1]) * s
+        marks.append((i * route.spacing + float(ahead), int(graph.stop_signal[k])))
+    u = np.arange(len(stop)) * route.spacing
+    for position, index in sorted(marks, reverse=True):
+        before = u <= position + 0.75
+        stop[before] = position - u[before]
+        signal[before] = index
+
+
+def _junctions(
+    route: Route, graph: LaneGraph, yaw: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Distance to the next junction and turn rank there, for every route point."""
+    n = len(route.xy)
+    inside = np.zeros(n, bool)
+    known = route.lane >= 0
+    inside[known] = graph.junction[route.lane[known]] >= 0
+    entry = np.full(n, FAR)
+    rank = np.zeros(n)
+    edge = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
+    runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
+    for start, stop in reversed(list(runs)):
+        turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
+        kind = 0.0 if abs(turn) < TURN else (2.0 if turn > 0 else 1.0)
+        entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
+        rank[: start + 1] = kind
+        entry[start:stop] = 0.0
+        rank[start:stop] = kind
+    return entry, rank
+
+
+def signal_programs(graph: LaneGraph) -> F32:
+    """[S, 4] cycle, start of green, green, yellow in s: a junction's phases take turns; virtual signals are off."""
+    out = np.zeros((len(graph.signal_phase), 4), np.float32)
+    for order, junction in enumerate(np.unique(graph.signal_junction)):
+        mine = np.flatnonzero((graph.signal_junction == junction) & ~graph.signal_virtual)
+        phases = {int(p): k for k, p in enumerate(np.unique(graph.signal_phase[mine]).tolist())}
+        one = GREEN + YELLOW + ALL_RED
+        cycle = one * max(len(phases), 2)  # a lone phase still shows red now and then
+        for s in mine:
+            begin = (phases[int(graph.signal_phase[s])] * one + 5.0 * order) % cycle
+            out[s] = cycle, begin, GREEN, YELLOW
+    return out
+
+
+@dataclass
+class _Pool:
+    """Routes of all agents, each stored once."""
+
+    tables: list[PathTable] = field(default_factory=list)
+    size: int = 0
+    where: dict[tuple[str, bytes], tuple[int, int]] = field(default_factory=dict)
+
+    def add(self, route: Route, graph: LaneGraph) -> tuple[int, int]:
+        key = (graph.name, route.xy.tobytes() + route.speed_limit.tobytes())
+        if key not in self.where:
+            table = path_table(route, graph)
+            self.tables.append(table)
+            self.where[key] = (self.size, len(table.path))
+            self.size += len(table.path)
+        return self.where[key]
+
+
+def _check(episode: Episode) -> None:
+    if not episode.agents:
+        raise ConfigError(f"episode {episode.key}: no agents; agent 0 must be the ego")
+    if len(episode.agents) > MAX_AGENTS:
+        raise ConfigError(f"episode {episode.key}: {len(episode.agents)} agents, at most {MAX_AGENTS}")
+    route = episode.agents[0].route
+    if route is None or len(route.xy) < 2:
+        raise ConfigError(f"episode {episode.key}: the ego needs a route of at least two points")
+
+
+def _put_agent(  # noqa: PLR0917
+    a: dict[str, npt.NDArray[np.generic]],
+    e: int,
+    i: int,
+    agent: EpisodeAgent,
+    names: dict[str, int],
+    route: tuple[int, int],
+) -> None:
+    model(agent.model)  # raises with the closest names
+    a["model"][e, i] = names[agent.model]
+    a["controller"][e, i] = int(agent.controller)
+    a["start"][e, i] = agent.pose.x, agent.pose.y, agent.pose.yaw, agent.speed
+    a["cruise"][e, i] = agent.target_speed, agent.wake_distance
+    a["route"][e, i] = route
+    a["phase_count"][e, i] = len(agent.phases)
+    for k, phase in enumerate(agent.phases):
+        a["phase_when"][e, i, k] = WHEN[phase.when.kind], phase.when.value, phase.when.actor + 1
+        a["phase_speed"][e, i, k] = phase.speed
+
+
+def build(
+    episodes: Sequence[Episode],
+    graphs: Mapping[str, LaneGraph],
+    device: str,
+    ego: Controller | None,
+    speed: float | None = None,
+) -> tuple[EpisodeArrays, Roads, int]:
+    """Arrays of all episodes on `device`, and the number of agent slots.
+
+    `ego` and `speed` replace the egos' controller and target speed.
+    """
+    if not episodes:
+        raise ConfigError("a world needs at least one episode")
+    for episode in episodes:
+        _check(episode)
+    towns = sorted({e.town for e in episodes})
+    count = max(len(e.agents) for e in episodes)
+    phases = max(1, *(len(a.phases) for e in episodes for a in e.agents))
+    signals = max(1, *(len(graphs[t].signal_phase) for t in towns))
+    names = {name: k for k, name in enumerate(MODELS)}
+    shape = (len(episodes), count)
+    a: dict[str, npt.NDArray[np.generic]] = {
+        "model": np.full(shape, -1, np.int32),
+        "controller": np.zeros(shape, np.int32),
+        "start": np.zeros((*shape, 4), np.float32),
+        "cruise": np.zeros((*shape, 2), np.float32),
+        "route": np.zeros((*shape, 2), np.int32),
+        "phase_count": np.zeros(shape, np.int32),
+        "phase_when": np.zeros((*shape, phases, 3), np.float32),
+        "phase_speed": np.zeros((*shape, phases), np.float32),
+        "town": np.zeros(len(episodes), np.int32),
+        "signal": np.full((len(episodes), signals), -1, np.int32),
+        "limits": np.zeros((len(episodes), 4), np.float32),
+    }
+    pool = _Pool()
+    for e, episode in enumerate(episodes):
+        graph = graphs[episode.town]
+        for i, agent in enumerate(episode.agents):
+            route = (0, 0)
+            if agent.route is not None and len(agent.route.xy) > 1:
+                route = pool.add(agent.route, graph)
+            _put_agent(a, e, i, agent, names, route)
+        if ego is not None:
+            a["controller"][e, 0] = int(ego)
+        if speed is not None:
+            a["cruise"][e, 0, 0] = speed
+        a["town"][e] = towns.index(episode.town)
+        for index, state in episode.signal_override.items():
+            a["signal"][e, index] = int(state)
+        limits = episode.limits
+        a["limits"][e] = limits.max_steps, limits.max_time, limits.max_distance, episode.override_until
+    body = [(m.length / 2, m.width / 2, max(m.wheelbase, 0.1), m.max_steer) for m in MODELS.values()]
+    power = [(m.max_accel, m.max_brake, m.max_speed, 0.0) for m in MODELS.values()]
+    a["kind"] = np.array([int(m.kind) for m in MODELS.values()], np.int32)
+    a["body"] = np.array(body, np.float32)
+    a["power"] = np.array(power, np.float32)
+    bank = EpisodeArrays()
+    types = {
+        "start": wp.vec4,
+        "cruise": wp.vec2,
+        "route": wp.vec2i,
+        "phase_when": wp.vec3,
+        "limits": wp.vec4,
+        "body": wp.vec4,
+        "power": wp.vec4,
+    }
+    for name, value in a.items():
+        kind = types.get(name, wp.int32 if value.dtype == np.int32 else wp.float32)
+        setattr(bank, name, wp.array(value, dtype=kind, device=device))
+    return bank, _roads([graphs[t] for t in towns], pool, device), count
+
+
+def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
+    parts: dict[str, list[npt.NDArray[np.generic]]] = {
+        k: []
+        for k in (
+            "segment",
+            "segment_half",
+            "segment_lane",
+            "lane_junction",
+            "cell_first",
+            "cell_segment",
+            "grid",
+            "grid_size",
+            "signal_first",
+            "signal_program",
+        )
+    }
+    segments = lanes = cells = entries = signals = 0
+    for graph in graphs:
+        query = LaneQuery(graph)
+        kind = graph.kind[query.seg_lane]
+        # only lanes that a car may be on count as road under its centre
+        keep = (kind == LaneType.DRIVING) | (kind == LaneType.PARKING)
+        number = np.cumsum(keep) - 1
+        listed = keep[query.cell_seg]
+        before = np.concatenate([[0], np.cumsum(listed)])
+        first = before[query.cell_offset]
+        parts["segment"].append(query.seg[keep])
+        parts["segment_half"].append(query.seg_half[keep])
+        parts["segment_lane"].append(query.seg_lane[keep] + lanes)
+        parts["lane_junction"].append((graph.junction >= 0).astype(np.int32))
+        parts["cell_first"].append(first + entries)
+        parts["cell_segment"].append(number[query.cell_seg[listed]] + segments)
+        parts["grid"].append(np.array([[*query.origin, 1.0 / query.cell, 0.0]]))
+        parts["grid_size"].append(np.array([[query.nx, query.ny, cells]]))
+        parts["signal_first"].append(np.array([signals]))
+        parts["signal_program"].append(signal_programs(graph))
+        segments += int(keep.sum())
+        lanes += len(graph.kind)
+        cells += len(first)
+        entries += int(listed.sum())
+        signals += len(graph.signal_phase)
+    roads = Roads()
+    types = {
+        "segment": wp.vec4,
+        "segment_half": wp.vec2,
+        "grid": wp.vec4,
+        "grid_size": wp.vec3i,
+        "signal_program": wp.vec4,
+        "path": wp.vec4,
+        "rule": wp.vec4,
+        "bend": wp.float32,
+    }
+    parts["path"] = [t.path for t in pool.tables]
+    parts["rule"] = [t.rule for t in pool.tables]
+    parts["path_signal"] = [t.signal for t in pool.tables]
+    parts["bend"] = [t.bend for t in pool.tables]
+    for name, values in parts.items():
+        kind = types.get(name, wp.int32)
+        dtype = np.int32 if kind in (wp.int32, wp.vec3i) else np.float32
+        joined = np.concatenate(values).astype(dtype)
+        if len(joined) == 0:  # a town without signals
+            joined = np.zeros((1, *joined.shape[1:]), dtype)
+        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=kind, device=device))
+    return roads
+
+
+def agent_kinds(bank: EpisodeArrays) -> npt.NDArray[np.int32]:
+    """[E, A] AgentKind of every slot."""
+    models = bank.model.numpy()
+    kinds = bank.kind.numpy()
+    return np.where(models < 0, int(AgentKind.NONE), kinds[np.maximum(models, 0)]).astype(np.int32)

@@ -1,0 +1,680 @@
+"""Meshes: solids, bodies of road users, users' own OBJ and glTF files."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import functools
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssad.assets.bodies import BODIES, PAINT_SHARES, PAINTS, draw_paint, draw_size, make_body
+from ssad.assets.bodies.parts import MARGIN, Chart, pack
+from ssad.assets.mesh import Material, Mesh, box, lathe, loft, merge, prism, ring, sphere, triangulate, tube
+from ssad.assets.obj import load_mesh, save_obj
+from ssad.core.errors import ConfigError, FormatError, UnknownNameError
+from ssad.core.seeding import generator
+
+GREY = Material("grey", (0.5, 0.5, 0.5))
+RED = Material("red", (0.5, 0.1, 0.1), paint=True)
+STYLES = [(kind, style) for kind, body in BODIES.items() for style in body.styles]
+PAINTED = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
+
+
+@functools.cache
+def body(kind: str, style: str, detail: int = 2) -> Mesh:
+    return make_body(kind, style=style, generator=generator("mesh", kind, style), detail=detail)
+
+
+def size_of(kind: str, style: str) -> np.ndarray:
+    low, high = body(kind, style).bounds()
+    return high - low
+
+
+def face_normals(mesh: Mesh) -> np.ndarray:
+    p = mesh.corners()
+    return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+
+
+# ---------------------------------------------------------------- solids
+
+
+@pytest.mark.parametrize(
+    ("mesh", "volume"),
+    [
+        (box((1.0, 2.0, 3.0), material=GREY), 6.0),
+        (prism([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], (1.0, 3.0), material=GREY), 6.0),
+        (prism([(0, 0), (0, 2), (1, 2), (1, 1), (2, 1), (2, 0)], (1.0, 3.0), material=GREY, axis=1), 6.0),
+        (lathe([(1.0, 0.0), (1.0, 2.0)], material=GREY, segments=256), 2.0 * np.pi),
+        (lathe([(1.0, 0.0), (1.0, 2.0)], material=GREY, segments=256, axis=0), 2.0 * np.pi),
+        (sphere(1.0, material=GREY, segments=200), 4.0 / 3.0 * np.pi),
+        (sphere((1.0, 2.0, 0.5), material=GREY, segments=200), 4.0 / 3.0 * np.pi),
+        (tube([(0, 0, 0), (0, 0, 2)], 0.5, material=GREY, segments=256), 0.5 * np.pi),
+        (ring(1.0, 0.2, material=GREY, segments=128, around=64), 2.0 * np.pi**2 * 0.9 * 0.01),
+    ],
+)
+def test_solids_have_their_volume_and_face_outwards(mesh: Mesh, volume: float) -> None:
+    mesh.check()
+    assert mesh.volume() == pytest.approx(volume, rel=4e-3)
+    # a closed surface: the area vectors cancel
+    np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0.0, atol=1e-4)
+    assert (np.einsum("fci,fi->fc", mesh.normals, face_normals(mesh)) > 0).all()
+
+
+def test_normals_are_smooth_round_a_sphere_and_sharp_on_a_box() -> None:
+    ball = sphere(2.0, material=GREY, segments=32)
+    radial = ball.corners() / np.linalg.norm(ball.corners(), axis=-1, keepdims=True)
+    assert np.einsum("fci,fci->fc", radial, ball.normals).min() > 0.99
+    cube = box((1.0, 1.0, 1.0), material=GREY)
+    assert np.allclose(np.abs(cube.normals).max(axis=-1), 1.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(0.2, 1.0), min_size=4, max_size=14))
+def test_triangulation_keeps_the_area_of_a_star(radii: list[float]) -> None:
+    angle = np.arange(len(radii)) * 2.0 * np.pi / len(radii)
+    p = np.array(radii)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    faces = triangulate(p)
+    assert faces.shape == (len(radii) - 2, 3)
+    a, b, c = p[faces[:, 0]], p[faces[:, 1]], p[faces[:, 2]]
+    areas = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    q = np.roll(p, -1, axis=0)
+    assert areas.min() >= -1e-9
+    assert areas.sum() == pytest.approx(0.5 * np.sum(p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]))
+
+
+def test_triangles_do_not_cut_a_corner_that_touches_them() -> None:
+    p = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], float)
+    a, b, c = (p[k] for k in triangulate(p).T)
+    areas = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    assert np.abs(areas).sum() == pytest.approx(3.0)
+
+
+def test_a_crossing_polygon_is_refused() -> None:
+    with pytest.raises(ConfigError, match="crosses itself"):
+        triangulate([(0, 0), (1, 1), (1, 0), (0, 1), (0.5, -1), (0.5, 2)])
+
+
+def test_transformed_keeps_outside_outside() -> None:
+    mesh = prism([(0, 0), (2, 0), (0, 1)], (0.0, 1.0), material=GREY)
+    mirror = mesh.transformed(np.diag([1.0, -1.0, 1.0, 1.0]))
+    assert mirror.volume() == pytest.approx(mesh.volume())
+    shear = np.eye(4)
+    shear[0, 2], shear[:3, 3] = 0.7, (1.0, 2.0, 3.0)
+    moved = mesh.transformed(shear)
+    made = face_normals(moved) / np.linalg.norm(face_normals(moved), axis=1, keepdims=True)
+    np.testing.assert_allclose(moved.normals[:, 0], made, atol=1e-5)
+    with pytest.raises(ConfigError, match="singular"):
+        mesh.transformed(np.zeros((3, 3)))
+
+
+def test_merge_joins_materials_and_panels() -> None:
+    a = box((1.0, 1.0, 1.0), material=GREY, panel="side")
+    b = box((1.0, 1.0, 1.0), material=RED, centre=(3.0, 0.0, 0.0), panel="top")
+    both = merge([a, b, a.moved(y=5.0)])
+    assert both.materials == (GREY, RED)
+    assert both.panels == ("side", "top")
+    assert both.volume() == pytest.approx(3.0)
+    assert both.painted().sum() == 12
+    assert both.panel_faces("side").sum() == 24
+    assert both.panel_scale("top") == pytest.approx(1.0)
+    with pytest.raises(ConfigError, match="no panel 'hood'; this mesh has: side, top"):
+        both.panel_rectangle("hood")
+
+
+def test_check_names_the_fault() -> None:
+    good = box((1.0, 1.0, 1.0), material=GREY)
+    good.check("cube.obj")
+    cases = {
+        "vertices hold NaN": {"vertices": np.full_like(good.vertices, np.nan)},
+        "vertex index is out of range": {"faces": good.faces + 1},
+        "material index is out of range": {"material": good.material + 1},
+        "panel index is out of range": {"panel": good.panel + 1},
+        r"leave \[0, 1\]": {"uv": good.uv + 0.5},
+        "faces have no area": {"faces": np.zeros_like(good.faces)},
+        "normals are not of unit length": {"normals": 2.0 * good.normals},
+        "have shape": {"uv": good.uv[:-1]},
+    }
+    for message, change in cases.items():
+        fields = {name: getattr(good, name) for name in Mesh.__dataclass_fields__}
+        with pytest.raises(FormatError, match=message) as error:
+            Mesh(**{**fields, **change}).check("cube.obj")
+        assert str(error.value).startswith("cube.obj: ")
+        assert "\n" not in str(error.value)
+
+
+# ---------------------------------------------------------------- bodies
+
+
+@pytest.mark.parametrize("detail", [0, 1, 2])
+@pytest.mark.parametrize(("kind", "style"), STYLES)
+def test_every_body_is_sound(kind: str, style: str, detail: int) -> None:
+    mesh = body(kind, style, detail)
+    mesh.check(f"{kind} {style}")
+    assert mesh.volume() > 0.0
+    turned = np.einsum("fci,fi->fc", mesh.normals, face_normals(mesh)) > 0
+    assert turned.mean() > 0.995
+    low, _ = mesh.bounds()
+    assert low[2] == pytest.approx(0.0, abs=0.09 if kind == "pedestrian" else 1e-5)
+    assert not (mesh.painted() & (mesh.panel < 0)).any(), "paint lies in a panel"
+
+
+@pytest.mark.parametrize("detail", [0, 1, 2])
+@pytest.mark.parametrize(("kind", "style"), [s for s in STYLES if s[0] != "pedestrian"])
+def test_a_body_fills_its_size_exactly(kind: str, style: str, detail: int) -> None:
+    size = np.array(BODIES[kind].styles[style].size) * [1.05, 0.96, 1.03]
+    mesh = make_body(kind, style=style, size=tuple(size), generator=generator(1), detail=detail)
+    low, high = mesh.bounds()
+    np.testing.assert_allclose(high, [0.5 * size[0], 0.5 * size[1], size[2]], atol=2e-5)
+    np.testing.assert_allclose(low, [-0.5 * size[0], -0.5 * size[1], 0.0], atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("style", "size"), [("adult", (0.73, 0.67, 1.77)), ("child", (0.5, 0.5, 1.2)), ("adult", (1.0, 0.9, 1.9))]
+)
+def test_a_walker_fills_its_box_over_the_cycle_and_never_leaves_it(
+    style: str, size: tuple[float, float, float]
+) -> None:
+    boxes = []
+    for phase in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
+        mesh = make_body("pedestrian", style=style, size=size, generator=generator(3), detail=2, phase=phase)
+        boxes.append(mesh.bounds())
+    low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+    half = np.array([0.5 * size[0], 0.5 * size[1], size[2]])
+    assert (low >= [-half[0] - 1e-5, -half[1] - 1e-5, -1e-5]).all()
+    assert (high <= half + 1e-5).all()
+    np.testing.assert_allclose(high - low, size, rtol=0.06)
+
+
+def test_walking_swings_opposite_legs() -> None:
+    forward = [
+        make_body("pedestrian", style="adult", generator=generator(9), phase=p).bounds()[1][0]
+        for p in (0.5 * np.pi, 0.0)
+    ]
+    assert forward[0] > forward[1] + 0.1
+    one, other = (
+        make_body("pedestrian", style="adult", generator=generator(9), phase=p) for p in (0.5 * np.pi, 1.5 * np.pi)
+    )
+    mirrored = one.transformed(np.diag([1.0, -1.0, 1.0]))
+    np.testing.assert_allclose(mirrored.bounds(), other.bounds(), atol=0.02)
+
+
+def test_a_standing_person_fills_the_box() -> None:
+    mesh = make_body("pedestrian", style="standing", size=(0.5, 0.6, 1.8), generator=generator(2))
+    low, high = mesh.bounds()
+    np.testing.assert_allclose(high - low, (0.5, 0.6, 1.8), atol=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "style"), STYLES)
+def test_panels_lie_apart_in_the_atlas_and_are_the_same_at_all_details(kind: str, style: str) -> None:
+    mesh = body(kind, style)
+    rectangles = np.array([mesh.panel_rectangle(p) for p in mesh.panels]).reshape(-1, 4)
+    assert (rectangles[:, :2] >= 0.0).all()
+    assert (rectangles[:, 2:] <= 1.0).all()
+    assert (rectangles[:, 2:] > rectangles[:, :2]).all()
+    for i, a in enumerate(rectangles):
+        for j, b in enumerate(rectangles[:i]):
+            width = min(a[2], b[2]) - max(a[0], b[0])
+            height = min(a[3], b[3]) - max(a[1], b[1])
+            assert min(width, height) < 1e-9, (mesh.panels[i], mesh.panels[j])
+            if mesh.panels[i].split("/")[0] != mesh.panels[j].split("/")[0]:
+                assert max(-width, -height) > 1.9 * MARGIN or min(width, height) < -1.9 * MARGIN
+    for detail in (0, 1):
+        other = body(kind, style, detail)
+        assert other.panels == mesh.panels
+        assert other.rectangles == mesh.rectangles
+    for name in {*(p.split("/")[0] for p in mesh.panels), *mesh.panels}:
+        chosen = mesh.panel_faces(name)
+        u0, v0, u1, v1 = mesh.panel_rectangle(name)
+        uv = mesh.uv[chosen]
+        assert uv.size == 0 or (uv.min(axis=(0, 1)) >= np.array([u0, v0]) - 5e-3).all()
+        assert uv.size == 0 or (uv.max(axis=(0, 1)) <= np.array([u1, v1]) + 5e-3).all()
+
+
+@pytest.mark.parametrize("style", BODIES["car"].styles)
+def test_car_panels_have_area_in_proportion_and_upright_texture(style: str) -> None:
+    mesh = body("car", style)
+    names = {"hood", "roof", "front", "rear", "left_side/front_door", "right_side/rear_door"}
+    assert names <= set(mesh.panels)
+    scales = [mesh.panel_scale(p) for p in (*names, "left_side", "right_side")]
+    assert max(scales) / min(scales) < 1.35
+    # left side: front of the car to the left of the texture, roof at its upper edge; the right side mirrors it
+    for name, sign in (("left_side", -1.0), ("right_side", 1.0)):
+        chosen = mesh.panel_faces(name)
+        p, uv = mesh.corners()[chosen].reshape(-1, 3), mesh.uv[chosen].reshape(-1, 2)
+        assert np.corrcoef(p[:, 0], uv[:, 0])[0, 1] * sign > 0.999
+        assert np.corrcoef(p[:, 2], uv[:, 1])[0, 1] < -0.999
+    rear = mesh.panel_faces("rear")
+    p, uv = mesh.corners()[rear].reshape(-1, 3), mesh.uv[rear].reshape(-1, 2)
+    assert np.corrcoef(p[:, 1], uv[:, 0])[0, 1] < -0.999
+
+
+@pytest.mark.parametrize("style", BODIES["car"].styles)
+def test_cars_cost_what_their_detail_says(style: str) -> None:
+    counts = [len(body("car", style, d).faces) for d in (0, 1, 2)]
+    assert counts[0] < 150
+    assert 800 <= counts[1] < counts[2] <= 5000
+    names = {m.name for m in body("car", style).materials}
+    assert {"paint", "glass", "tyre", "head_lamp", "tail_lamp", "plate", "trim"} <= names
+
+
+@pytest.mark.parametrize(("kind", "style"), [s for s in STYLES if s[0] in ("car", "truck", "bus", "trailer")])
+def test_the_silhouette_stays_at_low_detail(kind: str, style: str) -> None:
+    full, far = (silhouette(body(kind, style, d)) for d in (2, 0))
+    assert (full & far).sum() / (full | far).sum() > 0.86
+
+
+def silhouette(mesh: Mesh) -> np.ndarray:
+    """The side view (x, z) as filled pixels, [40, 100]."""
+    import cv2
+
+    low, high = mesh.bounds()
+    p = (mesh.corners()[..., [0, 2]] - low[[0, 2]]) / (high - low)[[0, 2]] * [99.0, 39.0]
+    image = np.zeros((40, 100), np.uint8)
+    for triangle in np.round(p).astype(np.int32):
+        cv2.fillConvexPoly(image, triangle, 1)
+    return image.astype(bool)
+
+
+@pytest.mark.parametrize("kind", BODIES)
+def test_a_body_depends_on_its_key_alone(kind: str) -> None:
+    one, same = (make_body(kind, generator=generator("a", 1), detail=1) for _ in range(2))
+    for name in ("vertices", "faces", "normals", "uv", "material", "panel"):
+        assert getattr(one, name).tobytes() == getattr(same, name).tobytes()
+    assert one.materials == same.materials
+    sizes = {tuple(np.round(make_body(kind, generator=generator("a", k), detail=0).bounds()[1], 4)) for k in range(6)}
+    assert len(sizes) > 3
+
+
+@pytest.mark.parametrize(("kind", "style"), STYLES)
+def test_what_is_drawn_does_not_depend_on_the_detail(kind: str, style: str) -> None:
+    states = []
+    for detail in (0, 2):
+        random = generator("draws", kind)
+        make_body(kind, style=style, generator=random, detail=detail)
+        states.append(random.random())
+    assert states[0] == states[1]
+
+
+def test_drawn_sizes_lie_about_their_mean() -> None:
+    random = generator("sizes")
+    sizes = np.array([draw_size("car", "sedan", generator=random) for _ in range(400)])
+    mean = np.array(BODIES["car"].styles["sedan"].size)
+    np.testing.assert_allclose(sizes.mean(axis=0), mean, rtol=0.01)
+    assert (np.abs(sizes / mean - 1.0) < 0.1).all()
+
+
+def test_paints_and_lights() -> None:
+    assert set(PAINTS) == set(PAINT_SHARES)
+    colours = np.array([draw_paint(generator("paint", k)) for k in range(50)])
+    assert ((colours >= 0.0) & (colours <= 0.9)).all()
+    mesh = body("car", "sedan").repainted({"paint": (0.1, 0.2, 0.3)}).relit({"tail_lamp": 0.9})
+    assert next(m for m in mesh.materials if m.paint).colour == (0.1, 0.2, 0.3)
+    assert next(m for m in mesh.materials if m.name == "tail_lamp").emission == 0.9
+    assert {"lamp_red", "lamp_yellow", "lamp_green"} <= {m.name for m in body("traffic_signal", "post").materials}
+    assert any(m.paint for kind in PAINTED for m in make_body(kind, generator=generator(0)).materials)
+
+
+def test_unknown_names_and_sizes_are_refused() -> None:
+    random = generator(0)
+    with pytest.raises(UnknownNameError, match="unknown body 'cra'; closest: car"):
+        make_body("cra", generator=random)
+    with pytest.raises(UnknownNameError, match="sedan"):
+        make_body("car", style="sedann", generator=random)
+    for size in ((4.0, 2.0, 0.0), (4.0, 2.0, np.nan), (1e6, 2.0, 1.5), (4.0, 2.0)):
+        with pytest.raises(ConfigError, match="three lengths"):
+            make_body("car", size=size, generator=random)
+    with pytest.raises(ConfigError, match="detail 3"):
+        make_body("car", generator=random, detail=3)
+
+
+def test_packing_fits_any_charts() -> None:
+    random = generator("pack")
+    charts = [Chart(f"c{k}", "front", (0.0, 0.0, 0.0), (0.0, *random.uniform(0.05, 5.0, 2))) for k in range(20)]
+    placed = pack(charts)
+    assert len({round(s, 12) for _, _, s in placed.values()}) == 1
+    for chart in charts:
+        u, v, scale = placed[chart.name]
+        width, height = chart.extent()
+        assert u + width * scale <= 1.0 - MARGIN + 1e-9
+        assert v + height * scale <= 1.0 - MARGIN + 1e-9
+
+
+# ---------------------------------------------------------------- OBJ
+
+
+QUAD = """
+mtllib m.mtl
+v 0 0 0
+v 2 0 0
+v 2 1 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+g panel
+usemtl body
+f 1/1 2/2 3/3 4/4
+f -5/1 -3/3 -1/4
+"""
+
+
+def write(folder: Path, text: str, name: str = "m.obj") -> Path:
+    (folder / "m.mtl").write_text("newmtl body\nKd 0.1 0.2 0.3\nKs 0.2 0.2 0.2\nNs 250\nKe 0 0 0\n")
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_obj_reads_polygons_negative_indices_and_colours(tmp_path: Path) -> None:
+    mesh = load_mesh(write(tmp_path, QUAD))
+    assert len(mesh.faces) == 3
+    assert mesh.panels == ("panel",)
+    (look,) = mesh.materials
+    assert (look.name, look.colour, look.paint) == ("body", (0.1, 0.2, 0.3), True)
+    assert (look.specular, look.gloss) == pytest.approx((0.2, 0.5))
+    assert mesh.areas()[:2].sum() == pytest.approx(2.0)
+    low, high = mesh.bounds()
+    np.testing.assert_allclose([low, high], [[-1.0, -0.5, 0.0], [1.0, 0.5, 1.0]], atol=1e-6)
+    # v runs down: the file's lower left corner is the lower left of the image
+    first = np.argmin(np.linalg.norm(mesh.corners()[:2] - low, axis=-1).reshape(-1))
+    np.testing.assert_allclose(mesh.uv[:2].reshape(-1, 2)[first], [0.0, 1.0], atol=1e-6)
+
+
+def test_obj_units_axes_and_size(tmp_path: Path) -> None:
+    path = write(tmp_path, QUAD)
+    low, high = load_mesh(path, unit=0.5, up="y", forward="-z").bounds()
+    np.testing.assert_allclose(high - low, [0.5, 1.0, 0.5], atol=1e-6)
+    low, high = load_mesh(path, size=(4.0, 2.0, 1.5)).bounds()
+    np.testing.assert_allclose(high - low, [4.0, 2.0, 1.5], atol=1e-5)
+    with pytest.raises(ConfigError, match="not two different axes"):
+        load_mesh(path, up="z", forward="-z")
+    with pytest.raises(ConfigError, match="unit"):
+        load_mesh(path, unit=0.0)
+
+
+def test_a_concave_polygon_keeps_its_area(tmp_path: Path) -> None:
+    text = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\nv 1 2 0\nv 0 2 0\nv 0 0 1\nvt 0 0\n"
+    mesh = load_mesh(write(tmp_path, text + "f 1/1 2/1 3/1 4/1 5/1 6/1\nf 1/1 2/1 7/1\n"))
+    assert mesh.areas().sum() == pytest.approx(3.0 + 1.0)
+
+
+@pytest.mark.parametrize("kind", ["car", "pedestrian", "trailer"])
+def test_obj_round_trip(kind: str, tmp_path: Path) -> None:
+    mesh = make_body(kind, generator=generator("obj"), detail=1)
+    save_obj(mesh, tmp_path / "body.obj")
+    read = load_mesh(tmp_path / "body.obj", paint=[m.name for m in mesh.materials if m.paint])
+    assert len(read.faces) == len(mesh.faces)
+    low, _ = mesh.bounds()
+    shift = (
+        [0.0, 0.0, low[2]]
+        if kind != "pedestrian"
+        else mesh.corners().reshape(-1, 3)[0] - read.corners().reshape(-1, 3)[0]
+    )
+    np.testing.assert_allclose(read.corners() + shift, mesh.corners(), atol=1e-4)
+    np.testing.assert_allclose(read.normals, mesh.normals, atol=1e-3)
+    painted = mesh.painted()
+    np.testing.assert_array_equal(read.painted(), painted)
+    np.testing.assert_allclose(read.uv[painted], mesh.uv[painted], atol=1e-5)
+    names = [mesh.materials[i].name for i in mesh.material]
+    assert [read.materials[i].name for i in read.material] == names
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", r"m\.obj:4: a face has no texture coordinates"),
+        ("v 0 0 nan\n", r"m\.obj:1: NaN"),
+        ("v 0 0 inf\n", r"m\.obj:1: NaN or infinity"),
+        ("v 0 0\n", r"m\.obj:1: 2 numbers where 3"),
+        ("v a b c\n", r"m\.obj:1: 'a b c' is not a list of numbers"),
+        ("v 0 0 0\nvt 0 0\nf 1/1 2/1 1/1\n", r"m\.obj:3: vertex index 2 is out of range \(there are 1\)"),
+        ("v 0 0 0\nvt 0 0\nf 1/1 1/7 1/1\n", r"m\.obj:3: texture index 7"),
+        ("v 0 0 0\nvt 0 0\nf 0/1 1/1 1/1\n", r"m\.obj:3: vertex index 0"),
+        ("v 0 0 0\nvt 0 0\nf 1/1 1/1\n", r"m\.obj:3: a face needs three corners"),
+        ("v 0 0 0\nvt 0 0\nf x 1/1 1/1\n", r"m\.obj:3: 'x' is not a corner"),
+        ("v 0 0 0\nvt 0 0\nf 1/1" + " 1/1" * 1200 + "\n", "triangulate the mesh"),
+        ("mtllib ../../etc/passwd\n", "outside its folder"),
+        ("mtllib /etc/passwd\n", "outside its folder"),
+        ("mtllib missing.mtl\n", r"missing\.mtl: no such file"),
+        ("# nothing\n", "no faces"),
+        (QUAD.replace("vt 1 1", "vt 1 5"), "over a tile's edge"),
+        (QUAD.replace("v 2", "v 2e9"), "set unit"),
+    ],
+)
+def test_broken_obj_files_get_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(FormatError, match=message) as error:
+        load_mesh(path)
+    assert "\n" not in str(error.value)
+
+
+def test_other_broken_files(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no such file"):
+        load_mesh(tmp_path / "none.obj")
+    with pytest.raises(FormatError, match=r"give an \.obj, \.gltf or \.glb file"):
+        load_mesh(tmp_path / "body.fbx")
+    (tmp_path / "binary.obj").write_bytes(b"\xff\xfe\x00v 0 0 0")
+    with pytest.raises(FormatError, match="not UTF-8"):
+        load_mesh(tmp_path / "binary.obj")
+    path = write(tmp_path, QUAD)
+    with pytest.raises(ConfigError, match="no material 'hull' to paint; it has: body"):
+        load_mesh(path, paint=["hull"])
+    (tmp_path / "m.mtl").write_text("newmtl body\nKd red\n")
+    with pytest.raises(FormatError, match=r"m\.mtl:2: 'Kd red' is not a colour"):
+        load_mesh(path)
+
+
+def test_tiled_coordinates_pass_on_what_is_not_painted(tmp_path: Path) -> None:
+    text = QUAD.replace("vt 1 1", "vt 1 5").replace("usemtl body", "usemtl tyre")
+    text += "usemtl body\nvt 3.25 2.5\nvt 3.75 2.5\nvt 3.75 2.75\nf 1/5 2/6 5/7\n"
+    mesh = load_mesh(write(tmp_path, text), paint=["body"])
+    assert mesh.painted().sum() == 1
+    np.testing.assert_allclose(mesh.uv[mesh.painted()][0], [[0.25, 0.5], [0.75, 0.5], [0.75, 0.25]], atol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text(alphabet="vftnmgo /0123456789.-e\n#\\u", max_size=200))
+def test_any_text_is_a_mesh_or_one_line(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.mktemp("obj") / "m.obj"
+    path.write_text(text)
+    with pytest.raises(FormatError):
+        load_mesh(path)
+
+
+# ---------------------------------------------------------------- glTF
+
+
+def gltf_tree(mesh: Mesh) -> tuple[dict, bytes]:
+    """A glTF tree (y up, front to +z) and its buffer, one primitive for each material."""
+    turn = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    blob = b""
+    views, accessors, primitives = [], [], []
+
+    def add(array: np.ndarray, component: int, kind: str) -> int:
+        nonlocal blob
+        data = array.tobytes()
+        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data)})
+        accessors.append({"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind})
+        blob += data + b"\0" * (-len(data) % 4)
+        return len(accessors) - 1
+
+    for k in range(len(mesh.materials)):
+        chosen = mesh.material == k
+        corners = mesh.corners()[chosen].reshape(-1, 3)
+        attributes = {
+            "POSITION": add((corners @ turn.T).astype("<f4"), 5126, "VEC3"),
+            "NORMAL": add((mesh.normals[chosen].reshape(-1, 3) @ turn.T).astype("<f4"), 5126, "VEC3"),
+            "TEXCOORD_0": add(mesh.uv[chosen].reshape(-1, 2).astype("<f4"), 5126, "VEC2"),
+        }
+        indices = add(np.arange(len(corners), dtype="<u4"), 5125, "SCALAR")
+        primitives.append({"attributes": attributes, "indices": indices, "material": k})
+    tree = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1], "scale": [0.5, 0.5, 0.5]}, {"mesh": 0, "name": "hull", "scale": [2.0, 2.0, 2.0]}],
+        "meshes": [{"primitives": primitives}],
+        "materials": [
+            {
+                "name": m.name,
+                "pbrMetallicRoughness": {"baseColorFactor": [*m.colour, 1.0], "roughnessFactor": 1.0 - m.gloss},
+            }
+            for m in mesh.materials
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    return tree, blob
+
+
+def save_glb(path: Path, tree: dict, blob: bytes) -> None:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(blob), 0x004E4942) + blob
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+
+
+@pytest.mark.parametrize("form", ["glb", "data URI", "file"])
+def test_gltf_round_trip(form: str, tmp_path: Path) -> None:
+    mesh = body("car", "suv", 1)
+    tree, blob = gltf_tree(mesh)
+    path = tmp_path / ("m.glb" if form == "glb" else "m.gltf")
+    if form == "glb":
+        save_glb(path, tree, blob)
+    else:
+        (tmp_path / "the data.bin").write_bytes(blob)
+        uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+        tree["buffers"][0]["uri"] = uri if form == "data URI" else "the%20data.bin"
+        path.write_text(json.dumps(tree))
+    read = load_mesh(path)
+    order = np.argsort(mesh.material, kind="stable")
+    np.testing.assert_allclose(read.corners(), mesh.corners()[order], atol=1e-4)
+    np.testing.assert_allclose(read.normals, mesh.normals[order], atol=1e-3)
+    np.testing.assert_allclose(read.uv, mesh.uv[order], atol=1e-5)
+    assert read.panels == ("hull",)
+    assert [m.name for m in read.materials][:-1] == [m.name for m in mesh.materials]
+    np.testing.assert_allclose(read.materials[0].colour, mesh.materials[0].colour)
+
+
+def test_gltf_strips_fans_mirrors_and_normalised_coordinates(tmp_path: Path) -> None:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]], "<f4")
+    uv = np.array([[0, 0], [65535, 0], [0, 65535], [65535, 65535]], "<u2")
+    blob = corners.tobytes() + uv.tobytes()
+    tree = {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}, {"mesh": 0, "scale": [-1, 1, 1], "rotation": [0, 0, 0, 1]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "mode": 5}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 4, "type": "VEC2", "normalized": True},
+        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 48}, {"buffer": 0, "byteOffset": 48, "byteLength": 16}],
+        "buffers": [{"byteLength": 64}],
+    }
+    save_glb(tmp_path / "m.glb", tree, blob)
+    mesh = load_mesh(tmp_path / "m.glb", up="z", forward="x")
+    assert len(mesh.faces) == 4
+    assert (face_normals(mesh)[:, 2] > 0).all(), "a strip turns every other triangle, a mirror all of them"
+    assert mesh.uv.max() == 1.0
+    tree["meshes"][0]["primitives"][0]["mode"] = 6
+    save_glb(tmp_path / "m.glb", tree, blob)
+    assert len(load_mesh(tmp_path / "m.glb").faces) == 4
+
+
+def set_in(tree: dict, path: str, value: object) -> None:
+    *head, last = [int(p) if p.isdigit() else p for p in path.split("/")]
+    for key in head:
+        tree = tree[key]
+    if value is None:
+        del tree[last]
+    else:
+        tree[last] = value
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("asset/version", "1.0", "only version 2"),
+        ("extensionsRequired", ["KHR_draco_mesh_compression"], "requires the extension KHR_draco"),
+        ("meshes/0/primitives/0/attributes/TEXCOORD_0", None, "no texture coordinates"),
+        ("meshes/0/primitives/0/attributes/POSITION", 99, r"accessors\[99\] does not exist"),
+        ("accessors/0/count", 10**12, "simplify the mesh"),
+        ("accessors/0/count", 2000, "cut short"),
+        ("accessors/0/count", -1, "entries"),
+        ("accessors/0/byteOffset", -4, "cut short"),
+        ("accessors/0/type", "MAT4", "where VEC3 is needed"),
+        ("accessors/0/sparse", {}, "sparse"),
+        ("bufferViews/0/byteLength", 10**9, "cut short"),
+        ("bufferViews/0/byteStride", 2, "cut short"),
+        ("buffers/0/byteLength", 10**9, "cut short"),
+        ("buffers/0/uri", "../secret.bin", "outside its folder"),
+        ("buffers/0/uri", "file:///etc/passwd", "outside its folder"),
+        ("buffers/0/uri", "http://example.org/x.bin", "outside its folder"),
+        ("buffers/0/uri", "data:application/octet-stream;base64,!!", "not base64"),
+        ("nodes/1/children", [0], "loop"),
+        ("nodes/1/scale", [0, 1, 1], "singular"),
+        ("nodes/1/scale", [1], "not a valid glTF file|singular|triangles"),
+        ("nodes/1/rotation", "north", "not a valid glTF file"),
+        ("nodes/1/mesh", -1, r"meshes\[-1\] does not exist"),
+        ("scenes/0/nodes", [], "no triangles"),
+        ("materials/0/pbrMetallicRoughness", {"baseColorFactor": ["red", 0, 0]}, "not a valid glTF file"),
+        ("meshes", "none", "not a valid glTF file|does not exist"),
+    ],
+)
+def test_broken_gltf_files_get_one_line(path: str, value: object, message: str, tmp_path: Path) -> None:
+    tree, blob = gltf_tree(box((1.0, 1.0, 1.0), material=GREY))
+    set_in(tree, path, value)
+    if "scale" in path and value == [1]:
+        message = "not a valid glTF file"
+    save_glb(tmp_path / "m.glb", tree, blob)
+    with pytest.raises(FormatError, match=message) as error:
+        load_mesh(tmp_path / "m.glb")
+    assert "\n" not in str(error.value)
+
+
+def test_gltf_values_that_break_geometry(tmp_path: Path) -> None:
+    tree, blob = gltf_tree(box((1.0, 1.0, 1.0), material=GREY))
+    bad = bytearray(blob)
+    bad[:4] = struct.pack("<f", np.nan)
+    save_glb(tmp_path / "m.glb", tree, bytes(bad))
+    with pytest.raises(FormatError, match="vertices hold NaN"):
+        load_mesh(tmp_path / "m.glb")
+    start = tree["bufferViews"][-1]["byteOffset"]
+    bad = bytearray(blob)
+    bad[start : start + 4] = struct.pack("<I", 4_000_000)
+    save_glb(tmp_path / "m.glb", tree, bytes(bad))
+    with pytest.raises(FormatError, match="index 4000000 is out of range"):
+        load_mesh(tmp_path / "m.glb")
+
+
+@settings(max_examples=60, deadline=None)
+@given(cut=st.integers(0, 3000), flip=st.integers(0, 3000), value=st.integers(0, 255))
+def test_damaged_glb_files_get_one_line_or_load(
+    tmp_path_factory: pytest.TempPathFactory, cut: int, flip: int, value: int
+) -> None:
+    tree, blob = gltf_tree(box((1.0, 1.0, 1.0), material=GREY))
+    path = tmp_path_factory.mktemp("glb") / "m.glb"
+    save_glb(path, tree, blob)
+    data = bytearray(path.read_bytes())
+    data[flip % len(data)] = value
+    path.write_bytes(bytes(data[: len(data) - cut % len(data)] if cut % 2 else data))
+    with contextlib.suppress(FormatError):
+        load_mesh(path).check()
+
+
+def test_an_open_loft_has_no_caps() -> None:
+    square = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+    open_side = loft(np.stack([square, square + np.array([0.0, 0.0, 1.0])]), material=GREY, closed=False)
+    assert open_side.areas().sum() == pytest.approx(3.0)
+    assert open_side.uv.min() == 0.0
+    assert open_side.uv.max() == 1.0

@@ -1,0 +1,53 @@
+"""Names: tables, the user's own module:object, and what goes wrong with them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.registry import names, resolve
+
+TABLE = {"loads": "json:loads", "dumps": "json:dumps"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return tmp_path
+
+
+def test_table_and_own_module(folder: Path) -> None:
+    import json
+
+    assert resolve("thing", TABLE, "loads") is json.loads
+    (folder / "own_module_a.py").write_text("class Outer:\n    class Inner: pass\n")
+    assert resolve("thing", TABLE, "own_module_a:Outer.Inner").__name__ == "Inner"
+    assert names("thing", TABLE) == TABLE
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "message"),
+    [
+        (None, "load", "closest: loads"),
+        (None, "not_there_at_all:X", "No module named"),
+        ("raise RuntimeError('boom')", "own:X", "RuntimeError: boom"),
+        ("x = (", "own:X", "SyntaxError"),
+        ("import not_there_either", "own:X", "not_there_either"),
+        ("class Driver: pass", "own:Diver", "closest: Driver"),
+        ("", "own:", "module:object"),
+        ("", "../own:X", "module:object"),
+    ],
+)
+def test_errors_are_one_line(folder: Path, source: str | None, name: str, message: str) -> None:
+    if source is not None:
+        (folder / "own.py").write_text(source)
+        sys.modules.pop("own", None)
+    with pytest.raises(ConfigError, match="thing") as caught:
+        resolve("thing", TABLE, name)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert isinstance(caught.value, UnknownNameError) == (source is None and ":" not in name)

@@ -1,0 +1,86 @@
+"""Traces keep every bit, and say where two of them part."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssad.core.errors import FormatError
+from ssad.core.traces import first_difference, load_trace, save_trace, trace_hash
+from ssad.core.types import EpisodeTrace
+
+T, A, S = 5, 3, 2
+
+
+def make_trace(seed: int = 0) -> EpisodeTrace:
+    rng = np.random.default_rng(seed)
+    shapes = {"kind": (A,), "length": (A,), "width": (A,), "signal_ids": (S,), "signal": (T, S), "route": (7, 2)}
+    shapes |= dict.fromkeys(("x", "y", "yaw", "speed", "active"), (T, A))
+    kinds = {"F32": np.float32, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
+    values = {
+        f.name: (rng.random(shapes.get(f.name, (T,))) * 3).astype(kinds[str(f.type)])
+        for f in fields(EpisodeTrace)
+        if str(f.type) in kinds
+    }
+    return EpisodeTrace(
+        key="k", town="Town", dt=0.1, names=("ego", "a", "b"), models=("car",) * 3, end="complete", **values
+    )
+
+
+def test_round_trip_to_the_bit(tmp_path: Path) -> None:
+    trace = make_trace()
+    save_trace(tmp_path / "t.npz", trace)
+    loaded = load_trace(tmp_path / "t.npz")
+    assert first_difference(trace, loaded) is None
+    assert trace_hash(loaded) == trace_hash(trace)
+    for field in fields(EpisodeTrace):
+        one, two = getattr(trace, field.name), getattr(loaded, field.name)
+        assert np.array_equal(one, two), field.name
+    before = (tmp_path / "t.npz").read_bytes()
+    save_trace(tmp_path / "t.npz", loaded)
+    assert (tmp_path / "t.npz").read_bytes() == before
+
+
+def test_without_signals(tmp_path: Path) -> None:
+    trace = replace(make_trace(), signal_ids=np.zeros(0, np.int32), signal=np.zeros((T, 0), np.uint8))
+    save_trace(tmp_path / "t.npz", trace)
+    assert first_difference(trace, load_trace(tmp_path / "t.npz")) is None
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(EpisodeTrace) if f.name not in ("names", "models")])
+def test_any_change_shows(name: str) -> None:
+    trace = make_trace()
+    value = getattr(trace, name)
+    if isinstance(value, np.ndarray):
+        changed = value.copy()
+        changed.reshape(-1).view(np.uint8)[-1] ^= 1
+    else:
+        changed = value + 1 if isinstance(value, float) else value + "x"
+    other = replace(trace, **{name: changed})
+    assert name in str(first_difference(trace, other))
+    assert trace_hash(trace) != trace_hash(other)
+
+
+def test_difference_names_the_first_step() -> None:
+    trace = make_trace()
+    x, speed = trace.x.copy(), trace.speed.copy()
+    x[3, 1] = np.nextafter(x[3, 1], np.float32(9))
+    speed[4, 0] += 1
+    assert str(first_difference(trace, replace(trace, x=x, speed=speed))).startswith("step 3: x")
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", x=np.zeros(3))
+    with pytest.raises(FormatError, match="not an episode trace"):
+        load_trace(tmp_path / "a.npz")
+    save_trace(tmp_path / "t.npz", make_trace())
+    data = (tmp_path / "t.npz").read_bytes()
+    (tmp_path / "t.npz").write_bytes(data[: len(data) // 2])
+    with pytest.raises(FormatError, match=r"t\.npz"):
+        load_trace(tmp_path / "t.npz")
+    save_trace(tmp_path / "t.npz", replace(make_trace(), x=np.zeros((2, 2), np.float32)))
+    with pytest.raises(FormatError, match="x has shape"):
+        load_trace(tmp_path / "t.npz")

@@ -1,0 +1,437 @@
+"""Pictures of one car for 2D detection: what `ssad record --clips` writes."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from ssad.assets.bodies import BODIES
+from ssad.camera.labels import label_picture
+from ssad.camera.render import View, Weather, render
+from ssad.camera.scene import Thing
+from ssad.core.errors import ConfigError, StoreError
+from ssad.core.frames import Camera
+from ssad.core.seeding import generator
+from ssad.core.types import F64
+from ssad.recording.clip_recorder import (
+    CLASSES,
+    HIDDEN,
+    SEEN,
+    SMALL,
+    TARGET,
+    Clips,
+    _prepare,
+    _Set,
+    pair_images,
+    record_clips,
+)
+from ssad.recording.nuscenes_recorder import NOISE
+from ssad.recording.viewpoints import AIM, EYE, follow, look_at, polar, turn_of, weather_name
+
+PAIRS = (("Twinford", 4), ("Oldmarket", 3))
+DISTANCES, AZIMUTHS, ELEVATIONS = (5.0, 10.0, 20.0), (0.0, 90.0, 180.0, 270.0), (0.0, 15.0, 30.0)
+
+
+def todo(out: Path, mode: str, **changes: Any) -> Clips:
+    """A small recording."""
+    given: dict[str, Any] = {"images": PAIRS, "mode": mode, "size": 160, "held_out": ("Oldmarket",)}
+    if mode == "orbit":
+        given |= {"distances": DISTANCES, "azimuths": AZIMUTHS, "elevations": ELEVATIONS}
+    return Clips(out, **(given | changes))
+
+
+def contents(root: Path) -> dict[str, str]:
+    """Hash of every picture and page."""
+    return {
+        str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(root.rglob("*"))
+        if p.is_file() and ".parts" not in p.parts
+    }
+
+
+def read(root: Path, split: str = "all") -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((root / "annotations" / f"{split}.json").read_text())
+    return found
+
+
+class Stopped(Exception):
+    """Somebody ended the recording."""
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording that was stopped after its first part and then gone on with."""
+    out = tmp_path_factory.mktemp("drive") / "a"
+
+    def stop(done: int, of: int) -> None:
+        assert (done, of) == (1, 2)
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        record_clips(todo(out, "drive"), workers=1, progress=stop)
+    assert not (out / "annotations").exists()
+    page = out / ".parts" / "drive-twinford-000" / "part.json"
+    assert list((out / ".parts").glob("*/part.json")) == [page]
+    # what a kill leaves of the next part
+    (out / "images" / "drive-oldmarket-000-001.jpg").write_bytes(b"torn")
+    steps: list[tuple[int, int]] = []
+    before = page.stat().st_mtime_ns
+    record_clips(todo(out, "drive"), workers=1, progress=lambda done, of: steps.append((done, of)))
+    assert steps == [(1, 2), (2, 2)]
+    assert page.stat().st_mtime_ns == before, "what was there is left alone"
+    return out
+
+
+@pytest.fixture(scope="module")
+def market(drives: Path) -> _Set:
+    """The drive of the pictures in Oldmarket, made again."""
+    return _prepare(todo(drives, "drive"), "Oldmarket", (0, "drive", "Oldmarket", 0, 0))
+
+
+@pytest.fixture(scope="module")
+def orbits(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_clips(todo(tmp_path_factory.mktemp("orbit") / "a", "orbit"), workers=1)
+
+
+def target_of(data: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
+    """The one annotation of a picture's target."""
+    own = [a for a in data["annotations"] if a["image_id"] == row["id"] and a["target"]]
+    assert len(own) == 1
+    return dict(own[0])
+
+
+def place_of(row: dict[str, Any]) -> tuple[float, float, float]:
+    """Distance, azimuth and elevation of a row's camera, from its poses."""
+    pose, target = np.array(row["pose"]), np.array(row["target_pose"])
+    ahead, left, up = np.linalg.inv(target)[:3] @ [*pose[:3, 3], 1.0] - [0.0, 0.0, AIM]
+    away = float(np.sqrt(ahead**2 + left**2 + up**2))
+    return away, float(np.degrees(np.arctan2(left, ahead))) % 360.0, float(np.degrees(np.arcsin(up / away)))
+
+
+def turned(a: float, b: float) -> float:
+    """Degrees between two angles."""
+    return abs((a - b + 180.0) % 360.0 - 180.0)
+
+
+def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: _Set) -> None:
+    rows = read(drives)["images"]
+    for row in rows:
+        away, azimuth, elevation = place_of(row)
+        assert row["distance"] == pytest.approx(away, abs=0.01)
+        assert 10.0 < away < 20.1
+        assert turned(row["azimuth"], azimuth) < 0.1
+        assert row["elevation"] == pytest.approx(elevation, abs=0.1)
+        assert np.array(row["pose"])[2, 3] == pytest.approx(2.0)
+    # one that takes the place of another comes out of turn
+    for before, after in pairwise(sorted(rows, key=lambda row: (row["drive"], row["time"]))):
+        if before["drive"] == after["drive"]:
+            assert after["way"] - before["way"] >= 1.0 - 0.011
+            moved = np.array(after["target_pose"])[:2, 3] - np.array(before["target_pose"])[:2, 3]
+            assert np.hypot(*moved) >= 0.9, "on a bend the chord is shorter than the way"
+    assert len({row["drive"] for row in rows}) == 2
+    trace = market.trace
+    xy = np.stack([trace.x[:, 0], trace.y[:, 0]], -1).astype(float)
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    for row in [r for r in rows if r["town"] == "Oldmarket"]:
+        step = round(row["time"] / trace.dt)
+        assert np.allclose(np.array(row["target_pose"])[:2, 3], xy[step], atol=1e-3)
+        assert row["way"] == pytest.approx(way[step], abs=0.1)
+        behind = [np.interp(way[step] - 20.0, way, xy[:, k]) for k in (0, 1)]
+        assert np.hypot(*(np.array(row["pose"])[:2, 3] - behind)) < 0.15
+
+
+def test_an_orbit_is_seen_from_where_its_row_says(orbits: Path) -> None:
+    rows = read(orbits)["images"]
+    assert len({row["target_style"] for row in rows}) > 1
+    cells = set()
+    for row in rows:
+        away, azimuth, elevation = place_of(row)
+        assert away == pytest.approx(row["distance"], abs=0.01)
+        assert turned(azimuth, row["azimuth"]) < 0.05
+        lowest = float(np.degrees(np.arcsin((EYE - AIM) / row["distance"])))
+        assert elevation == pytest.approx(max(row["elevation"], lowest), abs=0.05)
+        assert (row["distance"], row["azimuth"], row["elevation"]) not in cells or row["town"] != "Twinford"
+        cells.add((row["distance"], row["azimuth"], row["elevation"]))
+    assert {c[0] for c in cells} <= set(DISTANCES)
+    assert {c[1] for c in cells} <= set(AZIMUTHS)
+    assert {c[2] for c in cells} <= set(ELEVATIONS)
+
+
+def test_towns_of_train_and_test_are_apart(drives: Path, orbits: Path) -> None:
+    for root in (drives, orbits):
+        parts = {split: read(root, split) for split in ("train", "test", "all")}
+        assert {row["town"] for row in parts["train"]["images"]} == {"Twinford"}
+        assert {row["town"] for row in parts["test"]["images"]} == {"Oldmarket"}
+        for split, data in parts.items():
+            files = [row["file_name"] for row in data["images"]]
+            assert len(set(files)) == len(files) == data["info"]["images"]
+            assert data["info"]["split"] == split
+            assert sum(data["info"]["weathers"].values()) == len(files)
+            names = {c["id"]: c["name"] for c in data["categories"]}
+            counts = Counter(names[a["category_id"]] for a in data["annotations"] if not a["iscrowd"])
+            assert data["info"]["objects"] == counts
+        whole = [row["file_name"] for split in ("train", "test") for row in parts[split]["images"]]
+        assert [row["file_name"] for row in parts["all"]["images"]] == whole
+        assert sorted(p.name for p in (root / "images").iterdir()) == sorted(whole)
+
+
+@pytest.mark.parametrize("mode", ["drives", "orbits"])
+def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, request: pytest.FixtureRequest) -> None:
+    root = request.getfixturevalue(mode)
+    data = read(root)
+    sizes = {row["id"]: (row["width"], row["height"]) for row in data["images"]}
+    for thing in data["annotations"]:
+        x, y, w, h = thing["bbox"]
+        width, height = sizes[thing["image_id"]]
+        assert w > 0
+        assert h > 0
+        assert 0 <= x < x + w <= width
+        assert 0 <= y < y + h <= height
+        assert 0 < thing["area"] <= w * h
+        # the share is rounded to three decimals
+        if abs(thing["visible"] - HIDDEN) > 1e-3:
+            assert thing["iscrowd"] == (min(w, h) < SMALL or thing["visible"] < HIDDEN)
+    for row in data["images"]:
+        image = cv2.imread(str(root / "images" / row["file_name"]))
+        assert image is not None
+        assert image.shape == (row["height"], row["width"], 3)
+        assert row["weather"] == weather_name(Weather(**row["light"]))
+        thing = target_of(data, row)
+        assert not thing["iscrowd"]
+        assert thing["visible"] >= SEEN
+        assert data["categories"][thing["category_id"] - 1]["name"] == "car"
+        x0, y0, x1, y1 = projected(row)
+        x, y, w, h = thing["bbox"]
+        assert x0 - 1 <= x
+        assert y0 - 1 <= y
+        assert x + w <= x1 + 1
+        assert y + h <= y1 + 1
+        if thing["visible"] == 1.0:
+            assert w * h > 0.5 * (x1 - x0) * (y1 - y0)
+
+
+def projected(row: dict[str, Any]) -> F64:
+    """x0, y0, x1, y1 of the target's 3D box in its picture, cut at the borders."""
+    half = np.array(row["target_size"]) / 2
+    corners = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) * half + [0, 0, half[2]]
+    target, pose = np.array(row["target_pose"]), np.linalg.inv(np.array(row["pose"]))
+    seen = (corners @ target[:3, :3].T + target[:3, 3]) @ pose[:3, :3].T + pose[:3, 3]
+    pixels = seen @ np.array(row["intrinsic"]).T
+    # pixel x spans x..x+1 in a box, its middle is x in the matrix
+    xy = (pixels[:, :2] / pixels[:, 2:] + 0.5).clip(0, [row["width"], row["height"]])
+    return np.concatenate([xy.min(0), xy.max(0)])
+
+
+def test_a_row_tells_all_to_draw_the_picture_again(drives: Path, market: _Set) -> None:
+    data, made, target = read(drives, "test"), market, market.targets[0]
+    for row in data["images"]:
+        assert row["drive"] == made.trace.key
+        assert (row["target_style"], row["target_size"]) == (target.style, [round(v, 3) for v in target.size])
+        camera = Camera(row["width"], row["height"], np.array(row["intrinsic"]))
+        pose = np.array(row["pose"])
+        own = Thing(target.meshes[0], np.array(row["target_pose"]), target.paint, TARGET)
+        around = made.cast.at(row["time"], pose[:2, 3], 150.0)
+        view = View(camera, pose, (own, *(s.thing for s in around)), Weather(**row["light"]), NOISE, 1)
+        picture = render(made.stage, [view], linear=False)
+        labels = label_picture(made.stage, view, picture)
+        box = labels.box[labels.tag == TARGET][0]
+        x, y, w, h = target_of(data, row)["bbox"]
+        assert np.abs(box - [x, y, x + w, y + h]).max() <= 1.0
+        stored = cv2.imread(str(drives / "images" / row["file_name"]))
+        assert stored is not None
+        assert np.abs(stored[..., ::-1].astype(float) - picture.image[0]).mean() < 8.0
+
+
+def test_pycocotools_reads_it_and_the_truth_scores_1(drives: Path, orbits: Path) -> None:
+    coco = pytest.importorskip("pycocotools.coco")
+    evaluation = pytest.importorskip("pycocotools.cocoeval")
+    for root in (drives, orbits):
+        with contextlib.redirect_stdout(io.StringIO()):
+            truth = coco.COCO(str(root / "annotations" / "all.json"))
+            assert [c["name"] for c in truth.loadCats(truth.getCatIds())] == list(CLASSES)
+            said = [
+                {"image_id": a["image_id"], "category_id": a["category_id"], "bbox": a["bbox"], "score": 0.9}
+                for a in truth.dataset["annotations"]
+                if not a["iscrowd"]
+            ]
+            found = evaluation.COCOeval(truth, truth.loadRes(said), "bbox")
+            found.params.maxDets = [1, 10, 1000]
+            found.evaluate()
+            found.accumulate()
+        precision = found.eval["precision"][..., 0, -1]
+        assert (precision > -1).any()
+        assert (precision[precision > -1] > 1 - 1e-9).all()
+
+
+def test_same_bytes_for_two_workers_without_a_stop(drives: Path, tmp_path: Path) -> None:
+    record_clips(todo(tmp_path, "drive"), workers=2)
+    assert contents(tmp_path) == contents(drives)
+    record_clips(todo(tmp_path, "drive"), workers=1)
+    assert contents(tmp_path) == contents(drives), "all is there: again changes nothing"
+
+
+@pytest.mark.slow
+def test_same_bytes_of_an_orbit_for_two_workers_and_after_kill_9(orbits: Path, tmp_path: Path) -> None:
+    record_clips(todo(tmp_path / "d", "orbit"), workers=2)
+    assert contents(tmp_path / "d") == contents(orbits)
+    command = [sys.executable, "-m", "ssad.cli", "record", str(tmp_path / "e"), "--clips", "orbit", "--images", "2,1"]
+    command += ["--towns", "Twinford,Oldmarket", "--held-out", "Oldmarket", "--style", "van", "--workers", "2"]
+    for pause in (5.0, 7.0):
+        with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:
+            time.sleep(pause)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    command[4] = str(tmp_path / "f")
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    assert contents(tmp_path / "e") == contents(tmp_path / "f")
+    assert {row["target_style"] for row in read(tmp_path / "f")["images"]} == {"van"}
+
+
+@pytest.mark.slow
+def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_path: Path) -> None:
+    out = record_clips(todo(tmp_path, "orbit", images=(("Crossgate", 36),), held_out=()), workers=2)
+    data = read(out)
+    assert len({row["drive"] for row in data["images"]}) >= 2
+    assert len({(row["distance"], row["azimuth"], row["elevation"]) for row in data["images"]}) == 36
+    assert read(out, "test")["images"] == []
+
+
+def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path) -> None:
+    for changes in ({"seed": 1}, {"size": 168}, {"style": "van"}, {"images": PAIRS[:1]}):
+        with pytest.raises(StoreError, match="another recording") as error:
+            record_clips(todo(drives, "drive", **changes), workers=1)
+        assert "\n" not in str(error.value)
+    with pytest.raises(StoreError, match="another recording"):
+        record_clips(todo(drives, "orbit"), workers=1)
+    (tmp_path / "annotations").mkdir()
+    for text in ("{}", "[]", '{"info": 5}', '{"info": {"recording": {}}}', '{"images": [], "annotations": []}'):
+        (tmp_path / "annotations" / "all.json").write_text(text)
+        with pytest.raises(StoreError, match="another recording"):
+            record_clips(todo(tmp_path, "drive"), workers=1)
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(StoreError) as error:
+        record_clips(todo(blocked / "out", "drive"), workers=1)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"images": (("Nowhere", 3),)}, "unknown town 'Nowhere'"),
+        ({"held_out": ("Nowhere",)}, "unknown town 'Nowhere'"),
+        ({"images": ()}, "name a town"),
+        ({"images": (("Twinford", 0),)}, "0 pictures"),
+        ({"images": (("Twinford", 1), ("Twinford", 2))}, "named twice"),
+        ({"style": "spaceship"}, "spaceship.*choose from.*sedan"),
+        ({"mode": "walk"}, "drive or orbit"),
+        ({"size": 60}, "a car 20 m away needs"),
+        ({"size": 8192}, "4096"),
+        ({"behind": 2.0}, "behind: 3 to 60 m"),
+        ({"behind": float("nan")}, "behind: 3 to 60 m"),
+        ({"height": 0.0}, "height"),
+        ({"quality": 0}, "quality"),
+        ({"distances": ()}, "distances"),
+        ({"distances": (1.0,)}, "3 to 80 m"),
+        ({"elevations": (90.0,)}, "0 to 75 degrees"),
+        ({"azimuths": (float("inf"),)}, "azimuths"),
+    ],
+)
+def test_what_cannot_be_recorded_is_refused_in_one_line(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as error:
+        Clips(tmp_path, **wrong)
+    assert "\n" not in str(error.value)
+
+
+def test_numbers_of_pictures_are_paired_with_towns() -> None:
+    assert pair_images(["A", "B"], ["3"]) == (("A", 3), ("B", 3))
+    assert pair_images(["A", "B"], ["3", "4"]) == (("A", 3), ("B", 4))
+    for images, said in ((["3", "x"], "whole numbers"), (["1", "2", "3"], "3 numbers for 2 towns"), ([], "0 numbers")):
+        with pytest.raises(ConfigError, match=said) as error:
+            pair_images(["A", "B"], images)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["walk"], "drive or orbit"),
+        (["drive", "--images", "1,2"], "2 numbers for 4 towns"),
+        (["drive", "--towns", "Nowhere", "--images", "2"], "unknown town 'Nowhere'"),
+        (["orbit", "--style", "spaceship"], "no car of style 'spaceship'"),
+    ],
+)
+def test_the_command_says_what_is_wrong_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], more: list[str], said: str
+) -> None:
+    from ssad.cli import main
+
+    monkeypatch.setattr(sys, "argv", ["ssad", "record", str(tmp_path / "out"), "--clips", *more])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    found = capsys.readouterr()
+    assert found.err.startswith("error: ")
+    assert said in found.err
+    assert (found.out, found.err.count("\n")) == ("", 1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_cell_comes_once_in_a_turn() -> None:
+    whole = turn_of(range(120), 40, key=(0, "town"))
+    for k in range(3):
+        assert sorted(whole[40 * k : 40 * k + 40]) == list(range(40))
+    assert whole[:40] != whole[40:80], "each turn has its own order"
+    assert turn_of(range(25, 50), 40, key=(0, "town")) == whole[25:50], "parts fit together"
+    assert turn_of(range(40), 40, key=(1, "town")) != whole[:40]
+
+
+def test_a_camera_looks_at_its_point_upright() -> None:
+    eye, point = np.array([3.0, -2.0, 4.0]), np.array([-5.0, 7.0, 1.0])
+    pose = look_at(eye, point)
+    assert np.allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3))
+    assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
+    assert np.allclose(np.linalg.inv(pose)[:3] @ [*point, 1.0], [0, 0, float(np.linalg.norm(point - eye))])
+    assert pose[2, 0] == pytest.approx(0.0)
+    assert pose[2, 1] < 0
+    target = np.eye(4)
+    for offset, azimuth in (([9, 0], 0.0), ([0, 9], 90.0), ([-9, 0], 180.0), ([0, -9], 270.0)):
+        found = polar(np.array([*offset, AIM], float), target)
+        assert found == {"distance": 9.0, "azimuth": azimuth, "elevation": 0.0}
+
+
+def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: _Set) -> None:
+    trace = market.trace
+
+    def shots(behind: float) -> list[Any]:
+        return follow(trace, Weather(), behind=behind, height=2.0, count=4, draws=generator(1))
+
+    found = shots(20.0)
+    assert len(found) > 20
+    times = [s.time for s in found]
+    assert times[:4] == sorted(times[:4])
+    assert len(set(times)) == len(times)
+    way = sorted(s.about["way"] for s in found)
+    assert min(np.diff(way)) >= 1.0 - 0.011
+    assert shots(float(trace.driven[-1])) == []
+
+
+def test_styles_are_those_of_cars(tmp_path: Path) -> None:
+    for style in BODIES["car"].styles:
+        assert Clips(tmp_path, style=style).style == style

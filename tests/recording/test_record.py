@@ -1,0 +1,297 @@
+"""Recorded drives: the data set that `ssad record` writes."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssad.assets.street import cached_street
+from ssad.core.errors import ConfigError, MapError, StoreError
+from ssad.core.frames import rotation_matrix
+from ssad.core.geometry import obb_distance
+from ssad.core.images import read_image
+from ssad.core.types import LaneType
+from ssad.datasets.nuscenes.reader import NuScenes, read_points
+from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
+from ssad.recording.nuscenes_recorder import AHEAD, CATEGORY, Recording, drive, record_nuscenes
+from ssad.recording.scene_objects import place_objects
+from ssad.roads import load_town, save_graph
+from ssad.scenarios.static.shifts import ShiftSpec
+from ssad.toolbox.scene_shifter import SceneShifter
+
+SMALL = {"towns": ("Twinford", "Oldmarket"), "held_out": ("Oldmarket",), "scenes": 1, "seconds": 1.0, "width": 160}
+
+
+def contents(root: Path) -> dict[str, str]:
+    """Hash of every file of the data set."""
+    return {
+        str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(root.rglob("*"))
+        if p.is_file() and ".parts" not in p.parts
+    }
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_nuscenes(Recording(tmp_path_factory.mktemp("record") / "a", sweeps=1, **SMALL), workers=1)
+
+
+def test_the_reader_finds_what_was_recorded(root: Path) -> None:
+    data = NuScenes(root)
+    assert [s.name for s in data.scenes()] == ["scene-twinford-000", "scene-oldmarket-000"]
+    for record in data.scenes():
+        scene = data.scene(record.name)
+        assert len(scene.samples) == 3
+        assert {f.channel for f in scene.frames} >= {"CAM_FRONT", "CAM_BACK", "LIDAR_TOP"}
+        assert sum(not f.key_frame for f in scene.frames) == 2 * 7
+        for frame in scene.frames:
+            if frame.modality == "camera":
+                assert read_image(root / frame.filename).shape == (90, 160, 3)
+            else:
+                assert len(read_points(root / frame.filename)) > 3000
+    assert {CATEGORY_TO_CLASS[c] for c in CATEGORY.values()} == set(CLASSES)
+
+
+def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(root: Path) -> None:
+    data = NuScenes(root)
+    boxes = 0
+    for record in data.scenes():
+        scene = data.scene(record.name)
+        for frame in [f for f in scene.frames if f.channel == "LIDAR_TOP" and f.key_frame]:
+            pose = frame.ego_to_world @ frame.sensor_to_ego
+            world = read_points(root / frame.filename)[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+            assert (np.abs(world[:, 2]) < 0.2).mean() > 0.15, "the road"
+            assert world[:, 2].min() > -1.0
+            found = scene.annotations(frame.sample_token)
+            boxes += len(found)
+            for n in range(len(found)):
+                local = np.abs((world - found.centre[n]) @ rotation_matrix(found.rotation[n]))
+                half = found.size[n][[1, 0, 2]] / 2
+                least, most = ((local <= half + margin).all(1).sum() for margin in (-0.01, 0.01))
+                assert least <= found.lidar_points[n] <= most, "those on a face may fall either way"
+    assert boxes > 5
+
+
+def test_shifts_take_the_true_depth(root: Path) -> None:
+    data = NuScenes(root)
+    scene = data.scene(data.scenes()[0].name)
+    shifter = SceneShifter(root, scene, ShiftSpec("fog", 4))
+    frame = next(f for f in scene.frames if f.channel == "CAM_FRONT" and f.key_frame)
+    _, done = shifter.image(frame)
+    assert done.details["depth"] == "given"
+    depth = shifter.camera_frame(frame).depth
+    assert depth is not None
+    assert np.isinf(depth).any(), "sky"
+    assert 2 < depth[-1, 20] < 6, "the road before the car"
+
+
+def test_same_bytes_for_any_number_of_workers_and_after_a_stop(root: Path, tmp_path: Path) -> None:
+    again = tmp_path / "b"
+    todo = Recording(again, sweeps=1, **SMALL)
+    record_nuscenes(todo, workers=2)
+    assert contents(again) == contents(root)
+    # what a kill leaves: a scene half done, no tables
+    for path in (again / todo.version).iterdir():
+        path.unlink()
+    part = again / ".parts" / "scene-oldmarket-000"
+    (part / "part.json").unlink()
+    next(part.glob("*.jpg")).write_bytes(b"torn")
+    record_nuscenes(todo, workers=1)
+    assert contents(again) == contents(root)
+    with pytest.raises(StoreError, match="another recording"):
+        record_nuscenes(Recording(again, **SMALL))
+
+
+@pytest.mark.slow
+def test_same_bytes_after_kill_9_at_any_moment(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "c"
+    command = [sys.executable, "-m", "ssad.cli", "record", str(out), "--towns", "Twinford,Oldmarket", "--held-out"]
+    command += ["Oldmarket", "--scenes", "1", "--seconds", "1", "--width", "160", "--sweeps", "1", "--workers", "2"]
+    for pause in (4.0, 6.0, 7.0, 8.0):
+        with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:
+            time.sleep(pause)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    assert contents(out) == contents(root)
+
+
+def test_a_cast_has_every_class_and_nobody_stands_in_another(root: Path) -> None:
+    kinds: Counter[str] = Counter()
+    for town in ("Larkhill", "Crossgate"):
+        graph, street = load_town(town), cached_street(town)
+        trace = drive(make_drive(graph, key=(3, town), seconds=6.0), graph)
+        cast = place_objects(trace, graph, street, key=(3, town), detail=0)
+        kinds.update(body.kind for body in cast.bodies)
+        now = cast.at(3.0, np.array([trace.x[30, 0], trace.y[30, 0]]), 80.0)
+        assert len(now) > 8
+        still = [s for s in now if s.body.parked and s.body.kind != "bicycle"]
+        boxes = [(*s.pose[:2, 3], np.arctan2(s.pose[1, 0], s.pose[0, 0]), *s.body.size[:2]) for s in still]
+        for i in range(1, len(boxes)):
+            assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
+        walkers = [b for b in cast.bodies if b.kind == "pedestrian" and len(b.track) > 1]
+        assert any(np.hypot(*np.diff(b.track[:30, :2], axis=0).T).sum() > 1.0 for b in walkers), "they walk"
+    assert set(kinds) >= set(CATEGORY) - {"bus", "trailer"}
+    assert kinds["bus"] + kinds["trailer"] > 0
+
+
+def test_each_camera_fires_at_its_own_time_where_the_ego_is_then(root: Path) -> None:
+    scene = NuScenes(root).scene("scene-twinford-000")
+    sweep = next(f for f in scene.frames if f.channel == "LIDAR_TOP" and f.key_frame)
+    for frame in [f for f in scene.frames if f.sample_token == sweep.sample_token and f.modality == "camera"]:
+        gap = (sweep.timestamp_us - frame.timestamp_us) * 1e-6
+        assert gap == pytest.approx(AHEAD[frame.channel], abs=1e-6)
+        moved = np.linalg.norm(sweep.ego_to_world[:3, 3] - frame.ego_to_world[:3, 3])
+        assert moved <= 15.0 * gap + 1e-6
+
+
+def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
+    for wrong in (
+        {"towns": ("Nowhere",)},
+        {"towns": ()},
+        {"scenes": 0},
+        {"width": 100},
+        {"sweeps": 5},
+        {"seconds": 0.1},
+    ):
+        with pytest.raises(ConfigError) as error:
+            Recording(tmp_path, **wrong)  # type: ignore[arg-type]
+        assert "\n" not in str(error.value)
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(StoreError):
+        record_nuscenes(Recording(blocked / "out", **SMALL), workers=1)
+
+
+def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
+    graph = load_town("Twinford")
+    own = cached_street(graph)
+    assert drive_street(graph, "town", key=(0, "Twinford", 3)).vertices.tobytes() == own.vertices.tobytes()
+    some = [drive_street(graph, "any", key=(0, "Twinford", k)) for k in (3, 3, 4)]
+    assert some[0].vertices.tobytes() == some[1].vertices.tobytes(), "the key decides"
+    assert some[0].vertices.shape != some[2].vertices.shape != own.vertices.shape
+    with pytest.raises(ConfigError, match="streets 'none'; choose from: town, any"):
+        drive_street(graph, "none", key=())
+
+
+def test_long_vehicles_stand_at_the_kerb(tmp_path: Path) -> None:
+    """A street full of parked cars would leave trucks, buses and trailers no room."""
+    found: Counter[str] = Counter()
+    for number in range(6):
+        graph = load_town("Twinford")
+        trace = drive(make_drive(graph, key=("long", number), seconds=1.0), graph)
+        cast = place_objects(trace, graph, cached_street(graph), key=("long", number))
+        parked = [body for body in cast.bodies if body.parked]
+        found.update(body.kind for body in parked)
+        for body in parked:
+            others = [b for b in parked if b is not body]
+            gap = [float(np.hypot(*(b.track[0, :2] - body.track[0, :2]))) for b in others]
+            assert min(gap, default=9.0) > 1.5
+    assert {"car", "truck", "bus", "trailer"} <= set(found)
+    assert found["car"] > found["truck"] > 0.05 * found["car"]
+
+
+def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
+    tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ssad.recording.drives.cached_street", lambda town: None)  # takes long to build, is not needed
+    town = ssad_home / "towns" / "Paths.npz"
+    graph = load_town("ProvingGround")
+    # every lane to drive on lies within a junction: no place to start from
+    inside = np.where(graph.kind == LaneType.DRIVING, 0, graph.junction).astype(graph.junction.dtype)
+    save_graph(replace(graph, name="Paths", junction=inside), town)
+    with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
+        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+    assert "\n" not in str(error.value)
+    with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
+        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=1)
+    assert "\n" not in str(error.value)
+    with np.load(town) as stored:
+        arrays = dict(stored)
+    arrays["kind"] = np.full_like(arrays["kind"], LaneType.SIDEWALK)
+    np.savez(town, **arrays)
+    with pytest.raises(MapError, match="no drivable lane") as error:
+        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+    assert "\n" not in str(error.value)
+
+
+def test_a_stop_while_tables_are_written_and_a_folder_without_its_page(root: Path, tmp_path: Path) -> None:
+    again = tmp_path / "d"
+    shutil.copytree(root, again)
+    todo = Recording(again, sweeps=1, **SMALL)
+    (again / todo.version / "splits.json").unlink()  # the last that is written
+    record_nuscenes(todo, workers=1)
+    assert contents(again) == contents(root)
+    shutil.rmtree(again / ".parts")
+    with pytest.raises(StoreError, match="not how it was recorded") as error:
+        record_nuscenes(replace(todo, seed=7), workers=1)
+    assert "\n" not in str(error.value)
+    assert contents(again) == contents(root)
+
+
+def test_the_official_toolkit_scores_true_boxes_as_perfect(root: Path, tmp_path: Path) -> None:
+    """All that has a LiDAR point, told as it is: every class that is there has AP 1 and no error."""
+    python = os.environ.get("SSAD_DEVKIT_PYTHON")
+    if not python:
+        pytest.skip("SSAD_DEVKIT_PYTHON names no interpreter with nuscenes-devkit")
+    copy = tmp_path / "set"
+    shutil.copytree(root, copy)
+    data = NuScenes(copy)
+    rows: dict[str, list[dict[str, object]]] = {}
+    there: Counter[str] = Counter()
+    for record in data.scenes():
+        scene = data.scene(record.name)
+        for sample in scene.samples:
+            found = scene.annotations(sample.token)
+            own = rows.setdefault(sample.token, [])
+            for n in np.flatnonzero(found.lidar_points > 0):
+                name = CATEGORY_TO_CLASS.get(found.category[n])
+                if name is None:
+                    continue
+                there[name] += 1
+                own.append(
+                    {"sample_token": sample.token, "translation": found.centre[n].tolist(),
+                     "size": found.size[n].tolist(), "rotation": found.rotation[n].tolist(),
+                     "velocity": np.nan_to_num(found.velocity[n, :2]).tolist(), "detection_name": name,
+                     "detection_score": 1.0, "attribute_name": (*found.attributes[n], "")[0]}
+                )  # fmt: skip
+    meta = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
+    (copy / "results.json").write_text(json.dumps({"meta": meta, "results": rows}))
+    script = Path(__file__).parents[1] / "helpers" / "devkit_eval.py"
+    words = [python, str(script), str(tmp_path / "out.json"), data.version, "all", str(copy)]
+    subprocess.run(words, check=True, capture_output=True)
+    told = json.loads((tmp_path / "out.json").read_text())["set"]
+    assert "error" not in told, told["error"]
+    assert sum(count > 0 for count in there.values()) >= 3
+    near = [name for name, aps in told["label_aps"].items() if min(aps.values()) > 0.999]
+    assert set(near) <= set(there)
+    assert len(near) >= 3, told["mean_dist_aps"]
+    for name in near:
+        errors = told["label_tp_errors"][name]
+        assert errors["trans_err"] < 1e-6
+        assert errors["scale_err"] < 1e-6
+
+
+def test_streets_of_any_kind_have_fewer_cars_and_the_same_mix_of_all_else() -> None:
+    town, other = thinned(MIX, "town"), thinned(MIX, "any")
+    assert sum(town.values()) == pytest.approx(1.0)
+    assert sum(other.values()) == pytest.approx(1.0)
+    assert town == pytest.approx(MIX)
+    assert sum(other[body] for body in CARS) < 0.75 * sum(town[body] for body in CARS)
+    rest = [body for body in MIX if body not in CARS]
+    assert [other[b] / other["bus"] for b in rest] == pytest.approx([town[b] / town["bus"] for b in rest])

@@ -1,0 +1,163 @@
+"""`ssad shift` under kill -9: whatever the moment, the next run goes on, and the end is the same to the byte."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ssad.core.errors import StoreError
+from ssad.datasets.nuscenes.tiny import make_tiny
+from ssad.toolbox import Options, check_manifest, materialise, verify
+from ssad.toolbox.manifest import read_lines
+
+VERSION = "v1.0-mini"
+SHIFTS = ("snow", "scale")
+DRIVER = """
+import sys
+from pathlib import Path
+from ssad.toolbox import Options, materialise
+if __name__ == "__main__":
+    options = Options(Path(sys.argv[1]), Path(sys.argv[2]), "v1.0-mini", ("snow", "scale"), ("random",))
+    materialise(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))
+"""
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Large enough that a run takes a second or two."""
+    return make_tiny(tmp_path_factory.mktemp("tiny") / "clean", size=(640, 360), scenes=2, samples=4, sweeps=1)
+
+
+@pytest.fixture(scope="module")
+def unbroken(clean: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | bytes]:
+    """The bytes of a run that nobody disturbed."""
+    out = tmp_path_factory.mktemp("unbroken") / "o"
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    return tree(out)
+
+
+def tree(folder: Path) -> dict[str, str | bytes]:
+    """Every file with its bytes and every link with its target; locks left out."""
+    return {
+        str(path.relative_to(folder)): os.readlink(path) if path.is_symlink() else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.name != ".lock" and (path.is_symlink() or path.is_file())
+    }
+
+
+def start(clean: Path, out: Path, workers: int, folder: Path) -> subprocess.Popen[bytes]:
+    """A run in a process group of its own."""
+    script = folder / "driver.py"
+    script.write_text(DRIVER)
+    command = [sys.executable, "-W", "ignore", str(script), str(clean), str(out), str(workers)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True)
+
+
+def files(out: Path) -> int:
+    """How many images and sweeps are there."""
+    return sum(1 for path in out.glob("*/s[aw]*/*/*") if not path.is_dir())
+
+
+def kill_at(run: subprocess.Popen[bytes], out: Path, *, at_least: int, delay: float) -> bool:
+    """kill -9 of the whole group once so many files are there and some time more; whether the run was still going."""
+    deadline = time.monotonic() + 60
+    while run.poll() is None and files(out) < at_least and time.monotonic() < deadline:
+        time.sleep(0.002)
+    time.sleep(delay)
+    going = run.poll() is None
+    if going:
+        os.killpg(run.pid, signal.SIGKILL)
+    run.communicate()
+    return going
+
+
+def whole(out: Path, unbroken: dict[str, str | bytes]) -> None:
+    """What stands in the places of images and sweeps is never half a file, and never called complete too early."""
+    for name, data in tree(out).items():
+        if "/samples/" in name or "/sweeps/" in name:
+            assert data == unbroken[name], name
+    for root in out.glob("*-random"):
+        if (root / "manifest.json").exists():
+            check_manifest(root)
+        elif (root / "manifest").exists():
+            with pytest.raises(StoreError, match="not complete"):
+                check_manifest(root)
+
+
+def disturb(clean: Path, out: Path, folder: Path, *, kills: int, unbroken: dict[str, str | bytes]) -> int:
+    """Runs until one gets through; the first ones are killed, each a little later than the one before."""
+    killed, total = 0, sum("/samples/" in name or "/sweeps/" in name for name in unbroken)
+    for number in range(kills):
+        run = start(clean, out, 1 + number % 2, folder)
+        killed += kill_at(run, out, at_least=total * number // kills, delay=0.007 * (number % 5))
+        whole(out, unbroken)
+    last = start(clean, out, 2, folder)
+    _, problem = last.communicate(timeout=120)
+    assert last.returncode == 0, problem.decode()
+    return killed
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+def test_kills_leave_no_trace(clean: Path, tmp_path: Path, unbroken: dict[str, str | bytes], kills: int) -> None:
+    out = tmp_path / "o"
+    killed = disturb(clean, out, tmp_path, kills=kills, unbroken=unbroken)
+    assert killed >= kills - 1  # the last may have come too late
+    assert tree(out) == unbroken
+    for root in out.glob("*-random"):
+        assert verify(root) == (98, [])
+
+
+def test_what_a_killed_run_made_is_not_made_again(
+    clean: Path, tmp_path: Path, unbroken: dict[str, str | bytes]
+) -> None:
+    out = tmp_path / "o"
+    assert kill_at(start(clean, out, 1, tmp_path), out, at_least=30, delay=0.0)
+    kept = {}
+    for root in out.glob("*-random"):
+        for lines in (root / "manifest").glob("*.jsonl"):
+            kept |= {root / name: (root / name).stat().st_ino for name in read_lines(lines)}
+    assert len(kept) >= 25
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    assert {path: path.stat().st_ino for path in kept} == kept
+    assert tree(out) == unbroken
+
+
+def test_workers_end_with_the_process_that_started_them(
+    clean: Path, tmp_path: Path, unbroken: dict[str, str | bytes]
+) -> None:
+    """Only the parent is killed: the group is gone soon after, and nobody writes behind the next run's back."""
+    out = tmp_path / "o"
+    run = start(clean, out, 2, tmp_path)
+    while run.poll() is None and files(out) < 10:
+        time.sleep(0.002)
+    assert run.poll() is None
+    run.kill()
+    run.wait()
+    deadline = time.monotonic() + 20
+    while group_lives(run.pid) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    left = group_lives(run.pid)
+    if left:
+        os.killpg(run.pid, signal.SIGKILL)
+    run.communicate()
+    assert not left
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    assert tree(out) == unbroken
+
+
+def group_lives(group: int) -> bool:
+    """Whether a process of the group is left."""
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if fields[0] != "Z" and int(fields[2]) == group:
+            return True
+    return False

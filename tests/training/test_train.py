@@ -1,0 +1,166 @@
+"""`ssad train detector` from data on disk to weights with a card, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from torch.multiprocessing.spawn import spawn
+
+from ssad.cli import main
+from ssad.core.errors import ConfigError, FormatError
+from ssad.detectors import make_detector
+from ssad.detectors.checkpoints import read_card
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.training import detector as training
+from ssad.training.detector import Plan, command_of, run_training
+from ssad.training.recipe import find_recipe
+
+SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("train") / "clips"
+    pairs = (("Twinford", 6), ("Oldmarket", 2))
+    record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=1)
+    return out
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("train") / "drives"
+    towns, held = ("Twinford", "Oldmarket"), ("Oldmarket",)
+    return record_nuscenes(Recording(out, towns, held, scenes=1, seconds=0.5, width=160), workers=1)
+
+
+@pytest.fixture(scope="module")
+def done(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training."""
+    out = tmp_path_factory.mktemp("train") / "out"
+    list(run_training(Plan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), say=lambda line: None))
+    return out
+
+
+def test_weights_come_with_a_card_that_says_all(done: Path, clips: Path) -> None:
+    card = read_card(done / "yolov5n.safetensors")
+    assert card.command == "ssad train detector yolov5n --data clips --set epochs=2 --set batch=3 --set validate=1"
+    assert card.data.startswith("ssad record clips --clips drive --towns Twinford,Oldmarket --images 6,2")
+    assert card.config["epochs_done"] == 2
+    rows = [json.loads(line) for line in (done / "log.jsonl").read_text().splitlines()]
+    assert [row["epoch"] for row in rows] == [1, 2]
+    assert all("clips_target_AP50" in row for row in rows)
+    assert {name: rows[-1][name] for name in card.metrics} == pytest.approx(card.metrics)
+    assert make_detector("yolov5n", weights=done / "yolov5n.safetensors").classes == card.classes
+    assert (done / "curves.png").is_file()
+
+
+def test_the_card_tells_what_the_first_weights_were_made_of(done: Path, clips: Path, tmp_path: Path) -> None:
+    first = done / "yolov5n.safetensors"
+    more = Plan("yolov5n", (clips,), tmp_path / "a", changes=(*SHORT, ("epochs", 1)), weights=first, device="cpu")
+    list(run_training(more, say=lambda line: None))
+    second = tmp_path / "a" / "yolov5n.safetensors"
+    list(run_training(replace(more, out=tmp_path / "b", weights=second), say=lambda line: None))
+    cards = [read_card(path) for path in (first, second, tmp_path / "b" / "yolov5n.safetensors")]
+    known = [
+        {"data": c.data, "command": c.command, "hash": c.hash, "epochs_done": n}
+        for c, n in zip(cards, (2, 1, 1), strict=True)
+    ]
+    before = {"file": "yolov5n.safetensors", **known[0]}
+    assert cards[1].config["first_weights"] == before
+    assert cards[2].config["first_weights"] == {"file": "yolov5n.safetensors", **known[1], "first_weights": before}
+    assert "--weights yolov5n.safetensors" in cards[2].command
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", '{"config": [3]}', "{}"])
+def test_first_weights_with_a_page_that_is_no_card(text: str, tmp_path: Path) -> None:
+    (tmp_path / "w.json").write_text(text)
+    assert training._before(tmp_path / "w.safetensors") == {"first_weights": {"file": "w.safetensors"}}
+
+
+def test_a_finished_training_does_nothing_more(done: Path, clips: Path) -> None:
+    before = {path.name: path.stat().st_mtime_ns for path in done.iterdir()}
+    said: list[str] = []
+    list(run_training(Plan("yolov5n", (clips,), done, changes=SHORT, device="cpu"), say=said.append))
+    assert said == ["all 2 epochs are done, and yolov5n.safetensors is there"]
+    assert {path.name: path.stat().st_mtime_ns for path in done.iterdir()} == before
+
+
+def test_other_data_and_other_first_weights_are_refused(
+    done: Path, clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = Plan("yolov5n", (clips,), done, changes=SHORT, device="cpu")
+    monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
+    with pytest.raises(FormatError, match="of other data, other first weights"):
+        list(run_training(replace(plan, weights=done / "yolov5n.safetensors")))
+    with pytest.raises(FormatError, match="of other data, other first weights"):
+        list(run_training(replace(plan, split="all")))
+    with pytest.raises(FormatError, match="of another recipe"):
+        list(run_training(replace(plan, changes=(*SHORT, ("lr", 0.5)))))
+
+
+def test_what_is_missing_is_said_before_anything_is_read(
+    clips: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "fill", lambda *a, **k: pytest.fail("pictures were read"))
+    flat = Plan("yolov5n", (clips,), tmp_path / "out", changes=SHORT, device="cpu")
+    deep = replace(flat, recipe="fcos3d-light", data=(drives,))
+    twin = tmp_path / "clips"
+    twin.symlink_to(clips)
+    for plan, words in (
+        (replace(flat, val="evening"), "annotations/evening.json"),
+        (replace(flat, split="evening"), "annotations/evening.json"),
+        (replace(flat, data=(clips, twin)), "the same name"),
+        (replace(flat, val_data=drives), "--val-data is for 3D detectors"),
+        (replace(deep, data=(drives, drives)), "--more is for 2D detectors"),
+        (replace(deep, val="mini_val"), "none of its 2 scenes"),
+        (replace(deep, split="mini_train"), "mini_train"),
+        (replace(deep, data=(tmp_path / "nowhere",)), "nowhere"),
+        (replace(flat, gpus=2), "--gpus 2"),
+    ):
+        with pytest.raises((ConfigError, FormatError), match=words) as error:
+            list(run_training(plan, say=lambda line: None))
+        assert "\n" not in str(error.value)
+
+
+def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path) -> None:
+    plan = Plan("pgd-det-light", (drives,), tmp_path, changes=(("epochs", 2), ("batch", 4)), device="cpu", seconds=0.0)
+    said: list[str] = []
+    list(run_training(plan, say=said.append))
+    assert said[-1] == "stopped after 1 of 2 epochs; run it again to go on"
+    card = read_card(tmp_path / "pgd-det-light.safetensors")
+    assert card.config["epochs_done"] == 1
+    assert "--seconds 0.0" in card.command
+    assert {"mAP", "NDS"} <= card.metrics.keys()
+
+
+def test_the_command_can_be_given_to_a_shell() -> None:
+    plan = Plan(
+        "yolov5n", (Path("a b"), Path("c")), Path("out"), split="night", val="day", seconds=60.0, gpus=2,
+        changes=(("zoom", (0.8, 1.3)), ("epochs", 3)), weights=Path("w.pt"),
+    )  # fmt: skip
+    assert command_of(plan) == (
+        "ssad train detector yolov5n --data 'a b' --more c --split night --val day --weights w.pt --gpus 2 "
+        "--seconds 60.0 --set 'zoom=[0.8,1.3]' --set epochs=3"
+    )
+
+
+def test_an_error_in_one_of_several_processes_is_one_line(tmp_path: Path) -> None:
+    plan = Plan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=2)
+    with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._one_line():
+        spawn(training._worker, (plan, find_recipe("yolov5n"), training._free_port(), "gloo"), nprocs=2)
+
+
+def test_through_the_command(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["ssad", "train", "detector", "yolov5n", "--data", str(clips), "--out", str(tmp_path / "o")]
+    monkeypatch.setattr(sys, "argv", [*words, "--set", "zoom=[0.5,abc]"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "zoom" in capsys.readouterr().err
