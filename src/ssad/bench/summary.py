@@ -8,6 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
+from ssad.bench.kind import Plan
+
 SHOWN = ("CR", "OR", "DR", "RC")
 """Metrics of the table; the report has all of them, with intervals."""
 
@@ -57,13 +59,6 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     return result
 
 
-def name_of(record: Mapping[str, Any]) -> str:
-    """What people call a cell."""
-    if "detector" in record:
-        return f"{record['detector']}/{record['shift'] or 'clean'}/{record['severity']}"
-    return f"{record['system']}/{record['spec']['scenario']['name']}"
-
-
 def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     """A Rich table of a detection suite: shifts x detectors, mAP and NDS at "random", else means over severities."""
     from rich import box
@@ -92,3 +87,27 @@ def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
 
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2f}"
+
+
+def summary_table(plan: Plan, records: Sequence[Mapping[str, Any]]) -> Table:
+    """What a run ends with on the terminal."""
+    title = plan.suite.title or plan.suite.name
+    if plan.kind.name == "driving":
+        return table(title, records)
+    if plan.kind.name == "detection":
+        return shift_table(title, records)
+    return plain_table(title, plan, records)
+
+
+def plain_table(title: str, plan: Plan, records: Sequence[Mapping[str, Any]]) -> Table:
+    """A row a record: its factors, then its metrics."""
+    from rich import box
+
+    result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in (*plan.kind.factors, *(column.name for column in plan.kind.columns)):
+        result.add_column(name)
+    for record in records:
+        values = (record["metrics"].get(column.name) for column in plan.kind.columns)
+        shown = ("failed" if record["status"] != "ok" else "n/a" if v is None else f"{v:.3g}" for v in values)
+        result.add_row(*(str(record.get(name, "")) for name in plan.kind.factors), *shown)
+    return result
