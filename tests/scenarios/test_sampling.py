@@ -172,6 +172,13 @@ def test_draws_fill_the_box_evenly(kind: str) -> None:
     }
 
 
+def test_what_has_no_spread_is_kept() -> None:
+    (scenario,) = load_scenarios("TurningObstacle/00")
+    shifted = dataclasses.replace(scenario, parameters={**scenario.parameters, "longitudinal": 2.0})
+    assert sample_parameters(shifted, generator("test")).parameters["longitudinal"] == 2.0
+    assert sample_parameters(shifted, generator("test"), spread=0.0) == shifted
+
+
 def test_a_draw_is_the_same_everywhere() -> None:
     (scenario,) = load_scenarios("RightTurn/00")
     drawn = build(scenario, 7).scenario
@@ -225,6 +232,9 @@ def test_the_ego_starts_where_its_parameters_say() -> None:
     pose = _start(bend, 0.5, 0.0, 0.0)
     assert (pose.x, pose.y, abs(pose.yaw)) == pytest.approx((0.5, 0.0, math.pi), abs=1e-6)
     assert _start(bend, 99.0, 0.0, 0.0) == Pose(1.0, 1.0, -2.0)
+    # nominally just the route's first point: pi as a float32 is more than pi, and stays so
+    west = dataclasses.replace(bend, yaw=np.full(3, np.pi, np.float32))
+    assert _start(west, 0.0, 0.0, 0.0).yaw == float(np.float32(np.pi))
 
 
 def boxes(episode: Episode) -> np.ndarray:
