@@ -5,7 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +30,7 @@ from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
+from ssad.jobs.local import WORKER_MEMORY
 from ssad.metrics.detection import score_detections
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.report import write_report
@@ -266,6 +273,71 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
     assert [r["key"] for r in mended] == [r["key"] for r in records]
     assert [r for r in mended if r["detector"] == ORACLE] == good, "what worked was not run again"
     assert [r["metrics"] for r in mended if r["detector"] != ORACLE] == [r["metrics"] for r in good]
+
+
+DEEDS = {
+    "dying": ("crashed", "exit code 9"), "hanging": ("timeout", "took longer than 12 s"),
+    "raising": ("failed", "ZeroDivisionError: on purpose"), "hungry": ("crashed", "out of memory"),
+}  # fmt: skip
+
+
+def check_deadly_detectors(root: Path, folder: Path, out: Path, resources: Resources) -> None:
+    """Four detectors fail, each with its reason; all cells of the one among them that works are there, and equal."""
+    bad = [f"helpers.oracle3d:build_{deed}" for deed in DEEDS]
+    todo = suite_of(
+        root, detectors=[*bad[:2], ORACLE, *bad[2:]], shifts=["gaussian"], severities=[1, 3], timeout_s=12.0
+    )
+    records = run(plan_detection(todo), out, resources)
+    assert len(records) == 15
+    alone = {(r["shift"], r["severity"]): r["metrics"] for r in lines(folder)}
+    for record in records:
+        if record["detector"] == ORACLE:
+            assert record["status"] == "ok"
+            assert record["metrics"] == alone[record["shift"], record["severity"]]
+        else:
+            status, words = DEEDS[record["detector"].rpartition("_")[2]]
+            assert (record["status"], words in record["reason"]) == (status, True), record
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("workers", "ray"), [(1, None), (2, None), (None, "local")])
+def test_detectors_that_die_hang_raise_or_eat_memory_fail_alone(
+    root: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int | None, ray: str | None
+) -> None:
+    monkeypatch.setenv(WORKER_MEMORY, str(3 << 29))
+    resources = Resources(workers, ray, console=Console(file=io.StringIO()))
+    check_deadly_detectors(root, folder, tmp_path / "run", resources)
+
+
+def start(root: Path, out: Path) -> subprocess.Popen[bytes]:
+    """The suite of the fixture `folder` in a process of its own."""
+    code = (
+        "import sys; from pathlib import Path; from bench.test_detection import *\n"
+        "run_detection(plan_detection(suite_of(Path(sys.argv[1]))), Path(sys.argv[2]), workers=2)"
+    )
+    paths = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"ORACLE_DATA": str(root), "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(root), str(out)], env=environment, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_kill_9_at_20_moments(root: Path, folder: Path, tmp_path: Path) -> None:
+    out, moments = tmp_path / "run", random.Random(5)
+    began = time.monotonic()
+    assert start(root, tmp_path / "whole").wait(timeout=600) == 0
+    duration = time.monotonic() - began
+    for _ in range(20):
+        process = start(root, out)
+        time.sleep(moments.uniform(0.2, 1.0) * duration)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert start(root, out).wait(timeout=600) == 0
+    tables = [{r["key"]: r | {"wall_s": 0} for r in lines(one)} for one in (folder, tmp_path / "whole", out)]
+    assert tables[0] == tables[1] == tables[2]
+    assert len(lines(out)) == len(tables[2])
 
 
 def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path) -> None:

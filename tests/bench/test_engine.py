@@ -11,6 +11,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,51 @@ def test_on_ray_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert table(tmp_path / "ray") == table(tmp_path / "here")
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, workers: int) -> None:
+    """Nine numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
+    numbers = [f"n-{i}" for i in range(9)]
+    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=1.5)
+    plan = own_kind.SharedDice().plan(suite)
+    records = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())))
+    status = {name: {r["status"] for r in records if r["system"] == name} for name in suite.systems}
+    assert status == {"fair": {"ok"}, "die": {"crashed"}, "hang": {"timeout"}, "raise": {"failed"}, "loaded": {"ok"}}
+    for name in ("fair", "loaded"):
+        made = [path.read_text() for path in (tmp_path / "pieces").glob(f"{name}-*")]
+        assert len(made) == len(numbers)
+        again = sum(text.count("made") > 1 for text in made)
+        assert again <= 2 * workers, "together, but for the first"
+    given_up = [r["reason"] for r in records if r["system"] == "hang" and "not tried after 2 others" in r["reason"]]
+    assert len(given_up) >= len(numbers) - 2 * workers
+    again = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())), retry=True)
+    assert {r["status"] for r in again if r["system"] == "die"} == {"crashed"}
+    assert [r for r in again if r["system"] == "fair"] == [r for r in records if r["system"] == "fair"]
+
+
+@pytest.mark.slow
+def test_a_lost_node_of_a_cluster_changes_nothing(tmp_path: Path) -> None:
+    from ray.cluster_utils import Cluster
+
+    suite = dice([f"slow-{i}" for i in range(120)], batch=2)
+    go(suite, tmp_path / "here", workers=2)
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    second = cluster.add_node(num_cpus=1)
+
+    def lose() -> None:
+        while size(tmp_path / "cluster") == 0:
+            time.sleep(0.01)
+        cluster.remove_node(second, allow_graceful=False)
+
+    thread = threading.Thread(target=lose)
+    thread.start()
+    try:
+        go(suite, tmp_path / "cluster", ray=cluster.address)
+    finally:
+        thread.join()
+        cluster.shutdown()
+    assert table(tmp_path / "cluster") == table(tmp_path / "here")
+
+
 def test_what_failed_is_kept_until_it_is_retried(tmp_path: Path) -> None:
     suite = dice(["a", "raise", "b"])
     before = go(suite, tmp_path)
@@ -135,7 +181,7 @@ def test_artefacts_are_hashed(tmp_path: Path) -> None:
 
 def test_a_kind_of_ones_own_gets_a_report_for_nothing(tmp_path: Path) -> None:
     """The kind, without what makes it misbehave, has under 60 lines."""
-    lines = [x for x in inspect.getsource(own_kind).split("def _hold_memory")[0].splitlines() if x.strip()]
+    lines = [x for x in inspect.getsource(own_kind).split("class SharedDice")[0].splitlines() if x.strip()]
     assert len(lines) < 60
     path = tmp_path / "dice.yaml"
     path.write_text("name: mine\nkind: helpers.own_kind:Dice\nsystems: [fair]\nnumbers: [a, b, c, raise]\n")
