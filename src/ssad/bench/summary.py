@@ -18,20 +18,17 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     """A Rich table. A record that is not ok is a failed episode; the last rows are the means of the groups."""
     from rich import box
 
-    from ssad.metrics import EpisodeMetrics, aggregate_groups
+    from ssad.metrics import FAMILIES, Outcome, aggregate_groups
 
-    rows = aggregate_groups(
-        (r["system"], r["group"], EpisodeMetrics.from_dict(r["metrics"]) if r["status"] == "ok" else None)
-        for r in records
-    )
+    rows = aggregate_groups((r["system"], Outcome.from_record(r)) for r in records)
     systems = list(dict.fromkeys(row.system for row in rows))
-    average = rows[-1].group
-    groups = [*dict.fromkeys(row.group for row in rows if row.group != average), average]
+    averages = [name for name in FAMILIES.values() if any(row.group == name for row in rows)]
+    groups = [*dict.fromkeys(row.group for row in rows if row.group not in averages), *averages]
     failed = sum(r["status"] != "ok" for r in records)
     result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     result.caption = (
-        "CR collisions per episode and its 95 % interval; OR m driven off the road;\n"
-        "DR m from the route; RC share of the route"
+        "CR collisions per episode and its 95 % interval (below five scenarios: its range);\n"
+        "OR m driven off the road; DR m from the route; RC share of the route"
         + (f"\n{failed} of {len(records)} episodes failed and count" if failed else "")
     )
     result.caption_justify = "left"
@@ -40,10 +37,9 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     for name in ("n", "CR", "", *SHOWN[1:]):
         result.add_column(name, justify="right", no_wrap=True)
     for group in groups:
-        last = group == average
+        last = group in averages
         found = {row.system: row.values for row in rows if row.group == group}
         for i, system in enumerate(s for s in systems if s in found):
-            count = sum(r["system"] == system and (last or r["group"] == group) for r in records)
             crash, *others = (found[system][metric] for metric in SHOWN)
             interval = f"{_shown(crash.low)}-{_shown(crash.high)}"
             cells = [_shown(crash.mean), interval, *(_shown(other.mean) for other in others)]
@@ -51,10 +47,10 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
             result.add_row(
                 "" if i else group,
                 system.rsplit(":", maxsplit=1)[-1],
-                str(count),
+                str(crash.n),
                 *cells,
                 style="bold" if last else None,
-                end_section=end and group == groups[-2],
+                end_section=end and not last and groups[groups.index(group) + 1 :][:1] == averages[:1],
             )
     return result
 
