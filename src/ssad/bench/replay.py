@@ -9,11 +9,12 @@ from ssad.bench.kind import Cell, find_cell
 from ssad.bench.kinds.driving import Driving, drive, town
 from ssad.bench.run import read_plan
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.jsonl import read_lines
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.traces import first_difference, load_trace
 from ssad.core.types import EpisodeTrace
 from ssad.jobs.machine import quiet_warp
-from ssad.jobs.store import RESULTS, read_lines
+from ssad.jobs.store import RESULTS
 
 
 @dataclass(frozen=True)

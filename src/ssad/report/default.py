@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ssad.metrics import CaseValue, estimate
@@ -24,6 +25,11 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     ]
     page = render("default.html", run, results=table, factors=factors, failures=failed, pictures=pictures(run.folder))
     return page, [table]
+
+
+def summary(run: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return replace(result_table(run), note="")
 
 
 def result_table(run: Run) -> Table:

@@ -117,6 +117,21 @@ def _scaled(name: str, estimate: Estimate) -> Estimate:
     return replace(estimate, mean=mean, low=low, high=high)
 
 
+def summary_table(run: DrivingRun) -> Table:
+    """Scenario x system: the main metrics, the averages last; for the terminal."""
+    rows = [
+        Row((heading, system), tuple(Cell.of(values[symbol]) for symbol in SHOWN))
+        for group, heading in run.headings.items()
+        for system in run.systems
+        if (values := run.numbers.get((system, group)))
+    ]
+    note = (
+        "CR: collisions per episode, in brackets its 95 % interval, else the range of the scenarios;\n"
+        "OR: m driven off the road; DR: m from the route; RC: share of the route"
+    )
+    return Table("summary", run.run.title, ("Scenario", "System"), SHOWN, tuple(rows), note)
+
+
 def driving_tables(run: DrivingRun) -> list[Table]:
     """All tables of a run."""
     found = (precrash_table(run), natural_table(run), normalised_table(run), full_table(run))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,7 @@ from ssad.core import safeio
 from ssad.metrics import METRICS
 from ssad.report.artefacts import artefact_problems
 from ssad.report.load import Run, load_run
-from ssad.report.tables import Cell, Table, write_tables
-
-Section = Callable[[Run], tuple[str, Sequence[Table]]]
-"""From a run to the text of its page and its tables: `section` of a module in `ssad.report.kinds`."""
+from ssad.report.tables import Cell, write_tables
 
 
 def write_report(folder: Path | str) -> Path:
@@ -36,20 +32,19 @@ def write_report(folder: Path | str) -> Path:
         StoreError: the folder holds no run, has no results, or cannot be written.
     """
     run = load_run(folder)
-    page, tables = section_of(run.kind)(run)
+    page, tables = kind_module(run.kind).section(run)
     write_tables(run.folder, tables)
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
     return path
 
 
-def section_of(kind: str) -> Section:
-    """The section of a kind, the default one if it has none of its own."""
+def kind_module(kind: str) -> Any:
+    """The module with `section` and `summary` of a kind, the default one if it has none of its own."""
     name = f"ssad.report.kinds.{kind}"
     if not kind.isidentifier() or importlib.util.find_spec(name) is None:
         name = "ssad.report.default"
-    found: Section = importlib.import_module(name).section
-    return found
+    return importlib.import_module(name)
 
 
 def render(name: str, run: Run, **values: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any
 
@@ -350,6 +350,13 @@ def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
              "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else ""}
         )  # fmt: skip
     return found
+
+
+def summary(found: Run) -> Table:
+    """The table that is shown on the terminal: percent."""
+    drawn = "random" in found.suite["severities"]
+    note = f"percent; {'severities from 1 to 5' if drawn else 'means over the severities that ran'}"
+    return replace(main_table(load_detection_run(found)), note=note)
 
 
 def section(found: Run) -> tuple[str, Sequence[Table]]:

@@ -9,7 +9,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.metrics import METRICS
 from ssad.report.artefacts import pictures
-from ssad.report.driving_tables import driving_tables
+from ssad.report.driving_tables import driving_tables, summary_table
 from ssad.report.episodes import FAMILY_TITLES, DrivingRun, load_episodes
 from ssad.report.figures import interval_plot
 from ssad.report.load import Run
@@ -26,6 +26,11 @@ PICTURES = {
     "camera": ("Camera", "", ""),
 }
 """How names of pictures begin -> title of their section, and how to make more of them."""
+
+
+def summary(found: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return summary_table(load_episodes(found))
 
 
 def section(found: Run) -> tuple[str, Sequence[Table]]:
