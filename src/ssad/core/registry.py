@@ -34,7 +34,8 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
 
 def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
     """All names of a kind -> where they come from ("module:object"), built-in ones first."""
-    return dict(table) | {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+    plugins = {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+    return dict(table) | {name: where for name, where in plugins.items() if name not in table}
 
 
 def _import(kind: str, name: str, target: str) -> Any:
