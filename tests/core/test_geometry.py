@@ -78,6 +78,8 @@ def test_corners_keep_area_and_centre(b: np.ndarray) -> None:
         ((0.0, 5.0, 0.0, 4.0, 2.0), 3.0),  # side by side
         ((7.0, 5.0, 0.0, 4.0, 2.0), np.hypot(3.0, 3.0)),  # corner to corner
         ((5.0, 0.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 1.0),  # a corner against a side
+        ((0.0, 3.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 0.0),  # a corner touches a side
+        ((1.0, 2.5, np.pi / 4, np.sqrt(2.0), np.sqrt(2.0)), 0.5),  # only the long side's own axis separates them
         ((1.0, 0.5, 0.3, 4.0, 2.0), 0.0),  # overlap
         ((0.0, 0.0, np.pi / 2, 40.0, 0.1), 0.0),  # a cross: no corner inside the other
         ((4.0, 0.0, 0.0, 4.0, 2.0), 0.0),  # touching

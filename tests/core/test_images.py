@@ -148,6 +148,8 @@ def test_a_caption_stands_under_the_picture_and_fits() -> None:
         assert dark[152:].sum() > 40
         assert not dark[:152].any()
         assert np.flatnonzero(dark.any(0))[0] >= 6
+    wide = cv2.getTextSize("fog 3", cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0]
+    assert np.ptp(np.flatnonzero((short[152:] < 200).all(-1).any(0))) == pytest.approx(wide, abs=4)
     assert np.flatnonzero((long < 200).all(-1).any(0))[-1] < 300, "the letters shrink until all fit"
     tall = [np.ptp(np.flatnonzero((v < 128).all(-1).any(1))) for v in (short, long)]
     assert tall[0] > tall[1]
