@@ -11,8 +11,8 @@ from torch.nn.functional import one_hot, pad, softplus
 from torchvision.ops import generalized_box_iou_loss, sigmoid_focal_loss
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
-from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums, suppress
 from ssad.core.errors import ConfigError
+from ssad.detectors.adapters.common import check_images, check_threshold, check_truth, sums, suppress
 
 STRIDE = 8
 

@@ -440,6 +440,14 @@ def test_dealt_severities_differ_by_shift_and_seed() -> None:
     assert first == {1, 2, 3, 4, 5}
 
 
+def test_a_deal_begins_anywhere() -> None:
+    """Else a single scene would always have severity 1, and of six scenes two."""
+    alone = [dealt_severities(ShiftSpec("fog", seed=seed), ["scene"])["scene"] for seed in range(200)]
+    assert {alone.count(severity) > 20 for severity in (1, 2, 3, 4, 5)} == {True}
+    six = [list(dealt_severities(ShiftSpec("fog", seed=seed), "abcdef").values()) for seed in range(60)]
+    assert {severity for dealt in six for severity in dealt if dealt.count(severity) == 2} == {1, 2, 3, 4, 5}
+
+
 # ---------------------------------------------------------------- objects
 
 

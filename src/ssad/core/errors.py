@@ -7,7 +7,13 @@ from collections.abc import Iterable
 
 
 class SSADError(Exception):
-    """Something the user can mend. The message is one line: what is wrong, where, what to do."""
+    """Something the user can mend; the base of all errors below.
+
+    The command line prints the message alone and ends with exit code 2.
+
+    Args:
+        message: What is wrong, where (file, line, key), and what to do. It becomes one line.
+    """
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(message.split()))
@@ -38,7 +44,16 @@ class FormatError(SSADError):
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """An error that shows the three known names closest to `name`."""
+    """Make the error for a name that is not known.
+
+    Args:
+        kind: Singular noun, such as "town"; `ssad list` must know its plural.
+        name: What was asked for.
+        known: What there is.
+
+    Returns:
+        An error that shows the three known names closest to it, to be raised by the caller.
+    """
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
     hint = f"; closest: {', '.join(close)}" if close else ""

@@ -28,6 +28,22 @@ def test_wrap_takes_pi_to_minus_pi() -> None:
     assert wrap_angle(np.float32(np.pi)).dtype == np.float32
 
 
+@pytest.mark.parametrize("value", [np.nextafter(-np.pi, -4.0), np.float32(-3.1415932)])
+def test_wrap_just_under_minus_pi_never_rounds_up_to_pi(value: np.floating) -> None:
+    """The remainder of -1e-16 by 2 pi is 2 pi itself, to the last digit."""
+    for angles in (value, [value, 1.0, value - 2 * np.pi]):
+        wrapped = wrap_angle(np.array(angles, np.asarray(value).dtype))
+        assert (wrapped < np.pi).all()
+        assert (wrapped >= -np.pi).all()
+    assert float(wrap_angle(np.nextafter(-np.pi, -4.0))) == -np.pi
+
+
+def test_whole_numbers_become_floats() -> None:
+    assert wrap_angle(4) == pytest.approx(4 - 2 * np.pi)
+    assert wrap_angle(np.array([4, 1])).dtype == np.float64
+    assert corners(0, 0, 0, 3, 1)[0] == pytest.approx([1.5, 0.5])
+
+
 def test_rotate_and_frames_closed_form() -> None:
     assert rotate([1.0, 0.0], np.pi / 2) == pytest.approx([0.0, 1.0])
     assert to_local([10.0, 5.0, np.pi / 2], [10.0, 8.0]) == pytest.approx([3.0, 0.0])
@@ -62,6 +78,8 @@ def test_corners_keep_area_and_centre(b: np.ndarray) -> None:
         ((0.0, 5.0, 0.0, 4.0, 2.0), 3.0),  # side by side
         ((7.0, 5.0, 0.0, 4.0, 2.0), np.hypot(3.0, 3.0)),  # corner to corner
         ((5.0, 0.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 1.0),  # a corner against a side
+        ((0.0, 3.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 0.0),  # a corner touches a side
+        ((1.0, 2.5, np.pi / 4, np.sqrt(2.0), np.sqrt(2.0)), 0.5),  # only the long side's own axis separates them
         ((1.0, 0.5, 0.3, 4.0, 2.0), 0.0),  # overlap
         ((0.0, 0.0, np.pi / 2, 40.0, 0.1), 0.0),  # a cross: no corner inside the other
         ((4.0, 0.0, 0.0, 4.0, 2.0), 0.0),  # touching
