@@ -16,8 +16,8 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
+from ssad.assets.face_list import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
 from ssad.assets.mesh import F64, Material
-from ssad.assets.obj import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
 from ssad.core import safeio
 from ssad.core.errors import FormatError
 
@@ -70,7 +70,7 @@ class _Reader:
     def __init__(self, file: Path, tree: dict[str, Any], chunk: bytes | None) -> None:
         self.file, self.tree, self.chunk = file, tree, chunk
         self.buffers: dict[int, bytes] = {}
-        self.soup = FaceList()
+        self.triangles = FaceList()
         self.faces = self.visited = 0
 
     def fail(self, message: str) -> FormatError:
@@ -89,7 +89,9 @@ class _Reader:
         needed = [e for e in self.tree.get("extensionsRequired", []) if not str(e).startswith(_HARMLESS)]
         if needed:
             raise self.fail(f"requires the extension {str(needed[0])[:60]}; export without it")
-        self.soup.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [DEFAULT]
+        self.triangles.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [
+            DEFAULT
+        ]
         scenes = self.tree.get("scenes", [])
         nodes = self.tree.get("nodes", [])
         if scenes:
@@ -99,7 +101,7 @@ class _Reader:
             roots = [k for k in range(len(nodes)) if k not in children]
         for root in roots:
             self.node(root, np.eye(4), ())
-        return self.soup
+        return self.triangles
 
     def node(self, index: int, parent: F64, above: tuple[int, ...]) -> None:
         self.visited += 1
@@ -150,14 +152,14 @@ class _Reader:
         placed = points @ linear.T + matrix[:3, 3]
         turned = normals @ np.linalg.inv(linear)
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-        look = len(self.soup.materials) - 1
+        look = len(self.triangles.materials) - 1
         if "material" in data:
             self.item("materials", data["material"])
             look = data["material"]
-        if name not in self.soup.groups:
-            self.soup.groups.append(name)
-        group = self.soup.groups.index(name)
-        self.soup.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
+        if name not in self.triangles.groups:
+            self.triangles.groups.append(name)
+        group = self.triangles.groups.index(name)
+        self.triangles.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
 
     def accessor(self, index: int, kind: str, where: str) -> F64:
         """Values [n, width] of an accessor as float64."""
