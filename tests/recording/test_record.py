@@ -20,9 +20,9 @@ import pytest
 
 from ssad.assets.street import cached_street
 from ssad.core.errors import ConfigError, MapError, StoreError
-from ssad.core.frames import rotation_matrix
 from ssad.core.geometry import obb_distance
 from ssad.core.images import read_image
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
 from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
@@ -80,7 +80,7 @@ def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(root: Path) -> Non
             found = scene.annotations(frame.sample_token)
             boxes += len(found)
             for n in range(len(found)):
-                local = np.abs((world - found.centre[n]) @ rotation_matrix(found.rotation[n]))
+                local = np.abs((world - found.centre[n]) @ quaternion_to_matrix(found.rotation[n]))
                 half = found.size[n][[1, 0, 2]] / 2
                 least, most = ((local <= half + margin).all(1).sum() for margin in (-0.01, 0.01))
                 assert least <= found.lidar_points[n] <= most, "those on a face may fall either way"

@@ -20,6 +20,7 @@ from ssad.assets.face_list import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, F
 from ssad.assets.mesh import F64, Material
 from ssad.core import safeio
 from ssad.core.errors import FormatError
+from ssad.core.rotations import pose_matrix
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -234,16 +235,8 @@ def _local(node: dict[str, Any]) -> F64:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = (float(v) for v in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
-    norm = max(float(np.sqrt(x * x + y * y + z * z + w * w)), 1e-12)
-    x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    matrix = np.eye(4)
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
-    matrix[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3)
+    matrix = pose_matrix(np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3), (w, x, y, z))
+    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
     return matrix
 
 

@@ -9,7 +9,7 @@ import torch
 
 from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Solids, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.frames import rotation_matrix
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, Bool
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SensorFrame
@@ -51,7 +51,7 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     wanted &= (middle[:, 0] < frame.width - 0.5) & (middle[:, 1] < frame.height - 0.5)
     box, seen = _hulls(frame, found, turn)
     rows = np.flatnonzero(wanted & seen)
-    ahead = turn[:3, :3] @ rotation_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
+    ahead = turn[:3, :3] @ quaternion_to_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
     speed = found.velocity[rows] @ turn[:3, :3].T
     label = [CLASSES_3D.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
     attribute = [_attribute(found.attributes[r]) for r in rows]
@@ -73,7 +73,7 @@ def _attribute(names: Sequence[str]) -> int:
 def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
     corners = CORNERS * found.size[:, None, [1, 0, 2]]
-    world = np.einsum("nij,nkj->nki", rotation_matrix(found.rotation), corners) + found.centre[:, None]
+    world = np.einsum("nij,nkj->nki", quaternion_to_matrix(found.rotation), corners) + found.centre[:, None]
     local = world @ turn[:3, :3].T + turn[:3, 3]
     local[..., 2] = np.maximum(local[..., 2], NEAR)
     assert frame.intrinsic is not None

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, I32, Bool
 
 I8 = npt.NDArray[np.int8]
@@ -178,7 +179,7 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
     rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - low, count)]
 
     w, length, h = 0.5 * racks.size[rack].T
-    turn = rotation_matrix(racks.rotation[rack])
+    turn = quaternion_to_matrix(racks.rotation[rack])
     corner = np.empty((4, len(rack), 3))
     for i, (a, b, c) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
         local = np.stack([a * length, b * w, c * h], axis=-1)
@@ -189,21 +190,3 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
         along = (edge * offset).sum(axis=-1)
         inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=-1))
     return np.bincount(point[inside], minlength=len(sample)) > 0
-
-
-def rotation_matrix(quaternion: F64) -> F64:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), brought to unit length (0 stays 0)."""
-    norm = np.sqrt((quaternion * quaternion).sum(axis=-1, keepdims=True))
-    w, x, y, z = (quaternion / np.where(norm > 0.0, norm, 1.0)).T
-    rows = (
-        (w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def yaw(quaternion: F64) -> F64:
-    """Heading [N] of quaternions [N, 4]: direction of the turned x axis in the plane, radians."""
-    w, x, y, z = quaternion.T
-    return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))

@@ -11,10 +11,11 @@ from ssad.assets.bodies import draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, build
 from ssad.assets.street import cached_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.rig import RIG, place, rig_camera
+from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene, Thing
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.images import captioned, save_picture
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, LaneType
 from ssad.jobs.machine import quiet_warp
@@ -66,7 +67,7 @@ def class_sheet(width: int = 240) -> U8:
         low, high = meshes[mesh].bounds()
         away = 1.15 * float(np.linalg.norm(high - low)) + 0.6
         yaw = np.radians(-145.0)
-        pose = place(np.cos(yaw + np.pi) * away, np.sin(yaw + np.pi) * away, yaw, 0.45 * away)
+        pose = upright_pose(np.cos(yaw + np.pi) * away, np.sin(yaw + np.pi) * away, yaw, 0.45 * away)
         tilt = np.arctan2(0.45 * away - high[2] / 2, away)
         turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
         pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ turn
@@ -89,17 +90,17 @@ def street_scene(town: str = "Twinford") -> tuple[Scene, F64, tuple[Thing, ...]]
     lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == LaneType.DRIVING and graph.junction[k] < 0]
     start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
     first = int(graph.offset[start] + 8)
-    ego = place(float(graph.xy[first, 0]), float(graph.xy[first, 1]), float(graph.yaw[first]))
+    ego = upright_pose(float(graph.xy[first, 0]), float(graph.xy[first, 1]), float(graph.yaw[first]))
     draws, things = generator("gallery street"), []
     spots = [i for k in lanes for i in range(graph.offset[k] + 2, graph.offset[k + 1], 13)]
-    poses = [place(float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])) for i in spots]
-    poses += [place(float(q[0]), float(q[1]), float(q[2])) for q in street.parking]
+    poses = [upright_pose(float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])) for i in spots]
+    poses += [upright_pose(float(q[0]), float(q[1]), float(q[2])) for q in street.parking]
     for number, pose in enumerate(poses):
         if 8 < np.hypot(*(pose[:2, 3] - ego[:2, 3])) < 110 and draws.random() < 0.7:
             walker = number % len(kinds) == len(kinds) - 1
             mesh = number % (len(kinds) - 1) if number < len(spots) else (0, 1, 3, 5)[number % 4]
             aside = walker and number < len(spots)  # on the sidewalk
-            where = pose @ place(0.0, -4.2, 0.3) if aside else pose
+            where = pose @ upright_pose(0.0, -4.2, 0.3) if aside else pose
             things.append(Thing(len(kinds) - 1 if aside else mesh, where, draw_paint(draws), number + 1))
     return Scene(street, meshes), ego, tuple(things)
 

@@ -11,11 +11,11 @@ from ssad.assets.bodies import draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, box
 from ssad.assets.street import build_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.rig import place
 from ssad.camera.scene import Scene, Thing
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.images import captioned
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.world.models import MODELS
@@ -48,7 +48,7 @@ def things_at(trace: EpisodeTrace, step: int, *, ego: bool) -> tuple[Thing, ...]
     found = []
     for a in range(0 if ego else 1, len(trace.models)):
         if trace.active[step, a]:
-            pose = place(float(trace.x[step, a]), float(trace.y[step, a]), float(trace.yaw[step, a]))
+            pose = upright_pose(float(trace.x[step, a]), float(trace.y[step, a]), float(trace.yaw[step, a]))
             found.append(Thing(a, pose, draw_paint(generator("paint", trace.key, a)), a + 1))
     return tuple(found)
 
@@ -78,7 +78,7 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
     front = Camera.typical(width, width * 9 // 16)
     rows = []
     for step in moments(trace):
-        pose = place(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
+        pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
         over, over_pose = above(pose, 42.0, front.width, front.height)
         weather = Weather(0.9, 2.2, 0.3)
         seen = render(stage, [View(front, pose @ FORWARD, things_at(trace, step, ego=False), weather)]).image[0]

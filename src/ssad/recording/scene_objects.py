@@ -11,9 +11,9 @@ import numpy as np
 from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.assets.mesh import Material, Mesh, box
 from ssad.assets.street.model import Street
-from ssad.camera.rig import place
 from ssad.camera.scene import Thing
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 from ssad.recording.drives import thinned
@@ -92,14 +92,14 @@ class SceneObjects:
             if not (body.active[min(low, len(body.active) - 1)] and body.active[min(high, len(body.active) - 1)]):
                 continue
             a, b = body.track[low], body.track[high]
-            turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
+            turn = wrap_angle(b[2] - a[2])
             x, y, yaw, z = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn, a[3]
             if np.hypot(x - around[0], y - around[1]) > reach:
                 continue
             speed = float(np.hypot(b[0] - a[0], b[1] - a[1])) / self.dt if high > low else 0.0
             walked = float(body.driven[low] + part * (body.driven[high] - body.driven[low]))
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
-            pose = place(float(x), float(y), float(yaw), float(z))
+            pose = upright_pose(float(x), float(y), float(yaw), float(z))
             found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag)))
         return found
 

@@ -10,6 +10,7 @@ import torch
 
 from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Detections
 from ssad.core.errors import ConfigError
+from ssad.core.rotations import matrix_to_quaternion
 from ssad.core.types import F64, I32
 from ssad.detectors.mono3d.nms import rotated_nms
 
@@ -77,7 +78,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
     moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
     names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
     return WorldBoxes(
-        world[rows], size[rows][:, [2, 0, 1]], _quaternions(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
+        world[rows], size[rows][:, [2, 0, 1]], matrix_to_quaternion(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
         score[rows], label[rows].astype(np.int32), names,
     )  # fmt: skip
 
@@ -104,21 +105,6 @@ def _upright(yaw: F64) -> F64:
         [np.stack([cos, none, -sin], -1), np.stack([sin, none, cos], -1), np.tile([0.0, -1.0, 0.0], (len(yaw), 1))],
         -1,
     )
-
-
-def _quaternions(m: F64) -> F64:
-    """Unit quaternions [N, 4] (w, x, y, z; w at least 0) of rotation matrices [N, 3, 3]."""
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    four = np.empty((len(m), 4, 4))  # 4 q q^T: its largest column is q times its largest part
-    four[:, 0, 0] = 1 + trace
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        four[:, i + 1, i + 1] = 1 + 2 * m[:, i, i] - trace
-        four[:, 0, i + 1] = four[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
-        four[:, j + 1, k + 1] = four[:, k + 1, j + 1] = m[:, j, k] + m[:, k, j]
-    largest = np.einsum("nii->ni", four).argmax(1)
-    q = four[np.arange(len(m)), largest]
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(np.where(q[:, :1] < 0, -q, q), np.float64)
 
 
 def _attribute(label: int, attribute: int) -> str:
