@@ -10,7 +10,7 @@ import pytest
 from ssad.assets.bodies import BODIES
 from ssad.bench.pictures import make_pictures
 from ssad.camera.rig import RIG, rig_camera
-from ssad.datasets.nuscenes.schema import CLASSES as NUSCENES
+from ssad.core.nuscenes_names import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import CLASSES, class_sheet
 from ssad.recording.onboard import BODY, above, body_of, moments, onboard_sheet, pick_trace, things_at
 from ssad.roads import load_town

@@ -21,10 +21,11 @@ from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import encode_jpeg, read_image
+from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.rotations import quaternion_to_matrix, slerp
 from ssad.datasets.nuscenes import index
 from ssad.datasets.nuscenes.reader import Annotations, NuScenes, SceneData, points_bytes, read_points
-from ssad.datasets.nuscenes.schema import CAMERAS, TABLES
+from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 

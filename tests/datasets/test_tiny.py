@@ -15,10 +15,10 @@ import pytest
 
 from ssad.core.errors import StoreError
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes, SceneData, SensorFrame, read_points
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.tiny import RIG, make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 

@@ -22,10 +22,10 @@ from ssad.assets.street import cached_street
 from ssad.core.errors import ConfigError, MapError, StoreError
 from ssad.core.geometry import obb_distance
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, CLASSES
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
-from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, CATEGORY, Recording, drive, record_nuscenes

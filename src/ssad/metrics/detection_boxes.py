@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import RANGES
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, I32, Bool
 
@@ -22,18 +22,6 @@ I64 = npt.NDArray[np.int64]
 
 TP_METRICS: Final = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 RACKED: Final = ("bicycle", "motorcycle")
-_RANGES: Final = {
-    "car": 50.0,
-    "truck": 50.0,
-    "bus": 50.0,
-    "trailer": 50.0,
-    "construction_vehicle": 50.0,
-    "pedestrian": 40.0,
-    "motorcycle": 40.0,
-    "bicycle": 40.0,
-    "traffic_cone": 30.0,
-    "barrier": 30.0,
-}
 
 
 @dataclass(frozen=True)
@@ -95,7 +83,7 @@ class DetectionConfig:
     class_range: class -> range in metres, in the order of the labels; dist_ths: thresholds of a match, m.
     """
 
-    class_range: Mapping[str, float] = field(default_factory=lambda: MappingProxyType(_RANGES))
+    class_range: Mapping[str, float] = field(default_factory=lambda: RANGES)
     dist_ths: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     dist_th_tp: float = 2.0
     min_recall: float = 0.1

@@ -23,10 +23,10 @@ from ssad.camera.labels import label_picture
 from ssad.camera.render import Picture, View, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core import safeio
-from ssad.core.detections import CLASSES_3D
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.seeding import digest, generator
 from ssad.core.types import U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
@@ -37,7 +37,7 @@ from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects,
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
 from ssad.roads import load_town, town_names
 
-CLASSES: Final = CLASSES_3D  # category ids are 1 and more in this order
+CLASSES: Final = MMDET3D_CLASSES  # category ids are 1 and more in this order
 _LABEL = {"construction": "construction_vehicle"}
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there

@@ -17,7 +17,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from ssad.camera.labels import visibility_token, visible_share
+from ssad.camera.labels import visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
@@ -27,6 +27,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Boxes3D, Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.nuscenes_names import visibility_token
 from ssad.core.rotations import matrix_to_quaternion, upright_pose, wrap_angle
 from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, Episode, EpisodeTrace

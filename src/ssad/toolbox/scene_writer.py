@@ -17,6 +17,7 @@ from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.frames import Applied
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import LIDAR
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.index import fingerprint
@@ -34,7 +35,7 @@ from ssad.toolbox.manifest import (
     text,
 )
 from ssad.toolbox.options import Shard
-from ssad.toolbox.scene_shifter import LIDAR, SceneShifter
+from ssad.toolbox.scene_shifter import SceneShifter
 
 UNFINISHED: Final = ".unfinished"  # folder of a root for files that are being written; removed when it is done
 _DATA: dict[object, NuScenes] = {}

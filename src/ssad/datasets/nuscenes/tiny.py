@@ -14,13 +14,14 @@ from typing import Any, Final
 import numpy as np
 
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import CAMERAS, LIDAR, visibility_token
 from ssad.core.rotations import quaternion_product, yaw_to_quaternion
 from ssad.core.seeding import generator
 from ssad.core.types import F32
 from ssad.datasets.nuscenes.block_street import BlockObject, ego_place, make_street
 from ssad.datasets.nuscenes.drawing import BlockStreet, BlockView, Light
 from ssad.datasets.nuscenes.files import points_bytes
-from ssad.datasets.nuscenes.schema import CAMERAS, Vector
+from ssad.datasets.nuscenes.schema import Vector
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
 # place on the ego (m), yaw (degrees), focal length and principal point at 1600 x 900: about those of the real cars
@@ -32,7 +33,6 @@ RIG: Final[dict[str, tuple[Vector, float, float, float, float]]] = {
     "CAM_BACK_LEFT": ((1.04, 0.48, 1.50), 110.0, 1256.7, 792.1, 492.8),
     "CAM_FRONT_LEFT": ((1.52, 0.49, 1.50), 55.0, 1272.6, 826.6, 479.8),
 }
-LIDAR: Final = "LIDAR_TOP"
 LIDAR_PLACE: Final[Vector] = (0.94, 0.0, 1.84)
 LIDAR_YAW: Final = -math.pi / 2  # its y axis points forward
 AHEAD: Final = (0.5, -0.5, 0.5, -0.5)  # rotation of an upright camera that looks along x
@@ -111,7 +111,7 @@ class _Drive:
                 translation=self.point(x, y, thing.size[2] / 2),
                 size=thing.size,
                 rotation=tuple(yaw_to_quaternion(yaw + self.heading)),
-                visibility=str(1 + sum(share >= level for level in (0.4, 0.6, 0.8))),
+                visibility=visibility_token(share),
                 attributes=(thing.attribute,) if thing.attribute else (),
                 lidar_points=_count_inside(points, thing, seconds),
             )

@@ -8,22 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Detections
+from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, RANGES, USUAL_ATTRIBUTE
 from ssad.core.rotations import matrix_to_quaternion
 from ssad.core.types import F64, I32
 from ssad.detectors.mono3d.nms import rotated_nms
 
-# m from the ego within which a class is reported, in the order of CLASSES_3D (the evaluation's ranges)
-RANGES = np.array([50.0, 50.0, 50.0, 50.0, 50.0, 40.0, 40.0, 40.0, 30.0, 30.0])
+# m from the ego within which a label is reported
+REACH = np.array([RANGES[name] for name in MMDET3D_CLASSES])
 OVERLAP, LEAST, MOST = 0.05, 0.01, 500
-_CYCLES, _VEHICLES = (5, 6), (0, 1, 2, 3, 4)
 
 
 @dataclass(frozen=True, slots=True)
 class WorldBoxes:
     """Boxes of one moment in the world: translation [N, 3]; size [N, 3] width, length, height; rotation [N, 4]
-    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into CLASSES_3D; attribute names ("": none)."""
+    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into MMDET3D_CLASSES; attribute: names, ""
+    for none."""
 
     translation: F64
     size: F64
@@ -58,7 +59,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
             v.detach().cpu().double().numpy() for v in (solid.centre, solid.size, solid.yaw, solid.velocity)
         )
         score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
-        near = (score > LEAST) & (_distance(centre, to_ego) <= RANGES[label])
+        near = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
         rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ _upright(yaw),
                 _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
@@ -69,7 +70,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
     centre = (world - pose[:3, 3]) @ pose[:3, :3]
     turned = pose[:3, :3].T @ axes
     yaw = np.arctan2(turned[:, 0, 1], turned[:, 0, 0])
-    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= RANGES[label])
+    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= REACH[label])
     ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[near])
     kept = rotated_nms(ground, torch.from_numpy(score[near]), torch.from_numpy(label[near]), threshold=OVERLAP)
     rows = near[kept.numpy()]
@@ -109,12 +110,5 @@ def _upright(yaw: F64) -> F64:
 
 def _attribute(label: int, attribute: int) -> str:
     """The attribute's name where it fits the class, else the class's usual one."""
-    name = ATTRIBUTES[attribute]
-    if label in _VEHICLES:
-        usual = "vehicle.moving" if CLASSES_3D[label] == "bus" else "vehicle.parked"
-        return name if name.startswith("vehicle.") else usual
-    if label in _CYCLES:
-        return name if name.startswith("cycle.") else "cycle.without_rider"
-    if CLASSES_3D[label] == "pedestrian":
-        return name if name.startswith("pedestrian.") else "pedestrian.moving"
-    return ""
+    name, usual = MMDET3D_ATTRIBUTES[attribute], USUAL_ATTRIBUTE[MMDET3D_CLASSES[label]]
+    return name if name.split(".")[0] == usual.split(".")[0] else usual
