@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.assets.street import cached_street
 from ssad.core.errors import ConfigError, MapError, StoreError
 from ssad.core.geometry import obb_distance
@@ -28,7 +29,7 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
-from ssad.recording.nuscenes_recorder import AHEAD, CATEGORY, Recording, drive, record_nuscenes
+from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
 from ssad.recording.scene_objects import place_objects
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
@@ -64,7 +65,7 @@ def test_the_reader_finds_what_was_recorded(root: Path) -> None:
                 assert read_image(root / frame.filename).shape == (90, 160, 3)
             else:
                 assert len(read_points(root / frame.filename)) > 3000
-    assert {CATEGORY_TO_CLASS[c] for c in CATEGORY.values()} == set(CLASSES)
+    assert {CATEGORY_TO_CLASS[c] for c in BODY_CATEGORIES.values()} == set(CLASSES)
 
 
 def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(root: Path) -> None:
@@ -146,7 +147,7 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another(root: Path) -> None
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
         walkers = [b for b in cast.bodies if b.kind == "pedestrian" and len(b.track) > 1]
         assert any(np.hypot(*np.diff(b.track[:30, :2], axis=0).T).sum() > 1.0 for b in walkers), "they walk"
-    assert set(kinds) >= set(CATEGORY) - {"bus", "trailer"}
+    assert set(kinds) >= set(BODY_CATEGORIES) - {"bus", "trailer"}
     assert kinds["bus"] + kinds["trailer"] > 0
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ssad.assets.bodies import draw_paint, make_body
+from ssad.assets.actor_bodies import BODY_CATEGORIES, class_of
+from ssad.assets.bodies import BODIES, draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, build
 from ssad.assets.street import cached_street
 from ssad.camera.render import View, Weather, render
@@ -21,19 +22,8 @@ from ssad.core.types import F64, U8, LaneType
 from ssad.jobs.machine import quiet_warp
 from ssad.roads import load_town
 
-# the ten classes of nuScenes and the kinds and styles of bodies that play them
-CLASSES = {
-    "car": ("car", ("sedan", "hatchback", "estate", "suv", "van", "pickup")),
-    "truck": ("truck", ("box", "flatbed", "tractor", "tipper")),
-    "bus": ("bus", ("city", "coach", "bendy")),
-    "trailer": ("trailer", ("box", "tank", "utility")),
-    "construction vehicle": ("construction", ("excavator", "wheel_loader")),
-    "motorcycle": ("motorcycle", ("ridden", "parked")),
-    "bicycle": ("bicycle", ("ridden", "parked")),
-    "pedestrian": ("pedestrian", ("adult", "child", "standing")),
-    "traffic cone": ("traffic_cone", ("cone", "tall", "drum")),
-    "barrier": ("barrier", ("jersey", "fence", "water")),
-}
+# styles of a kind of body that the sheet of classes shows, where they are not its first three
+SHOWN = {"trailer": ("box", "tank", "utility"), "barrier": ("jersey", "fence", "water")}
 WEATHERS = {
     "clear, noon": Weather(1.0, 0.9, 0.2),
     "overcast": Weather(0.7, 0.9, 1.0),
@@ -56,10 +46,10 @@ def _floor() -> Mesh:
 def class_sheet(width: int = 240) -> U8:
     """The ten classes, one row each kind of body."""
     meshes, cells = [_floor()], []
-    for name, (kind, styles) in CLASSES.items():
-        for style in styles[:3]:
+    for kind in BODY_CATEGORIES:
+        for style in SHOWN.get(kind, tuple(BODIES[kind].styles)[:3]):
             meshes.append(make_body(kind, style=style, generator=generator("gallery", kind, style)))
-            cells.append((f"{name}: {style.replace('_', ' ')}", len(meshes) - 1))
+            cells.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
     stage = Scene(None, meshes)
     camera = Camera.typical(width * 2, width * 3 // 2)
     views = []

@@ -17,6 +17,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.camera.labels import visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
@@ -45,12 +46,6 @@ KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
 REACH: Final = 80.0  # m within which things are annotated
 PART: Final = "part.json"
-CATEGORY: Final = {
-    "car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "trailer": "vehicle.trailer",
-    "construction": "vehicle.construction", "motorcycle": "vehicle.motorcycle", "bicycle": "vehicle.bicycle",
-    "pedestrian": "human.pedestrian.adult", "traffic_cone": "movable_object.trafficcone",
-    "barrier": "movable_object.barrier",
-}  # fmt: skip
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
     "CAM_FRONT_LEFT": 0.0431, "CAM_FRONT": 0.0355, "CAM_FRONT_RIGHT": 0.0276, "CAM_BACK_RIGHT": 0.0201,
@@ -314,9 +309,9 @@ def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[in
         share = shares.get(who.body.tag, 0.0)
         if counts[n] or share > 0:
             found.append(
-                {"tag": who.body.tag, "category": CATEGORY[who.body.kind], "attributes": list(attributes_of(who)),
-                 "centre": centre[n].tolist(), "size": size[n].tolist(), "rotation": list(rotation[n]),
-                 "points": int(counts[n]), "visibility": visibility_token(share)}
+                {"tag": who.body.tag, "category": BODY_CATEGORIES[who.body.kind],
+                 "attributes": list(attributes_of(who)), "centre": centre[n].tolist(), "size": size[n].tolist(),
+                 "rotation": list(rotation[n]), "points": int(counts[n]), "visibility": visibility_token(share)}
             )  # fmt: skip
     return found
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ssad.assets.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.assets.bodies import draw_paint, make_body
-from ssad.assets.mesh import Material, Mesh, box
+from ssad.assets.mesh import Mesh
 from ssad.assets.street import build_street
 from ssad.camera.render import View, Weather, render
 from ssad.camera.scene import Scene, Thing
@@ -20,22 +21,15 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.world.models import MODELS
 
-# model of the world -> kind and style of body; what is not here is a plain box
-BODY = {
-    "car": ("car", "sedan"), "suv": ("car", "suv"), "coupe": ("car", "sedan"), "compact": ("car", "hatchback"),
-    "van": ("car", "van"), "truck": ("truck", "box"), "bus": ("bus", "city"), "motorcycle": ("motorcycle", "ridden"),
-    "bicycle": ("bicycle", "ridden"), "walker": ("pedestrian", "adult"), "cone": ("traffic_cone", "cone"),
-}  # fmt: skip
-
 
 @lru_cache(maxsize=256)
 def body_of(model: str, key: int) -> Mesh:
     """The body that plays a model of the world, of its size. UnknownNameError."""
     size = MODELS[model].length, MODELS[model].width, MODELS[model].height
-    if model not in BODY:
-        return box(size, material=Material("sheet", (0.5, 0.08, 0.06), gloss=0.4), centre=(0, 0, size[2] / 2))
-    kind, style = BODY[model]
-    return make_body(kind, style=style, size=size, generator=generator("body", model, key))
+    if model not in ACTOR_BODIES:
+        return plain_body(size)
+    kind, styles = ACTOR_BODIES[model]
+    return make_body(kind, style=styles[0], size=size, generator=generator("body", model, key))
 
 
 def cast(trace: EpisodeTrace) -> list[Mesh]:
