@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ssad.core.frames import Applied, Boxes3D, Frame, camera_to_world
+from ssad.core.nuscenes_names import VISIBILITY
 from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
@@ -26,11 +27,11 @@ from ssad.scenarios.static.shifts.depth import lens
 from ssad.scenarios.static.shifts.kernels import objects as kernels
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
-LEAST_VISIBLE = 0.4  # objects less visible than this (nuScenes: token 1) have no pixels worth moving
+LEAST_VISIBLE = VISIBILITY["2"]  # objects less visible than this have no pixels worth moving
 LEAST_PIXELS = 6.0
 NEAREST = 0.3  # m before the camera
 LONGEST = 200.0  # px of a streak
-MARGIN, STEP = 8, 4
+MARGIN = 8
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -256,7 +257,7 @@ def _add_item(
         high = middle + (both.max(0) - middle) * 1.25 + MARGIN
     low = np.clip(np.floor(low), 0, [size[0] - 1, size[1] - 1]).astype(int)
     high = np.clip(np.ceil(high) + 1, 1, size).astype(int)
-    wide, tall = ((high - low + STEP - 1) // STEP + 2).tolist()
+    wide, tall = ((high - low + kernels.STEP - 1) // kernels.STEP + 2).tolist()
     plan.items.append(
         (
             index, into, -into @ new_centre, old, old_centre, middle, *plan.outline(target), *plan.outline(outline),
