@@ -9,7 +9,7 @@ import pytest
 
 from ssad.assets.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
 from ssad.assets.bodies import BODIES
-from ssad.bench.pictures import make_pictures
+from ssad.bench.kinds.driving import make_pictures
 from ssad.camera.rig import RIG, rig_camera
 from ssad.core.nuscenes_names import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import SHOWN, class_sheet

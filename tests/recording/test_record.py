@@ -27,13 +27,13 @@ from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, CLASSES
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
+from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
 from ssad.recording.scene_objects import place_objects
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
-from ssad.toolbox.scene_shifter import SceneShifter
 
 SMALL = {"towns": ("Twinford", "Oldmarket"), "held_out": ("Oldmarket",), "scenes": 1, "seconds": 1.0, "width": 160}
 
@@ -49,7 +49,7 @@ def contents(root: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_nuscenes(Recording(tmp_path_factory.mktemp("record") / "a", sweeps=1, **SMALL), workers=1)
+    return record_nuscenes(Recording(tmp_path_factory.mktemp("record") / "a", sweeps=1, **SMALL), workers=0)
 
 
 def test_the_reader_finds_what_was_recorded(root: Path) -> None:
@@ -112,7 +112,7 @@ def test_same_bytes_for_any_number_of_workers_and_after_a_stop(root: Path, tmp_p
     part = again / ".parts" / "scene-oldmarket-000"
     (part / "part.json").unlink()
     next(part.glob("*.jpg")).write_bytes(b"torn")
-    record_nuscenes(todo, workers=1)
+    record_nuscenes(todo, workers=0)
     assert contents(again) == contents(root)
     with pytest.raises(StoreError, match="another recording"):
         record_nuscenes(Recording(again, **SMALL))
@@ -176,7 +176,7 @@ def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(StoreError):
-        record_nuscenes(Recording(blocked / "out", **SMALL), workers=1)
+        record_nuscenes(Recording(blocked / "out", **SMALL), workers=0)
 
 
 def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
@@ -217,17 +217,17 @@ def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
     inside = np.where(graph.kind == LaneType.DRIVING, 0, graph.junction).astype(graph.junction.dtype)
     save_graph(replace(graph, name="Paths", junction=inside), town)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=1)
+        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
     assert "\n" not in str(error.value)
     with np.load(town) as stored:
         arrays = dict(stored)
     arrays["kind"] = np.full_like(arrays["kind"], LaneType.SIDEWALK)
     np.savez(town, **arrays)
     with pytest.raises(MapError, match="no drivable lane") as error:
-        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
 
 
@@ -236,11 +236,11 @@ def test_a_stop_while_tables_are_written_and_a_folder_without_its_page(root: Pat
     shutil.copytree(root, again)
     todo = Recording(again, sweeps=1, **SMALL)
     (again / todo.version / "splits.json").unlink()  # the last that is written
-    record_nuscenes(todo, workers=1)
+    record_nuscenes(todo, workers=0)
     assert contents(again) == contents(root)
     shutil.rmtree(again / ".parts")
     with pytest.raises(StoreError, match="not how it was recorded") as error:
-        record_nuscenes(replace(todo, seed=7), workers=1)
+        record_nuscenes(replace(todo, seed=7), workers=0)
     assert "\n" not in str(error.value)
     assert contents(again) == contents(root)
 

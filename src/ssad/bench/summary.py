@@ -8,6 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
+from ssad.bench.kind import Plan
+
 SHOWN = ("CR", "OR", "DR", "RC")
 """Metrics of the table; the report has all of them, with intervals."""
 
@@ -16,20 +18,17 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     """A Rich table. A record that is not ok is a failed episode; the last rows are the means of the groups."""
     from rich import box
 
-    from ssad.metrics import EpisodeMetrics, aggregate_groups
+    from ssad.metrics import FAMILIES, Outcome, aggregate_groups
 
-    rows = aggregate_groups(
-        (r["system"], r["group"], EpisodeMetrics.from_dict(r["metrics"]) if r["status"] == "ok" else None)
-        for r in records
-    )
+    rows = aggregate_groups((r["system"], Outcome.from_record(r)) for r in records)
     systems = list(dict.fromkeys(row.system for row in rows))
-    average = rows[-1].group
-    groups = [*dict.fromkeys(row.group for row in rows if row.group != average), average]
+    averages = [name for name in FAMILIES.values() if any(row.group == name for row in rows)]
+    groups = [*dict.fromkeys(row.group for row in rows if row.group not in averages), *averages]
     failed = sum(r["status"] != "ok" for r in records)
     result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     result.caption = (
-        "CR collisions per episode and its 95 % interval; OR m driven off the road;\n"
-        "DR m from the route; RC share of the route"
+        "CR collisions per episode and its 95 % interval (below five scenarios: its range);\n"
+        "OR m driven off the road; DR m from the route; RC share of the route"
         + (f"\n{failed} of {len(records)} episodes failed and count" if failed else "")
     )
     result.caption_justify = "left"
@@ -38,10 +37,9 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
     for name in ("n", "CR", "", *SHOWN[1:]):
         result.add_column(name, justify="right", no_wrap=True)
     for group in groups:
-        last = group == average
+        last = group in averages
         found = {row.system: row.values for row in rows if row.group == group}
         for i, system in enumerate(s for s in systems if s in found):
-            count = sum(r["system"] == system and (last or r["group"] == group) for r in records)
             crash, *others = (found[system][metric] for metric in SHOWN)
             interval = f"{_shown(crash.low)}-{_shown(crash.high)}"
             cells = [_shown(crash.mean), interval, *(_shown(other.mean) for other in others)]
@@ -49,19 +47,12 @@ def table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
             result.add_row(
                 "" if i else group,
                 system.rsplit(":", maxsplit=1)[-1],
-                str(count),
+                str(crash.n),
                 *cells,
                 style="bold" if last else None,
-                end_section=end and group == groups[-2],
+                end_section=end and not last and groups[groups.index(group) + 1 :][:1] == averages[:1],
             )
     return result
-
-
-def name_of(record: Mapping[str, Any]) -> str:
-    """What people call a cell."""
-    if "detector" in record:
-        return f"{record['detector']}/{record['shift'] or 'clean'}/{record['severity']}"
-    return f"{record['system']}/{record['spec']['scenario']['name']}"
 
 
 def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
@@ -92,3 +83,27 @@ def shift_table(title: str, records: Sequence[Mapping[str, Any]]) -> Table:
 
 def _shown(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.2f}"
+
+
+def summary_table(plan: Plan, records: Sequence[Mapping[str, Any]]) -> Table:
+    """What a run ends with on the terminal."""
+    title = plan.suite.title or plan.suite.name
+    if plan.kind.name == "driving":
+        return table(title, records)
+    if plan.kind.name == "detection":
+        return shift_table(title, records)
+    return plain_table(title, plan, records)
+
+
+def plain_table(title: str, plan: Plan, records: Sequence[Mapping[str, Any]]) -> Table:
+    """A row a record: its factors, then its metrics."""
+    from rich import box
+
+    result = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in (*plan.kind.factors, *(column.name for column in plan.kind.columns)):
+        result.add_column(name)
+    for record in records:
+        values = (record["metrics"].get(column.name) for column in plan.kind.columns)
+        shown = ("failed" if record["status"] != "ok" else "n/a" if v is None else f"{v:.3g}" for v in values)
+        result.add_row(*(str(record.get(name, "")) for name in plan.kind.factors), *shown)
+    return result

@@ -7,9 +7,10 @@ failed goes when it is to be tried again.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -67,6 +68,7 @@ class Store:
         self._lock = lock
         self._files: dict[str, int] = {}
         self.results: dict[str, dict[str, Any]] = {}
+        self.retried: frozenset[str] = frozenset()
 
     @classmethod
     def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
@@ -97,7 +99,8 @@ class Store:
             if record["key"] in self.results:
                 raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
             self.results[record["key"]] = record
-        if retry and any(_failed(record) for record in results):
+        self.retried = frozenset(record["key"] for record in results if retry and _failed(record))
+        if self.retried:
             self.results = {key: record for key, record in self.results.items() if not _failed(record)}
             lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
             safeio.write_atomic(self.folder / RESULTS, "".join(lines))
@@ -108,7 +111,6 @@ class Store:
         _cut(self.folder / EPISODES, ends[-1] if ends else 0)
         for name in (RESULTS, EPISODES):
             self._files[name] = _open_append(self.folder / name)
-        (self.folder / "traces").mkdir(exist_ok=True)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
         """Add one finished cell; durable when this returns. A key that is already there raises ValueError."""
@@ -169,14 +171,42 @@ def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
     )
 
 
-def _lock(folder: Path) -> int:
-    descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+def _lock(folder: Path, what: str = "ssad run") -> int:
+    """The descriptor of a lock file that only one process may hold. StoreError: another one does."""
+    path = folder / LOCK
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         os.close(descriptor)
-        raise StoreError(f"{folder}: another ssad run is writing there; wait for it or use --out") from None
+        raise StoreError(
+            f"{folder}: another {what} is writing there; wait for its end or choose another folder"
+        ) from None
+    except OSError as error:
+        os.close(descriptor)
+        raise StoreError(f"{path}: cannot be locked: {error.strerror or error}") from None
     return descriptor
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """The folder, made if need be, for this process alone while the block lasts.
+
+    Args:
+        folder: to be written.
+        what: the command, for the message.
+
+    Raises:
+        StoreError: another process has it.
+    """
+    descriptor = _lock(safeio.make_folder(folder), what)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _cut(path: Path, size: int) -> None:
