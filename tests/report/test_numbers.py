@@ -20,7 +20,7 @@ from PIL import Image
 from ssad.core.errors import StoreError
 from ssad.core.traces import save_trace, trace_hash
 from ssad.report import check_artefacts, write_report
-from ssad.report.pages import section_of
+from ssad.report.pages import kind_module
 
 
 class _Text(html.parser.HTMLParser):
@@ -264,9 +264,9 @@ def test_a_kind_without_columns_or_factors_gets_those_of_its_lines(tmp_path: Pat
 
 @pytest.mark.parametrize("kind", ["driving", "detection"])
 def test_kinds_have_their_sections(kind: str) -> None:
-    assert section_of(kind).__module__ == f"ssad.report.kinds.{kind}"
-    assert section_of("tables").__module__ == "ssad.report.default"
-    assert section_of("../driving").__module__ == "ssad.report.default"
+    assert kind_module(kind).section.__module__ == f"ssad.report.kinds.{kind}"
+    assert kind_module("tables").section.__module__ == "ssad.report.default"
+    assert kind_module("../driving").section.__module__ == "ssad.report.default"
 
 
 def detection_line(shift: str | None, severity: Any, scenes: int) -> dict[str, Any]:
