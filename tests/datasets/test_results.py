@@ -282,8 +282,7 @@ def test_score_results(tmp_path: Path) -> None:
     own = found["ssad"]
     assert np.mean(list(own["dist_aps"].values())) == pytest.approx(found["mean_ap"])
     assert (own["samples"], own["scenes"]) == (16, 2)
-    low, high = own["intervals"]["nd_score"]
-    assert low <= high
+    assert np.isnan(own["intervals"]["nd_score"]).all()  # two scenes are too few
     assert own["truth"]["car"] > 0
     (root / VERSION / "splits.json").write_text('{"first": ["scene-0103"]}')
     part = score_results(root / "results.json", dataroot=root, version=VERSION, split="first")

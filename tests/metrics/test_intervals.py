@@ -165,6 +165,11 @@ def test_a_group_of_one_cluster_borrows_from_the_others():
     assert found.mean == pytest.approx((3 / 8 + 1) / 2)
     assert found.low < 0.5
     assert found.high > 0.85
+    # groups of one cluster each are as uncertain as clusters of one group
+    values = np.array([1.0, 0, 1, 0, 1, 0, 0, 1])
+    apart = bounded_limits(values, Clusters(np.ones(8), np.arange(8)), cap=16.0)
+    together = bounded_limits(values, design(8, 1), cap=16.0)
+    assert (apart.low, apart.high) == (pytest.approx(together.low), pytest.approx(together.high))
 
 
 def test_replicates_of_few_clusters_are_widened():

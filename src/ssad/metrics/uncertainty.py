@@ -71,11 +71,6 @@ class Estimate:
     method: str = "none"
     clusters: int = 0
 
-    @property
-    def has_interval(self) -> bool:
-        """Whether low and high are limits of a 95 % interval."""
-        return self.method in ("beta", "t")
-
     def as_dict(self) -> dict[str, Any]:
         """Field name -> value."""
         return asdict(self)
