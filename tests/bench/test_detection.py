@@ -114,8 +114,7 @@ def test_random_is_put_together_from_the_severities(folder: Path, root: Path) ->
 
 def test_intervals_hold_the_value_and_replicates_are_paired(folder: Path) -> None:
     for record in lines(folder):
-        low, high = record["intervals"]["NDS"]
-        assert low <= high
+        assert record["intervals"] == {}, "two scenes are too few"
         assert len(record["replicates"]["NDS"]) == 20
     # of two scenes a replicate takes one twice, or both: what the same draw gave is equal in every cell
     draws = generator("detection suite", 0, 2).multinomial(2, [0.5, 0.5], size=20)[:, 0]

@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from ssad.core.types import F64
 from ssad.metrics.intervals import (
-    LEVEL,
     MIN_CLUSTERS,
     Clusters,
     Limits,
@@ -154,13 +153,6 @@ def paired_difference(first: Mapping[str, CaseValue], second: Mapping[str, CaseV
     ]
     missing = len(set(first) | set(second)) - len(pairs)
     return replace(estimate(pairs, "mean"), failed=missing)
-
-
-def percentile_interval(samples: npt.ArrayLike, level: float = LEVEL) -> tuple[float, float]:
-    """Limits that leave (1 - level) / 2 of the samples on each side."""
-    tail = 0.5 * (1.0 - level)
-    low, high = np.quantile(np.asarray(samples, np.float64), [tail, 1.0 - tail])
-    return float(low), float(high)
 
 
 def _distinct(values: Iterable[CaseValue]) -> list[CaseValue]:
