@@ -126,7 +126,7 @@ class Detector(Protocol):
         """Raw outputs, differentiable to the images."""
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Which place answers for which object, as in training; no gradient flows through it."""
+        """Target assignment as in training: which object each location should predict. Not differentiable."""
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"

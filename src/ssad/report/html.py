@@ -130,7 +130,7 @@ def _outcome(record: Record) -> str:
 
 
 def _matrix(run: Run) -> list[dict[str, Any]]:
-    """Groups with one line a system, one mark an episode."""
+    """Groups of episodes, one row per system."""
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
     for r in run.records:
         name = r.heading

@@ -240,7 +240,9 @@ def episode_of(cell: Cell) -> Episode:
     from ssad.scenarios.dynamic import build_episode, scenario_from
 
     scenario = scenario_from(cell.spec["scenario"])
-    return replace(build_episode(scenario, town(scenario.town), seed=cell.seed, spread=cell.spec["spread"]), key=cell.key)
+    return replace(
+        build_episode(scenario, town(scenario.town), seed=cell.seed, spread=cell.spec["spread"]), key=cell.key
+    )
 
 
 def _check(cell: Cell) -> None:
