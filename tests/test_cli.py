@@ -52,7 +52,7 @@ def test_nothing_heavy_is_imported_for_help() -> None:
         (("run", "quick", "--device", "tpu"), ("auto, cpu or cuda",)),
         (("report", "nowhere"), ("nowhere: not a results folder", "ssad run")),
         (("replay", "nowhere", "x"), ("nowhere: not a results folder",)),
-        (("list", "towms"), ("unknown kind 'towms'", "towns")),
+        (("list", "towms"), ("unknown list 'towms'", "towns")),
         (("import", "map", "nowhere.xodr"), ("nowhere.xodr",)),
         (("import", "map", "x.xodr", "--name", "Twinford"), ("built-in town",)),
         (("import", "routes", "nowhere"), ("nowhere: no such folder",)),
@@ -132,6 +132,7 @@ def test_doctor() -> None:
     [
         ("suites", "quick"),
         ("systems", "blind"),
+        ("kinds", "detection"),
         ("agents", "autopilot"),
         ("towns", "ProvingGround"),
         ("scenarios", "StraightObstacle/00"),
@@ -185,9 +186,9 @@ def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--clips", "drive", "--scenes", "3"], "--scenes does not go with --clips"),
-        (["--clips", "orbit", "--width", "640"], "--width does not go with --clips"),
-        (["--images", "5"], "--images goes only with --clips"),
+        (["--clips", "drive", "--scenes", "3"], "--scenes cannot be used with --clips"),
+        (["--clips", "orbit", "--width", "640"], "--width cannot be used with --clips"),
+        (["--images", "5"], "--images can only be used with --clips"),
     ],
 )
 def test_record_refuses_options_that_would_do_nothing(words: list[str], message: str, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""The command line: one thin function a verb. Heavy imports are inside, so that --help is quick."""
+"""The command line: one short function per command. Heavy imports are inside them, so that --help is quick."""
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,14 +19,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-imports = typer.Typer(help="Bring in OpenDRIVE maps and SafeBench / FREA / leaderboard routes.", no_args_is_help=True)
+imports = typer.Typer(help="Import OpenDRIVE maps and SafeBench, FREA or leaderboard routes.", no_args_is_help=True)
 app.add_typer(imports, name="import")
 
-Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `ssad run` wrote.")]
+Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of `ssad run`.")]
+Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
+Workers = Annotated[int | None, typer.Option(min=1, help="Number of worker processes.  [default: one per core]")]
+Ray = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Run on the Ray cluster at ADDRESS; 'local' starts one here.")
+]
 
 
 class Video(StrEnum):
-    """Kinds of video that `ssad replay` writes."""
+    """Video formats that `ssad replay` can write."""
 
     mp4 = "mp4"
     gif = "gif"
@@ -33,21 +39,22 @@ class Video(StrEnum):
 
 @app.command()
 def run(
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="Name (see: ssad list suites) or YAML file.")],
+    suite: Annotated[
+        str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
+    ],
     out: Annotated[Path | None, typer.Option(help="Results folder.  [default: runs/SUITE]")] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the suite.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the suite; can be repeated."),
     ] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
-    ] = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Run again what failed.")] = False,
+    device: Device = "auto",
+    workers: Workers = None,
+    ray: Ray = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Run failed cells again.")] = False,
 ) -> None:
-    """Run a suite and write its report; run again to resume.
+    """Run a suite and write its report. To resume a stopped run, repeat the command.
 
-    Exit code 0: all of it ran; 1: some failed (they are in the results with the reason); 2: wrong input.
+    Exit code 0: every cell ran. 1: some cells failed; the results give the reasons. 2: invalid input.
     """
     from rich.console import Console
 
@@ -67,7 +74,7 @@ def run(
         records = run_plan(plan, folder, Resources(workers, ray, where), retry=retry)
         kind.finish(plan, folder)
     except KeyboardInterrupt:
-        print(f"stopped; what is done is kept in {folder}: the same command goes on from there", file=sys.stderr)
+        print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
         raise typer.Exit(130) from None
     console = Console()
     console.print(summary(folder))
@@ -77,7 +84,7 @@ def run(
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     if failed:
-        console.print("what failed is kept as it is; to try it again: the same command with --retry")
+        console.print("to run the failed cells again, repeat the command with --retry")
     report(folder)
     raise typer.Exit(1 if failed else 0)
 
@@ -101,13 +108,13 @@ def report(folder: Dir) -> None:
 @app.command()
 def replay(
     folder: Dir,
-    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key, start of a key, or system/scenario.")],
-    out: Annotated[Path | None, typer.Option(help="Where to write.  [default: DIR/replays]")] = None,
-    video: Annotated[Video, typer.Option(help="Kind of video.")] = Video.mp4,
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key of a cell, the start of one, or SYSTEM/SCENARIO.")],
+    out: Annotated[Path | None, typer.Option(help="Output folder.  [default: DIR/replays]")] = None,
+    video: Annotated[Video, typer.Option(help="Video format.")] = Video.mp4,
 ) -> None:
-    """Run one cell again, compare it bit for bit with the record, and write its video and recording.
+    """Run one cell again, compare it with its record bit by bit, and write a video and the trace.
 
-    Exit code 1 when the two differ.
+    Exit code 1: the new run differs from the record.
     """
     from ssad.bench.replay import replay as run_again
     from ssad.core.safeio import make_folder
@@ -120,52 +127,53 @@ def replay(
     film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
     verdict = f"differs: {found.difference}" if found.difference else "identical"
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
-    print(f"video: {film}\nrecording: {target.with_suffix('.npz')}")
+    print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
     raise typer.Exit(1 if found.difference else 0)
 
 
 @app.command()
 def shift(
-    source: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, or a picture of your own.")],
+    source: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, or an image file.")],
     out: Annotated[
         Path,
-        typer.Argument(
-            metavar="OUT", help="Folder for one nuScenes root a shift and severity; FILE.png: a contact sheet."
-        ),
+        typer.Argument(metavar="OUT", help="Folder for the shifted nuScenes roots, or FILE.png for a contact sheet."),
     ],
-    shifts: Annotated[
-        str, typer.Option(help="Names with commas between them (see: ssad list shifts), or all.")
-    ] = "all",
-    severity: Annotated[str, typer.Option(help="1 to 5, with commas between them, or random.")] = "random",
-    seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    shifts: Annotated[str, typer.Option(help="Comma-separated names (see: ssad list shifts), or all.")] = "all",
+    severity: Annotated[str, typer.Option(help="Comma-separated severities from 1 to 5, or random.")] = "random",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     calibration: Annotated[
-        str, typer.Option(help="physical, or paper: the published figures, image by image.")
+        str, typer.Option(help="physical: severities in units. paper: the published severities, image by image.")
     ] = "physical",
     labels: Annotated[
-        str, typer.Option(help="Boxes in the tables: original, or transformed with the objects.")
+        str, typer.Option(help="Boxes in the annotation table: original, or transformed with the objects.")
     ] = "original",
-    version: Annotated[str | None, typer.Option(help="Such as v1.0-mini.  [default: the only one]")] = None,
-    split: Annotated[str | None, typer.Option(help="Only the scenes of a split, such as mini_val.")] = None,
-    scenes: Annotated[
-        str, typer.Option(help="Only these scenes, with commas between them; a contact sheet is of one.")
-    ] = "",
-    sweeps: Annotated[bool, typer.Option(help="Shift the files between key frames too.")] = True,
-    lidar: Annotated[bool, typer.Option(help="Shift the LiDAR too.")] = True,
-    quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG files.")] = 95,
-    subsampling: Annotated[str, typer.Option(help="auto (444 for sensor noise, else 420), 444, 422 or 420.")] = "auto",
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
+    version: Annotated[
+        str | None, typer.Option(help="Dataset version, such as v1.0-mini.  [default: the only one in DATAROOT]")
     ] = None,
-    channel: Annotated[str, typer.Option(help="Camera of a contact sheet.")] = "CAM_FRONT",
-    box: Annotated[list[str] | None, typer.Option(metavar="X0,Y0,X1,Y1", help="An object in your picture.")] = None,
+    split: Annotated[str | None, typer.Option(help="Only the scenes of this split, such as mini_val.")] = None,
+    scenes: Annotated[
+        str, typer.Option(help="Only these scenes, comma-separated. A contact sheet shows one scene.")
+    ] = "",
+    sweeps: Annotated[bool, typer.Option(help="Also shift the frames between keyframes.")] = True,
+    lidar: Annotated[bool, typer.Option(help="Also shift the LiDAR points.")] = True,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="JPEG quality.")] = 95,
+    subsampling: Annotated[
+        str, typer.Option(help="JPEG chroma subsampling: auto (444 for sensor noise, else 420), 444, 422 or 420.")
+    ] = "auto",
+    workers: Workers = None,
+    ray: Ray = None,
+    channel: Annotated[str, typer.Option(help="Camera that a contact sheet shows.")] = "CAM_FRONT",
+    box: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X0,Y0,X1,Y1", help="2D box of an object in the image file, pixels; can be repeated."),
+    ] = None,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Only compare OUT with its manifests, file by file.")
+        bool, typer.Option("--verify", help="Write nothing; compare every file in OUT with the manifests.")
     ] = False,
 ) -> None:
-    """Distribution shifts: a nuScenes folder into nuScenes-N, or a contact sheet of one picture.
+    """Apply distribution shifts to a nuScenes folder (nuScenes-N), or to one image as a contact sheet.
 
-    Run the same command again to go on after a stop. Exit code 1: some files failed, or are not as the manifest says.
+    To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
     """
     from ssad.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
 
@@ -207,16 +215,18 @@ def shift(
 
 @app.command()
 def score(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS.json", help="Detections in the official format.")],
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.json", help="Detections in the nuScenes results format.")],
     dataroot: Annotated[Path, typer.Option(help="nuScenes or nuScenes-N folder.")],
-    version: Annotated[str, typer.Option(help="Such as v1.0-trainval.")],
-    split: Annotated[str, typer.Option(help="Such as val, mini_val, or one of the folder's splits.json.")],
-    file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write all numbers there.")] = None,
-    intervals: Annotated[int, typer.Option(min=0, help="Bootstrap replicates over scenes for 95 % intervals.")] = 0,
+    version: Annotated[str, typer.Option(help="Dataset version, such as v1.0-trainval.")],
+    split: Annotated[str, typer.Option(help="val, mini_val, or a split that the folder's splits.json defines.")],
+    file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers to this file.")
+    ] = None,
+    intervals: Annotated[int, typer.Option(min=0, help="Bootstrap replicates for 95 % intervals; 0: none.")] = 0,
 ) -> None:
-    """mAP, NDS and the TP errors, as the official nuScenes evaluation gives them.
+    """Compute mAP, NDS and the true-positive errors of the official nuScenes evaluation.
 
-    A shifted folder is checked against its manifest first, so that clean data are not scored as shifted.
+    A shifted folder is first checked against its manifest, so that clean data cannot be scored as shifted.
     """
     from rich.console import Console
 
@@ -236,31 +246,34 @@ def score(
 @app.command()
 def record(
     context: typer.Context,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Root of the data set.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the dataset.")],
     towns: Annotated[
-        str, typer.Option(help="Towns with commas between them.")
+        str, typer.Option(help="Comma-separated towns (see: ssad list towns).")
     ] = "Twinford,Crossgate,Oldmarket,Larkhill",
-    held_out: Annotated[str, typer.Option(help="Towns of the split val; the others are train.")] = "Oldmarket,Larkhill",
-    scenes: Annotated[int, typer.Option(min=1, help="Scenes of each town.")] = 2,
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a scene.")] = 20.0,
-    width: Annotated[int, typer.Option(min=64, help="Width of the pictures (16:9).")] = 1600,
-    sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between key frames.")] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Root of all random numbers.")] = 0,
+    held_out: Annotated[str, typer.Option(help="Towns of the split val; all others are train.")] = "Oldmarket,Larkhill",
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes per town.")] = 2,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a scene, s.")] = 20.0,
+    width: Annotated[int, typer.Option(min=64, help="Image width in pixels (16:9).")] = 1600,
+    sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between two keyframes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     clips: Annotated[
-        str | None, typer.Option(help="Instead of it pictures of one car for 2D detection, COCO: drive or orbit.")
+        str | None,
+        typer.Option(help="Record images of one target car with COCO annotations instead: drive or orbit."),
     ] = None,
     streets: Annotated[
-        str, typer.Option(help="town: what always stands there; any: built anew for each drive, for training.")
+        str, typer.Option(help="town: the town's own buildings. any: new ones for each drive, for training data.")
     ] = "town",
-    images: Annotated[str, typer.Option(help="With --clips: pictures of each of the towns.")] = "600,400,400,400",
-    style: Annotated[str | None, typer.Option(help="With --clips: body of the target car (default: any).")] = None,
-    device: Annotated[str, typer.Option(help="Where pictures are rendered: cpu or cuda.")] = "cpu",
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
-    ray: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
+    images: Annotated[
+        str, typer.Option(help="With --clips: images per town, one number for each town or one for all.")
+    ] = "600,400,400,400",
+    style: Annotated[
+        str | None, typer.Option(help="With --clips: body style of the target car.  [default: random]")
     ] = None,
+    device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
+    workers: Workers = None,
+    ray: Ray = None,
 ) -> None:
-    """Drives in the world, seen by the nuScenes rig: a data set in the nuScenes schema. Run again to go on."""
+    """Record drives with the nuScenes sensors as a dataset in the nuScenes schema. To resume, repeat the command."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -274,7 +287,7 @@ def record(
     for name in idle:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            raise ConfigError(f"--{name} {'does not go' if clips is not None else 'goes only'} with --clips")
+            raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("record", total=None)
@@ -290,7 +303,7 @@ def record(
                 out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device), streets=streets,  # type: ignore[arg-type]
             )  # fmt: skip
             record_clips(todo, workers=workers, ray=ray, progress=progress)
-            text = f"{out}: {sum(count for _, count in pairs)} pictures, annotations train, test and all"
+            text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"
         else:
             drives = Recording(
                 out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
@@ -301,7 +314,7 @@ def record(
     print(text)
 
 
-train_app = typer.Typer(no_args_is_help=True, help="Train a detector (more to come).")
+train_app = typer.Typer(no_args_is_help=True, help="Train a detector.")
 app.add_typer(train_app, name="train")
 
 
@@ -310,26 +323,27 @@ def train_detector(
     recipe: Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a recipe (see: ssad list recipes).")],
     data: Annotated[
         Path,
-        typer.Option(help="Root of a data set in the nuScenes schema (3D), or a folder of `ssad record --clips` (2D)."),
+        typer.Option(help="3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote."),
     ],
-    more: Annotated[list[Path] | None, typer.Option(help="2D: more folders of clips.")] = None,
+    more: Annotated[list[Path] | None, typer.Option(help="2D only: another such folder; can be repeated.")] = None,
     val_data: Annotated[
-        Path | None, typer.Option(help="3D: another data set to validate on (default: that of --data).")
+        Path | None, typer.Option(help="3D only: dataset to validate on.  [default: that of --data]")
     ] = None,
-    out: Annotated[Path, typer.Option(help="Checkpoint, log, curves, weights; run again to go on.")] = Path("training"),
-    split: Annotated[str, typer.Option(help="Split to learn from.")] = "train",
+    out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
+    split: Annotated[str, typer.Option(help="Split to train on.")] = "train",
     val: Annotated[str, typer.Option(help="Split to validate on.")] = "val",
     change: Annotated[
-        list[str] | None, typer.Option("--set", help="A value of the recipe: --set epochs=3 --set lr=0.001.")
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the recipe, such as epochs=3."),
     ] = None,
-    weights: Annotated[Path | None, typer.Option(help="Start from these weights.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
-    gpus: Annotated[int, typer.Option(min=1, help="GPUs to share the work, one process each.")] = 1,
+    weights: Annotated[Path | None, typer.Option(help="Initial weights.")] = None,
+    device: Device = "auto",
+    gpus: Annotated[int, typer.Option(min=1, help="Number of GPUs, one process each.")] = 1,
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after the epoch in which this time is over.")
+        float | None, typer.Option(min=0.0, help="Time limit; stops at the end of the epoch that exceeds it.")
     ] = None,
 ) -> None:
-    """Train a detector; validates on towns that it does not learn from."""
+    """Train a detector and validate it on the split val. To resume, repeat the command."""
     from ssad.training.detector import Plan, parse_changes, run_training
 
     plan = Plan(
@@ -341,11 +355,15 @@ def train_detector(
 
 
 def _scenario_list() -> dict[str, str]:
+    from ssad.core.registry import names
     from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
+    from ssad.scenarios.dynamic.sets import SHIPPED
 
     sets = {name: load_scenarios(name) for name in set_names()}
-    rows = {name: f"set of {len(found)}" for name, found in sets.items()}
-    rows |= {name: f"class, {sum(s.type == name for s in sets['precrash'])} pre-crash" for name in SCENARIOS}
+    rows = {name: f"set of {len(found)} scenarios" for name, found in sets.items()}
+    shipped = Counter(s.type for name in SHIPPED for s in sets[name])
+    for name, where in names("scenario", SCENARIOS).items():
+        rows[name] = f"class with {shipped[name]} scenarios" if name in SCENARIOS else f"class of your own: {where}"
     return rows | {s.name: f"{s.type} in {s.town}" for found in sets.values() for s in found}
 
 
@@ -353,7 +371,14 @@ def _system_list() -> dict[str, str]:
     from ssad.core.registry import names
     from ssad.drivers import SYSTEMS
 
-    return names("system", SYSTEMS) | {"module:object": "a driving system of your own, see README"}
+    return names("system", SYSTEMS) | {"module:object": "a driving system of your own (README.md)"}
+
+
+def _kind_list() -> dict[str, str]:
+    from ssad.bench.suite import KINDS
+    from ssad.core.registry import names
+
+    return names("kind", KINDS) | {"module:class": "a kind of your own (ARCHITECTURE.md)"}
 
 
 def _town_list() -> dict[str, str]:
@@ -384,7 +409,7 @@ def _detector_list() -> dict[str, str]:
         return where
 
     rows = {name: about(name, where) for name, where in detector_names().items()}
-    return rows | {"module:object": "a detector of your own, see docs/detectors.md"}
+    return rows | {"module:object": "a detector of your own (docs/detectors.md)"}
 
 
 def _recipe_list() -> dict[str, str]:
@@ -396,8 +421,9 @@ def _recipe_list() -> dict[str, str]:
     }
 
 
-KINDS = {
+LISTS = {
     "suites": _suite_list,
+    "kinds": _kind_list,
     "scenarios": _scenario_list,
     "systems": _system_list,
     "detectors": _detector_list,
@@ -410,15 +436,13 @@ ALIASES = {"agents": "systems"}
 
 @app.command("list")
 def list_names(
-    kind: Annotated[
-        str | None, typer.Argument(metavar="[KIND]", help="suites, scenarios, systems, detectors, recipes, ...")
-    ] = None,
+    what: Annotated[str | None, typer.Argument(metavar="[WHAT]", help=f"One of: {', '.join(LISTS)}.")] = None,
 ) -> None:
-    """List what can be named: suites, scenarios, systems (agents), detectors, recipes, shifts, towns."""
-    chosen = ALIASES.get(kind or "", kind)
-    if chosen is not None and chosen not in KINDS:
-        raise unknown_name("kind", str(kind), [*KINDS, *ALIASES])
-    for name, rows in KINDS.items():
+    """List the names that other commands and suites accept. Without WHAT: all lists, scenarios by set and class."""
+    chosen = ALIASES.get(what or "", what)
+    if chosen is not None and chosen not in LISTS:
+        raise unknown_name("list", str(what), [*LISTS, *ALIASES])
+    for name, rows in LISTS.items():
         if chosen not in (None, name):
             continue
         found = rows()
@@ -433,36 +457,36 @@ def list_names(
 
 @imports.command("map")
 def import_map(
-    file: Annotated[Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE map.")],
-    name: Annotated[str | None, typer.Option(help="Name of the town.  [default: that of the file]")] = None,
+    file: Annotated[Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file.")],
+    name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
 ) -> None:
-    """Turn an OpenDRIVE map into a town (needs the extra `carla`)."""
+    """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
     from ssad.core.safeio import home
     from ssad.roads import import_map as bake
     from ssad.roads import load_town, town_names
 
     label = name or file.stem
     if town_names().get(label) == "built-in":
-        raise ConfigError(f"'{label}' is the name of a built-in town; choose another with --name")
+        raise ConfigError(f"'{label}' is a built-in town; choose another name with --name")
     path = bake(file, label, home())
     print(f"town {label}: {len(load_town(label).kind)} lanes, written to {path}")
 
 
 @imports.command("routes")
 def import_routes(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="SafeBench, FREA or leaderboard routes.")],
-    name: Annotated[str | None, typer.Option(help="Name of the set.  [default: that of the folder]")] = None,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of SafeBench, FREA or leaderboard routes.")],
+    name: Annotated[str | None, typer.Option(help="Name of the set.  [default: name of the folder]")] = None,
 ) -> None:
-    """Turn a folder of routes into a set of scenarios that suites can name."""
+    """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite."""
     from ssad.core.safeio import home
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
 
     label = name or folder.resolve().name
     if not label.replace("-", "").replace("_", "").isalnum():
-        raise ConfigError(f"'{label}' cannot name a set of scenarios; use letters, digits, _ and - with --name")
+        raise ConfigError(f"'{label}' cannot name a set; choose a name of letters, digits, _ and - with --name")
     if label in ("precrash", "natural"):
-        raise ConfigError(f"'{label}' is the name of a built-in set; choose another with --name")
+        raise ConfigError(f"'{label}' is a built-in set; choose another name with --name")
     scenarios = read(folder)
     path = home() / "scenarios" / f"{label}.yaml"
     save_scenarios(path, scenarios)
@@ -472,7 +496,7 @@ def import_routes(
 
 @app.command()
 def doctor() -> None:
-    """Say what works on this machine and what is missing. Exit code 1 when nothing can run."""
+    """Check this machine: what works, what is missing. Exit code 1: something that every run needs is broken."""
     from ssad.doctor import examine
 
     broken = False
@@ -483,8 +507,8 @@ def doctor() -> None:
 
 
 def main() -> None:
-    """Entry point: an error that the user can mend becomes one line and exit code 2."""
-    # click's UsageError, which typer carries along under a name of its own
+    """Entry point: an error that the user can fix becomes one line and exit code 2."""
+    # click's UsageError, which typer does not export
     usage_error: Any = typer.BadParameter.__mro__[1]
     try:
         code = app(standalone_mode=False)

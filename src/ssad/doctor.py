@@ -1,4 +1,4 @@
-"""`ssad doctor`: what works on this machine and what is missing."""
+"""`ssad doctor`: what works on this machine, what is missing, and how to get it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 import ssad
-from ssad.core.errors import SSADError
+from ssad.core.errors import SSADError, install_extra
 from ssad.core.safeio import home
 
 
 @dataclass(frozen=True)
 class Finding:
-    """state: ok, missing (an extra that some commands need) or broken (nothing runs without it)."""
+    """One check. state: ok, missing (some commands need it) or broken (no suite runs without it)."""
 
     what: str
     state: str
@@ -26,7 +26,7 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Look at one thing after the other."""
+    """Run the checks one by one."""
     ok = (3, 11) <= sys.version_info < (3, 14)
     python = f"{platform.python_version()} on {platform.platform(terse=True)}"
     yield Finding("python", "ok" if ok else "broken", python if ok else f"{python}; SSAD needs 3.11 to 3.13")
@@ -59,19 +59,21 @@ def _warp() -> Iterator[Finding]:
         devices = ", ".join(f"{d.alias} ({d.name})" for d in warp.get_devices())
         yield Finding("warp", "ok", f"{version('warp-lang')}: {devices}")
         gpu = warp.is_cuda_available()
-        yield Finding("cuda", "ok" if gpu else "missing", "usable" if gpu else "no CUDA device; runs use the CPU")
+        yield Finding(
+            "cuda", "ok" if gpu else "missing", "usable" if gpu else "no CUDA device found; everything runs on the CPU"
+        )
     except Exception as error:
-        yield Finding("warp", "broken", f"{type(error).__name__}: {error}; reinstall warp-lang")
+        yield Finding("warp", "broken", f"{type(error).__name__}: {error}; reinstall the package warp-lang")
 
 
 def _carla() -> Finding:
     if importlib.util.find_spec("carla") is None:
-        why = "OpenDRIVE maps cannot be imported; install ssad-testbed[carla] (Python 3.11 or 3.12)"
+        why = f"`ssad import map` needs it, and Python 3.11 or 3.12; {install_extra('carla')}"
         return Finding("carla", "missing", why)
     try:
-        return Finding("carla", "ok", f"{version('carla')}: OpenDRIVE maps can be imported")
+        return Finding("carla", "ok", f"{version('carla')}: `ssad import map` works")
     except PackageNotFoundError:
-        return Finding("carla", "ok", "OpenDRIVE maps can be imported")
+        return Finding("carla", "ok", "`ssad import map` works")
 
 
 def _home() -> Finding:
@@ -80,8 +82,12 @@ def _home() -> Finding:
     while not near.exists() and near != near.parent:
         near = near.parent
     if not os.access(near, os.W_OK):
-        return Finding("SSAD_HOME", "missing", f"{folder}: not writable; set SSAD_HOME to another folder")
-    return Finding("SSAD_HOME", "ok", f"{folder}{'' if folder.exists() else ' (made when first needed)'}")
+        return Finding(
+            "SSAD_HOME",
+            "missing",
+            f"{folder}: not writable, so nothing can be imported; set SSAD_HOME to another folder",
+        )
+    return Finding("SSAD_HOME", "ok", f"{folder}{'' if folder.exists() else ' (created when first needed)'}")
 
 
 def _towns() -> Iterator[Finding]:
@@ -95,7 +101,7 @@ def _towns() -> Iterator[Finding]:
         except (SSADError, OSError) as error:
             built_in = where == "built-in"
             bad.append(Finding(f"town {name}", "broken" if built_in else "missing", str(error)))
-    yield Finding("towns", "ok" if good else "broken", ", ".join(good) or "none can be read")
+    yield Finding("towns", "ok" if good else "broken", ", ".join(good) or "no town can be read; reinstall SSAD")
     yield from bad
 
 
@@ -103,4 +109,4 @@ def _suites() -> Finding:
     from ssad.bench.suite import suite_files
 
     found = ", ".join(suite_files())
-    return Finding("suites", "ok" if found else "broken", found or "none found; reinstall ssad-testbed")
+    return Finding("suites", "ok" if found else "broken", found or "no suite found; reinstall SSAD")

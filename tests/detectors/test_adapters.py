@@ -281,7 +281,8 @@ def test_without_the_package_one_line_says_so() -> None:
     with pytest.raises(ConfigError) as caught:
         ultralytics_detector("yolov8n")
     text = str(caught.value)
-    assert "the package is not installed; pip install 'ssad-testbed[ultralytics]' (AGPL-3.0" in text
+    assert "the package is not installed; in the checkout of SSAD run: pip install '.[ultralytics]'" in text
+    assert "AGPL-3.0" in text
     assert "\n" not in text
 
 

@@ -1,4 +1,4 @@
-"""Which place answers for which object, and that what is asked for decodes to the truth."""
+"""Target assignment, and that the assigned targets decode to the ground truth."""
 
 import math
 from collections.abc import Iterator

@@ -76,8 +76,11 @@ class Dense:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Which place answers for which object, fixed before an attack or a step. label [B, P]: class, -1 background, -2
-    ignored; owner [B, P]: index into that image's objects, -1 none; extra: what the detector's loss needs besides."""
+    """Target assignment: which object each location is trained to predict. Fixed before an attack or a training step.
+
+    label [B, P]: class, -1 background, -2 ignored; owner [B, P]: index into that image's objects, -1 none; extra: what
+    else the detector's loss needs.
+    """
 
     label: Tensor
     owner: Tensor

@@ -1,4 +1,4 @@
-"""Errors a user can cause. Each ends in one line (what, where, what to do) and exit code 2."""
+"""Errors that a user can cause and fix. Each ends in one line (what, where, what to do) and exit code 2."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class SSADError(Exception):
 
 
 class ConfigError(SSADError):
-    """A suite, scenario or option that is not valid."""
+    """An invalid suite, scenario or option."""
 
 
 class UnknownNameError(ConfigError):
-    """A name that no table holds."""
+    """A name that is neither built in nor offered by an installed package."""
 
 
 class MapError(SSADError):
@@ -40,7 +40,11 @@ class StoreError(SSADError):
 
 
 class FormatError(SSADError):
-    """A data file that is broken, hostile or of another kind."""
+    """A data file that is broken, malicious or in another format."""
+
+
+LISTED = ("suite", "kind", "scenario", "system", "detector", "recipe", "shift", "town")
+"""What `ssad list` can list, in the singular: `ssad list suites` and so on."""
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
@@ -57,4 +61,10 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
     hint = f"; closest: {', '.join(close)}" if close else ""
-    return UnknownNameError(f"unknown {kind} '{name}'{hint} (see: ssad list {kind}s)")
+    everything = f"see: ssad list {kind}s" if kind in LISTED else f"known: {', '.join(names) or 'none'}"
+    return UnknownNameError(f"unknown {kind} '{name}'{hint} ({everything})")
+
+
+def install_extra(extra: str) -> str:
+    """How to install an optional dependency ("extra") of pyproject.toml, for the end of a message."""
+    return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"

@@ -263,7 +263,7 @@ class Detector(Protocol):
         """
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Decide which place answers for which object, as in training; no gradient flows through it.
+        """Decide which object each location should predict, as in training (target assignment).
 
         Args:
             dense: Outputs for B images.

@@ -14,7 +14,7 @@ import sys
 import time
 from typing import Any
 
-from ssad.core.errors import ConfigError, SSADError, StoreError
+from ssad.core.errors import ConfigError, SSADError, StoreError, install_extra
 from ssad.jobs.local import LocalProcesses, Start
 from ssad.jobs.task import Outcome, Task
 
@@ -64,7 +64,7 @@ class RayCluster:
         try:
             import ray
         except ImportError:
-            raise ConfigError("--ray needs Ray; install the extra `ray`: uv sync --extra ray") from None
+            raise ConfigError(f"--ray needs the package ray; {install_extra('ray')}") from None
         self._ray = ray
         self._own = not ray.is_initialized()
         try:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.errors import MapError
+from ssad.core.errors import MapError, install_extra
 from ssad.core.lane_graph import LaneGraph, Marking, save_graph
 from ssad.core.types import F64, I32, LaneType
 from ssad.roads.signals import Approaches, place_signals
@@ -78,7 +78,7 @@ def import_map(path: Path, name: str | None, home: Path) -> Path:
 def _sample(path: Path, network: Network, keys: list[Key]) -> Answer:
     """Ask carla.Map, in a process of its own, where the lanes are."""
     if importlib.util.find_spec("carla") is None:
-        raise MapError(f"{path}: reading OpenDRIVE needs carla; pip install 'ssad-testbed[carla]'")
+        raise MapError(f"{path}: reading OpenDRIVE needs the package carla; {install_extra('carla')}")
     sections = [network.roads[road].sections[i] for road, i, _ in keys]
     with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
         request, answer = Path(folder) / "request.npz", Path(folder) / "answer.npz"

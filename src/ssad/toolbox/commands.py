@@ -1,4 +1,4 @@
-"""What `ssad shift` and `ssad score` do with the toolbox: options in words, progress, and what is printed."""
+"""`ssad shift` and `ssad score`: parse the options, show progress, print the outcome."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ssad.toolbox.write import materialise
 
 
 def severities(text: str) -> tuple[Strength, ...]:
-    """ "1,3", "random" -> severities. ConfigError."""
+    """Severities from the text of --severity, such as "1,3" or "random". ConfigError."""
     found: list[Strength] = []
     for part in (p.strip() for p in text.split(",")):
         if part == "random":
@@ -30,12 +30,12 @@ def severities(text: str) -> tuple[Strength, ...]:
         elif part in ("0", "1", "2", "3", "4", "5"):
             found.append(int(part))
         else:
-            raise ConfigError(f"--severity {text}: expected 1 to 5 with commas between them, or random")
+            raise ConfigError(f"--severity {text}: expected comma-separated numbers from 1 to 5, or random")
     return tuple(dict.fromkeys(found))
 
 
 def shift_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Names, or all of them. UnknownNameError."""
+    """The shifts of --shifts; ["all"] means every one. UnknownNameError."""
     if list(names) == ["all"]:
         return tuple(SHIFTS)
     for name in names:
@@ -57,7 +57,7 @@ def shift_folder(
     ray: str | None,
     settings: Mapping[str, Any],
 ) -> int:
-    """Writes nuScenes-N and prints a line a root; 1 when files failed. ConfigError, FormatError, StoreError."""
+    """Write nuScenes-N, print one line per root, return the exit code. ConfigError, FormatError, StoreError."""
     with NuScenes(source, version) as data:
         chosen = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())
         version = data.version
@@ -65,7 +65,9 @@ def shift_folder(
             known = {record.name for record in data.scenes()}
             chosen = tuple(name for name in chosen if name in known)
             if not chosen:
-                raise ConfigError(f"{source}: {version} holds no scene of the split '{split}'")
+                raise ConfigError(
+                    f"{source}: version {version} has no scene of the split '{split}'; choose another --split"
+                )
     options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=chosen, **settings)
     columns = (TextColumn("shift"), BarColumn(), MofNCompleteColumn(), TextColumn("scenes"), TimeRemainingColumn())
     console = Console(stderr=True)
@@ -77,36 +79,37 @@ def shift_folder(
             )
         except KeyboardInterrupt:
             bar.stop()
-            print(f"stopped; what is done is kept in {out}: the same command goes on from there", file=sys.stderr)
+            print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
             return 130
     failed = 0
     for root in written:
         failed += root.failed
-        line = f"{root.root}: {root.shifted} files shifted, {root.linked} linked, "
+        line = f"{root.root}: {root.shifted} files shifted, {root.linked} linked unchanged, "
         line += f"{100 * root.applied:.0f} % of the images changed"
-        print(line + (f", {root.failed} FAILED" if root.failed else ""))
+        print(line + (f", {root.failed} failed" if root.failed else ""))
         for reason in root.reasons[:3]:
             print(f"  {reason}")
         if len(root.reasons) > 3:
             print(f"  ... and {len(root.reasons) - 3} more: see {root.root / 'manifest'}")
     if failed:
         print(
-            f"{failed} files failed, so their roots are not complete; mend the dataset and run the same command again"
+            f"{failed} files failed, so their roots are incomplete and cannot be scored; "
+            "fix these files in the dataset and repeat the command"
         )
     return int(failed > 0)
 
 
 def verify_folder(out: Path) -> int:
-    """Compares a root, or all roots of a folder, with their manifests; exit code 1 for differences. StoreError."""
+    """Compare a root, or all roots in a folder, with their manifests; exit code 1 if files differ. StoreError."""
     roots = [out] if (out / PAGE).is_file() or (out / "manifest").is_dir() else sorted(out.glob("*/manifest"))
     roots = [root.parent if root.name == "manifest" and root != out else root for root in roots]
     if not roots:
-        raise StoreError(f"{out}: not written by ssad shift")
+        raise StoreError(f"{out}: not written by ssad shift; give its OUT folder, or one root in it")
     bad = 0
     for root in roots:
         count, problems = verify(root)
         bad += len(problems)
-        print(f"{root}: {count} files, {len(problems)} not as in the manifest")
+        print(f"{root}: {count} files, {len(problems)} differ from the manifest")
         for problem in problems[:5]:
             print(f"  {problem}")
     return int(bad > 0)
@@ -125,13 +128,13 @@ def write_contact_sheets(
     seed: int,
     calibration: str,
 ) -> None:
-    """Contact sheets of a picture or of a dataset's camera. ConfigError, SSADError."""
+    """Write two contact sheets of an image, or of one camera of a dataset. ConfigError, SSADError."""
     if split is not None or (scenes and source.is_file()):
         raise ConfigError(
-            f"{'--split' if split is not None else '--scenes'} does not go with a contact sheet of {source}"
+            f"{'--split' if split is not None else '--scenes'} cannot be used for a contact sheet of {source}"
         )
     if len(scenes) > 1:
-        raise ConfigError(f"a contact sheet is of one scene, not of {len(scenes)}: --scenes {scenes[0]}")
+        raise ConfigError(f"a contact sheet shows one scene, not {len(scenes)}; give one, such as --scenes {scenes[0]}")
     if calibration not in get_args(Calibration):
         raise unknown_name("calibration", calibration, get_args(Calibration))
     strength = severities(severity)[0]
@@ -142,24 +145,33 @@ def write_contact_sheets(
         source, out, version=version, channel=channel, scene=next(iter(scenes), None), boxes=rectangles,
         severity=level, seed=seed, calibration=kind,
     )  # fmt: skip
-    print(f"12 panels: {first}\nseverities: {second}")
+    print(f"all shifts: {first}\nall severities: {second}")
 
 
 def checked(root: Path) -> Callable[[dict[str, Any], GroundTruth], dict[str, Any]]:
-    """A check for `score_results`: a shifted root must be what its manifest says, and the results, if they say which
-    data they saw (`ssad_manifest` in their meta), must have seen these. Returns what is known of the data."""
+    """A check for `score_results` that refuses to score clean data as shifted, or the other way round.
+
+    A shifted root must match its manifest. If the results name the data that they were made from (`ssad_manifest` in
+    their meta), these must be the same data. The check returns what is known of the data.
+    """
 
     def check(meta: dict[str, Any], truth: GroundTruth) -> dict[str, Any]:
         said = meta.get("ssad_manifest")
         if read_manifest(root) is None:
             if said not in (None, "clean"):
-                raise FormatError(f"the results were made on shifted data (manifest {said}), {root} is a clean dataset")
+                raise FormatError(
+                    f"the results were made on shifted data (manifest {said}), but {root} is a clean dataset; "
+                    "give the shifted folder as --dataroot"
+                )
             return {"data": "clean"}
         manifest = check_manifest(root, truth.scenes)
         mine = manifest_digest(root)
         if said is not None and said != mine:
             seen = "clean data" if said == "clean" else f"other data (manifest {said})"
-            raise FormatError(f"the results were made on {seen}, not on {root} (manifest {mine})")
+            raise FormatError(
+                f"the results were made on {seen}, not on {root} (manifest {mine}); "
+                "give the data that they were made on as --dataroot"
+            )
         assert manifest is not None
         return {"data": "shifted", "manifest": mine, "stated": said is not None} | dict(manifest["identity"])
 

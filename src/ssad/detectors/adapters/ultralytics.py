@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, install_extra
 from ssad.detectors.adapters.common import Adapter, check_images, check_truth, sums
 from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.yolo.assign import Targets
@@ -41,7 +41,7 @@ GREY = 114 / 255
 NMS_IOU, MOST, THRESHOLD = 0.7, 300, 0.25  # its published defaults for predictions
 BOX_GAIN, CLASS_GAIN, DFL_GAIN = 7.5, 0.5, 1.5  # and for training
 TOP, ALPHA, BETA = 10, 0.5, 6.0  # of the task-aligned assignment
-INSTALL = "pip install 'ssad-testbed[ultralytics]' (AGPL-3.0; not a dependency of SSAD)"
+INSTALL = f"{install_extra('ultralytics')} (licence AGPL-3.0; not a dependency of SSAD)"
 
 
 def ultralytics_detector(

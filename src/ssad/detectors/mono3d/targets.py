@@ -1,4 +1,4 @@
-"""Which place answers for which object, and what it should say."""
+"""Target assignment: which object each location should predict, and with which values."""
 
 from __future__ import annotations
 

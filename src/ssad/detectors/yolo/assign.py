@@ -1,4 +1,4 @@
-"""Which place answers for which object: the best anchor (YOLOv3), or all that fit and the cells beside (YOLOv5).
+"""Target assignment: to the best anchor (YOLOv3), or to all anchors that fit and the neighbouring cells (YOLOv5).
 
 Boxes are in pixels of the network's own input. Nothing here is differentiable.
 """

@@ -90,7 +90,7 @@ def _tile(run: DrivingRun, system: str) -> dict[str, Any]:
 
 
 def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
-    """Groups with one line a system, one mark an episode."""
+    """Groups of episodes, one row per system."""
     groups: dict[str, dict[str, list[dict[str, str]]]] = {}
     for r in run.records:
         why = r.reason or r.end.replace("_", " ")
