@@ -146,6 +146,7 @@ def test_list(kind: str, name: str) -> None:
 
 def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first run as a process of its own, with a driving system of an installed package; the rest in this one."""
+    monkeypatch.setenv("COLUMNS", "120")  # for whole names in the table
     settings = ("--set", "scenarios=[StraightObstacle/00,RightTurn/01]", "--set", "name=little")
     settings += ("--set", "systems=[acme-coast,blind]")
     site = tmp_path / "site-packages"

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ssad.bench.component.run import state_hash
-from ssad.bench.component.work import detector_of
+from ssad.bench.kinds.detection import state_hash
+from ssad.evaluation.scene_boxes import detector_of
 from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[1]

@@ -40,6 +40,9 @@ def run(
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
+    ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run again what failed.")] = False,
 ) -> None:
     """Run a suite and write its report; run again to resume.
@@ -48,37 +51,29 @@ def run(
     """
     from rich.console import Console
 
-    from ssad.bench.pictures import make_pictures
-    from ssad.bench.run import plan
+    from ssad.bench.kind import Resources
     from ssad.bench.run import run as run_plan
-    from ssad.bench.suite import Suite, load_suite
-    from ssad.bench.summary import name_of, shift_table, table
+    from ssad.bench.suite import kind_of, load_suite
     from ssad.jobs.machine import pick_device
+    from ssad.report.terminal import summary
 
     chosen = load_suite(suite, settings or [])
     folder = out or Path("runs") / chosen.name
     where = pick_device(device)
+    kind = kind_of(chosen.kind)
+    plan = kind.plan(chosen, device=where)
+    names = {cell.key: cell.name for cell in plan.cells}
     try:
-        if isinstance(chosen, Suite):
-            records = run_plan(plan(chosen, device=where), folder, workers=workers, retry=retry)
-            make_pictures(list(chosen.pictures), folder)
-            shown = table(chosen.title or chosen.name, records)
-        else:
-            from ssad.bench.component.pictures import draw_detections
-            from ssad.bench.component.run import plan_detection, run_detection
-
-            todo = plan_detection(chosen, device=where)
-            records = run_detection(todo, folder, workers=workers, retry=retry)
-            draw_detections(todo, folder)
-            shown = shift_table(chosen.title or chosen.name, records)
+        records = run_plan(plan, folder, Resources(workers, ray, where), retry=retry)
+        kind.finish(plan, folder)
     except KeyboardInterrupt:
         print(f"stopped; what is done is kept in {folder}: the same command goes on from there", file=sys.stderr)
         raise typer.Exit(130) from None
     console = Console()
-    console.print(shown)
+    console.print(summary(folder))
     failed = [r for r in records if r["status"] != "ok"]
     for record in failed[:5]:
-        console.print(f"{record['status']}: {name_of(record)}: {record['reason']}", markup=False, soft_wrap=True)
+        console.print(f"{record['status']}: {names[record['key']]}: {record['reason']}", markup=False, soft_wrap=True)
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     if failed:
@@ -89,12 +84,18 @@ def run(
 
 @app.command()
 def report(folder: Dir) -> None:
-    """Write DIR/report.html and DIR/tables from the results in DIR."""
+    """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed."""
     from ssad.jobs.store import read_run
-    from ssad.report import write_report
+    from ssad.report import check_artefacts, write_report
 
     read_run(folder)
     print(f"report: {write_report(folder)}")
+    problems = check_artefacts(folder)
+    for problem in problems[:5]:
+        print(problem)
+    if problems:
+        print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -255,6 +256,9 @@ def record(
     style: Annotated[str | None, typer.Option(help="With --clips: body of the target car (default: any).")] = None,
     device: Annotated[str, typer.Option(help="Where pictures are rendered: cpu or cuda.")] = "cpu",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes.  [default: one a core]")] = None,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Work on a Ray cluster (local: start one).")
+    ] = None,
 ) -> None:
     """Drives in the world, seen by the nuScenes rig: a data set in the nuScenes schema. Run again to go on."""
     from rich.console import Console
@@ -285,14 +289,14 @@ def record(
             todo = Clips(
                 out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device), streets=streets,  # type: ignore[arg-type]
             )  # fmt: skip
-            record_clips(todo, workers=workers, progress=progress)
+            record_clips(todo, workers=workers, ray=ray, progress=progress)
             text = f"{out}: {sum(count for _, count in pairs)} pictures, annotations train, test and all"
         else:
             drives = Recording(
                 out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
                 seed=seed, device=pick_device(device), streets=streets,
             )  # fmt: skip
-            record_nuscenes(drives, workers=workers, progress=progress)
+            record_nuscenes(drives, workers=workers, ray=ray, progress=progress)
             text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
     print(text)
 

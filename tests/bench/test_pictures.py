@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ssad.assets.bodies import BODIES
-from ssad.bench.pictures import make_pictures
+from ssad.bench.kinds.driving import make_pictures
 from ssad.camera.rig import RIG, rig_camera
 from ssad.datasets.nuscenes.schema import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import CLASSES, class_sheet

@@ -15,14 +15,15 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from ssad.bench.kind import Plan, Resources
+from ssad.bench.kinds.driving import Driving, DrivingSuite
 from ssad.bench.replay import replay
-from ssad.bench.run import plan, run
-from ssad.bench.suite import Suite
-from ssad.bench.summary import table
+from ssad.bench.run import run
 from ssad.core.errors import ConfigError, RouteError, SSADError, StoreError
+from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace, save_trace
-from ssad.jobs.store import read_lines
+from ssad.report.terminal import summary
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
 
@@ -48,13 +49,17 @@ class Wicked:
 """
 
 
-def suite(**changes: Any) -> Suite:
+def plan(chosen: DrivingSuite) -> Plan:
+    return Driving().plan(chosen)
+
+
+def suite(**changes: Any) -> DrivingSuite:
     values: dict[str, Any] = {"name": "small", "systems": ["autopilot", "blind"], "scenarios": SCENARIOS}
-    return Suite(**(values | changes))
+    return DrivingSuite(**(values | changes))
 
 
-def go(folder: Path, chosen: Suite, workers: int = 2) -> list[dict[str, Any]]:
-    return run(plan(chosen), folder, workers=workers, console=Console(file=io.StringIO()))
+def go(folder: Path, chosen: DrivingSuite, workers: int = 2) -> list[dict[str, Any]]:
+    return run(plan(chosen), folder, Resources(workers, console=Console(file=io.StringIO())))
 
 
 @pytest.fixture(scope="module")
@@ -144,12 +149,12 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     assert "exit code 7" in records["LaneChanging"]["reason"]
     assert "not finite" in records["VehiclePassing"]["reason"]
     console = Console(file=io.StringIO(), width=100)
-    console.print(table("t", list(records.values())))
+    console.print(summary(tmp_path / "run"))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "4 of 5 episodes failed and count" in shown
+    assert "4 of 5 cells failed and count" in shown
     with pytest.raises(StoreError, match="left no trace: failed"):
         replay(tmp_path / "run", "wicked_system:Wicked/StraightObstacle/00")
-    again = run(plan(chosen), tmp_path / "run", workers=1, console=console, retry=True)
+    again = run(plan(chosen), tmp_path / "run", Resources(1, console=console), retry=True)
     assert {r["group"]: r["status"] for r in again} == {name: records[name]["status"] for name in names}
     assert len((tmp_path / "run" / "results.jsonl").read_text().splitlines()) == len(names)
 
@@ -185,8 +190,9 @@ def test_an_unroutable_scenario_ends_before_anything_is_written(
 
 def start(folder: Path, name: str) -> subprocess.Popen[bytes]:
     code = (
-        "import sys\nfrom ssad.bench.run import plan, run\nfrom ssad.bench.suite import load_suite\n"
-        "run(plan(load_suite(sys.argv[1])), sys.argv[2], workers=2)\n"
+        "import sys\nfrom ssad.bench.kind import Resources\nfrom ssad.bench.kinds.driving import Driving\n"
+        "from ssad.bench.run import run\nfrom ssad.bench.suite import load_suite\n"
+        "run(Driving().plan(load_suite(sys.argv[1])), sys.argv[2], Resources(2))\n"
     )
     command = [sys.executable, "-c", code, name, str(folder)]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-from helpers.suites import fake_plan, fake_scenario
 
-from ssad.bench.cells import find_cell, make_cells
-from ssad.bench.suite import Suite, load_suite, suite_files
+from ssad.bench.kind import Plan, find_cell
+from ssad.bench.kinds import driving
+from ssad.bench.kinds.driving import Driving, DrivingSuite
+from ssad.bench.source import source_files, source_version
+from ssad.bench.suite import command_of, load_suite, suite_files
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
+from ssad.core.types import Pose, Scenario
 
 GOOD = "name: mine\nsystems: [blind]\nscenarios: [precrash]\n"
 
@@ -32,14 +35,14 @@ def test_shipped_suites_are_valid() -> None:
         suite = load_suite(name)
         assert suite.name == name
         assert suite.title
-        if isinstance(suite, Suite):
+        if isinstance(suite, DrivingSuite):
             assert {"autopilot", "blind"} <= set(suite.systems)
 
 
 def test_set(write: Callable[[str], str]) -> None:
     path = write(GOOD)
     suite = load_suite(path, ["scenarios=[safebench,frea]", "repetitions=3", "systems=my.mod:Sys", "timeout_s=5"])
-    assert isinstance(suite, Suite)
+    assert isinstance(suite, DrivingSuite)
     assert suite.scenarios == ["safebench", "frea"]
     assert (suite.repetitions, suite.systems, suite.timeout_s) == (3, ["my.mod:Sys"], 5.0)
 
@@ -77,48 +80,110 @@ def test_unknown_suite() -> None:
         load_suite("quik")
 
 
-def test_cell_keys_depend_on_what_matters_only() -> None:
-    names = ["a", "b", "c"]
-    keys = {c.name: c.key for c in fake_plan(names, systems=("autopilot", "blind"), repetitions=2).cells}
-    assert len(set(keys.values())) == 12
-    turned = fake_plan(names[::-1], systems=("blind", "autopilot"), repetitions=2, chunk=9, timeout_s=1)
-    assert {c.name: c.key for c in turned.cells} == keys
-    other = fake_plan(names, systems=("autopilot", "blind"), repetitions=2, seed=1)
-    assert not set(keys.values()) & {c.key for c in other.cells}
+def plan_of(scenarios: list[Scenario], monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Plan:
+    """A plan without a world behind it."""
+    monkeypatch.setattr(driving, "suite_scenarios", lambda suite: tuple(scenarios))
+    monkeypatch.setattr(driving, "town", lambda name: None)
+    monkeypatch.setattr(driving, "town_version", lambda graph: "0")
+    values = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"], "repetitions": 2}
+    return Driving().plan(DrivingSuite(**(values | changes)), check=False)
 
 
-def test_systems_meet_the_same_episodes() -> None:
-    cells = fake_plan(["a"], systems=("autopilot", "blind"), repetitions=3).cells
-    seeds = {(c.system, c.repetition): c.seed for c in cells}
+def scenario(name: str, **changes: Any) -> Scenario:
+    return Scenario(
+        **{"name": name, "type": "StraightObstacle", "town": "Nowhere", "route": (Pose(0, 0), Pose(9, 0)), **changes}
+    )
+
+
+def keys(plan: Plan) -> dict[str, str]:
+    return {cell.name: cell.key for cell in plan.cells}
+
+
+def test_cell_keys_depend_on_what_matters_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    three = [scenario(name) for name in "abc"]
+    found = keys(plan_of(three, monkeypatch))
+    assert len(set(found.values())) == 12
+    turned = plan_of(three[::-1], monkeypatch, systems=["blind", "autopilot"], chunk=9, timeout_s=1.0)
+    assert keys(turned) == found
+    assert not set(found.values()) & set(keys(plan_of(three, monkeypatch, seed=1)).values())
+
+
+def test_only_repetitions_depend_on_the_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = (keys(plan_of([scenario("a")], monkeypatch, spread=spread)) for spread in (1.0, 0.5))
+    assert one["blind/a"] == two["blind/a"], "the nominal case"
+    assert one["blind/a#1"] != two["blind/a#1"]
+
+
+def test_systems_meet_the_same_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = plan_of([scenario("a")], monkeypatch, repetitions=3).cells
+    seeds = {(c.system, c.spec["repetition"]): c.seed for c in cells}
     assert all(seeds["autopilot", r] == seeds["blind", r] for r in range(3))
     assert len(set(seeds.values())) == 3
 
 
 @pytest.mark.parametrize("change", [{"target_speed": 9.0}, {"seed": 1}, {"parameters": {"speed": 2.0}}])
-def test_a_changed_scenario_is_another_cell(change: dict[str, object]) -> None:
-    suite = Suite(name="s", systems=["blind"], scenarios=["a"])
-    one, two = (
-        make_cells(suite, [s], systems={"blind": ""}, towns={})[0].key
-        for s in (fake_scenario("a"), replace(fake_scenario("a"), **change))  # type: ignore[arg-type]
-    )
+def test_a_changed_scenario_is_another_cell(change: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    one, two = (plan_of([s], monkeypatch).cells[0].key for s in (scenario("a"), scenario("a", **change)))
     assert one != two
 
 
-def test_a_changed_system_or_town_is_another_cell() -> None:
-    suite = Suite(name="s", systems=["m:S"], scenarios=["a"])
-    keys = {
-        make_cells(suite, [fake_scenario("a")], systems={"m:S": version}, towns={"Nowhere": town})[0].key
-        for version in ("1", "2")
-        for town in ("1", "2")
-    }
-    assert len(keys) == 4
+def test_a_changed_system_or_town_is_another_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = set()
+    for version in "12":
+        for town in "12":
+            monkeypatch.setattr(driving, "system_version", lambda name, v=version: v)
+            plan = plan_of([scenario("a")], monkeypatch)
+            monkeypatch.setattr(driving, "town_version", lambda graph, v=town: v)
+            found.add(Driving().plan(plan.suite, check=False).cells[0].key)
+    assert len(found) == 4
 
 
-def test_find_cell() -> None:
-    cells = fake_plan(["a", "b"], systems=("autopilot", "blind"), repetitions=2).cells
-    assert find_cell(cells, "blind/a#1").repetition == 1
+def test_find_cell(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = plan_of([scenario("a"), scenario("b")], monkeypatch).cells
+    assert find_cell(cells, "blind/a#1").spec["repetition"] == 1
     assert find_cell(cells, cells[0].key[:8]) == cells[0]
     with pytest.raises(ConfigError, match="closest: blind/"):
         find_cell(cells, "blind/x")
     with pytest.raises(ConfigError, match="no cell ''"):
         find_cell(cells, "")
+
+
+def test_a_command_spells_out_what_differs(write: Callable[[str], str]) -> None:
+    assert command_of(load_suite("quick")) == "ssad run quick"
+    assert command_of(load_suite("quick", ["repetitions=3", "systems=blind"])) == (
+        "ssad run quick --set 'systems=[blind]' --set repetitions=3"
+    )
+
+
+def test_the_source_of_a_cell_is_found() -> None:
+    """What a drive depends on is in its key, and a report or a detector is not."""
+    found = set(source_files("ssad.bench.kinds.driving"))
+    for name in ("core.safeio", "core.registry", "core.traces", "core.geometry", "metrics.driving",
+                 "metrics.criticality", "world.kernels.traffic", "world.witness", "drivers.builtin", "roads.router",
+                 "scenarios.dynamic.knowledge.lane_changing", "scenarios.dynamic.knowledge._placing"):  # fmt: skip
+        assert f"ssad.{name}" in found, name
+    assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
+    seen = set(source_files("ssad.bench.kinds.detection"))
+    for name in ("detectors.mono3d.nms", "detectors.yolo.decode", "scenarios.static.shifts.kernels.falling",
+                 "metrics.detection_match", "evaluation.scene_boxes", "recording.drives", "camera.kernels.shade",
+                 "assets.street.palette", "datasets.nuscenes.truth"):  # fmt: skip
+        assert f"ssad.{name}" in seen, name
+
+
+def test_any_changed_file_that_is_led_to_changes_the_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    files = {
+        "one.py": "import two\nfrom pack import inner\nNAMES = {'x': 'pack.named:X'}\nimport numpy\n",
+        "two.py": "def f():\n    from three import (\n        g,\n    )\n", "three.py": "g = 1\n", "four.py": "h = 1\n",
+        "pack/__init__.py": "", "pack/inner.py": "from . import beside\n", "pack/beside.py": "", "pack/named.py": "",
+    }  # fmt: skip
+    (tmp_path / "pack").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert set(source_files("one")) == {"one", "two", "three", "pack", "pack.inner", "pack.beside", "pack.named"}
+    before = source_version("one")
+    for name, text in files.items():
+        (tmp_path / name).write_text(text + "# changed\n")
+        assert (source_version("one") != before) == (name != "four.py"), name
+        (tmp_path / name).write_text(text)
+        assert source_version("one") == before

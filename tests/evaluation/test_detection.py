@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.component.run import workers_on
 from ssad.core.detections import Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -18,6 +17,7 @@ from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.evaluation.camera_truth import camera_truth
 from ssad.evaluation.detection import detect_scene, joined, match_boxes, score_2d, to_host
+from ssad.jobs.machine import gpu_workers
 from ssad.metrics.detection_boxes import TP_METRICS
 from ssad.training.batches import PictureSet
 from ssad.training.data import nuscenes_items
@@ -132,7 +132,7 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
 def test_processes_share_the_memory_of_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes = [141 << 30, 24 << 30, 2 << 30]
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda k: SimpleNamespace(total_memory=sizes[k]))
-    assert [workers_on(n) for n in (0, 1, 2, 3)] == [0, 14, 20, 21]
+    assert [gpu_workers(n) for n in (0, 1, 2, 3)] == [0, 14, 20, 21]
 
 
 def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:

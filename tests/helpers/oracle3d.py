@@ -4,6 +4,7 @@ not."""
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import torch
@@ -62,6 +63,47 @@ class Bad(Oracle):
             assert one.solid is not None
             one.solid.size.neg_()
         return found
+
+
+class Deadly(Oracle):
+    """Does to its process what it is made for."""
+
+    def __init__(self, root: Path, deed: str) -> None:
+        super().__init__(root)
+        self.deed = deed
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        if self.deed == "die":
+            os._exit(9)
+        if self.deed == "hang":
+            time.sleep(1e6)
+        if self.deed == "raise":
+            raise ZeroDivisionError("on purpose")
+        held = []
+        while True:
+            held.append(bytearray(b"x" * (64 << 20)))
+
+
+def build_dying() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "die")
+
+
+def build_hanging() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "hang")
+
+
+def build_raising() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "raise")
+
+
+def build_hungry() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "eat")
 
 
 def build_bad() -> Bad:

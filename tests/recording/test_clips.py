@@ -83,7 +83,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
         raise Stopped
 
     with pytest.raises(Stopped):
-        record_clips(todo(out, "drive"), workers=1, progress=stop)
+        record_clips(todo(out, "drive"), workers=0, progress=stop)
     assert not (out / "annotations").exists()
     page = out / ".parts" / "drive-twinford-000" / "part.json"
     assert list((out / ".parts").glob("*/part.json")) == [page]
@@ -91,7 +91,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (out / "images" / "drive-oldmarket-000-001.jpg").write_bytes(b"torn")
     steps: list[tuple[int, int]] = []
     before = page.stat().st_mtime_ns
-    record_clips(todo(out, "drive"), workers=1, progress=lambda done, of: steps.append((done, of)))
+    record_clips(todo(out, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
     assert steps == [(1, 2), (2, 2)]
     assert page.stat().st_mtime_ns == before, "what was there is left alone"
     return out
@@ -105,7 +105,7 @@ def market(drives: Path) -> _Set:
 
 @pytest.fixture(scope="module")
 def orbits(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_clips(todo(tmp_path_factory.mktemp("orbit") / "a", "orbit"), workers=1)
+    return record_clips(todo(tmp_path_factory.mktemp("orbit") / "a", "orbit"), workers=0)
 
 
 def target_of(data: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def test_same_bytes_for_two_workers_without_a_stop(drives: Path, tmp_path: Path)
 def test_recording_again_changes_nothing(drives: Path) -> None:
     before = contents(drives)
     steps: list[tuple[int, int]] = []
-    record_clips(todo(drives, "drive"), workers=1, progress=lambda done, of: steps.append((done, of)))
+    record_clips(todo(drives, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
     assert contents(drives) == before
     assert steps == [(1, 2), (2, 2)]
 
@@ -323,19 +323,19 @@ def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_pa
 def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path) -> None:
     for changes in ({"seed": 1}, {"size": 168}, {"style": "van"}, {"images": PAIRS[:1]}):
         with pytest.raises(StoreError, match="another recording") as error:
-            record_clips(todo(drives, "drive", **changes), workers=1)
+            record_clips(todo(drives, "drive", **changes), workers=0)
         assert "\n" not in str(error.value)
     with pytest.raises(StoreError, match="another recording"):
-        record_clips(todo(drives, "orbit"), workers=1)
+        record_clips(todo(drives, "orbit"), workers=0)
     (tmp_path / "annotations").mkdir()
     for text in ("{}", "[]", '{"info": 5}', '{"info": {"recording": {}}}', '{"images": [], "annotations": []}'):
         (tmp_path / "annotations" / "all.json").write_text(text)
         with pytest.raises(StoreError, match="another recording"):
-            record_clips(todo(tmp_path, "drive"), workers=1)
+            record_clips(todo(tmp_path, "drive"), workers=0)
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(StoreError) as error:
-        record_clips(todo(blocked / "out", "drive"), workers=1)
+        record_clips(todo(blocked / "out", "drive"), workers=0)
     assert "\n" not in str(error.value)
 
 

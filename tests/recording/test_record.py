@@ -26,13 +26,13 @@ from ssad.core.images import read_image
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
 from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
+from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, CATEGORY, Recording, drive, record_nuscenes
 from ssad.recording.scene_objects import place_objects
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
-from ssad.toolbox.scene_shifter import SceneShifter
 
 # as the fixture `recorded` was made, but for its sweeps
 SMALL = {"towns": ("Twinford", "Oldmarket"), "held_out": ("Oldmarket",), "scenes": 1, "seconds": 1.0, "width": 160}
@@ -108,7 +108,7 @@ def test_same_bytes_for_any_number_of_workers_and_after_a_stop(recorded: Path, t
     for path in part.glob("*.jpg"):
         path.write_bytes(b"torn")
     shutil.rmtree(again / "samples")
-    record_nuscenes(todo, workers=1)
+    record_nuscenes(todo, workers=0)
     assert contents(again) == contents(recorded)
     with pytest.raises(StoreError, match="another recording"):
         record_nuscenes(Recording(again, **SMALL))
@@ -126,7 +126,7 @@ def test_same_bytes_after_kill_9_at_any_moment(recorded: Path, tmp_path: Path) -
                 os.killpg(process.pid, signal.SIGKILL)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     assert contents(out) == contents(recorded)
-    one = record_nuscenes(Recording(tmp_path / "d", sweeps=1, **SMALL), workers=1)
+    one = record_nuscenes(Recording(tmp_path / "d", sweeps=1, **SMALL), workers=0)
     assert contents(one) == contents(recorded)
 
 
@@ -174,7 +174,7 @@ def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     with pytest.raises(StoreError):
-        record_nuscenes(Recording(blocked / "out", **SMALL), workers=1)
+        record_nuscenes(Recording(blocked / "out", **SMALL), workers=0)
 
 
 def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
@@ -215,17 +215,17 @@ def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
     inside = np.where(graph.kind == LaneType.DRIVING, 0, graph.junction).astype(graph.junction.dtype)
     save_graph(replace(graph, name="Paths", junction=inside), town)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+        record_nuscenes(Recording(tmp_path / "a", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
     with pytest.raises(MapError, match="'Paths' has no driving lane of 25 m") as error:
-        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=1)
+        record_clips(Clips(tmp_path / "b", (("Paths", 1),), size=160), workers=0)
     assert "\n" not in str(error.value)
     with np.load(town) as stored:
         arrays = dict(stored)
     arrays["kind"] = np.full_like(arrays["kind"], LaneType.SIDEWALK)
     np.savez(town, **arrays)
     with pytest.raises(MapError, match="no drivable lane") as error:
-        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=1)
+        record_nuscenes(Recording(tmp_path / "c", ("Paths",), scenes=1, seconds=1.0, width=160), workers=0)
     assert "\n" not in str(error.value)
 
 
@@ -234,11 +234,11 @@ def test_a_stop_while_tables_are_written_and_a_folder_without_its_page(recorded:
     shutil.copytree(recorded, again)
     todo = Recording(again, sweeps=1, **SMALL)
     (again / todo.version / "splits.json").unlink()  # the last that is written
-    record_nuscenes(todo, workers=1)
+    record_nuscenes(todo, workers=0)
     assert contents(again) == contents(recorded)
     shutil.rmtree(again / ".parts")
     with pytest.raises(StoreError, match="not how it was recorded") as error:
-        record_nuscenes(replace(todo, seed=7), workers=1)
+        record_nuscenes(replace(todo, seed=7), workers=0)
     assert "\n" not in str(error.value)
     assert contents(again) == contents(recorded)
 

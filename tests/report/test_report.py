@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ssad.bench.execute import plain
+from ssad.bench.kinds.driving import plain
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.traces import load_trace, save_trace

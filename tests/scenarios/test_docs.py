@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from ssad.roads import load_town
-from ssad.scenarios.dynamic import SCENARIOS, build_episode, load_scenarios, parameter_box
+from ssad.scenarios.dynamic import SCENARIOS, build_episode, load_scenarios, scenario_type
+from ssad.scenarios.dynamic.knowledge._kind import EGO_START, TARGET_SPEED_SPREAD
 from ssad.world.models import MODELS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
@@ -26,9 +27,16 @@ def test_the_examples_become_episodes(text: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", SCENARIOS)
 def test_the_table_has_the_parameters(kind: str) -> None:
     row = next(line for line in PAGE.splitlines() if line.startswith(f"| {kind} |"))
-    for p in parameter_box(kind).values():
+    for p in scenario_type(kind).parameters:
         unit = f" {p.unit}" if p.unit else ""
-        assert f"`{p.name}` {p.default:g} ({p.low:.4g} to {p.high:.4g}{unit})" in row
+        spread = f" ± {p.spread:g}" if p.spread else ""
+        assert f"`{p.name}` {p.default:g}{spread} ({p.low:.4g} to {p.high:.4g}{unit})" in row
+
+
+def test_the_table_has_the_egos_start() -> None:
+    for p in EGO_START:
+        assert f"| `{p.name}` | {p.default:g} ± {p.spread:g} ({p.low:g} to {p.high:g} {p.unit}) |" in PAGE
+    assert f"its own value ± {100 * TARGET_SPEED_SPREAD:g} %" in PAGE
 
 
 def test_the_models_are_listed() -> None:

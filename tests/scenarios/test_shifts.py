@@ -20,6 +20,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.tiny import make_tiny
+from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.metrics.robustness import page_trend
 from ssad.scenarios.static.shifts import (
     SHIFTS,
@@ -34,7 +35,6 @@ from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
-from ssad.toolbox.scene_shifter import SceneShifter
 
 WIDTH, HEIGHT = 320, 180
 CAMERA = Camera.typical(WIDTH, HEIGHT)
@@ -340,7 +340,7 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
     scene = street.scene(street.scenes()[0].name)
     frames = [f for f in scene.frames if f.key_frame and f.modality == "camera"][:6]
     for share in (0.0, 0.4, 1.0):
-        monkeypatch.setattr("ssad.toolbox.scene_shifter.free_sun", lambda *_, share=share: share)
+        monkeypatch.setattr("ssad.evaluation.scene_shifter.free_sun", lambda *_, share=share: share)
         shifter = SceneShifter(street.root, scene, ShiftSpec("sunlight", 5))
         found = [shifter.image(frame)[1] for frame in frames]
         front = [one for one in found if "the sun is not in front of this camera" not in one.skipped]

@@ -56,11 +56,9 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         path = st.lists(st.tuples(number, number), min_size=2, max_size=4).map(tuple)
         actor = st.builds(Actor, texts, body, poses, st.lists(phase, max_size=3).map(tuple), path)
         actors = tuple(draw(st.lists(actor, min_size=1, max_size=3)))
-        parameters = {}
-    else:
-        box = parameter_box(kind)
-        chosen = draw(st.sets(st.sampled_from(sorted(box))))
-        parameters = {name: draw(st.floats(box[name].low, box[name].high)) for name in sorted(chosen)}
+    box = parameter_box(kind)
+    chosen = draw(st.sets(st.sampled_from(sorted(box))))
+    parameters = {name: draw(st.floats(box[name].low, box[name].high)) for name in sorted(chosen)}
     return Scenario(
         name=draw(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,8}(/[0-9]{2})?", fullmatch=True)),
         type=kind,
@@ -170,7 +168,7 @@ BAD: list[tuple[dict[str, Any], int, str]] = [
     ({"seed": "-1"}, 5, "seed: must not be negative"),
     ({"seed": "[1, 2"}, 6, "not valid YAML"),
     ({"seed": "!!python/object/apply:os.system ['true']"}, 5, "is not allowed"),
-    ({"type": "Custom", "parameters": "{speed: 1}"}, 5, "type Custom takes none"),
+    ({"type": "Custom", "parameters": "{speed: 1}"}, 5, "speed: no such parameter; Custom has: ego_speed, "),
     ({"type": "Custom", "actors": "[{name: x, model: caar, pose: {x: 0, y: 0}}]"}, 5, "closest: car"),
     ({"type": "Custom", "actors": "[{name: x, model: car, pose: {x: 0, y: 0}, path: [[0, 0]]}]"}, 5, "two points"),
     (

@@ -52,7 +52,7 @@ def source(clean: Path, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def fog(clean: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished root; not to be changed."""
-    return materialise(options(clean, tmp_path_factory.mktemp("fog")), workers=1)[0].root
+    return materialise(options(clean, tmp_path_factory.mktemp("fog")), workers=0)[0].root
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def test_every_shift_is_written_as_it_is_on_the_fly(clean: Path, tmp_path: Path,
         clean, tmp_path / "out", *SHIFTS, calibration=calibration, severities=("random",), scenes=SCENES[:1], seed=4
     )
     scene = NuScenes(clean, VERSION).scene(SCENES[0])
-    for written in materialise(chosen, workers=1):
+    for written in materialise(chosen, workers=0):
         name = written.root.name.removesuffix("-random")
         assert written.failed == 0
         assert 0 < written.applied <= 1
@@ -169,7 +169,7 @@ def test_every_shift_is_written_as_it_is_on_the_fly(clean: Path, tmp_path: Path,
 
 def test_severity_0_is_the_dataset_itself(clean: Path, tmp_path: Path) -> None:
     """A file in which nothing changes is linked, never encoded anew: pixel for pixel the clean one."""
-    for written in materialise(options(clean, tmp_path / "o", "fog", "scale", "gaussian", severities=(0,)), workers=1):
+    for written in materialise(options(clean, tmp_path / "o", "fog", "scale", "gaussian", severities=(0,)), workers=0):
         assert (written.shifted, written.linked, written.failed, written.applied) == (0, 42, 0, 0.0)
         check_manifest(written.root)
         assert verify(written.root) == (42, [])
@@ -179,7 +179,7 @@ def test_severity_0_is_the_dataset_itself(clean: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_not_asked_for_is_linked(clean: Path, tmp_path: Path) -> None:
-    written = materialise(options(clean, tmp_path / "o", sweeps=False, lidar=False), workers=1)[0]
+    written = materialise(options(clean, tmp_path / "o", sweeps=False, lidar=False), workers=0)[0]
     assert (written.shifted, written.linked) == (24, 18)
     for name, record in lines(written.root).items():
         assert record["state"] == ("shifted" if name.startswith("samples/CAM") else "linked")
@@ -191,7 +191,7 @@ def test_what_is_not_asked_for_is_linked(clean: Path, tmp_path: Path) -> None:
 def test_a_file_neither_asked_for_nor_in_the_dataset_is_absent(source: Path, tmp_path: Path) -> None:
     """Key frames alone are a common download."""
     shutil.rmtree(source / "sweeps")
-    written = materialise(options(source, tmp_path / "o", "gaussian", sweeps=False), workers=1)[0]
+    written = materialise(options(source, tmp_path / "o", "gaussian", sweeps=False), workers=0)[0]
     assert (written.shifted, written.failed) == (28, 0)
     assert check_manifest(written.root) is not None
     assert verify(written.root) == (42, [])
@@ -204,15 +204,15 @@ def test_a_file_neither_asked_for_nor_in_the_dataset_is_absent(source: Path, tmp
 
 def test_tables_without_image_sizes(source: Path, clean: Path, tmp_path: Path) -> None:
     edit(source, "sample_data", lambda row: row.update(width=None, height=None))
-    one = materialise(options(source, tmp_path / "a", "scale"), workers=1)[0].root
-    two = materialise(options(clean, tmp_path / "b", "scale"), workers=1)[0].root
+    one = materialise(options(source, tmp_path / "a", "scale"), workers=0)[0].root
+    two = materialise(options(clean, tmp_path / "b", "scale"), workers=0)[0].root
     assert {n: (one / n).read_bytes() for n in lines(one)} == {n: (two / n).read_bytes() for n in lines(two)}
 
 
 @pytest.mark.parametrize(("calibration", "scope"), [("physical", "scene_token"), ("paper", "sample_token")])
 def test_random_severity_is_shared(clean: Path, tmp_path: Path, calibration: Any, scope: str) -> None:
     chosen = options(clean, tmp_path / "o", "gaussian", severities=("random",), calibration=calibration, seed=1)
-    root = materialise(chosen, workers=1)[0].root
+    root = materialise(chosen, workers=0)[0].root
     drawn: dict[str, set[int]] = {}
     spec = ShiftSpec("gaussian", 1, 1, calibration)
     data = NuScenes(clean, VERSION)
@@ -232,8 +232,8 @@ def test_jpeg_subsampling_does_not_weaken_noise(source: Path, tmp_path: Path) ->
         path.write_bytes(encode_jpeg(grey, 95))
     chosen = options(source, tmp_path / "a", "gaussian", sweeps=False, lidar=False, scenes=SCENES[:1])
     drawn, _ = shift_images(grey, None, ShiftSpec("gaussian", 3))
-    kept = materialise(chosen, workers=1)[0].root
-    weak = materialise(replace(chosen, out=tmp_path / "b", subsampling="420"), workers=1)[0].root
+    kept = materialise(chosen, workers=0)[0].root
+    weak = materialise(replace(chosen, out=tmp_path / "b", subsampling="420"), workers=0)[0].root
     share = {}
     for root in (kept, weak):
         levels = [read_image(root / n).astype(float).std() for n in lines(root, SCENES[0]) if "samples/CAM" in n]
@@ -246,7 +246,7 @@ def test_jpeg_subsampling_does_not_weaken_noise(source: Path, tmp_path: Path) ->
 
 
 def test_original_labels_are_those_of_the_dataset(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", "scale"), workers=1)[0].root
+    root = materialise(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
     source = (clean / VERSION / "sample_annotation.json").read_bytes()
     assert (root / VERSION / "sample_annotation.json").read_bytes() == source
     assert (root / VERSION / "sample_annotation.original.json").read_bytes() == source
@@ -254,7 +254,7 @@ def test_original_labels_are_those_of_the_dataset(clean: Path, tmp_path: Path) -
 
 def test_transformed_labels_are_the_moved_boxes_with_their_points(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "o", "scale", labels="transformed", seed=3)
-    root = materialise(chosen, workers=1)[0].root
+    root = materialise(chosen, workers=0)[0].root
     assert (root / VERSION / "sample_annotation.json").readlink() == Path("sample_annotation.transformed.json")
     assert table(root, "sample_annotation") == table(root, "sample_annotation.transformed")
     old, new = NuScenes(clean, VERSION), NuScenes(root, VERSION)
@@ -301,7 +301,7 @@ def test_counts_are_of_the_sweep_that_is_written(clean: Path, tmp_path: Path) ->
     counts = {}
     for lidar in (True, False):
         chosen = options(clean, tmp_path / str(lidar), "snow", severities=(5,), lidar=lidar)
-        root = materialise(chosen, workers=1)[0].root
+        root = materialise(chosen, workers=0)[0].root
         rows = table(root, "sample_annotation.transformed")
         counts[lidar] = {row["token"]: row["num_lidar_pts"] for row in rows}
         kept = [{k: v for k, v in row.items() if k != "num_lidar_pts"} for row in rows]
@@ -321,7 +321,7 @@ def test_the_official_toolkit_reads_a_root(clean: Path, tmp_path: Path) -> None:
     python = os.environ.get("SSAD_DEVKIT_PYTHON")
     if not python:
         pytest.skip("SSAD_DEVKIT_PYTHON names no interpreter with nuscenes-devkit")
-    root = materialise(options(clean, tmp_path / "o", "rotation", labels="transformed"), workers=1)[0].root
+    root = materialise(options(clean, tmp_path / "o", "rotation", labels="transformed"), workers=0)[0].root
     shown = subprocess.run([python, str(HELPER), str(root), VERSION], capture_output=True, text=True, check=False)
     assert shown.returncode == 0, shown.stderr
     found = json.loads(shown.stdout)
@@ -339,21 +339,21 @@ def test_the_official_toolkit_reads_a_root(clean: Path, tmp_path: Path) -> None:
 def test_workers_order_and_runs_do_not_matter(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "a", "snow", "scale", severities=("random",))
     seen: list[tuple[int, int]] = []
-    materialise(chosen, workers=1, progress=lambda done, of: seen.append((done, of)))
+    materialise(chosen, workers=0, progress=lambda done, of: seen.append((done, of)))
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     expected = tree(tmp_path / "a")
     materialise(replace(chosen, out=tmp_path / "b", scenes=SCENES[::-1]), workers=4)
     assert tree(tmp_path / "b") == expected
-    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[1:]), workers=1)
+    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[1:]), workers=0)
     for shift in chosen.shifts:
         fails(StoreError, lambda s=shift: check_manifest(tmp_path / "c" / f"{s}-random", SCENES), SCENES[0])
-    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[:1]), workers=1)
+    materialise(replace(chosen, out=tmp_path / "c", scenes=SCENES[:1]), workers=0)
     assert tree(tmp_path / "c") == expected
 
 
 def test_asked_for_twice_is_written_once(clean: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "a", "fog", "fog", severities=(3, 3), scenes=(SCENES[0], SCENES[0]))
-    assert len(materialise(chosen, workers=1)) == 1
+    assert len(materialise(chosen, workers=0)) == 1
 
 
 @pytest.mark.slow
@@ -374,7 +374,7 @@ def test_options_and_shards_travel(clean: Path, tmp_path: Path) -> None:
 
 def test_resume_keeps_what_stands_and_redoes_what_does_not(clean: Path, fog: Path, tmp_path: Path) -> None:
     chosen = options(clean, tmp_path / "o")
-    root = materialise(chosen, workers=1)[0].root
+    root = materialise(chosen, workers=0)[0].root
     files = sorted(n for n, r in lines(root).items() if r["kind"] == "camera")
     gone, cut, replaced, linked = files[:4]
     (root / gone).unlink()
@@ -385,7 +385,7 @@ def test_resume_keeps_what_stands_and_redoes_what_does_not(clean: Path, fog: Pat
     (root / linked).unlink()
     (root / linked).symlink_to(clean / linked)
     before = {name: (root / name).stat().st_mtime_ns for name in lines(root) if name not in files[:4]}
-    written = materialise(chosen, workers=1)[0]
+    written = materialise(chosen, workers=0)[0]
     assert (written.shifted, written.failed) == (42, 0)
     assert {name: (root / name).stat().st_mtime_ns for name in before} == before
     assert tree(root) == tree(fog)
@@ -399,7 +399,7 @@ def test_a_torn_manifest_line_costs_one_file(clean: Path, fog: Path, tmp_path: P
     path.write_bytes(path.read_bytes()[:-50] + rest)
     last = max(lines(fog, SCENES[0]))
     before = {n: (root / n).stat().st_ino for n in lines(fog)}
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert [n for n, inode in before.items() if (root / n).stat().st_ino != inode] == [last]
     assert tree(root) == tree(fog)
 
@@ -409,7 +409,7 @@ def test_damaged_labels_are_made_again(clean: Path, fog: Path, tmp_path: Path) -
     root = tmp_path / "o" / "fog-3"
     (root / "manifest" / f"{SCENES[0]}.labels.json").write_text('{"lines"')
     (root / "manifest" / f"{SCENES[1]}.labels.json").unlink()
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(root) == tree(fog)
 
 
@@ -420,7 +420,7 @@ def test_leftovers_of_a_killed_run_are_removed(clean: Path, fog: Path, tmp_path:
     (root / ".unfinished" / "123-abc").write_bytes(b"half")
     (root / VERSION / ".sample_annotation.transformed-12-0123abcd.tmp.json").write_bytes(b"half")
     (root / "manifest" / ".probe-77").write_bytes(b"")
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(root) == tree(fog)
 
 
@@ -428,25 +428,25 @@ def test_a_root_of_another_identity_is_refused(clean: Path, fog: Path, tmp_path:
     shutil.copytree(fog, tmp_path / "o" / "fog-3", symlinks=True)
     before = tree(tmp_path / "o")
     for other in ({"seed": 1}, {"quality": 90}, {"calibration": "paper"}, {"sweeps": False}, {"subsampling": "444"}):
-        fails(StoreError, lambda o=other: materialise(options(clean, tmp_path / "o", **o), workers=1), "other data or")
+        fails(StoreError, lambda o=other: materialise(options(clean, tmp_path / "o", **o), workers=0), "other data or")
     assert tree(tmp_path / "o") == before
 
 
 def test_a_root_of_other_tables_is_refused(source: Path, tmp_path: Path) -> None:
-    materialise(options(source, tmp_path / "o"), workers=1)
+    materialise(options(source, tmp_path / "o"), workers=0)
     edit(source, "ego_pose", lambda row: row["translation"].__setitem__(0, row["translation"][0] + 1))
-    fails(StoreError, lambda: materialise(options(source, tmp_path / "o"), workers=1), "other data or options")
+    fails(StoreError, lambda: materialise(options(source, tmp_path / "o"), workers=0), "other data or options")
     # and the same process reads the changed tables, not those it knows
-    one = materialise(options(source, tmp_path / "p", "snow"), workers=1)[0].root
+    one = materialise(options(source, tmp_path / "p", "snow"), workers=0)[0].root
     work._DATA.clear()
-    two = materialise(options(source, tmp_path / "q", "snow"), workers=1)[0].root
+    two = materialise(options(source, tmp_path / "q", "snow"), workers=0)[0].root
     assert tree(one) == tree(two)
 
 
 def test_labels_may_be_asked_for_anew(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", "scale"), workers=1)[0].root
+    root = materialise(options(clean, tmp_path / "o", "scale"), workers=0)[0].root
     before = {n: (root / n).stat().st_ino for n in lines(root)}
-    materialise(options(clean, tmp_path / "o", "scale", labels="transformed"), workers=1)
+    materialise(options(clean, tmp_path / "o", "scale", labels="transformed"), workers=0)
     manifest = check_manifest(root)
     assert manifest is not None
     assert manifest["labels"] == "transformed"
@@ -462,8 +462,8 @@ def test_one_shift_at_a_time(clean: Path, tmp_path: Path) -> None:
     out.mkdir()
     with open(out / ".lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        fails(StoreError, lambda: materialise(options(clean, out), workers=1), "another ssad shift")
-    materialise(options(clean, out, scenes=SCENES[:1]), workers=1)
+        fails(StoreError, lambda: materialise(options(clean, out), workers=0), "another ssad shift")
+    materialise(options(clean, out, scenes=SCENES[:1]), workers=0)
 
 
 # ---------------------------------------------------------------- options
@@ -478,10 +478,10 @@ def test_options_that_make_no_sense(clean: Path, fog: Path, tmp_path: Path) -> N
         fails(ConfigError, lambda s=severity: options(clean, tmp_path, severities=(s,)))
     fails(ConfigError, lambda: options(clean, tmp_path, "smog"), "unknown shift")
     out = tmp_path / "o"
-    fails(ConfigError, lambda: materialise(options(clean, out, scenes=("scene-9",)), workers=1), "scene-9")
-    fails(ConfigError, lambda: materialise(options(clean, out), workers=0), "0 workers")
-    fails(ConfigError, lambda: materialise(options(tmp_path / "none", out), workers=1), "no such folder")
-    fails(ConfigError, lambda: materialise(options(fog, out), workers=1), "shifted already")
+    fails(ConfigError, lambda: materialise(options(clean, out, scenes=("scene-9",)), workers=0), "scene-9")
+    fails(ConfigError, lambda: materialise(options(clean, out), workers=-1), "-1 workers")
+    fails(ConfigError, lambda: materialise(options(tmp_path / "none", out), workers=0), "no such folder")
+    fails(ConfigError, lambda: materialise(options(fog, out), workers=0), "shifted already")
     assert not out.exists()
 
 
@@ -492,7 +492,7 @@ def test_nothing_is_written_through_a_link_into_the_dataset(clean: Path, tmp_pat
         place = out / "fog-3" / name
         place.parent.mkdir(parents=True)
         place.symlink_to(clean / name)
-        fails(StoreError, lambda o=out: materialise(options(clean, o), workers=1), name, "leads into the dataset")
+        fails(StoreError, lambda o=out: materialise(options(clean, o), workers=0), name, "leads into the dataset")
     assert tree(clean) == before
 
 
@@ -507,7 +507,7 @@ def test_a_shift_that_changes_nothing_is_an_error(source: Path, tmp_path: Path) 
         lambda row: row.update(first_annotation_token="", last_annotation_token="", nbr_annotations=0),
     )
     chosen = options(source, tmp_path / "o", "rotation", "gaussian")
-    message = fails(StoreError, lambda: materialise(chosen, workers=1), "rotation changed none of 36 images")
+    message = fails(StoreError, lambda: materialise(chosen, workers=0), "rotation changed none of 36 images")
     assert message.rsplit(": ", 1)[1]  # a reason
     fails(StoreError, lambda: check_manifest(tmp_path / "o" / "rotation-3"), "not complete")
     assert verify(tmp_path / "o" / "gaussian-3") == (42, [])  # the other root is finished all the same
@@ -545,9 +545,9 @@ def test_a_broken_image_is_on_record_and_mending_it_completes(
     name = str(broken.relative_to(source))
     data = broken.read_bytes()
     chosen = options(source, tmp_path / "o", shift)
-    expected = tree(materialise(replace(chosen, out=tmp_path / "whole"), workers=1)[0].root)
+    expected = tree(materialise(replace(chosen, out=tmp_path / "whole"), workers=0)[0].root)
     damage(broken)
-    written = materialise(chosen, workers=1)[0]
+    written = materialise(chosen, workers=0)[0]
     assert written.failed == 1
     assert written.shifted + written.linked == 41
     assert name in written.reasons[0]
@@ -556,9 +556,9 @@ def test_a_broken_image_is_on_record_and_mending_it_completes(
     assert not (written.root / name).exists()
     assert not (written.root / "manifest.json").exists()
     fails(StoreError, lambda: check_manifest(written.root), "not complete")
-    assert materialise(chosen, workers=1)[0] == written  # again, with the same end
+    assert materialise(chosen, workers=0)[0] == written  # again, with the same end
     broken.write_bytes(data)
-    assert materialise(chosen, workers=1)[0].failed == 0
+    assert materialise(chosen, workers=0)[0].failed == 0
     assert tree(written.root) == expected
 
 
@@ -568,13 +568,13 @@ def test_a_broken_sweep_is_on_record_and_mending_it_completes(source: Path, tmp_
     broken = min(source.glob("samples/LIDAR_TOP/*.bin"))
     data = broken.read_bytes()
     chosen = options(source, tmp_path / "o", "fog", "scale", lidar=lidar, scenes=SCENES[:1])
-    materialise(replace(chosen, out=tmp_path / "whole"), workers=1)
+    materialise(replace(chosen, out=tmp_path / "whole"), workers=0)
     broken.write_bytes(data[:-7])
-    for written in materialise(chosen, workers=1):
+    for written in materialise(chosen, workers=0):
         assert written.failed == 1
         assert "cut short" in written.reasons[0]
     broken.write_bytes(data)
-    assert [w.failed for w in materialise(chosen, workers=1)] == [0, 0]
+    assert [w.failed for w in materialise(chosen, workers=0)] == [0, 0]
     assert tree(tmp_path / "o") == tree(tmp_path / "whole")
 
 
@@ -582,8 +582,8 @@ def test_a_failed_scene_does_not_hold_up_another(source: Path, tmp_path: Path) -
     broken = min(source.glob("samples/CAM_FRONT/scene-0103*.jpg"))
     _truncated(broken)
     chosen = options(source, tmp_path / "o", scenes=SCENES[:1])
-    assert materialise(chosen, workers=1)[0].failed == 1
-    root = materialise(replace(chosen, scenes=SCENES[1:]), workers=1)[0].root
+    assert materialise(chosen, workers=0)[0].failed == 1
+    root = materialise(replace(chosen, scenes=SCENES[1:]), workers=0)[0].root
     assert check_manifest(root, SCENES[1:]) is not None
     fails(StoreError, lambda: check_manifest(root, SCENES), SCENES[0])
 
@@ -592,9 +592,9 @@ def test_a_failed_scene_does_not_hold_up_another(source: Path, tmp_path: Path) -
 def test_broken_tables_are_one_line_before_anything_is_written(source: Path, tmp_path: Path, name: str) -> None:
     path = source / VERSION / f"{name}.json"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=1), f"{name}.json")
+    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=0), f"{name}.json")
     path.unlink()
-    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=1), f"{name}.json", "no such file")
+    fails(FormatError, lambda: materialise(options(source, tmp_path / "o"), workers=0), f"{name}.json", "no such file")
     assert not (tmp_path / "o").exists()
 
 
@@ -614,7 +614,7 @@ def test_boxes_behind_around_and_without_size_do_no_harm(source: Path, tmp_path:
     for shift in ("scale", "shear", "rotation", "motion_blur"):
         # none is seen: that is said, in one line
         with contextlib.suppress(StoreError):
-            written = materialise(options(source, tmp_path / "o", shift, scenes=SCENES[:1]), workers=1)[0]
+            written = materialise(options(source, tmp_path / "o", shift, scenes=SCENES[:1]), workers=0)[0]
             assert written.failed == 0
             assert verify(written.root) == (21, [])
 
@@ -622,13 +622,13 @@ def test_boxes_behind_around_and_without_size_do_no_harm(source: Path, tmp_path:
 def test_a_box_without_volume_stays_as_it_is(source: Path, clean: Path, tmp_path: Path) -> None:
     token = table(source, "sample_annotation")[0]["token"]
     edit(source, "sample_annotation", lambda row: row["token"] == token and row.update(size=[0.0, 4.0, 1.5]))
-    written = materialise(options(source, tmp_path / "o", "scale", "shear", "rotation", "motion_blur"), workers=1)
+    written = materialise(options(source, tmp_path / "o", "scale", "shear", "rotation", "motion_blur"), workers=0)
     for root in (w.root for w in written):
         assert verify(root) == (42, [])
         rows = {row["token"]: row for row in table(root, "sample_annotation.transformed")}
         assert rows[token] == table(source, "sample_annotation")[0]
     edit(source, "sample_annotation", lambda row: row.update(size=[0.0, 0.0, 0.0]))
-    fails(StoreError, lambda: materialise(options(source, tmp_path / "p", "scale"), workers=1), "none of 36 images")
+    fails(StoreError, lambda: materialise(options(source, tmp_path / "p", "scale"), workers=0), "none of 36 images")
 
 
 def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path) -> None:
@@ -637,7 +637,7 @@ def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path
         "calibrated_sensor",
         lambda row: row["camera_intrinsic"] and row.update(camera_intrinsic=[[0.0] * 3] * 3),
     )
-    for written in materialise(options(source, tmp_path / "o", "fog", "sunlight", "scale", "gaussian"), workers=1):
+    for written in materialise(options(source, tmp_path / "o", "fog", "sunlight", "scale", "gaussian"), workers=0):
         assert written.failed == 36
         assert "no focal length" in written.reasons[0]
 
@@ -647,13 +647,13 @@ def test_a_camera_without_focal_length_is_on_record(source: Path, tmp_path: Path
 
 def test_output_below_a_file(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    fails(StoreError, lambda: materialise(options(clean, tmp_path / "file" / "o"), workers=1), "cannot write there")
+    fails(StoreError, lambda: materialise(options(clean, tmp_path / "file" / "o"), workers=0), "cannot write there")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_read_only_output(clean: Path, tmp_path: Path) -> None:
     (tmp_path / "o").mkdir(mode=0o500)
-    fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=1), "cannot write there")
+    fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), "cannot write there")
 
 
 @pytest.mark.parametrize(
@@ -676,14 +676,14 @@ def test_output_that_cannot_be_written_loses_nothing(
     moved = os.replace
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", full)
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=1), os.strerror(code))
+        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), os.strerror(code))
     whole = tree(fog)
     for name, data in tree(tmp_path / "o" / "fog-3").items():
         assert name != "manifest.json"
         assert not Path(name).name.startswith(".")
         if name.startswith(("samples", "sweeps", VERSION)):
             assert data == whole[name]
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == whole
 
 
@@ -701,12 +701,12 @@ def largest_file(size: int) -> Iterator[None]:
 @pytest.mark.parametrize("size", [100, 3000, 9000, 20_000])
 def test_writes_that_stop_half_way(clean: Path, fog: Path, tmp_path: Path, size: int) -> None:
     with largest_file(size):
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=1), "File too large")
+        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=0), "File too large")
     whole = tree(fog)
     for name, data in tree(tmp_path / "o").items():
         if "samples" in name or "sweeps" in name:
             assert data == whole[name.removeprefix("fog-3/")]
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == whole
 
 
@@ -716,7 +716,7 @@ def test_a_worker_that_dies_is_one_line(
     with monkeypatch.context() as patch:
         patch.setattr(run, "make_shard", _die)
         fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=2), "a worker died")
-    materialise(options(clean, tmp_path / "o"), workers=1)
+    materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == tree(fog)
 
 
@@ -798,7 +798,7 @@ def test_same_size_other_bytes(root: Path) -> None:
 
 
 def test_a_link_to_another_file(clean: Path, tmp_path: Path) -> None:
-    root = materialise(options(clean, tmp_path / "o", sweeps=False), workers=1)[0].root
+    root = materialise(options(clean, tmp_path / "o", sweeps=False), workers=0)[0].root
     name = first(root, state="linked")
     other = max(n for n, r in lines(root).items() if r["state"] == "linked" and r["kind"] == "camera")
     (root / name).unlink()
@@ -834,7 +834,7 @@ def test_a_broken_page(root: Path, text: str) -> None:
 
 def test_nothing_is_left_open_or_changed(clean: Path, tmp_path: Path) -> None:
     before, threads = tree(clean), cv2.getNumThreads()
-    materialise(options(clean, tmp_path / "o", "fog", "gaussian", "scale", scenes=SCENES[:1]), workers=1)
+    materialise(options(clean, tmp_path / "o", "fog", "gaussian", "scale", scenes=SCENES[:1]), workers=0)
     assert tree(clean) == before
     assert cv2.getNumThreads() == threads
     assert len(work._DATA) == 1

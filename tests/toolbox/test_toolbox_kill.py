@@ -38,7 +38,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def unbroken(clean: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str | bytes]:
     """The bytes of a run that nobody disturbed."""
     out = tmp_path_factory.mktemp("unbroken") / "o"
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     return tree(out)
 
 
@@ -123,7 +123,7 @@ def test_what_a_killed_run_made_is_not_made_again(
         for lines in (root / "manifest").glob("*.jsonl"):
             kept |= {root / name: (root / name).stat().st_ino for name in read_lines(lines)}
     assert len(kept) >= 25
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     assert {path: path.stat().st_ino for path in kept} == kept
     assert tree(out) == unbroken
 
@@ -147,7 +147,7 @@ def test_workers_end_with_the_process_that_started_them(
         os.killpg(run.pid, signal.SIGKILL)
     run.communicate()
     assert not left
-    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=1)
+    materialise(Options(clean, out, VERSION, SHIFTS, ("random",)), workers=0)
     assert tree(out) == unbroken
 
 

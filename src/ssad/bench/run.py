@@ -1,158 +1,256 @@
-"""`ssad run`: a suite becomes cells, cells become records in a folder; run again to go on where it stopped."""
+"""The engine: cells become records in a folder; run again to go on where it stopped. One way for every kind."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from ssad.bench.cells import Cell, code_version, make_cells, system_version, town_version
-from ssad.bench.suite import Suite, command_of, suite_scenarios
-from ssad.core.errors import ConfigError, SSADError
+from ssad.bench.kind import Cell, CellError, Job, Kind, Plan, Resources
+from ssad.bench.suite import command_of, kind_of
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
 from ssad.jobs.machine import default_workers, versions
+from ssad.jobs.pool import Pool, open_pool
 from ssad.jobs.progress import Live
-from ssad.jobs.runner import EXECUTE, Runner
 from ssad.jobs.store import Store, read_run
+from ssad.jobs.task import Outcome, Task
 
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything that a run will do, known and checked before anything is written."""
-
-    suite: Suite
-    cells: tuple[Cell, ...]
-    device: str
-    towns: Mapping[str, str]
-    systems: Mapping[str, str]
-
-    def run_json(self) -> dict[str, Any]:
-        """What run.json says. `identity` covers all that results depend on, so a folder holds one run only."""
-        return {
-            "identity": digest("run", self.device, *[cell.key for cell in self.cells])[:16],
-            "suite": self.suite.model_dump(mode="json"),
-            "command": command_of(self.suite.model_dump(mode="json")),
-            "versions": versions(self.device),
-            "code": code_version(),
-            "towns": dict(self.towns),
-            "systems": dict(self.systems),
-            "cells": [
-                {"key": c.key, "system": c.system, "scenario": c.scenario["name"], "group": c.group, "seed": c.seed}
-                | {"repetition": c.repetition, "town": c.scenario["town"]}
-                for c in self.cells
-            ],
-        }
-
-
-def plan(suite: Suite, *, device: str = "cpu", check: bool = True) -> Plan:
-    """Resolve a suite. With `check`, each scenario is built once, so that bad input ends here and not in a record."""
-    from ssad.bench.execute import episode_of, town
-
-    systems = {name: system_version(name) for name in suite.systems}
-    if len(systems) != len(suite.systems):
-        raise ConfigError(f"suite {suite.name}: systems: a name appears twice")
-    scenarios = suite_scenarios(suite)
-    towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
-    cells = make_cells(suite, scenarios, systems=systems, towns=towns)
-    if check:
-        for cell in cells:
-            if cell.system == suite.systems[0] and cell.repetition == 0:
-                _check(cell, episode_of)
-    return Plan(suite, cells, device, towns, systems)
-
-
-def _check(cell: Cell, build: Any) -> None:
-    try:
-        build(cell.as_dict())
-    except SSADError as error:
-        name = f"scenario {cell.scenario['name']}"
-        raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None
+MOST = 1 << 30  # bytes of an artefact that is hashed
 
 
 def run(
-    todo: Plan,
-    folder: str | Path,
-    *,
-    workers: int | None = None,
-    execute: str = EXECUTE,
-    console: Console | None = None,
-    retry: bool = False,
+    plan: Plan, folder: str | Path, resources: Resources | None = None, *, retry: bool = False
 ) -> list[dict[str, Any]]:
-    """Run what is missing (retry: and what failed) and return all records, in the order of the plan. StoreError,
-    SSADError."""
-    console = console or Console(stderr=True)
-    suite, header = todo.suite, todo.run_json()
+    """Run what is missing (retry: and what failed) and return all records, in the order of the plan.
+
+    Raises:
+        StoreError: the folder cannot be written, is in use, or holds another run.
+        SSADError: no worker can start, or data cannot be made.
+    """
+    resources = resources or Resources(device=plan.device)
+    header, out = run_json(plan), Path(folder).resolve()
     with Store.open(folder, header, retry=retry) as store:
-        missing = [cell for cell in todo.cells if cell.key not in store.results]
-        _keep_towns(Path(folder), todo.towns)
-        settings = {"folder": str(Path(folder).resolve()), "device": todo.device, "witness": suite.witness}
-        count = min(workers or default_workers(), max(1, len(missing)))
-        # with few cells a smaller chunk keeps all workers busy
-        chunk = max(1, min(suite.chunk, -(-len(missing) // count)))
-        runner = Runner(execute=execute, settings=settings, workers=count, chunk=chunk, timeout_s=suite.timeout_s)
+        missing = sorted((c for c in plan.cells if c.key not in store.results), key=plan.kind.order)
         if missing:
-            done = len(todo.cells) - len(missing)
-            with Live(suite.name, len(todo.cells), done, console=console) as live:
-
-                def finish(cell: Cell, result: Mapping[str, Any]) -> None:
-                    store.append(*_records(cell, result, suite.name, header["versions"]))
-                    live.advance(result["status"] == "ok")
-
-                runner.run(missing, finish, live.tick)
-        return [store.results[cell.key] for cell in todo.cells]
+            again = [cell for cell in missing if cell.key in store.retried]
+            settings = plan.kind.prepare(plan, out, resources, retry=again)
+            job = Job(out, plan.device, settings)
+            _Schedule(plan, job, store, header["versions"], resources).work(missing)
+        return [store.results[cell.key] for cell in plan.cells]
 
 
-def _keep_towns(folder: Path, towns: Iterable[str]) -> None:
-    """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
-    from ssad.bench.execute import town
-    from ssad.roads import save_graph
-
-    for name in towns:
-        path = folder / "towns" / f"{name}.npz"
-        if Path(name).name == name and not path.exists():
-            save_graph(town(name), path)
-
-
-def _records(
-    cell: Cell, result: Mapping[str, Any], suite: str, found: Mapping[str, str]
-) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """The line for results.jsonl, and the one for episodes.jsonl when there is an episode."""
-    common: dict[str, Any] = {
-        "key": cell.key,
-        "suite": suite,
-        "system": cell.system,
-        "group": cell.group,
-        "seed": cell.seed,
+def run_json(plan: Plan) -> dict[str, Any]:
+    """What run.json says. `identity` covers all that results depend on, so a folder holds one run only."""
+    kind = plan.kind
+    return {
+        "identity": digest("run", plan.device, *[cell.key for cell in plan.cells])[:16],
+        "kind": kind.name,
+        "suite": plan.suite.model_dump(mode="json"),
+        "command": command_of(plan.suite),
+        "versions": {**versions(plan.device), **plan.versions},
+        "code": kind.code(),
+        "columns": [vars(column) for column in kind.columns],
+        "factors": list(kind.factors),
+        "cells": [{"key": c.key, "name": c.name, "seed": c.seed, **c.fields} for c in plan.cells],
+        **plan.inputs,
     }
-    record = common | {
-        "status": result["status"],
-        "reason": result["reason"],
-        "spec": {"scenario": dict(cell.scenario), "system": cell.system, "repetition": cell.repetition},
-        "metrics": result.get("metrics", {}),
-        "n": result.get("n", 1),
-        "versions": dict(found),
-        "wall_s": result.get("wall_s", 0.0),
-        "artefacts": result.get("artefacts", {}),
-    }
-    if "witness" in result:
-        record["witness"] = result["witness"]
-    if result["status"] != "ok":
-        return record, None
-    episode = common | {"scenario": cell.scenario["name"], "repetition": cell.repetition}
-    kept = {name: result[name] for name in ("town", "end", "trace_hash", "metrics") if name in result}
-    return record, episode | kept | {"trace": record["artefacts"].get("trace", "")}
 
 
 def read_plan(folder: str | Path) -> Plan:
-    """The plan of a folder that holds a run. StoreError when code, towns or systems have changed since."""
+    """The plan of a folder that holds a run. ConfigError when code or inputs have changed since."""
     header = read_run(folder)
-    suite = Suite.model_validate(header["suite"])
-    todo = plan(suite, device=header["versions"]["device"], check=False)
-    if todo.run_json()["identity"] != header["identity"]:
-        changed = [name for name in ("code", "towns", "systems") if todo.run_json()[name] != header[name]]
-        what = ", ".join(changed) or "scenarios"
+    kind = kind_of(str(header["suite"]["kind"]))
+    plan = kind.plan(kind.suite.model_validate(header["suite"]), device=header["versions"]["device"], check=False)
+    now = run_json(plan)
+    if now["identity"] != header["identity"]:
+        what = ", ".join(name for name in ("code", *plan.inputs) if now[name] != header.get(name)) or "scenarios"
         raise ConfigError(f"{folder}: {what} changed since this run was made; run the suite again to compare")
-    return todo
+    return plan
+
+
+class _Schedule:
+    """Who waits for what: shared pieces of work first, then cells in batches, one by one where a batch fails."""
+
+    def __init__(self, plan: Plan, job: Job, store: Store, versions: Mapping[str, str], resources: Resources) -> None:
+        self.plan, self.kind, self.job, self.store = plan, plan.kind, job, store
+        self.versions, self.resources = versions, resources
+        self.timeout: float = plan.suite.timeout_s
+        self.left: dict[str, set[str]] = {}  # cell key -> pieces that it waits for
+        self.users: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
+        self.data: dict[str, Any] = {}
+        self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
+        self.alone: set[str] = set()  # systems that share no pieces any more
+        self.trouble: Counter[str] = Counter()  # system -> its crashes and time-outs
+        self.given_up: dict[str, Outcome] = {}
+        self.pool: Pool
+        self.live: Live
+
+    def work(self, missing: Sequence[Cell]) -> None:
+        """Run cells until each has a record."""
+        for cell in missing:
+            pieces = self.kind.pieces(cell, self.job)
+            self.data |= pieces
+            self.left[cell.key] = set(pieces)
+            for name in pieces:
+                self.users.setdefault((name, cell.system), []).append(cell)
+        ready = [cell for cell in missing if not self.left[cell.key]]
+        count = len(self.data) + len(missing)
+        place = self.resources
+        start = (_start, (self.kind, self.job))
+        total = len(self.plan.cells) + len(self.data)
+        done = len(self.plan.cells) - len(missing)
+        with (
+            open_pool(count, workers=place.workers, ray=place.ray, device=self.plan.device, start=start) as self.pool,
+            Live(self.plan.suite.name, total, done, console=place.console) as self.live,
+        ):
+            for batch in self.kind.batches(self.plan, ready, min(count, place.workers or default_workers())):
+                self._add(batch)
+            for name in self.data:
+                self._add_piece(name, [system for piece, system in self.users if piece == name])
+            for outcome in self.pool.outcomes(self.live.tick):
+                if isinstance(outcome.task.label, list):
+                    self._batch_ended(outcome.task.label, outcome)
+                else:
+                    name, systems = outcome.task.label
+                    self._piece_ended(name, systems, outcome)
+
+    def _add(self, batch: list[Cell], *, first: bool = False) -> None:
+        # a batch may take longer than one cell, but not the sum of all
+        limit = self.timeout * (1 if len(batch) == 1 else 2)
+        self.pool.add(Task(_execute, (self.kind, batch, self.job), limit, label=batch), first=first)
+
+    def _add_piece(self, name: str, systems: Sequence[str], *, first: bool = False) -> None:
+        argument = (self.kind, name, self.data[name], tuple(systems), self.job)
+        self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
+
+    def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
+        """Lets go the cells that waited; a piece that failed for several systems is done again for each alone."""
+        if outcome.status != "ok" and len(systems) > 1:
+            for system in systems:
+                if system in self.alone:
+                    self._release(name, system)
+                else:
+                    self._add_piece(name, [system], first=True)
+            return
+        for system in systems:
+            self._release(name, system, outcome.seconds / len(systems))
+        if outcome.status != "ok":
+            self._share_no_more(systems[0])
+            self._blame(systems[0], outcome)
+
+    def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
+        waiting = self.users.pop((name, system), [])
+        if not any(piece == name for piece, _ in self.users):
+            self.live.advance(True)
+        for cell in waiting:
+            self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting)
+            self.left[cell.key].discard(name)
+            if self.left[cell.key]:
+                continue
+            if cell.system in self.given_up:
+                self._give_up(cell)
+            else:
+                self._add([cell], first=True)
+
+    def _batch_ended(self, batch: list[Cell], outcome: Outcome) -> None:
+        if outcome.status == "ok":
+            for cell in batch:
+                result = dict(outcome.value[cell.key])
+                seconds = result.pop("wall_s", outcome.seconds / len(batch)) + self.shared.get(cell.key, 0.0)
+                self._record(cell, "ok", "", result, seconds)
+        elif len(batch) > 1:
+            for cell in reversed(batch):
+                self._add([cell], first=True)
+        else:
+            reason = outcome.reason
+            if outcome.status == "timeout":
+                reason = f"took longer than {self.timeout:g} s"
+            self._record(batch[0], outcome.status, reason, {}, outcome.seconds + self.shared.get(batch[0].key, 0.0))
+            self._blame(batch[0].system, outcome)
+
+    def _share_no_more(self, system: str) -> None:
+        """A system failed alone: its cells do without shared pieces from now on."""
+        if system in self.alone:
+            return
+        self.alone.add(system)
+        for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
+            name, systems = task.label
+            others = [one for one in systems if one != system]
+            if others:
+                self._add_piece(name, others)
+            self._release(name, system)
+
+    def _blame(self, system: str, outcome: Outcome) -> None:
+        """A system has hung or died alone; after some times it is given up."""
+        if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
+            return
+        self.trouble[system] += 1
+        if self.trouble[system] == self.kind.patience:
+            self.given_up[system] = outcome
+            for task in self.pool.drop(lambda task: isinstance(task.label, list) and task.label[0].system == system):
+                for cell in task.label:
+                    self._give_up(cell)
+
+    def _give_up(self, cell: Cell) -> None:
+        outcome = self.given_up[cell.system]
+        why = f"not tried after {self.kind.patience} others of {cell.system} ended like this: {outcome.reason}"
+        self._record(cell, outcome.status, why, {}, 0.0)
+
+    def _record(self, cell: Cell, status: str, reason: str, result: dict[str, Any], seconds: float) -> None:
+        """A line for results.jsonl, and one for episodes.jsonl when the kind has one."""
+        common: dict[str, Any] = {"key": cell.key, "suite": self.plan.suite.name, **cell.fields, "seed": cell.seed}
+        episode = result.pop("episode", None)
+        record = common | {
+            "status": status, "reason": reason, "spec": dict(cell.spec), "metrics": {}, "n": 1,
+            "versions": dict(self.versions), "wall_s": round(seconds, 4), "artefacts": {},
+        } | result  # fmt: skip
+        self.store.append(record, None if episode is None else common | episode)
+        self.live.advance(status == "ok")
+
+
+def _start(argument: tuple[Kind, Job]) -> None:
+    kind, job = argument
+    kind.start(job)
+
+
+def _make(argument: tuple[Kind, str, Any, Sequence[str], Job]) -> None:
+    kind, name, data, systems, job = argument
+    kind.make(name, data, systems, job)
+
+
+def _execute(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, Any]]:
+    """Results of a batch, checked to be what a store can keep, with the hashes of their artefacts."""
+    kind, batch, job = argument
+    results = kind.execute(batch, job)
+    if set(results) != {cell.key for cell in batch}:
+        raise CellError(f"the kind {kind.name} answered for other cells")
+    checked: dict[str, Mapping[str, Any]] = {}
+    for key, result in results.items():
+        try:
+            safeio.dump_json(dict(result))
+        except (TypeError, ValueError) as error:
+            raise CellError(f"the result is not plain data: {error}") from None
+        paths = [
+            path
+            for value in result.get("artefacts", {}).values()
+            for path in ([value] if isinstance(value, str) else value)
+        ]
+        checked[key] = {**result, "hashes": hash_artefacts(job.folder, paths)}
+    return checked
+
+
+def hash_artefacts(folder: Path, paths: Iterable[str]) -> dict[str, str]:
+    """Path below the folder -> 32 hex digits of BLAKE2b, of files and of all files in folders."""
+    found = {}
+    for path in (folder / name for name in paths):
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file():
+                data = safeio.read_bytes(file, limit=MOST)
+                name = os.path.relpath(file, folder)
+                found[name] = hashlib.blake2b(data, digest_size=16).hexdigest()
+    return found

@@ -1,54 +1,41 @@
-"""Suites: which systems drive which scenarios, how often; YAML files with a strict schema."""
+"""Suites: YAML files with a strict schema, one a table; which schema, their kind says."""
 
 from __future__ import annotations
 
 import difflib
 import re
 import shlex
+import typing
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 import ssad
-from ssad.bench.component.suite import DetectionSuite
+from ssad.bench.kind import Kind, SuiteBase
 from ssad.core.errors import ConfigError, UnknownNameError, unknown_name
+from ssad.core.registry import resolve
 from ssad.core.safeio import Document, dotted, parse_yaml, read_yaml_document
-from ssad.core.types import Scenario
 
-Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
+KINDS: dict[str, str] = {
+    "driving": "ssad.bench.kinds.driving:Driving",
+    "detection": "ssad.bench.kinds.detection:Detection",
+}
+"""Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
 
 
-class Suite(BaseModel):
-    """One table: systems x scenarios x repetitions.
+def kind_of(name: str) -> Kind:
+    """The kind of that name, entry point or "module:class".
 
-    systems: names, or module:object; scenarios: what `load_scenarios` understands (sets, types, names, YAML files);
-    repetitions: episodes of each pair, with seeds of their own; timeout_s: seconds that one cell may take; chunk:
-    cells that run as one batch of the world (results do not depend on it); reference: the published table that the
-    report shows beside this one; witness: search each collision for a way out; pictures: what the report shows besides
-    (shifts: contact sheets of the distribution shifts; camera: what the camera sees).
+    Raises:
+        UnknownNameError: there is none.
+        ConfigError: it cannot be imported, or is no kind.
     """
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-    kind: Literal["driving"] = "driving"
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
-    title: str = ""
-    description: str = ""
-    systems: Names
-    scenarios: Names
-    repetitions: int = Field(default=1, ge=1, le=100_000)
-    seed: int = Field(default=0, ge=0)
-    timeout_s: float = Field(default=120.0, gt=0, allow_inf_nan=False)
-    chunk: int = Field(default=16, ge=1, le=4096)
-    reference: str | None = None
-    witness: bool = True
-    pictures: list[Literal["shifts", "camera"]] = []
-
-
-KINDS: dict[str, type[Suite] | type[DetectionSuite]] = {"driving": Suite, "detection": DetectionSuite}
-LISTS = ("systems", "scenarios", "pictures", "detectors", "shifts", "severities")  # one value alone is a list of one
+    found = resolve("kind", KINDS, name)
+    if not isinstance(found, type) or not issubclass(found, Kind):
+        raise ConfigError(f"kind '{name}': expected a class derived from ssad.bench.kind.Kind")
+    return found()
 
 
 def suite_folders() -> list[Path]:
@@ -70,7 +57,7 @@ def suite_files() -> dict[str, Path]:
     return files
 
 
-def load_suite(ref: str, settings: Sequence[str] = ()) -> Suite | DetectionSuite:
+def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
     """The suite of that name or YAML file, with `--set key=value` settings applied; its key `kind` says of which kind.
 
     ConfigError or FormatError say file, line and key; UnknownNameError shows the closest names.
@@ -83,41 +70,33 @@ def load_suite(ref: str, settings: Sequence[str] = ()) -> Suite | DetectionSuite
         path = Path(ref)
     document = read_yaml_document(path)
     if not isinstance(document.data, dict):
-        raise document.error((), "a suite is a mapping with the keys name, systems and scenarios")
+        raise document.error((), "a suite is a mapping with the keys kind, name and those of its kind")
     data = dict(document.data)
-    kind = KINDS.get(str(data.get("kind", "driving")))
-    if kind is None:
-        raise document.error(("kind",), f"'{data['kind']}' is no kind of suite; choose from: {', '.join(KINDS)}")
+    try:
+        schema = kind_of(str(data.setdefault("kind", "driving"))).suite
+    except UnknownNameError:
+        raise document.error(
+            ("kind",), f"'{data['kind']}' is no kind of suite; choose from: {', '.join(KINDS)}"
+        ) from None
     changed: dict[str, str] = {}
     for setting in settings:
-        changed[_apply(data, setting, list(kind.model_fields))] = setting
+        changed[_apply(data, setting, schema)] = setting
     try:
-        suite = kind.model_validate(data)
+        return schema.model_validate(data).beside(path)
     except ValidationError as error:
-        raise _explain(error, document, changed, list(kind.model_fields)) from None
-    if isinstance(suite, DetectionSuite):
-        return suite
-    return suite.model_copy(update={"scenarios": [_beside(name, path) for name in suite.scenarios]})
+        raise _explain(error, document, changed, list(schema.model_fields)) from None
 
 
-def _beside(ref: str, suite_file: Path) -> str:
-    """A scenario file is looked for in the working folder, then beside the suite."""
-    near = suite_file.parent / ref
-    if ref.endswith((".yaml", ".yml")) and not Path(ref).exists() and near.exists():
-        return str(near)
-    return ref
-
-
-def _apply(data: dict[str, Any], setting: str, known: Sequence[str]) -> str:
+def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
     """Put one `key=value` into the data; returns the top-level key."""
     key, equals, text = setting.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError(f"--set {setting}: expected key=value, such as --set repetitions=3")
-    if parts[0] not in known:
-        raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], known)}")
+    if parts[0] not in schema.model_fields:
+        raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], list(schema.model_fields))}")
     value = parse_yaml(text, f"--set {key}")
-    if len(parts) == 1 and parts[0] in LISTS and isinstance(value, str | int):
+    if len(parts) == 1 and _is_list(schema, parts[0]) and isinstance(value, str | int):
         value = [value]
     place = data
     for part in parts[:-1]:
@@ -128,6 +107,11 @@ def _apply(data: dict[str, Any], setting: str, known: Sequence[str]) -> str:
         place = place[part]
     place[parts[-1]] = value
     return parts[0]
+
+
+def _is_list(schema: type[SuiteBase], key: str) -> bool:
+    """Whether a key takes a list; one value alone then is a list of one."""
+    return typing.get_origin(schema.model_fields[key].annotation) is list
 
 
 def _unknown_key(key: str, known: Sequence[str]) -> str:
@@ -156,35 +140,16 @@ def _explain(error: ValidationError, document: Document, changed: dict[str, str]
     return document.error(location, text)
 
 
-def suite_scenarios(suite: Suite) -> tuple[Scenario, ...]:
-    """All scenarios of a suite, in order, each once. ConfigError when two differ but share a name."""
-    from ssad.scenarios.dynamic import load_scenarios
-
-    found: dict[str, Scenario] = {}
-    for ref in suite.scenarios:
-        try:
-            loaded = load_scenarios(ref)
-        except UnknownNameError as error:
-            raise UnknownNameError(f"suite {suite.name}: {error}") from None
-        for scenario in loaded:
-            if found.setdefault(scenario.name, scenario) != scenario:
-                raise ConfigError(
-                    f"suite {suite.name}: two different scenarios are named '{scenario.name}' (one from {ref}); "
-                    "rename one"
-                )
-    return tuple(found.values())
-
-
-def command_of(suite: dict[str, Any]) -> str:
+def command_of(suite: SuiteBase) -> str:
     """The command that runs a suite again; only what differs from the suite of that name is spelt out."""
-    suite = dict(suite)
-    name = str(suite.pop("name", "quick"))
+    values = suite.model_dump(mode="json")
+    name = str(values.pop("name"))
     try:
         stock = load_suite(name).model_dump(mode="json")
     except ConfigError:  # a suite of the user's own, by its file
-        stock = suite
+        stock = values
     words = ["ssad", "run", name]
-    for key, value in suite.items():
+    for key, value in values.items():
         if value != stock.get(key):
             text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
             if isinstance(value, dict):

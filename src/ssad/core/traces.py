@@ -68,6 +68,14 @@ def trace_hash(trace: EpisodeTrace) -> str:
     return total.hexdigest()
 
 
+def motion_hash(trace: EpisodeTrace) -> str:
+    """32 hex digits over how everybody moved, whatever the episode is called: equal in copies of one case."""
+    total = hashlib.sha256(safeio.dump_json([trace.town, trace.dt, *trace.models]).encode())
+    for name in _PER_AGENT:
+        total.update(np.ascontiguousarray(getattr(trace, name), _ARRAYS[name]).tobytes())
+    return total.hexdigest()[:32]
+
+
 def first_difference(a: EpisodeTrace, b: EpisodeTrace) -> str | None:
     """None when equal to the bit, else one line: which array differs first, at which step."""
     for name in _META:

@@ -79,3 +79,17 @@ def visible_gpus() -> list[str]:
     import torch
 
     return [str(k) for k in range(torch.cuda.device_count())]
+
+
+# processes that share a GPU: planning a shift and reading pictures is work for the host; and memory of each, bytes
+GPU_WORKERS, GPU_SHARE = 14, 4 << 30
+
+
+def gpu_workers(gpus: int) -> int:
+    """How many processes share so many GPUs (the first ones that are visible)."""
+    if not gpus:
+        return 0
+    import torch
+
+    memory = [torch.cuda.get_device_properties(k).total_memory for k in range(gpus)]
+    return sum(max(1, min(GPU_WORKERS, size // GPU_SHARE)) for size in memory)

@@ -1,82 +1,57 @@
-"""Work shared out over processes of this machine."""
+"""Work shared out: one pool for suites, recordings and the toolbox, over processes of this machine or a Ray cluster."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent import futures
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
-from multiprocessing.sharedctypes import Synchronized
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from ssad.core.errors import StoreError
+from ssad.jobs.cluster import RayCluster
+from ssad.jobs.local import LocalProcesses, Start, ThisProcess
+from ssad.jobs.machine import default_workers, gpu_workers, visible_gpus
+from ssad.jobs.task import Backend, Outcome, Task
 
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-def spread(
-    function: Callable[[T], R], tasks: Sequence[T], workers: int | None = None, *, gpus: Sequence[str] = ()
-) -> Iterator[R]:
-    """Results as they come, in any order; workers: how many processes (default: one a core), one: this one.
-
-    gpus: the processes see one of these each, in turn (see `visible_gpus`). An error ends it, and what has not begun
-    is not begun. StoreError: a process died.
-    """
-    with Crew(min(workers or os.cpu_count() or 1, len(tasks)), gpus=gpus) as crew:
-        for task in tasks:
-            crew.add(function, task)
-        yield from crew.results()
+TICK_S = 0.2
 
 
-class Crew:
-    """Processes that work through a queue, to which more may be added while results are read; a context.
+class Pool:
+    """A queue of tasks before a backend; a context.
 
-    workers: how many processes; one (or fewer): this one. gpus, errors: see `spread`.
+    Tasks may be added while outcomes are read. No task costs more than itself: see `Outcome.status`.
+
+    Args:
+        backend: where the tasks run; see `open_pool`.
     """
 
-    def __init__(self, workers: int, *, gpus: Sequence[str] = ()) -> None:
-        self._urgent: deque[tuple[Callable[[Any], Any], Any]] = deque()
-        self._queue: deque[tuple[Callable[[Any], Any], Any]] = deque()
-        self._running: set[Future[Any]] = set()
-        self._pool: ProcessPoolExecutor | None = None
-        self._count = workers
-        if workers > 1:
-            spawn = multiprocessing.get_context("spawn")
-            threads = max((os.cpu_count() or 1) // workers, 1)
-            start = (spawn.Value("i", 0), tuple(gpus), threads)
-            self._pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin, initargs=start)
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self._urgent: deque[Task] = deque()
+        self._queue: deque[Task] = deque()
 
-    def add(self, function: Callable[[Any], Any], task: Any, *, first: bool = False) -> None:
-        """One more piece of work; first: before all that has not begun and was not added so."""
-        (self._urgent if first else self._queue).append((function, task))
+    def add(self, task: Task, *, first: bool = False) -> None:
+        """One more task; first: before all that has not begun and was not added so."""
+        (self._urgent if first else self._queue).append(task)
 
-    def results(self) -> Iterator[Any]:
-        """What the functions return, until nothing is left to do."""
-        while self._urgent or self._queue or self._running:
-            if self._pool is None:
-                function, task = self._next()
-                yield function(task)
-                continue
-            try:
-                while (self._urgent or self._queue) and len(self._running) < self._count:
-                    function, task = self._next()
-                    self._running.add(self._pool.submit(function, task))
-                done, self._running = futures.wait(self._running, return_when=futures.FIRST_COMPLETED)
-            except BrokenProcessPool:
-                raise _died() from None
-            yield from (future.result() for future in done if future.exception() is None)
-            for error in filter(None, (future.exception() for future in done)):
-                raise _died() if isinstance(error, BrokenProcessPool) else error
+    def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:
+        """Takes back the tasks that have not begun and are not wanted any more; they are returned."""
+        dropped = [task for task in (*self._urgent, *self._queue) if unwanted(task)]
+        self._urgent = deque(task for task in self._urgent if not unwanted(task))
+        self._queue = deque(task for task in self._queue if not unwanted(task))
+        return dropped
 
-    def _next(self) -> tuple[Callable[[Any], Any], Any]:
-        return (self._urgent or self._queue).popleft()
+    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[Outcome]:
+        """How each task ended, as they end, until nothing is left to do; `tick` is called several times a second.
+
+        Raises:
+            SSADError: no worker can start.
+        """
+        while self._urgent or self._queue or self.backend.busy:
+            while (self._urgent or self._queue) and self.backend.busy < self.backend.capacity:
+                self.backend.submit((self._urgent or self._queue).popleft())
+            yield from self.backend.wait(TICK_S)
+            tick()
 
     def __enter__(self) -> Self:
         return self
@@ -84,33 +59,73 @@ class Crew:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self.backend.close()
 
 
-def _died() -> StoreError:
-    return StoreError("a worker died (out of memory?); run the same command again to go on")
+def open_pool(
+    tasks: int,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    device: str = "cpu",
+    start: Start | None = None,
+) -> Pool:
+    """A pool for about so many tasks.
+
+    Args:
+        tasks: how many there will be at the most at a time; no more workers are started.
+        workers: processes of this machine (None: one a core, on GPUs what their memory takes); 0: this very process,
+            without isolation, for debugging.
+        ray: address of a Ray cluster instead; see `RayCluster`.
+        device: cpu or cuda; on cuda each worker sees one of the visible GPUs.
+        start: see `LocalProcesses`.
+
+    Raises:
+        ConfigError: there is no such cluster.
+    """
+    gpus = visible_gpus() if device != "cpu" else []
+    if ray is not None:
+        share = 1.0 / max(1, gpu_workers(len(gpus)) // max(len(gpus), 1)) if device != "cpu" else 0.0
+        return Pool(RayCluster(ray, start=start, gpu_share=share))
+    if workers == 0:
+        return Pool(ThisProcess(start))
+    count = workers or min(gpu_workers(len(gpus)) or default_workers(), default_workers())
+    count = max(1, min(count, tasks))
+    return Pool(LocalProcesses(count, start=start, gpus=gpus, threads=max(1, default_workers() // count)))
 
 
-def _begin(turn: Synchronized[int], gpus: tuple[str, ...], threads: int) -> None:
-    """Makes a worker ready. threads: of the linear algebra in each, which would otherwise take every core in each."""
-    for library in ("OMP", "OPENBLAS", "MKL"):  # read when NumPy is imported, which has not happened yet
-        os.environ.setdefault(f"{library}_NUM_THREADS", str(threads))
-    if gpus:
-        with turn.get_lock():
-            number = turn.value
-            turn.value = number + 1
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[number % len(gpus)]
-    _end_with_parent()
+def run_all(
+    pool: Pool,
+    function: Callable[[Any], Any],
+    arguments: Sequence[Any],
+    *,
+    timeout_s: float = float("inf"),
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Any]:
+    """`function` of each argument, in order, for work that is of use only as a whole; what is done is on disk.
 
+    Args:
+        pool: where; it is used up.
+        function, arguments, timeout_s: see `Task`.
+        progress: called with how many are done, and of how many.
 
-def _end_with_parent() -> None:
-    """Ends this worker when the process that started it is gone, even by kill -9."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    Raises:
+        SSADError: what the function raised first; nothing more is begun then.
+        StoreError: some crashed or took too long, when all others are done.
+    """
+    results: list[Any] = [None] * len(arguments)
+    lost: list[str] = []
+    with pool:
+        for number, argument in enumerate(arguments):
+            pool.add(Task(function, argument, timeout_s, label=number))
+        for done, outcome in enumerate(pool.outcomes(), 1):
+            progress(done, len(arguments))
+            results[outcome.task.label] = outcome.value
+            if outcome.error is not None:
+                raise outcome.error
+            if outcome.status != "ok":
+                lost.append(outcome.reason)
+    if lost:
+        more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+        raise StoreError(f"{len(lost)} of {len(arguments)} parts failed: {lost[0]}{more}; run the same command again")
+    return results

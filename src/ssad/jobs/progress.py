@@ -13,9 +13,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 class Live:
     """A context: a Rich bar on a terminal, else a line every `every` seconds."""
 
-    def __init__(self, title: str, total: int, done: int, *, console: Console, every: float = 10.0) -> None:
+    def __init__(
+        self, title: str, total: int, done: int, *, console: Console, every: float = 10.0, unit: str = "cells"
+    ) -> None:
         self.total, self.done, self.failed, self.first = total, done, 0, done
-        self.title, self.console, self.every = title, console, every
+        self.title, self.console, self.every, self.unit = title, console, every, unit
         self.began = self.said = time.monotonic()
         self.bar: Progress | None = None
         if console.is_terminal:
@@ -42,6 +44,11 @@ class Live:
         self.done += 1
         self.failed += not ok
 
+    def show(self, done: int, of: int) -> None:
+        """So many are done, of so many."""
+        self.done, self.total = done, of
+        self.tick()
+
     def tick(self) -> None:
         """Show where things are."""
         if self.bar:
@@ -52,7 +59,7 @@ class Live:
 
     def line(self) -> None:
         """One plain line."""
-        self.console.print(f"{self.title}: {self.done}/{self.total} cells  {self.note()}", highlight=False)
+        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}", highlight=False)
 
     def __enter__(self) -> Self:
         if self.bar:

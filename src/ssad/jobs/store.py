@@ -7,15 +7,17 @@ failed goes when it is to be tried again.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from ssad.core import safeio
-from ssad.core.errors import FormatError, StoreError
+from ssad.core.errors import StoreError
+from ssad.core.jsonl import scan_lines
 
 RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
 
@@ -31,34 +33,6 @@ def read_run(folder: str | Path) -> dict[str, Any]:
     return data
 
 
-def read_lines(path: str | Path) -> list[dict[str, Any]]:
-    """Whole lines of a JSONL file; a torn last line is left out. StoreError for a broken line elsewhere."""
-    return _scan(Path(path))[0]
-
-
-def _scan(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
-    """Records, and the offset at which each of them ends."""
-    records: list[dict[str, Any]] = []
-    ends: list[int] = []
-    if not path.exists():
-        return records, ends
-    lines = safeio.read_bytes(path, limit=1 << 34).split(b"\n")
-    whole, offset = lines[:-1], 0
-    for number, line in enumerate(whole, 1):
-        offset += len(line) + 1
-        try:
-            record = safeio.parse_json(line.decode(), f"{path}:{number}")
-            if not isinstance(record, dict) or "key" not in record:
-                raise FormatError(f"{path}:{number}: not a record")
-        except (FormatError, UnicodeDecodeError):
-            if number == len(whole):  # the last line may be torn even if it ends (blocks lost in a power cut)
-                break
-            raise StoreError(f"{path}:{number}: this line is broken; mend or remove it, then run again") from None
-        records.append(record)
-        ends.append(offset)
-    return records, ends
-
-
 class Store:
     """One results folder, held by one process (`with Store.open(...) as store`)."""
 
@@ -67,6 +41,7 @@ class Store:
         self._lock = lock
         self._files: dict[str, int] = {}
         self.results: dict[str, dict[str, Any]] = {}
+        self.retried: frozenset[str] = frozenset()
 
     @classmethod
     def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
@@ -91,24 +66,24 @@ class Store:
     def _begin(self, run: Mapping[str, Any], *, retry: bool) -> None:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
-        results, ends = _scan(self.folder / RESULTS)
+        results, ends = scan_lines(self.folder / RESULTS)
         _cut(self.folder / RESULTS, ends[-1] if ends else 0)
         for record in results:
             if record["key"] in self.results:
                 raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
             self.results[record["key"]] = record
-        if retry and any(_failed(record) for record in results):
+        self.retried = frozenset(record["key"] for record in results if retry and _failed(record))
+        if self.retried:
             self.results = {key: record for key, record in self.results.items() if not _failed(record)}
             lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
             safeio.write_atomic(self.folder / RESULTS, "".join(lines))
-        episodes, ends = _scan(self.folder / EPISODES)
+        episodes, ends = scan_lines(self.folder / EPISODES)
         while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
             episodes.pop()
             ends.pop()
         _cut(self.folder / EPISODES, ends[-1] if ends else 0)
         for name in (RESULTS, EPISODES):
             self._files[name] = _open_append(self.folder / name)
-        (self.folder / "traces").mkdir(exist_ok=True)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
         """Add one finished cell; durable when this returns. A key that is already there raises ValueError."""
@@ -169,14 +144,42 @@ def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
     )
 
 
-def _lock(folder: Path) -> int:
-    descriptor = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+def _lock(folder: Path, what: str = "ssad run") -> int:
+    """The descriptor of a lock file that only one process may hold. StoreError: another one does."""
+    path = folder / LOCK
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written: {error.strerror or error}") from None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         os.close(descriptor)
-        raise StoreError(f"{folder}: another ssad run is writing there; wait for it or use --out") from None
+        raise StoreError(
+            f"{folder}: another {what} is writing there; wait for its end or choose another folder"
+        ) from None
+    except OSError as error:
+        os.close(descriptor)
+        raise StoreError(f"{path}: cannot be locked: {error.strerror or error}") from None
     return descriptor
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """The folder, made if need be, for this process alone while the block lasts.
+
+    Args:
+        folder: to be written.
+        what: the command, for the message.
+
+    Raises:
+        StoreError: another process has it.
+    """
+    descriptor = _lock(safeio.make_folder(folder), what)
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _cut(path: Path, size: int) -> None:

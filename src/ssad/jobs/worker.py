@@ -1,21 +1,20 @@
-"""The child process of the runner: reads chunks of cells from its standard input, answers on a pipe of its own.
+"""The child process that does the work: `python -m ssad.jobs.worker IN OUT`, two file descriptors of pipes.
 
-Run as `python -m ssad.jobs.worker FD`. One JSON line in: {"cells": [...]}; one out: {"results": [...]} or
-{"error": text}. The first line in is the set-up {"execute", "settings", "path"}; its answer is {"ready": true}.
-What the executor prints goes to standard error, so it cannot disturb the answers.
+In come (import path, whether there is a start) once, then (function, argument) pairs, the start first. Out go (kind,
+value) pairs: "ready"; "value"; "error", the exception of a user's mistake or a line of text; "fatal", it cannot start.
+What the work prints goes to the process's own standard error, so it cannot disturb the answers.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import importlib
-import json
 import os
 import queue
 import signal
 import sys
 import threading
+from multiprocessing.connection import Connection
 from typing import Any
 
 from ssad.core.errors import SSADError
@@ -28,51 +27,51 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
 
 
-def _read(lines: queue.SimpleQueue[dict[str, Any]]) -> None:
-    """Hand over the lines of standard input; end the process with the input, even in the middle of a chunk."""
-    for line in sys.stdin.buffer:
-        lines.put(json.loads(line))
-    os._exit(0)
+def _read(orders: Connection, received: queue.SimpleQueue[Any]) -> None:
+    """Hand over what comes in; end the process with the input, even in the middle of a task."""
+    while True:
+        try:
+            received.put(orders.recv())
+        except (EOFError, OSError):
+            os._exit(0)
+        except Exception as error:  # what came cannot be imported here
+            received.put((_raise, describe(error)))
 
 
-def main(descriptor: int) -> None:
+def _raise(text: str) -> None:
+    raise ImportError(text)
+
+
+def main(orders: int, answers: int) -> None:
     """Serve until the input ends."""
     _die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the runner's to handle
-    lines: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(lines,), daemon=True).start()
-    with os.fdopen(descriptor, "wb", buffering=0) as answers:
-
-        def answer(message: dict[str, Any]) -> None:
-            data = memoryview(json.dumps(message, allow_nan=False).encode() + b"\n")
-            while data:
-                data = data[answers.write(data) or 0 :]
-
-        setup = lines.get()
-        sys.path[:] = list(dict.fromkeys([*setup["path"], *sys.path]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    reader, out = Connection(orders, writable=False), Connection(answers, readable=False)
+    path, starts = reader.recv()
+    sys.path[:] = list(dict.fromkeys([*path, *sys.path]))
+    received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(reader, received), daemon=True).start()
+    if starts:
         try:
-            module_name, _, attribute = setup["execute"].partition(":")
-            module = importlib.import_module(module_name)
-            execute = getattr(module, attribute)
-            if hasattr(module, "warm_up"):
-                module.warm_up(setup["settings"])
+            function, argument = received.get()
+            function(argument)
         except Exception as error:
-            answer({"fatal": str(error) if isinstance(error, SSADError) else describe(error)})
+            out.send(("fatal", str(error) if isinstance(error, SSADError) else describe(error)))
             return
-        answer({"ready": True})
-        while True:
-            cells = lines.get()["cells"]
-            try:
-                message = {"results": execute(cells, setup["settings"])}
-            except SSADError as error:
-                message = {"error": str(error)}
-            except (Exception, SystemExit) as error:
-                message = {"error": describe(error)}
-            try:
-                answer(message)
-            except (TypeError, ValueError) as error:
-                answer({"error": f"the result is not plain data: {error}"})
+    out.send(("ready", None))
+    while True:
+        function, argument = received.get()
+        try:
+            message: tuple[str, Any] = ("value", function(argument))
+        except SSADError as error:
+            message = ("error", error)
+        except (Exception, SystemExit) as error:
+            message = ("error", describe(error))
+        try:
+            out.send(message)
+        except Exception as error:  # whatever pickling raises
+            out.send(("error", f"the result cannot be handed over: {describe(error)}"))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -31,6 +31,8 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.jobs.machine import quiet_warp
+from ssad.jobs.pool import open_pool
+from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
 from ssad.recording.nuscenes_recorder import HELD_OUT, NOISE, draw_weather, drive, run_parts
 from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
@@ -289,7 +291,11 @@ def _annotate(
 
 
 def record_clips(
-    clips: Clips, *, workers: int | None = None, progress: Callable[[int, int], None] | None = None
+    clips: Clips,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Path:
     """Takes all pictures and writes annotations/{train,test,all}.json; the folder. Run again to go on.
 
@@ -306,21 +312,23 @@ def record_clips(
     for town, count in clips.images:
         for number, start in enumerate(range(0, count, EACH)):
             tasks.append((clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}"))
-    run_parts(out, identity, _part, tasks, workers=workers, progress=progress)
-    splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
-              "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
-    for split, members in splits.items():
-        rows: list[dict[str, Any]] = []
-        skipped: Counter[str] = Counter()
-        for task in members:
-            part = safeio.read_json(out / ".parts" / task[4] / "part.json")
-            rows += part["images"]
-            skipped.update(part["skipped"])
-        counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
-        about = {
-            "recording": identity, "split": split, "towns": sorted({t[1] for t in members}), "images": len(rows),
-            "objects": counts, "weathers": Counter(row["weather"] for row in rows), "skipped": skipped,
-        }  # fmt: skip
-        page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
-        safeio.write_atomic(out / "annotations" / f"{split}.json", page)
+    pool = open_pool(len(tasks), workers=workers, ray=ray, device=clips.device)
+    with locked(out, "ssad record"):
+        run_parts(out, identity, _part, tasks, pool=pool, progress=progress)
+        splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
+                  "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
+        for split, members in splits.items():
+            rows: list[dict[str, Any]] = []
+            skipped: Counter[str] = Counter()
+            for task in members:
+                part = safeio.read_json(out / ".parts" / task[4] / "part.json")
+                rows += part["images"]
+                skipped.update(part["skipped"])
+            counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
+            about = {
+                "recording": identity, "split": split, "towns": sorted({t[1] for t in members}), "images": len(rows),
+                "objects": counts, "weathers": Counter(row["weather"] for row in rows), "skipped": skipped,
+            }  # fmt: skip
+            page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
+            safeio.write_atomic(out / "annotations" / f"{split}.json", page)
     return out

@@ -31,8 +31,9 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, Episode, EpisodeTrace
 from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
-from ssad.jobs.machine import quiet_warp, visible_gpus
-from ssad.jobs.pool import spread
+from ssad.jobs.machine import quiet_warp
+from ssad.jobs.pool import Pool, open_pool, run_all
+from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
 from ssad.recording.scene_objects import PlacedObject, SceneObjects, place_objects
 from ssad.roads import load_town, town_names
@@ -56,6 +57,7 @@ AHEAD: Final = {
 }  # fmt: skip
 NOISE: Final = 0.012  # of the sensor
 FIRST: Final = 0.1  # s, when the first sweep ends
+PART_S: Final = 7200.0  # s that a part may take
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
@@ -338,7 +340,11 @@ def _sensors(cameras: list[Camera]) -> list[dict[str, Any]]:
 
 
 def record_nuscenes(
-    recording: Recording, *, workers: int | None = None, progress: Callable[[int, int], None] | None = None
+    recording: Recording,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Path:
     """Records all scenes and writes the tables; the root of the data set. Run again to go on. StoreError."""
     out = recording.out
@@ -352,9 +358,10 @@ def record_nuscenes(
             raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
         _check_page(out, recording.identity())
         return out
-    gpus = visible_gpus() if recording.device != "cpu" else []
-    run_parts(out, recording.identity(), _scene, tasks, workers=workers, progress=progress, gpus=gpus)
-    _merge(recording, [task[3] for task in tasks])
+    pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
+    with locked(out, "ssad record"):
+        run_parts(out, recording.identity(), _scene, tasks, pool=pool, progress=progress)
+        _merge(recording, [task[3] for task in tasks])
     return out
 
 
@@ -369,16 +376,18 @@ def _check_page(out: Path, identity: dict[str, Any]) -> None:
 
 
 def run_parts(
-    out: Path, identity: dict[str, Any], record: Callable[[Any], str], tasks: Sequence[Any], *,
-    workers: int | None = None, progress: Callable[[int, int], None] | None = None, gpus: Sequence[str] = (),
-) -> None:  # fmt: skip
-    """Records every part that is not there yet, in processes (see `spread`). StoreError: another recording, or a
-    worker died."""
+    out: Path,
+    identity: dict[str, Any],
+    record: Callable[[Any], str],
+    tasks: Sequence[Any],
+    *,
+    pool: Pool,
+    progress: Callable[[int, int], None],
+) -> None:
+    """Records every part that is not there yet. StoreError: another recording, or parts that failed (see `run_all`)."""
     safeio.make_folder(out / ".parts")
     _check_page(out, identity)
-    for done, _ in enumerate(spread(record, tasks, workers, gpus=gpus), 1):
-        if progress:
-            progress(done, len(tasks))
+    run_all(pool, record, tasks, timeout_s=PART_S, progress=progress)
 
 
 def _merge(recording: Recording, names: list[str]) -> None:

@@ -90,7 +90,7 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
 
 def pick_trace(folder: Path) -> Path | None:
     """The recording of a collision of the run, with a walker if there is one; any recording if nobody collides."""
-    from ssad.jobs.store import read_lines
+    from ssad.core.jsonl import read_lines
 
     found = []
     for record in read_lines(folder / "results.jsonl"):

@@ -17,10 +17,10 @@ from ssad.core.frames import Boxes3D, Camera, Frame, SceneContext, camera_to_wor
 from ssad.core.images import captioned, read_image, save_picture
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts import SEVERITIES, SHIFTS, Calibration, ShiftSpec, shift_images, viewing_direction
 from ssad.scenarios.static.shifts.sun import choose_sun
-from ssad.toolbox.scene_shifter import SceneShifter
 
 
 def box_at(camera: Camera, rectangle: Sequence[float]) -> Boxes3D:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -58,6 +58,10 @@ class Options:
             raise ConfigError(
                 f"{self.out}: the output must lie outside of the dataset {self.source}, and not around it"
             )
+
+    def absolute(self) -> Options:
+        """The same with folders whose names hold in another process."""
+        return replace(self, source=self.source.absolute(), out=self.out.absolute())
 
     def shards(self, scenes: tuple[str, ...]) -> list[Shard]:
         """One piece of work a shift, severity and scene."""

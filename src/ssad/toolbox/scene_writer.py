@@ -22,6 +22,7 @@ from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.evaluation.scene_shifter import LIDAR, SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.toolbox.manifest import (
     FOLDER,
@@ -34,7 +35,6 @@ from ssad.toolbox.manifest import (
     text,
 )
 from ssad.toolbox.options import Shard
-from ssad.toolbox.scene_shifter import LIDAR, SceneShifter
 
 UNFINISHED: Final = ".unfinished"  # folder of a root for files that are being written; removed when it is done
 _DATA: dict[object, NuScenes] = {}

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError, SSADError, StoreError
+from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import stream, table_path
-from ssad.jobs.pool import spread
+from ssad.jobs.pool import open_pool, run_all
+from ssad.jobs.store import locked
 from ssad.scenarios.static.shifts.sun import NO_SUN
 from ssad.toolbox.manifest import FOLDER, PAGE, TABLE, Tally, digest_file, page, read_lines, shard_path
 from ssad.toolbox.options import Options, Shard, Strength
 from ssad.toolbox.scene_writer import UNFINISHED, check_folders, finished, link, make_shard
 
 Progress = Callable[[int, int], None]
+SHARD_S = 7200.0  # s that a scene under a shift may take
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +41,15 @@ class Written:
 
 
 def materialise(
-    options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress | None = None
+    options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress = lambda done, of: None
 ) -> list[Written]:
     """Writes one nuScenes root a shift and severity. Run again to resume: what stands is kept.
 
     workers: processes (None: one a core); ray: address of a cluster that sees the same folders. The bytes do not
     depend on either. ConfigError, FormatError, StoreError; StoreError also when a shift changed no image at all.
     """
-    if workers is not None and workers < 1:
-        raise ConfigError(f"{workers} workers: expected 1 or more")
+    if workers is not None and workers < 0:
+        raise ConfigError(f"{workers} workers: expected 1 or more (0: in this process)")
     if (options.source / FOLDER / "identity.json").exists():
         raise ConfigError(f"{options.source}: shifted already; give the clean dataset")
     data = NuScenes(options.source, options.version)
@@ -64,14 +64,13 @@ def materialise(
     data.close()
     roots = [(shift, severity) for shift in options.shifts for severity in options.severities]
     source = {"root": str(options.source.resolve()), "version": options.version, "tables": _tables(options)}
-    safeio.make_folder(options.out)
-    with _locked(options.out):
+    with locked(options.out, "ssad shift"):
         for shift, severity in roots:
             _begin(options, shift, severity, source)
-        shards = options.shards(chosen)
-        for count, _ in enumerate(_work(shards, workers=workers, ray=ray), 1):
-            if progress is not None:
-                progress(count, len(shards))
+        shards = options.absolute().shards(chosen)
+        run_all(
+            open_pool(len(shards), workers=workers, ray=ray), make_shard, shards, timeout_s=SHARD_S, progress=progress
+        )
         written, problems = [], []
         for shift, severity in roots:
             try:
@@ -86,32 +85,6 @@ def materialise(
 def _tables(options: Options) -> dict[str, str]:
     """Hashes of the tables: a shifted root belongs to one dataset."""
     return {name: digest_file(table_path(options.source, options.version, name)) for name in sorted(TABLES)}
-
-
-class _locked:
-    """One `ssad shift` a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / ".lock"
-
-    def __enter__(self) -> None:
-        import fcntl
-
-        try:
-            self.descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise StoreError(f"{self.path}: cannot be written: {error.strerror or error}") from None
-        try:
-            fcntl.flock(self.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(self.descriptor)
-            raise StoreError(f"{self.path.parent}: another ssad shift is writing there; wait for its end") from None
-        except OSError as error:
-            os.close(self.descriptor)
-            raise StoreError(f"{self.path}: cannot be locked: {error.strerror or error}") from None
-
-    def __exit__(self, *_: object) -> None:
-        os.close(self.descriptor)
 
 
 def _begin(options: Options, shift: str, severity: Strength, source: dict[str, Any]) -> None:
@@ -157,51 +130,6 @@ def _clear(root: Path, version: str) -> None:
         for path in folder.glob(".*") if folder.is_dir() else ():
             if re.fullmatch(r"\.probe-\d+|\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?", path.name):
                 path.unlink(missing_ok=True)
-
-
-def _work(shards: Sequence[Shard], *, workers: int | None, ray: str | None) -> Iterator[dict[str, int]]:
-    """Runs the shards; results as they come."""
-    if ray is not None:
-        yield from _on_ray(shards, ray)
-        return
-    yield from spread(make_shard, shards, workers)
-
-
-def _on_ray(shards: Sequence[Shard], address: str) -> Iterator[dict[str, int]]:
-    """Runs the shards on a Ray cluster; "local" starts one for as long as it takes."""
-    try:
-        import ray
-    except ImportError:
-        raise ConfigError("--ray needs the extra `ray`: pip install 'ssad-testbed[ray]'") from None
-    own = not ray.is_initialized()
-    try:
-        if own:
-            ray.init(address="local" if address == "local" else address, log_to_driver=False)
-    except Exception as error:
-        raise ConfigError(f"no Ray cluster at '{address}': {error}") from None
-    task = ray.remote(make_shard)
-    # workers have a folder of their own: names as seen from here
-    waiting = [
-        task.remote(
-            replace(s, options=replace(s.options, source=s.options.source.absolute(), out=s.root.parent.absolute()))
-        )
-        for s in shards
-    ]
-    try:
-        while waiting:
-            ready, waiting = ray.wait(waiting)
-            yield ray.get(ready[0])
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        raise cause if isinstance(cause, SSADError) else StoreError(f"a Ray task failed: {cause}") from None
-    except ray.exceptions.RayError as error:
-        raise StoreError(f"a Ray worker died: {error}; run the same command again to go on") from None
-    finally:
-        for left in waiting:
-            with contextlib.suppress(ray.exceptions.RayError):
-                ray.cancel(left)
-        if own:
-            ray.shutdown()
 
 
 def _finish(

@@ -4,6 +4,7 @@ from ssad.scenarios.dynamic.catalog import CUSTOM, PRECRASH, SCENARIOS, paramete
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.importer import import_routes
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.sampling import sample_parameters, sampling_ranges
 from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
 from ssad.scenarios.dynamic.sets import load_scenarios, set_names
 from ssad.scenarios.dynamic.yamlio import read_scenarios, save_scenarios, scenario_text
@@ -19,6 +20,8 @@ __all__ = [
     "load_scenarios",
     "parameter_box",
     "read_scenarios",
+    "sample_parameters",
+    "sampling_ranges",
     "save_scenarios",
     "scenario_data",
     "scenario_from",

@@ -28,7 +28,18 @@ CUSTOM = "Custom"
 
 
 def scenario_type(name: str) -> ScenarioType:
-    """The class of that name, or behind "module:object". UnknownNameError, ConfigError."""
+    """The scenario class of a name.
+
+    Args:
+        name: A key of `SCENARIOS`, "Custom", the name of an entry point, or "module:object".
+
+    Returns:
+        The class.
+
+    Raises:
+        UnknownNameError: There is none of that name; the message has the closest ones.
+        ConfigError: A module of the user does not import, or has something else under that name.
+    """
     found = resolve("scenario", {**SCENARIOS, CUSTOM: f"{_HERE}.custom:SCENARIO"}, name)
     if not isinstance(found, ScenarioType):
         raise ConfigError(f"scenario type '{name}': expected a ScenarioType, found {type(found).__name__}")
@@ -36,5 +47,16 @@ def scenario_type(name: str) -> ScenarioType:
 
 
 def parameter_box(type_name: str) -> dict[str, Parameter]:
-    """Parameters of a scenario class by name, with range, default and unit. UnknownNameError."""
-    return scenario_type(type_name).box
+    """The parameters of a scenario class, those of the ego's start among them.
+
+    Args:
+        type_name: Name of the class, as for `scenario_type`.
+
+    Returns:
+        Parameter name -> range, default, unit and spread.
+
+    Raises:
+        UnknownNameError: There is no class of that name.
+        ConfigError: As for `scenario_type`.
+    """
+    return dict(scenario_type(type_name).box)

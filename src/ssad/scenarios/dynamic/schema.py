@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _DATA = (Scenario, Pose, Actor, Phase, Condition, SignalPlan, TrafficPlan, Limits)
 _NAME = re.compile(r"^[A-Za-z0-9][A-Za-z0-9_.:@+\-]*(/[A-Za-z0-9][A-Za-z0-9_.:@+\-]*)*$")
 # Bounds that no scenario needs to leave; they keep a slip of the pen from running for hours.
-_MAX_SPEED = 60.0
+MAX_SPEED = 60.0
 _MAX_COORDINATE = 1.0e5
 _MAX_STEPS = 100_000
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
@@ -39,9 +39,18 @@ def _adapter() -> TypeAdapter[Scenario]:
 
 
 def scenario_from(data: Any, document: Document | None = None, place: Location = ()) -> Scenario:
-    """A checked scenario from plain data (as YAML or JSON gives it).
+    """A checked scenario from plain data.
 
-    document, place: where the data stands. ConfigError names file, line, key and what is allowed.
+    Args:
+        data: The data as YAML or JSON gives it.
+        document: The document that it stands in, for messages.
+        place: Where in the document it stands.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ConfigError: Something is missing, unknown or out of range; names file, line, key and what is allowed.
     """
     from pydantic import ValidationError
 
@@ -63,7 +72,14 @@ def scenario_from(data: Any, document: Document | None = None, place: Location =
 
 
 def check(scenario: Scenario) -> None:
-    """Raise ConfigError with the scenario's name and key if it is not valid."""
+    """Checks the values of a scenario.
+
+    Args:
+        scenario: The scenario.
+
+    Raises:
+        ConfigError: It is not valid; names the scenario and the key.
+    """
     for location, message in problems(scenario):
         raise ConfigError(f"scenario {scenario.name}: {dotted(location)}: {message}")
 
@@ -103,7 +119,14 @@ def _shown(value: Any) -> str:
 
 
 def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """What is wrong with the values: (place, message)."""
+    """What is wrong with the values of a scenario.
+
+    Args:
+        scenario: The scenario.
+
+    Yields:
+        Place of the value among the scenario's keys, and a message.
+    """
     if not _NAME.match(scenario.name):
         yield ("name",), f"'{scenario.name}' is not a name; use letters, digits, and -_.:@+/ between them"
     if not scenario.town:
@@ -111,17 +134,14 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
     if len(scenario.route) < 2:
         yield ("route",), "a route needs at least two key points"
     yield from _poses(scenario)
-    if not 0.0 < scenario.target_speed <= _MAX_SPEED:
-        yield ("target_speed",), f"{scenario.target_speed:g} is outside 0 to {_MAX_SPEED:g} m/s"
+    if not 0.0 < scenario.target_speed <= MAX_SPEED:
+        yield ("target_speed",), f"{scenario.target_speed:g} is outside 0 to {MAX_SPEED:g} m/s"
     if scenario.seed < 0:
         yield ("seed",), "must not be negative"
     yield from _plans(scenario)
     if scenario.type == CUSTOM:
-        if scenario.parameters:
-            yield ("parameters",), "type Custom takes none; its actors say it all"
         yield from _actors(scenario)
-        return
-    if scenario.actors:
+    elif scenario.actors:
         yield ("actors",), f"only type {CUSTOM} takes actors; {scenario.type} makes its own"
     try:
         box = scenario_type(scenario.type).box
@@ -130,7 +150,7 @@ def problems(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         return
     for name, value in scenario.parameters.items():
         if name not in box:
-            yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box) or 'none'}"
+            yield ("parameters", name), f"no such parameter; {scenario.type} has: {', '.join(box)}"
         elif problem := box[name].problem(value):
             yield ("parameters", name), problem
 
@@ -195,7 +215,14 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:
-    """Plain data of a scenario, defaults left out; `scenario_from` gives the scenario back."""
+    """Plain data of a scenario.
+
+    Args:
+        scenario: The scenario.
+
+    Returns:
+        Data for YAML or JSON, defaults left out; `scenario_from` gives the scenario back.
+    """
     data: dict[str, Any] = _plain(scenario)
     return data
 

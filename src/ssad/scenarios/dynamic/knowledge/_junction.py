@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ssad.core.types import EpisodeAgent, Phase, Route, Scenario
-from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
+from ssad.scenarios.dynamic.knowledge._kind import SPEED_SPREAD, Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._meeting import meeting_place
 from ssad.scenarios.dynamic.knowledge._placing import (
     ahead,
@@ -27,14 +27,25 @@ _BODY = "coupe"
 
 
 def box(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
-    """Speed, trigger distance and place, each 5 either side of SafeBench's value."""
+    """The parameters of a car that meets the ego in a junction, each 5 either side of SafeBench's value.
+
+    Args:
+        speed: SafeBench's speed of the car, m/s.
+        trigger_distance: SafeBench's trigger distance, m.
+
+    Returns:
+        Trigger distance, speed and place along the car's heading.
+    """
     return (
         Parameter(
             "trigger_distance", trigger_distance - 5.0, trigger_distance + 5.0, trigger_distance, "m",
-            "the car starts when the ego is this near to it",
+            "the car starts when the ego is this near to it", 2.0,
         ),
-        Parameter("speed", speed - 5.0, speed + 5.0, speed, "m/s", "speed that the car accelerates to"),
-        Parameter("longitudinal", -5.0, 5.0, 0.0, "m", "shift of the car along its heading"),
+        Parameter(
+            "speed", speed - 5.0, speed + 5.0, speed, "m/s",
+            "speed that the car accelerates to", SPEED_SPREAD * speed,
+        ),
+        Parameter("longitudinal", -5.0, 5.0, 0.0, "m", "shift of the car along its heading", 1.5),
     )  # fmt: skip
 
 
@@ -51,6 +62,21 @@ def meeting_car(
     """The car where the author put it, going straight; else on a lane, where it meets the ego.
 
     That place is found with the class's default speed and trigger distance: other values change the outcome.
+
+    Args:
+        kind: The scenario's class.
+        scenario: The scenario; its first placement, if there is one, is the car's place.
+        graph: Lane graph of the town.
+        route: The ego's route.
+        name: Name of the car.
+        sides: Headings of the car relative to the ego's, rad, best first.
+        phases: What the car does.
+
+    Returns:
+        The car alone.
+
+    Raises:
+        RouteError: No lane into the ego's junction crosses its route.
     """
     value = kind.values(scenario.parameters)
     if scenario.placements:

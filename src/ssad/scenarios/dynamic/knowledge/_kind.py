@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -18,7 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number that varies a scenario: its range and default, both in `unit`."""
+    """One number that varies a scenario.
+
+    Attributes:
+        name: Key in `Scenario.parameters`.
+        low: Least value allowed, in `unit`.
+        high: Greatest value allowed, in `unit`.
+        default: Value of a scenario that does not give one, in `unit`.
+        unit: Unit of the values, "" for a plain number.
+        doc: What the number means.
+        spread: How far a repetition may draw the number from the scenario's own value at spread 1, in `unit`; 0: it
+            is never drawn.
+    """
 
     name: str
     low: float
@@ -26,18 +38,51 @@ class Parameter:
     default: float
     unit: str
     doc: str
+    spread: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.low <= self.default <= self.high:
             raise ValueError(f"{self.name}: default {self.default} outside [{self.low}, {self.high}]")
+        if not 0.0 <= self.spread <= self.high - self.low:
+            raise ValueError(f"{self.name}: spread {self.spread} outside [0, {self.high - self.low}]")
 
     def problem(self, value: float) -> str | None:
-        """What is wrong with `value`, None if nothing."""
+        """Says what is wrong with a value.
+
+        Args:
+            value: The value, in `unit`.
+
+        Returns:
+            A message, or None if the value is allowed.
+        """
         if math.isfinite(value) and self.low <= value <= self.high:
             return None
         unit = f" {self.unit}" if self.unit else ""
         return f"{value:g} is outside {self.low:g} to {self.high:g}{unit} ({self.doc})"
 
+
+EGO_START: tuple[Parameter, ...] = (
+    Parameter("ego_speed", 0.0, 15.0, 0.0, "m/s", "speed of the ego at the start", spread=2.0),
+    Parameter("ego_longitudinal", 0.0, 10.0, 0.0, "m", "from the start of the route along it to the ego", spread=4.0),
+    Parameter("ego_lateral", -1.0, 1.0, 0.0, "m", "ego to the left of its route", spread=0.375),
+    Parameter("ego_heading", -0.2, 0.2, 0.0, "rad", "turn of the ego to the left of its route", spread=0.03),
+)
+"""How the ego starts: parameters that every scenario class has. Nominally it stands at the start of its route.
+
+Draws are even within the spread, so their standard deviation is spread / sqrt(3).
+Lateral: 0.375 m is the zone in which a car wanders within its lane (UN Regulation 157, annex 4, appendix 3); standard
+deviation 0.22 m. Heading: that of a car which crosses those 0.375 m in 1.5 s at 8 m/s. Longitudinal: about a car's
+length. Speed: from a standstill, as in SafeBench, to rolling.
+"""
+
+TARGET_SPEED_SPREAD = 0.125
+"""How far a repetition may draw the ego's target speed at spread 1, as a share of it: standard deviation 7 %.
+
+Drivers on a free road differ by 5 to 10 % (SUMO gives its cars 10 %).
+"""
+
+SPEED_SPREAD = 0.125
+"""The same share for the speeds of scripted vehicles."""
 
 Build: TypeAlias = "Callable[[Scenario, LaneGraph, Route, np.random.Generator], Sequence[EpisodeAgent]]"
 
@@ -46,11 +91,17 @@ Build: TypeAlias = "Callable[[Scenario, LaneGraph, Route, np.random.Generator], 
 class ScenarioType:
     """A scenario class.
 
-    title: its name in the paper; nhtsa: the pre-crash situation it comes from; build: (scenario, lane
-    graph, the ego's route, random numbers) -> the agents after the ego, in the order that `Condition.actor`
-    counts; signals, traffic: what a scenario gets that leaves them at their defaults; max_distance: m that
-    the ego may drive; whole_town: the signal plan covers every signal of the map, not only the junctions on
-    the route.
+    Attributes:
+        name: Name in `Scenario.type`.
+        title: Name in the paper.
+        nhtsa: The pre-crash situation that it comes from.
+        build: (scenario, lane graph, the ego's route, random numbers) -> the agents after the ego, in the order that
+            `Condition.actor` counts.
+        parameters: Its own parameters; those of the ego's start (`EGO_START`) come by themselves.
+        signals: Signal plan of a scenario that leaves it at the default.
+        traffic: Traffic of a scenario that leaves it at the default.
+        max_distance: How far the ego may drive, m.
+        whole_town: The signal plan covers every signal of the map, not only the junctions on the route.
     """
 
     name: str
@@ -63,18 +114,30 @@ class ScenarioType:
     max_distance: float = 1.0e9
     whole_town: bool = False
 
-    @property
-    def box(self) -> dict[str, Parameter]:
-        """Parameters by name."""
-        return {p.name: p for p in self.parameters}
+    def __post_init__(self) -> None:
+        if len(self.box) != len(self.parameters) + len(EGO_START):
+            raise ValueError(f"{self.name}: a parameter's name is there twice: {', '.join(self.box)}")
+
+    @cached_property
+    def box(self) -> Mapping[str, Parameter]:
+        """Parameters by name: the class's own, then those of the ego's start."""
+        return {p.name: p for p in (*self.parameters, *EGO_START)}
 
     def values(self, given: Mapping[str, float]) -> dict[str, float]:
-        """All parameters, `given` over the defaults. ConfigError for an unknown name or a bad value."""
+        """The value of every parameter.
+
+        Args:
+            given: Parameter name -> value, in the parameter's unit; the others have their defaults.
+
+        Returns:
+            Parameter name -> value for all of `box`.
+
+        Raises:
+            ConfigError: A name is unknown, or a value out of range.
+        """
         box = self.box
         for name, value in given.items():
-            problem = (
-                box[name].problem(value) if name in box else f"no such parameter; known: {', '.join(box) or 'none'}"
-            )
+            problem = box[name].problem(value) if name in box else f"no such parameter; known: {', '.join(box)}"
             if problem:
                 raise ConfigError(f"{self.name}: parameter {name}: {problem}")
         return {name: float(given.get(name, p.default)) for name, p in box.items()}

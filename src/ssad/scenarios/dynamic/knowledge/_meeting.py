@@ -18,6 +18,7 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     turn_of,
     wrap,
 )
+from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -70,12 +71,46 @@ def meeting_place(
 ) -> Place:
     """Where an actor stands on an approach of the ego's junction so that it meets an ego of `ego_times`.
 
-    sides: wanted headings of the approach relative to the ego's, rad, best first (-pi/2: from the left).
-    The actor starts when the ego is within `trigger_distance`, at full throttle up to `speed`; it stands
-    before the junction, and both reach the point where their paths meet at one moment, as nearly as the
-    road allows. RouteError if no approach crosses the ego's path.
+    The actor stands before the junction, and both reach the point where their paths meet at one moment, as nearly as
+    the road allows. The search is done once for a route; its answer is kept.
+
+    Args:
+        graph: Lane graph of the town.
+        scenario: The scenario; its trigger says from where on the junction is looked for.
+        route: The ego's route.
+        sides: Wanted headings of the approach relative to the ego's, rad, best first (-pi/2: from the left).
+        trigger_distance: The actor starts when the ego is this near to it, m,
+        speed: at full throttle up to this speed, m/s.
+        body: Model of the actor.
+
+    Returns:
+        The place on the approach.
+
+    Raises:
+        RouteError: The route has no junction, or no approach to it crosses the ego's path.
     """
-    enter, leave = junction_span(graph, scenario, route)
+    span = junction_span(graph, scenario, route)
+    place = _search(graph, route, span, tuple(sides), trigger_distance, speed, body)
+    if place is None:
+        junction = int(graph.junction[route.lane[span[0]]])
+        raise RouteError(
+            f"scenario {scenario.name}: no lane into junction {junction} crosses the ego's route; give placements"
+        )
+    return place
+
+
+@remembered()
+def _search(  # noqa: PLR0917  a remembered function takes its arguments by position
+    graph: LaneGraph,
+    route: Route,
+    span: tuple[int, int],
+    sides: tuple[float, ...],
+    trigger_distance: float,
+    speed: float,
+    body: str,
+) -> Place | None:
+    """The start on the best of the approaches to the junction at points `span` of the route, None without one."""
+    enter = span[0]
     junction = int(graph.junction[route.lane[enter]])
     ego_lanes = {int(n) for n in np.unique(route.lane)}
     heading = float(route.yaw[max(enter - 1, 0)])
@@ -91,7 +126,7 @@ def meeting_place(
             found = _meet(
                 graph,
                 route,
-                span=(enter, leave),
+                span=span,
                 lanes=(before, inside),
                 trigger_distance=trigger_distance,
                 speed=speed,
@@ -101,9 +136,7 @@ def meeting_place(
                 best = found
         if best is not None:
             return best[1]
-    raise RouteError(
-        f"scenario {scenario.name}: no lane into junction {junction} crosses the ego's route; give placements"
-    )
+    return None
 
 
 def _meet(

@@ -12,6 +12,7 @@ import numpy as np
 from ssad.core.errors import RouteError
 from ssad.core.geometry import wrap_angle
 from ssad.core.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
+from ssad.scenarios.dynamic.knowledge._remember import remembered
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -83,6 +84,7 @@ def turn_of(graph: LaneGraph, lane: int) -> float:
     return float(yaw[-1] - yaw[0])
 
 
+@remembered(1 << 14)
 def straightest(graph: LaneGraph, lane: int) -> int | None:
     """The driving successor that turns least, None at the end of the road."""
     after = [int(n) for n in graph.successors(lane) if graph.kind[n] == LaneType.DRIVING] or [
@@ -158,21 +160,31 @@ def trigger_index(scenario: Scenario, route: Route) -> int:
     """Route point nearest to the trigger; without one, 30 m after the start. RouteError if it is far off."""
     if scenario.trigger is None:
         return min(round(DEFAULT_TRIGGER / route.spacing), len(route.xy) - 1)
-    off = np.hypot(route.xy[:, 0] - scenario.trigger.x, route.xy[:, 1] - scenario.trigger.y)
-    best = int(np.argmin(off))
-    if off[best] > 5.0:
-        raise RouteError(
-            f"scenario {scenario.name}: the trigger is {off[best]:.1f} m off the route; put it on the route"
-        )
+    best, off = _nearest_point(route, scenario.trigger)
+    if off > 5.0:
+        raise RouteError(f"scenario {scenario.name}: the trigger is {off:.1f} m off the route; put it on the route")
     return best
+
+
+@remembered()
+def _nearest_point(route: Route, pose: Pose) -> tuple[int, float]:
+    """The route point nearest to a pose, and how far off it is."""
+    off = np.hypot(route.xy[:, 0] - pose.x, route.xy[:, 1] - pose.y)
+    best = int(np.argmin(off))
+    return best, float(off[best])
 
 
 def route_place(graph: LaneGraph, scenario: Scenario, route: Route, index: int) -> Place:
     """The lane under a point of the route. RouteError where the route has left the lane graph."""
-    lane = int(route.lane[index])
-    if lane < 0:
+    if route.lane[index] < 0:
         raise RouteError(f"scenario {scenario.name}: no lane under the route at {index * route.spacing:.0f} m")
-    return project(graph, lane, float(route.xy[index, 0]), float(route.xy[index, 1]))
+    return _lane_under(graph, route, index)
+
+
+@remembered()
+def _lane_under(graph: LaneGraph, route: Route, index: int) -> Place:
+    """The lane under a point of a route on the lane graph."""
+    return project(graph, int(route.lane[index]), float(route.xy[index, 0]), float(route.xy[index, 1]))
 
 
 def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> Place:
@@ -182,11 +194,19 @@ def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> Place:
 
 def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[int, int]:
     """Route points where the first junction after the trigger begins and where it has ended. RouteError."""
-    first = trigger_index(scenario, route) if scenario.trigger is not None else 0
+    span = _first_junction(graph, route, trigger_index(scenario, route) if scenario.trigger is not None else 0)
+    if span is None:
+        raise RouteError(f"scenario {scenario.name}: the route passes no junction after its trigger")
+    return span
+
+
+@remembered()
+def _first_junction(graph: LaneGraph, route: Route, first: int) -> tuple[int, int] | None:
+    """Route points where the first junction from point `first` on begins and where it has ended."""
     inside = (route.lane >= 0) & (graph.junction[np.maximum(route.lane, 0)] >= 0)
     entries = np.flatnonzero(inside[first:])
     if not len(entries):
-        raise RouteError(f"scenario {scenario.name}: the route passes no junction after its trigger")
+        return None
     enter = first + int(entries[0])
     exits = np.flatnonzero(~inside[enter:])
     return enter, enter + int(exits[0]) if len(exits) else len(route.xy) - 1

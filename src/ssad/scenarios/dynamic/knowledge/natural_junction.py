@@ -28,6 +28,7 @@ from ssad.core.types import (
 )
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import Place, pose_at
+from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
 
 if TYPE_CHECKING:
@@ -68,8 +69,20 @@ def spawn_places(graph: LaneGraph) -> list[Place]:
     return places
 
 
-def candidates(graph: LaneGraph, route: Route) -> list[tuple[Place, Pose]]:
-    """The places that FREA's rules leave for a route."""
+@remembered(64)
+def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]:
+    """The places that FREA's rules leave for a route.
+
+    Args:
+        graph: Lane graph of the town.
+        route: The ego's route.
+
+    Returns:
+        Places on lanes and their poses, in the order of `spawn_places`.
+
+    Raises:
+        RouteError: The route is nowhere on the lane graph.
+    """
     on_graph = route.lane[route.lane >= 0]
     if not len(on_graph):
         raise RouteError("the route is nowhere on the lane graph")
@@ -94,7 +107,7 @@ def candidates(graph: LaneGraph, route: Route) -> list[tuple[Place, Pose]]:
         if float(np.hypot(start[:, 0] - pose.x, start[:, 1] - pose.y).min()) <= CLEAR_OF_EGO:
             continue
         found.append((place, pose))
-    return found
+    return tuple(found)
 
 
 def fits(body: str, route: Route) -> bool:

@@ -59,12 +59,13 @@ SCENARIO = ScenarioType(
     title="Straight Obstacle",
     nhtsa="The ego drives straight and an unseen walker enters the road; it must brake or swerve.",
     build=build,
+    # the spread of the speed gives a standard deviation of 0.26 m/s: that of walking speeds (Weidmann 1993)
     parameters=(
-        Parameter("trigger_distance", 15.0, 50.0, 20.0, "m", "the walker starts when the ego is this near to it"),
-        Parameter("walker_speed", 0.5, 4.0, 2.5, "m/s", "speed of the walker"),
-        Parameter("start_distance", 35.0, 55.0, 45.0, "m", "from the trigger along the lane to the walker"),
-        Parameter("lateral", 0.0, 1.0, 1.0, "lane widths", "walker to the right of the outermost lane's centre"),
-        Parameter("yaw", -math.pi / 3, math.pi / 3, 0.0, "rad", "turn of the walker from facing the road"),
+        Parameter("trigger_distance", 15.0, 50.0, 20.0, "m", "the walker starts when the ego is this near to it", 2.0),
+        Parameter("walker_speed", 0.5, 4.0, 2.5, "m/s", "speed of the walker", 0.45),
+        Parameter("start_distance", 35.0, 55.0, 45.0, "m", "from the trigger along the lane to the walker", 3.0),
+        Parameter("lateral", 0.0, 1.0, 1.0, "lane widths", "walker to the right of the outermost lane's centre", 0.15),
+        Parameter("yaw", -math.pi / 3, math.pi / 3, 0.0, "rad", "turn of the walker from facing the road", 0.1),
     ),
     max_distance=150.0,
 )

@@ -48,12 +48,12 @@ SCENARIO = ScenarioType(
     nhtsa="The ego turns at a junction and finds an unseen cyclist crossing the road that it enters.",
     build=build,
     parameters=(
-        Parameter("trigger_distance", 10.0, 50.0, 20.0, "m", "the cyclist starts when the ego is this near to it"),
-        Parameter("speed", 2.0, 12.0, 10.0, "m/s", "speed that the cyclist accelerates to"),
-        Parameter("exit_distance", 2.0, 20.0, 8.0, "m", "from the junction's exit along the route to the cyclist"),
+        Parameter("trigger_distance", 10.0, 50.0, 20.0, "m", "the cyclist starts when the ego is this near to it", 2.0),
+        Parameter("speed", 2.0, 12.0, 10.0, "m/s", "speed that the cyclist accelerates to", 1.25),
+        Parameter("exit_distance", 2.0, 20.0, 8.0, "m", "from the junction's exit along the route to the cyclist", 2.0),
         Parameter("longitudinal", -5.0, 5.0, 0.0, "m", "shift along the exit road"),
-        Parameter("lateral", 0.0, 2.0, 1.0, "lane widths", "cyclist to the right of the outermost lane's centre"),
-        Parameter("yaw", -math.pi, math.pi, 0.0, "rad", "turn of the cyclist from facing the road"),
+        Parameter("lateral", 0.0, 2.0, 1.0, "lane widths", "cyclist to the right of the outermost lane's centre", 0.15),
+        Parameter("yaw", -math.pi, math.pi, 0.0, "rad", "turn of the cyclist from facing the road", 0.1),
     ),
     max_distance=180.0,
 )

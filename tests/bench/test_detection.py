@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import os
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
-from ssad.bench.component.pictures import draw_detections
-from ssad.bench.component.run import plan_detection, run_detection
-from ssad.bench.component.suite import SHIFTS, DetectionSuite
-from ssad.bench.component.work import Unit, forget_failures, make_unit, read_unit
+from ssad.bench.kind import Plan, Resources
+from ssad.bench.kinds import detection
+from ssad.bench.kinds.detection import Detection, DetectionSuite
+from ssad.bench.run import run, run_json
 from ssad.bench.suite import load_suite
 from ssad.cli import app
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.evaluation.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
+from ssad.jobs.local import WORKER_MEMORY
 from ssad.metrics.detection import score_detections
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.report import write_report
@@ -38,13 +48,21 @@ TOWNS = ["Larkhill", "Oldmarket"]
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("component") / "data"
     return record_nuscenes(
-        Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3), workers=1
+        Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3), workers=0
     )
 
 
 @pytest.fixture(autouse=True)
 def known(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ORACLE_DATA", str(root))
+
+
+def plan_detection(suite: DetectionSuite) -> Plan:
+    return Detection().plan(suite)
+
+
+def run_detection(plan: Plan, folder: Path, *, workers: int, retry: bool = False) -> list[dict[str, Any]]:
+    return run(plan, folder, Resources(workers, console=Console(file=io.StringIO())), retry=retry)
 
 
 def suite_of(root: Path, **changes: Any) -> DetectionSuite:
@@ -60,7 +78,7 @@ def folder(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("component") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ORACLE_DATA", str(root))
-        run_detection(plan_detection(suite_of(root)), out, workers=1)
+        run_detection(plan_detection(suite_of(root)), out, workers=0)
         write_report(out)
     return out
 
@@ -82,7 +100,7 @@ def test_scores_fall_with_what_the_detector_sees(folder: Path) -> None:
 
 def test_random_is_put_together_from_the_severities(folder: Path, root: Path) -> None:
     """In the physical calibration each scene is dealt one: its boxes are those of that severity."""
-    assert not (folder / "detections" / "fog-random").exists()
+    assert not list((folder / "detections").glob("*/fog-random"))
     record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     drawn = {Path(p).name for p in record["artefacts"]["detections"]}
     tokens = [s["token"] for s in json.loads((root / "v1.0-ssad" / "scene.json").read_text())]
@@ -111,8 +129,8 @@ def test_a_stopped_run_goes_on_to_the_same_records(folder: Path, root: Path, tmp
     again = tmp_path / "run"
     shutil.copytree(folder, again)
     (again / "results.jsonl").write_text("".join((folder / "results.jsonl").read_text().splitlines(True)[:3]) + '{"k')
-    shutil.rmtree(again / "detections" / "fog-3")
-    run_detection(plan_detection(suite_of(root)), again, workers=1)
+    shutil.rmtree(next((again / "detections").iterdir()) / "fog-3")
+    run_detection(plan_detection(suite_of(root)), again, workers=0)
 
     def plain(record: dict[str, Any]) -> dict[str, Any]:
         return {k: v for k, v in record.items() if k != "wall_s"}
@@ -126,21 +144,22 @@ def test_cells_are_scored_as_soon_as_their_boxes_are_there(
     """Clean first, then what the main table tells, shift by shift; what is scored by then outlives a stop."""
     todo, order = plan_detection(suite_of(root)), []
 
-    def make(task: Any) -> Any:
-        if len(order) == 7:
-            raise KeyboardInterrupt
-        order.append(task[1])
-        return make_unit(task)
+    def make(examination: Any, scene: ShiftedScene, detectors: Any) -> None:
+        if not boxes_path(examination.folder, ORACLE, scene).is_file():
+            if len(order) == 7:
+                raise KeyboardInterrupt
+            order.append(scene)
+        find_boxes(examination, scene, detectors)
 
     with monkeypatch.context() as patch:
-        patch.setattr("ssad.bench.component.run.make_unit", make)
+        patch.setattr(detection, "find_boxes", make)
         with pytest.raises(KeyboardInterrupt):
-            run_detection(todo, tmp_path / "run", workers=1)
+            run_detection(todo, tmp_path / "run", workers=0)
     assert [u.shift for u in order[:6]] == [None, None, "gaussian", "gaussian", "fog", "fog"]
     assert len({u.scene for u in order[2:4]}) == 2, "the severities drawn for the two scenes"
     done = [(r["shift"], r["severity"]) for r in lines(tmp_path / "run")]
     assert {(None, 0), ("gaussian", "random"), ("fog", "random")} <= set(done)
-    run_detection(todo, tmp_path / "run", workers=1)
+    run_detection(todo, tmp_path / "run", workers=0)
     found = {r["key"]: r["metrics"] for r in lines(tmp_path / "run")}
     assert found == {r["key"]: r["metrics"] for r in lines(folder)}
 
@@ -202,7 +221,7 @@ def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None
     from ssad.metrics.detection_boxes import filter_boxes
 
     truth = read_truth(root, "v1.0-ssad")
-    found = [b for path in sorted((folder / "detections" / "gaussian-3").iterdir()) for b in read_unit(path, ORACLE)[0]]
+    found = [b for path in sorted(folder.glob("detections/*/gaussian-3/*.npz")) for b in read_boxes(path)[0]]
     scores = score_detections(
         filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
         filter_boxes(box_table(found, truth), racks=truth.racks), samples=len(truth.samples),
@@ -220,13 +239,13 @@ def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path
     victim.unlink()
     todo = suite_of(broken, shifts=["gaussian"], severities=[3])
     records = run_detection(plan_detection(todo), tmp_path / "run", workers=2)
-    draw_detections(plan_detection(todo), tmp_path / "run")  # goes without
+    Detection().finish(plan_detection(todo), tmp_path / "run")  # goes without
     assert {r["status"] for r in records} == {"failed"}
     assert all(victim.name in r["reason"] for r in records)
     page = write_report(tmp_path / "run").read_text()
     assert "Failed cells" in page
     shutil.copy(root / "samples" / "CAM_FRONT" / victim.name, victim)
-    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=1, retry=True)
+    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=0, retry=True)
     assert {r["status"] for r in mended} == {"ok"}
 
 
@@ -236,7 +255,7 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
 ) -> None:
     monkeypatch.setenv("ORACLE_WAY", way)
     todo = suite_of(root, detectors=[ORACLE, "helpers.oracle3d:build_bad"], shifts=["gaussian"], severities=[3])
-    records = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    records = run_detection(plan_detection(todo), tmp_path / "run", workers=0)
     good = [r for r in records if r["detector"] == ORACLE]
     bad = [r for r in records if r["detector"] != ORACLE]
     assert {r["status"] for r in good} == {"ok"}
@@ -246,21 +265,86 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
     alone = {(r["shift"], r["severity"]): r["metrics"] for r in lines(folder)}
     assert all(r["metrics"] == alone[r["shift"], r["severity"]] for r in good), "as if it ran by itself"
     assert "Failed cells" in write_report(tmp_path / "run").read_text()
-    again = run_detection(plan_detection(todo), tmp_path / "run", workers=1)
+    again = run_detection(plan_detection(todo), tmp_path / "run", workers=0)
     assert again == records
     monkeypatch.setenv("ORACLE_WAY", "none")
-    assert run_detection(plan_detection(todo), tmp_path / "run", workers=1) == records, "what failed is kept"
-    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=1, retry=True)
+    assert run_detection(plan_detection(todo), tmp_path / "run", workers=0) == records, "what failed is kept"
+    mended = run_detection(plan_detection(todo), tmp_path / "run", workers=0, retry=True)
     assert [r["key"] for r in mended] == [r["key"] for r in records]
     assert [r for r in mended if r["detector"] == ORACLE] == good, "what worked was not run again"
     assert [r["metrics"] for r in mended if r["detector"] != ORACLE] == [r["metrics"] for r in good]
 
 
+DEEDS = {
+    "dying": ("crashed", "exit code 9"), "hanging": ("timeout", "took longer than 12 s"),
+    "raising": ("failed", "ZeroDivisionError: on purpose"), "hungry": ("crashed", "out of memory"),
+}  # fmt: skip
+
+
+def check_deadly_detectors(root: Path, folder: Path, out: Path, resources: Resources) -> None:
+    """Four detectors fail, each with its reason; all cells of the one among them that works are there, and equal."""
+    bad = [f"helpers.oracle3d:build_{deed}" for deed in DEEDS]
+    todo = suite_of(
+        root, detectors=[*bad[:2], ORACLE, *bad[2:]], shifts=["gaussian"], severities=[1, 3], timeout_s=12.0
+    )
+    records = run(plan_detection(todo), out, resources)
+    assert len(records) == 15
+    alone = {(r["shift"], r["severity"]): r["metrics"] for r in lines(folder)}
+    for record in records:
+        if record["detector"] == ORACLE:
+            assert record["status"] == "ok"
+            assert record["metrics"] == alone[record["shift"], record["severity"]]
+        else:
+            status, words = DEEDS[record["detector"].rpartition("_")[2]]
+            assert (record["status"], words in record["reason"]) == (status, True), record
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("workers", "ray"), [(1, None), (2, None), (None, "local")])
+def test_detectors_that_die_hang_raise_or_eat_memory_fail_alone(
+    root: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int | None, ray: str | None
+) -> None:
+    monkeypatch.setenv(WORKER_MEMORY, str(3 << 29))
+    resources = Resources(workers, ray, console=Console(file=io.StringIO()))
+    check_deadly_detectors(root, folder, tmp_path / "run", resources)
+
+
+def start(root: Path, out: Path) -> subprocess.Popen[bytes]:
+    """The suite of the fixture `folder` in a process of its own."""
+    code = (
+        "import sys; from pathlib import Path; from bench.test_detection import *\n"
+        "run_detection(plan_detection(suite_of(Path(sys.argv[1]))), Path(sys.argv[2]), workers=2)"
+    )
+    paths = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"ORACLE_DATA": str(root), "PYTHONPATH": os.pathsep.join(paths)}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(root), str(out)], env=environment, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_kill_9_at_20_moments(root: Path, folder: Path, tmp_path: Path) -> None:
+    out, moments = tmp_path / "run", random.Random(5)
+    began = time.monotonic()
+    assert start(root, tmp_path / "whole").wait(timeout=600) == 0
+    duration = time.monotonic() - began
+    for _ in range(20):
+        process = start(root, out)
+        time.sleep(moments.uniform(0.2, 1.0) * duration)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert start(root, out).wait(timeout=600) == 0
+    tables = [{r["key"]: r | {"wall_s": 0} for r in lines(one)} for one in (folder, tmp_path / "whole", out)]
+    assert tables[0] == tables[1] == tables[2]
+    assert len(lines(out)) == len(tables[2])
+
+
 def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path) -> None:
     todo = suite_of(root, detectors=["fcos3d-light", "fcos3d-light@fresh=random"], shifts=["fog"], severities=[3])
     plan = plan_detection(todo)
-    assert [name for name, _ in plan.detectors] == ["fcos3d-light", "fcos3d-light@fresh"]
-    assert plan.weights["fcos3d-light"] != plan.weights["fcos3d-light@fresh"]
+    assert list(plan.details) == ["fcos3d-light", "fcos3d-light@fresh"]
+    assert plan.inputs["weights"]["fcos3d-light"] != plan.inputs["weights"]["fcos3d-light@fresh"]
 
 
 def test_a_changed_detector_of_ones_own_is_another_run(
@@ -270,10 +354,10 @@ def test_a_changed_detector_of_ones_own_is_another_run(
     source = tmp_path / "own_eye.py"
     source.write_text("from helpers.oracle3d import build\n")
     todo = suite_of(root, detectors=["own_eye:build"], shifts=["fog"], severities=[3])
-    first = plan_detection(todo).run_json()["identity"]
-    assert plan_detection(todo).run_json()["identity"] == first
+    first = run_json(plan_detection(todo))["identity"]
+    assert run_json(plan_detection(todo))["identity"] == first
     source.write_text("from helpers.oracle3d import build  # mended\n")
-    assert plan_detection(todo).run_json()["identity"] != first
+    assert run_json(plan_detection(todo))["identity"] != first
 
 
 BAD: dict[str, tuple[dict[str, Any], str]] = {
@@ -302,20 +386,17 @@ def test_bad_suites_end_in_one_line(root: Path, case: tuple[dict[str, Any], str]
 
 def test_a_broken_file_of_boxes_is_named(folder: Path, tmp_path: Path) -> None:
     path = tmp_path / "boxes.npz"
-    path.write_bytes(next((folder / "detections" / "clean").iterdir()).read_bytes()[:200])
+    path.write_bytes(next(folder.glob("detections/*/clean/*.npz")).read_bytes()[:200])
     with pytest.raises(FormatError, match=r"boxes\.npz: broken"):
-        read_unit(path, ORACLE)
-    unit = Unit(None, 0, "scene")
-    (tmp_path / unit.path).parent.mkdir(parents=True)
-    path.rename(tmp_path / unit.path)
-    with pytest.raises(FormatError, match=r"scene\.npz: broken"):
-        forget_failures(tmp_path, [unit])
+        read_boxes(path)
+    with pytest.raises(FormatError, match=r"boxes\.npz: broken"):
+        forget_failures([path])
 
 
 def test_the_shipped_suites_load_and_take_settings() -> None:
     full = load_suite("shifts")
     assert isinstance(full, DetectionSuite)
-    assert sorted(full.shifts) == sorted(SHIFTS) == sorted(KNOWN)
+    assert sorted(full.shifts) == sorted(KNOWN)
     assert full.severities == [1, 2, 3, 4, 5, "random"]
     changed = load_suite("shifts", ["recorded.scenes=3", "severities=2", "shifts=fog"])
     assert isinstance(changed, DetectionSuite)

@@ -1,27 +1,23 @@
-"""What the first detector of a suite sees under each shift: one moment, its boxes and the true ones."""
+"""What a detector sees under each shift: one moment, its boxes and the true ones."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from ssad.bench.component.run import Plan
-from ssad.bench.component.work import Job, Unit, Watched, detector_of, shifter_of
-from ssad.bench.pictures import FOLDER, PAGE
-from ssad.core import safeio
 from ssad.core.detections import Solids
-from ssad.core.errors import FormatError
-from ssad.core.images import read_image, save_picture
+from ssad.core.images import read_image
 from ssad.core.types import F64, U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detectors.mono3d.decode import corners
 from ssad.evaluation.camera_truth import camera_truth, scenes_of
 from ssad.evaluation.detection import to_images
+from ssad.evaluation.scene_boxes import Examination, ShiftedScene, Watched, detector_of, shifter_of
 from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts import SHIFTS
 
@@ -30,42 +26,31 @@ EDGES = tuple((a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit
 TRUE, FOUND = (255, 255, 255), (255, 170, 30)
 
 
-def draw_detections(todo: Plan, folder: str | Path) -> None:
-    """DIR/pictures/detections.jpg: clean and every shift at severity 3 (or the nearest that ran). StoreError."""
-    target = Path(folder) / FOLDER
-    path = target / "detections.jpg"
-    name, weights = todo.detectors[0]
-    caption = (
-        f"What {name} finds (orange, score at least {LEAST}) and what is there (white), clean and under each shift "
-        f"at severity {_severity(todo)}."
-    )
-    if not path.is_file():
-        try:
-            save_picture(path, _sheet(todo, Path(folder), name, weights))
-        except FormatError:  # a picture that cannot be read has failed its cells, which say so
-            return
-    safeio.write_atomic(target / PAGE, safeio.dump_json({path.name: caption}, indent=1) + "\n")
+def detection_sheet(examination: Examination, split: str, shifts: Sequence[str], severity: int) -> U8:
+    """One moment, clean and under each shift, with the boxes of the examination's first detector and the true ones.
 
+    Args:
+        examination: data, detector, device.
+        split: of which the moment with most to see is taken.
+        shifts: names.
+        severity: of all of them.
 
-def _severity(todo: Plan) -> int:
-    numbers = [s for s in todo.suite.severities if isinstance(s, int)] or [STRONG]
-    return min(numbers, key=lambda s: abs(s - STRONG))
+    Returns:
+        Picture [H, W, 3], RGB.
 
-
-def _sheet(todo: Plan, folder: Path, name: str, weights: str) -> U8:
-    suite, root = todo.suite, todo.root or folder / "data"
+    Raises:
+        FormatError: a picture cannot be read.
+    """
     quiet_warp()
-    with NuScenes(root, suite.version) as data:
-        version = data.version
-        scene, frame = _richest(data, scenes_of(data, suite.split))
-        job = Job(folder, root, version, todo.detectors, suite.calibration, suite.seed, 0, todo.device, 1)
-        detector = Watched(detector_of(name, weights, todo.device))
-        clean = read_image(root / frame.filename)
-        tiles = [_tile((detector, todo.device), scene, frame, clean, title="clean")]
-        for shift in suite.shifts:
-            shifter = shifter_of(job, data, Unit(shift, _severity(todo), scene.record.name))
+    name, weights = examination.detectors[0]
+    detector = Watched(detector_of(name, weights, examination.device)), examination.device
+    with NuScenes(examination.root, examination.version) as data:
+        scene, frame = _richest(data, scenes_of(data, split))
+        tiles = [_tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
+        for shift in shifts:
+            shifter = shifter_of(examination, data, ShiftedScene(shift, severity, scene.record.name))
             assert shifter is not None
-            tiles.append(_tile((detector, todo.device), scene, frame, shifter.image(frame)[0], title=shift))
+            tiles.append(_tile(detector, scene, frame, shifter.image(frame)[0], title=shift))
     while len(tiles) % COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]

@@ -1,0 +1,222 @@
+"""What a kind of experiment brings, and the plan of a run.
+
+A kind says what its cells are (`plan`), how a worker executes some of them (`execute`), and which columns its records
+have. Everything else is the engine's: processes, time-outs, resume, retry, progress, the store, tables.
+"""
+
+from __future__ import annotations
+
+import difflib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
+
+from ssad.bench.source import source_version
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, SSADError
+from ssad.core.seeding import digest
+
+Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
+
+
+class SuiteBase(BaseModel):
+    """What suites of every kind say.
+
+    Attributes:
+        kind: the kind of experiment (`ssad list kinds`).
+        name: of the suite, and of the results folder if none is given.
+        title, description: what people read.
+        seed: root of all random numbers.
+        timeout_s: seconds that one cell may take.
+        reference: the published table that the report shows beside this one.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    kind: str
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    title: str = ""
+    description: str = ""
+    seed: int = Field(default=0, ge=0)
+    timeout_s: float = Field(default=3600.0, gt=0, allow_inf_nan=False)
+    reference: str | None = None
+
+    def beside(self, path: Path) -> Self:
+        """The suite with the files that it names found: in the working folder, else beside the suite's own file."""
+        return self
+
+
+@dataclass(frozen=True)
+class Column:
+    """A metric of a kind's records: its name in them, what it is, its unit, and which way is better ("": neither)."""
+
+    name: str
+    title: str = ""
+    unit: str = ""
+    better: Literal["higher", "lower", ""] = ""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One row of the results: the smallest thing that is run, kept, retried and counted.
+
+    Attributes:
+        key: hash of all that the result depends on; made by `make_cell`.
+        name: what people call it, such as "blind/StraightObstacle/00".
+        system: what is put to the test; cells of one system may run as one batch.
+        seed: its random numbers.
+        fields: columns of its record that tell it from other cells.
+        spec: plain data, all that a worker needs.
+    """
+
+    key: str
+    name: str
+    system: str
+    seed: int
+    fields: Mapping[str, Any]
+    spec: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a run will do, known and checked before anything is written.
+
+    Attributes:
+        kind: the kind.
+        suite: the resolved suite.
+        device: cpu or cuda.
+        cells: in the order of the tables.
+        inputs: what the results depend on besides source and suite, by name: versions of systems, towns, weights, data.
+        versions: of what else decides results, beside those of the packages.
+        details: what else the kind's own methods want to know; not written.
+    """
+
+    kind: Kind
+    suite: Any
+    device: str
+    cells: tuple[Cell, ...]
+    inputs: Mapping[str, Any]
+    versions: Mapping[str, str] = field(default_factory=dict)
+    details: Any = None
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a run may use: processes of this machine (None: one a core) or a Ray cluster, a device, a place to talk."""
+
+    workers: int | None = None
+    ray: str | None = None
+    device: str = "cpu"
+    console: Console = field(default_factory=lambda: Console(stderr=True))
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the workers of a run know besides the cells: the results folder, the device, and the kind's settings."""
+
+    folder: Path
+    device: str
+    settings: Mapping[str, Any]
+
+
+class CellError(SSADError):
+    """Why a cell has no result, in words for the record."""
+
+
+class Kind(ABC):
+    """A kind of experiment. It has no state: workers get it by the name of its class.
+
+    Attributes:
+        name: in suites (`kind: NAME`) and in run.json; the report looks for a section of that name.
+        suite: the schema of its suites.
+        columns: the metrics of its records.
+        factors: fields of a record that make a row of the default table, from coarse to fine.
+        patience: crashes and time-outs of one system after which its other cells are not tried any more (None: all
+            are tried); for systems of which one hanging call says all.
+    """
+
+    name: ClassVar[str]
+    suite: ClassVar[type[SuiteBase]]
+    columns: ClassVar[tuple[Column, ...]]
+    factors: ClassVar[tuple[str, ...]]
+    patience: ClassVar[int | None] = None
+
+    @abstractmethod
+    def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Resolve a suite. check: look at all input, so that what is wrong with it ends here and not in a record.
+
+        Raises:
+            ConfigError, FormatError: the input is wrong.
+        """
+
+    @abstractmethod
+    def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
+        """In a worker: results of some cells by key.
+
+        A result is plain data: metrics (name -> number, None where it was not measured); n; artefacts (name -> path in
+        the folder, or list of them; on disk when this returns); case and cluster (see docs/metrics.md); episode (a
+        line for episodes.jsonl); and whatever else the record shall have. What goes wrong raises: alone, a cell then
+        fails with that reason; of several, each is run again alone.
+        """
+
+    def start(self, job: Job) -> None:  # noqa: B027  nothing to do by default
+        """In a worker, once: what no cell's time-out shall pay for."""
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """In the main process, before cells run: make data; the settings of the `Job`, plain data. retry: cells that
+        failed before and are tried again."""
+        return {}
+
+    def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
+        """Cells in groups that `execute` is given at once; they share a system."""
+        return [[cell] for cell in cells]
+
+    def order(self, cell: Cell) -> float:
+        """Cells of a lower number run earlier."""
+        return 0.0
+
+    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
+        """Work that cells of different systems can share, done before them: name -> plain data. What is there already
+        need not be named."""
+        return {}
+
+    def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
+        """In a worker: do a piece for some systems, leaving its result in the folder. If this fails, nothing is lost
+        but time: `execute` must do without, and its failure counts."""
+        raise NotImplementedError
+
+    def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default
+        """In the main process, when all cells have run: pictures for the report."""
+
+    def code(self) -> str:
+        """12 hex digits over the source that results depend on."""
+        return source_version(type(self).__module__)
+
+    def make_cell(
+        self, name: str, system: str, seed: int, fields: Mapping[str, Any], spec: Mapping[str, Any], *inputs: object
+    ) -> Cell:
+        """A cell with its key. inputs: versions of what it depends on besides the source and its own description."""
+        described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
+        key = digest("cell", self.name, self.code(), safeio.dump_json(described), system, seed, *inputs)
+        return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
+
+
+def find_cell(cells: Sequence[Cell], text: str) -> Cell:
+    """The one cell whose key begins with `text`, or that is called `text` ("blind/StraightObstacle/00").
+
+    Raises:
+        ConfigError: there is none, or more than one.
+    """
+    found = [c for c in cells if c.name == text] or [c for c in cells if text and c.key.startswith(text)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        shown = ", ".join(f"{c.key} ({c.name})" for c in found[:3])
+        raise ConfigError(f"'{text}' means {len(found)} cells: {shown} ...; give more of the key")
+    close = difflib.get_close_matches(text, [c.name for c in cells], n=3, cutoff=0.0)
+    raise ConfigError(f"no cell '{text}' in this run; closest: {', '.join(close)}")

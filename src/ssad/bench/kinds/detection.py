@@ -1,0 +1,279 @@
+"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.source import source_version
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.images import save_picture
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.detectors import DETECTORS, SHIPPED
+from ssad.detectors.checkpoints import hash_state
+from ssad.evaluation.camera_truth import scenes_of
+from ssad.evaluation.pictures import STRONG, detection_sheet
+from ssad.evaluation.scene_boxes import (
+    Examination,
+    ShiftedScene,
+    boxes_path,
+    detector_of,
+    find_boxes,
+    forget_failures,
+    score_scenes,
+)
+from ssad.jobs.machine import default_workers, quiet_warp
+from ssad.jobs.progress import Live
+from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+
+Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
+RECORDED = "recorded"
+
+
+class Recorded(BaseModel):
+    """The validation set that is recorded where none is given: drives in towns that the shipped detectors never saw.
+
+    Attributes:
+        towns: names.
+        scenes: of each town.
+        seconds: of a scene, two samples each.
+        width: of the pictures.
+        seed: of the drives.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    towns: Names = ["Oldmarket", "Larkhill"]
+    scenes: int = Field(default=12, ge=1)
+    seconds: float = Field(default=8.0, ge=0.5, allow_inf_nan=False)
+    width: int = Field(default=800, ge=64)
+    seed: int = Field(default=0, ge=0)
+
+
+class DetectionSuite(SuiteBase):
+    """One table: 3D detectors x shifts x severities, beside the clean data.
+
+    Attributes:
+        detectors: names, with weights of your own as NAME=FILE, or module:object; the first is the baseline of mCE.
+        data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the one that is
+            there) and split.
+        recorded: what is recorded.
+        shifts: names.
+        severities: 1 to 5, or random (dealt to the scenes, all as often, give or take one; drawn by sample in the
+            calibration of the paper).
+        calibration: of the shifts.
+        replicates: of the bootstrap over scenes.
+        timeout_s: seconds that one scene under one shift, or one score, may take.
+    """
+
+    kind: Literal["detection"]
+    detectors: Names = Field(default=["fcos3d-light", "pgd-det-light"], min_length=1)
+    data: str = Field(default=RECORDED, min_length=1)
+    version: str | None = None
+    split: str = "val"
+    recorded: Recorded = Recorded()
+    shifts: Names = Field(default=list(SHIFTS), min_length=1)
+    severities: Annotated[list[Severity], Field(min_length=1)] = Field(default=[1, 2, 3, 4, 5, "random"], min_length=1)
+    calibration: Literal["physical", "paper"] = "physical"
+    replicates: int = Field(default=100, ge=0, le=10_000)
+
+
+class Detection(Kind):
+    """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
+
+    name = "detection"
+    suite = DetectionSuite
+    columns = (
+        Column("mAP", "mean average precision", "", "higher"),
+        Column("NDS", "nuScenes detection score", "", "higher"),
+        Column("AP_car", "average precision of cars", "", "higher"),
+    )
+    factors = ("detector", "shift", "severity")
+    patience = 2
+
+    def plan(self, suite: DetectionSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Detectors are built once, the data set is looked at."""
+        lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
+        for what, values in lists.items():
+            if len(set(values)) != len(values):
+                raise ConfigError(f"suite {suite.name}: a {what} appears twice")
+        for known in suite.shifts:
+            ShiftSpec(known, calibration=suite.calibration)
+        weights, detectors = _detectors(suite)
+        data = _data(suite)
+        conditions: list[tuple[str | None, int | str]] = [
+            (None, 0),
+            *((shift, s) for shift in suite.shifts for s in suite.severities),
+        ]
+        cells = []
+        for detector in detectors:
+            for shift, severity in conditions:
+                family = SHIFTS[shift][0] if shift else "clean"
+                fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
+                spec = {"calibration": suite.calibration, "labels": "original"}
+                title = f"{detector}/{shift or 'clean'}/{severity}"
+                inputs = weights[detector], safeio.dump_json(data), device, suite.replicates
+                cells.append(self.make_cell(title, detector, suite.seed, fields, spec, *inputs))
+        versions = {"shifts": str(VERSIONS[suite.calibration])}
+        return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, versions, detectors)
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Records the data set if none is given; which scenes each shift and severity needs."""
+        suite: DetectionSuite = plan.suite
+        root = Path(suite.data).expanduser()
+        if suite.data == RECORDED:
+            total = suite.recorded.scenes * len(suite.recorded.towns)
+            with Live("recording", total, 0, console=resources.console, unit="scenes") as live:
+                root = record_nuscenes(
+                    recording_of(suite, folder / "data"), workers=resources.workers, ray=resources.ray,
+                    progress=live.show,
+                )  # fmt: skip
+        with NuScenes(root, suite.version) as data:
+            version = data.version
+            tokens = {name: data.scene(name).record.token for name in scenes_of(data, suite.split)}
+        settings = {
+            "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
+            "calibration": suite.calibration, "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,
+            "threads": max(1, default_workers() // (resources.workers or default_workers())),
+        }  # fmt: skip
+        job = Job(folder, plan.device, settings)
+        forget_failures([boxes_path(folder, c.system, one) for c in retry for one in _scenes(c, job)])
+        return settings
+
+    def order(self, cell: Cell) -> float:
+        """Clean first, then what the main table tells, the middle severity, the others."""
+        severity = cell.fields["severity"]
+        if cell.fields["shift"] is None:
+            return 0
+        return 1 if isinstance(severity, str) else 2 + abs(severity - 3)
+
+    def start(self, job: Job) -> None:
+        """Warp runs the shifts."""
+        quiet_warp()
+
+    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
+        """Scenes whose boxes are still to be found."""
+        scenes = _scenes(cell, job)
+        missing = [one for one in scenes if not boxes_path(job.folder, cell.system, one).is_file()]
+        return {one.name: [one.shift, one.severity, one.scene] for one in missing}
+
+    def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
+        """Boxes of one scene under one shift."""
+        find_boxes(_examination(job), ShiftedScene(*data), systems)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Scores of a cell; boxes that could not be found together with others are looked for alone."""
+        examination, results = _examination(job), {}
+        for cell in cells:
+            scenes = _scenes(cell, job)
+            for one in scenes:
+                find_boxes(examination, one, [cell.system])
+            found = score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"])
+            folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
+            results[cell.key] = found | {"artefacts": {"detections": folders}}
+        return results
+
+    def finish(self, plan: Plan, folder: Path) -> None:
+        """What the first detector sees under each shift: DIR/pictures/detections.jpg."""
+        suite: DetectionSuite = plan.suite
+        path = folder / "pictures" / "detections.jpg"
+        severity = min([s for s in suite.severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
+        name, weights = next(iter(plan.details.items()))
+        if not path.is_file():
+            root = folder / "data" if suite.data == RECORDED else Path(suite.data).expanduser()
+            with NuScenes(root, suite.version) as data:
+                version = data.version
+            examination = Examination(
+                folder, root, version, ((name, weights),), suite.calibration, suite.seed, plan.device, 1
+            )
+            try:
+                save_picture(path, detection_sheet(examination, suite.split, suite.shifts, severity))
+            except FormatError:  # a picture that cannot be read has failed its cells, which say so
+                return
+        caption = (
+            f"What {name} finds (orange, score at least 0.3) and what is there (white), clean and under each shift at "
+            f"severity {severity}."
+        )
+        safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n")
+
+
+def _detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str]]:
+    """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones)."""
+    weights: dict[str, str] = {}
+    files: dict[str, str] = {}
+    for text in suite.detectors:
+        name, _, file = text.partition("=")
+        if name in files:
+            raise ConfigError(
+                f"suite {suite.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
+                f"{name}@mine=FILE"
+            )
+        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
+        kind = name.partition("@")[0]
+        if not path and kind in DETECTORS and not (SHIPPED / f"{kind}.json").is_file():
+            raise ConfigError(
+                f"suite {suite.name}: no weights of {kind} are shipped; give a file, {kind}=FILE "
+                f"(docs/detectors.md: ssad train detector {kind}, or official ones)"
+            )
+        detector = detector_of(name, path, "cpu")
+        if getattr(detector, "task", None) != "3d":
+            raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
+        own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
+        weights[name], files[name] = state_hash(detector) + own, path
+    return weights, files
+
+
+def state_hash(detector: Any) -> str:
+    """12 hex digits over the weights of a detector; "" for one that is no module."""
+    return hash_state(detector.state_dict())[:12] if hasattr(detector, "state_dict") else ""
+
+
+def _data(suite: DetectionSuite) -> dict[str, Any]:
+    """What the results depend on of the data set, which is looked at. ConfigError, FormatError."""
+    if suite.data == RECORDED:
+        if suite.split not in ("val", "all"):
+            raise ConfigError(f"suite {suite.name}: recorded data have the splits val and all, not '{suite.split}'")
+        return {**recording_of(suite, Path(RECORDED)).identity(), "split": suite.split}
+    root = Path(suite.data).expanduser()
+    if not root.is_dir():
+        raise ConfigError(f"suite {suite.name}: data: {root} is no folder; give the root of a data set, or {RECORDED}")
+    with NuScenes(root, suite.version) as data:
+        version, scenes = data.version, scenes_of(data, suite.split)
+    about: dict[str, Any] = {"version": version, "split": suite.split, "scenes": list(scenes)}
+    for name in ("sample", "sample_annotation", "sample_data", "calibrated_sensor"):
+        table = safeio.read_bytes(root / version / f"{name}.json", limit=1 << 34)
+        about[name] = hashlib.sha256(table).hexdigest()[:16]
+    return about
+
+
+def recording_of(suite: DetectionSuite, out: Path) -> Recording:
+    """On the CPU, on any machine: it decides bits."""
+    own = suite.recorded
+    towns = tuple(own.towns)
+    return Recording(out, towns, towns, scenes=own.scenes, seconds=own.seconds, width=own.width, seed=own.seed)
+
+
+def _examination(job: Job) -> Examination:
+    own = job.settings
+    return Examination(
+        job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["calibration"], own["seed"],
+        job.device, own["threads"],
+    )  # fmt: skip
+
+
+def _scenes(cell: Cell, job: Job) -> list[ShiftedScene]:
+    """The scenes of a cell. A severity dealt to a scene is one of the five: nothing runs twice."""
+    tokens: Mapping[str, str] = job.settings["scenes"]
+    shift, severity = cell.fields["shift"], cell.fields["severity"]
+    if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
+        return [ShiftedScene(shift, severity, scene) for scene in tokens]
+    spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
+    dealt = dealt_severities(spec, tokens.values())
+    return [ShiftedScene(shift, dealt[token], scene) for scene, token in tokens.items()]

@@ -1,0 +1,322 @@
+"""Kind `driving`: driving systems x scenarios x repetitions in the embedded world; an episode a cell."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import Field
+
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.source import source_version
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, SSADError, UnknownNameError
+from ssad.core.images import save_picture
+from ssad.core.lane_graph import LaneGraph, load_graph, save_graph
+from ssad.core.protocols import DrivingSystem
+from ssad.core.registry import resolve
+from ssad.core.seeding import digest, seed32
+from ssad.core.traces import load_trace, motion_hash, save_trace, trace_hash
+from ssad.core.types import Episode, EpisodeTrace, Scenario
+from ssad.jobs.machine import quiet_warp
+from ssad.metrics import METRICS, episode_metrics
+
+
+class DrivingSuite(SuiteBase):
+    """One table: systems x scenarios x repetitions.
+
+    Attributes:
+        systems: names, or module:object.
+        scenarios: what `load_scenarios` understands (sets, types, names, YAML files).
+        repetitions: episodes of each pair; the first is the nominal case.
+        spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
+            not at all, then scenarios without traffic of their own give copies, which count once.
+        chunk: cells that run as one batch of the world (results do not depend on it).
+        witness: search each collision for a way out.
+        pictures: what the report shows besides (shifts: contact sheets of the distribution shifts; camera: what the
+            camera sees).
+    """
+
+    kind: Literal["driving"] = "driving"
+    systems: Names
+    scenarios: Names
+    repetitions: int = Field(default=1, ge=1, le=100_000)
+    spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
+    timeout_s: float = Field(default=120.0, gt=0, allow_inf_nan=False)
+    chunk: int = Field(default=16, ge=1, le=4096)
+    witness: bool = True
+    pictures: list[Literal["shifts", "camera"]] = Field(default=[])
+
+    def beside(self, path: Path) -> Self:
+        """Scenario files are looked for in the working folder, then beside the suite."""
+
+        def find(ref: str) -> str:
+            near = path.parent / ref
+            return str(near) if ref.endswith((".yaml", ".yml")) and not Path(ref).exists() and near.exists() else ref
+
+        return self.model_copy(update={"scenarios": [find(ref) for ref in self.scenarios]})
+
+
+class Driving(Kind):
+    """See the module."""
+
+    name = "driving"
+    suite = DrivingSuite
+    columns = tuple(Column(m.symbol, m.title, m.unit, m.better) for m in METRICS.values() if m.field)
+    factors = ("system", "group")
+
+    def plan(self, suite: DrivingSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Systems, scenarios and towns are looked up; with `check`, each scenario is built once."""
+        systems = {name: system_version(name) for name in suite.systems}
+        if len(systems) != len(suite.systems):
+            raise ConfigError(f"suite {suite.name}: systems: a name appears twice")
+        scenarios = suite_scenarios(suite)
+        towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
+        cells = tuple(self._cells(suite, scenarios, systems=systems, towns=towns))
+        if check:
+            for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
+                _check(cell)
+        return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
+
+    def _cells(
+        self,
+        suite: DrivingSuite,
+        scenarios: Sequence[Scenario],
+        *,
+        systems: Mapping[str, str],
+        towns: Mapping[str, str],
+    ) -> Sequence[Cell]:
+        """The seed does not depend on the system: systems meet the same episodes."""
+        found = []
+        for system in suite.systems:
+            for scenario in scenarios:
+                data = scenario_json(scenario)
+                text = safeio.dump_json(data)
+                group = scenario.group or scenario.type
+                versions = systems[system], towns.get(scenario.town, ""), type_version(scenario.type)
+                for repetition in range(suite.repetitions):
+                    seed = seed32("episode", suite.seed, text, repetition)
+                    name = f"{system}/{scenario.name}{f'#{repetition}' if repetition else ''}"
+                    spec = {"scenario": data, "system": system, "repetition": repetition}
+                    spec["spread"] = suite.spread if repetition else 0.0
+                    fields = {"system": system, "group": group, "cluster": scenario.name}
+                    found.append(self.make_cell(name, system, seed, fields, spec, *versions))
+        return found
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
+        for name in plan.inputs["towns"]:
+            path = folder / "towns" / f"{name}.npz"
+            if Path(name).name == name and not path.exists():
+                save_graph(town(name), path)
+        safeio.make_folder(folder / "traces")
+        return {"witness": plan.suite.witness}
+
+    def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
+        """Cells that share a system; with few cells a smaller batch keeps all workers busy."""
+        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
+        groups: dict[str, list[Cell]] = {}
+        for cell in cells:
+            groups.setdefault(cell.system, []).append(cell)
+        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+
+    def start(self, job: Job) -> None:
+        """Loads the world's kernels, which are compiled on first use."""
+        import warp
+
+        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+        quiet_warp()
+        warp.force_load(device=job.device)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Drives the episodes as one batch of the world, measures them, writes their traces."""
+        began = time.perf_counter()
+        episodes, traces = drive(cells, device=job.device)
+        shared = (time.perf_counter() - began) / len(cells)
+        results: dict[str, dict[str, Any]] = {}
+        for cell, episode, trace in zip(cells, episodes, traces, strict=True):
+            began = time.perf_counter()
+            artefact = f"traces/{cell.key}.npz"
+            save_trace(job.folder / artefact, trace)
+            metrics = plain(episode_metrics(trace).as_dict())
+            about = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
+            about |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
+            result = {
+                "metrics": metrics,
+                "artefacts": {"trace": artefact},
+                "episode": about,
+                "case": motion_hash(trace),
+            }
+            if job.settings["witness"] and trace.end == "collision":
+                speed = getattr(system_of(cell.system), "target_speed", None)
+                result["witness"] = witness(job.folder, episode, speed, job.device)
+            results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
+        return results
+
+    def finish(self, plan: Plan, folder: Path) -> None:
+        """The pictures that the suite asks for, made once beside its results."""
+        make_pictures(plan.suite.pictures, folder)
+
+
+@lru_cache(maxsize=8)
+def town(name: str) -> LaneGraph:
+    """A town, read once a process."""
+    from ssad.roads import load_town
+
+    return load_town(name)
+
+
+@lru_cache(maxsize=4)
+def system_of(name: str) -> DrivingSystem:
+    """A driving system, made once a process."""
+    from ssad.drivers import make_system
+
+    return make_system(name)
+
+
+def system_version(name: str) -> str:
+    """12 hex digits over the source of a system and all that it imports.
+
+    Raises:
+        UnknownNameError, ConfigError: there is no such system.
+    """
+    from ssad.drivers import SYSTEMS
+
+    found = resolve("system", SYSTEMS, name)
+    if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
+        raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
+    return source_version((found if isinstance(found, type) else type(found)).__module__)
+
+
+def type_version(name: str) -> str:
+    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one."""
+    return source_version(name.partition(":")[0]) if ":" in name else ""
+
+
+def town_version(graph: LaneGraph) -> str:
+    """12 hex digits over every array of a lane graph."""
+    total = hashlib.sha256()
+    for name, value in sorted(vars(graph).items()):
+        if hasattr(value, "tobytes"):
+            total.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
+    return total.hexdigest()[:12]
+
+
+def scenario_json(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as plain data, as it stands in YAML, with its defaults written out."""
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return data
+
+
+def suite_scenarios(suite: DrivingSuite) -> tuple[Scenario, ...]:
+    """All scenarios of a suite, in order, each once. ConfigError when two differ but share a name."""
+    from ssad.scenarios.dynamic import load_scenarios
+
+    found: dict[str, Scenario] = {}
+    for ref in suite.scenarios:
+        try:
+            loaded = load_scenarios(ref)
+        except UnknownNameError as error:
+            raise UnknownNameError(f"suite {suite.name}: {error}") from None
+        for scenario in loaded:
+            if found.setdefault(scenario.name, scenario) != scenario:
+                raise ConfigError(
+                    f"suite {suite.name}: two different scenarios are named '{scenario.name}' (one from {ref}); "
+                    "rename one"
+                )
+    return tuple(found.values())
+
+
+def episode_of(cell: Cell) -> Episode:
+    """The concrete episode of a cell. RouteError, MapError or ConfigError when it cannot be built."""
+    from ssad.scenarios.dynamic import build_episode, scenario_from
+
+    scenario = scenario_from(cell.spec["scenario"])
+    return replace(
+        build_episode(scenario, town(scenario.town), seed=cell.seed, spread=cell.spec["spread"]), key=cell.key
+    )
+
+
+def _check(cell: Cell) -> None:
+    try:
+        episode_of(cell)
+    except SSADError as error:
+        name = f"scenario {cell.spec['scenario']['name']}"
+        raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None
+
+
+def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
+    """Episodes and traces of cells that share a system, run as one batch."""
+    from ssad.world.rollout import rollout
+
+    episodes = [episode_of(cell) for cell in cells]
+    graphs = {episode.town: town(episode.town) for episode in episodes}
+    return episodes, rollout(episodes, graphs, system_of(cells[0].system), device=device)
+
+
+def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
+    """Could anybody have avoided the collision, coming at the speed (m/s) of the system that had it?
+
+    Searched once for an episode and speed, whichever systems collide in it.
+    """
+    from ssad.world.witness import find_witness
+
+    if speed is not None:
+        ego = replace(episode.agents[0], target_speed=speed)
+        episode = replace(episode, agents=(ego, *episode.agents[1:]))
+    name = digest("witness", safeio.dump_json(scenario_json(episode.scenario)), episode.seed, speed)[:16]
+    path = folder / "witness" / f"{name}.json"
+    if path.exists():
+        found: dict[str, Any] = safeio.read_json(path)
+        return found
+    found = plain(find_witness(episode, town(episode.town), device=device).as_dict())
+    safeio.write_atomic(path, safeio.dump_json(found) + "\n")
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON data; a number that is not finite (no such event) becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def make_pictures(names: Sequence[str], folder: Path) -> None:
+    """Makes what is missing of DIR/pictures; pictures.json says what each shows. StoreError."""
+    target, captions = folder / "pictures", {}
+    if "shifts" in names:
+        captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a drawn street."
+        captions["shifts-severities.jpg"] = "Each shift at severities 1 to 5."
+        if not all((target / name).is_file() for name in captions):
+            from ssad.datasets.nuscenes.tiny import make_tiny
+            from ssad.toolbox.contact_sheet import write_sheets
+
+            with tempfile.TemporaryDirectory() as temporary:
+                street = make_tiny(Path(temporary) / "street", scenes=1, samples=2, sweeps=1, size=(960, 540))
+                write_sheets(street, safeio.make_folder(target) / "shifts.jpg")
+    if "camera" in names:
+        from ssad.recording.camera_sheets import write_gallery
+        from ssad.recording.onboard import onboard_sheet, pick_trace
+
+        captions |= write_gallery(safeio.make_folder(target))
+        chosen = pick_trace(folder)
+        if chosen is not None:
+            captions["camera.jpg"] = f"An episode of this run ({chosen.stem}) from the ego's camera and from above."
+            if not (target / "camera.jpg").is_file():
+                trace = load_trace(chosen)
+                graph = load_graph(folder / "towns" / f"{trace.town}.npz")
+                save_picture(target / "camera.jpg", onboard_sheet(trace, graph))
+    if captions:
+        safeio.write_atomic(target / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")

@@ -1,0 +1,301 @@
+"""What detectors find in one scene under one shift, kept as files: the work that cells of a detection suite share."""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.detections import Detections, Solids
+from ssad.core.errors import FormatError, SSADError
+from ssad.core.seeding import digest, generator
+from ssad.core.types import U8
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import SensorFrame
+from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
+from ssad.detectors import make_detector
+from ssad.detectors.check import promises
+from ssad.detectors.mono3d.multi_camera import WorldBoxes
+from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.evaluation.scene_shifter import SceneShifter
+from ssad.metrics.uncertainty import percentile_interval
+from ssad.scenarios.static.shifts import Calibration, ShiftSpec
+
+FOLDER = "detections"
+_COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label")
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftedScene:
+    """One scene under one shift (None: clean) at one severity ("random": drawn by sample)."""
+
+    shift: str | None
+    severity: int | str
+    scene: str
+
+    @property
+    def name(self) -> str:
+        """Its place below the folder of a detector's boxes."""
+        return f"{'clean' if self.shift is None else f'{self.shift}-{self.severity}'}/{self.scene}"
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What is the same for all scenes of a run.
+
+    Attributes:
+        folder: of the results.
+        root, version: of the data set.
+        detectors: name -> weights ("" for the shipped ones).
+        calibration, seed: of the shifts.
+        device: where detectors and shifts run.
+        threads: of linear algebra.
+    """
+
+    folder: Path
+    root: Path
+    version: str
+    detectors: tuple[tuple[str, str], ...]
+    calibration: Calibration
+    seed: int
+    device: str
+    threads: int
+
+
+def detector_of(name: str, weights: str, device: str) -> Any:
+    """A detector by name (what follows an @ is a label of the suite's own) and weights."""
+    return make_detector(name.partition("@")[0], weights=weights or None, device=device)
+
+
+def boxes_path(folder: Path, detector: str, scene: ShiftedScene) -> Path:
+    """Where the boxes of a detector lie: detections/DETECTOR/SHIFT-SEVERITY/SCENE.npz."""
+    plain = re.sub(r"[^\w.@-]", "-", detector)
+    own = plain if plain == detector else f"{plain}-{digest(detector)[:6]}"
+    return folder / FOLDER / own / f"{scene.name}.npz"
+
+
+class Watched:
+    """A detector whose failure is a result: once it has raised, or broken a promise, it finds nothing more.
+
+    Memory that is used up and a device that is lost are raised. What it finds is on the host.
+
+    Attributes:
+        reason: why it failed, in one line; "" while it works.
+    """
+
+    def __init__(self, detector: Any) -> None:
+        self.detector, self.reason = detector, ""
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """As the detector, or nothing."""
+        if not self.reason:
+            try:
+                found = to_host(self.detector.predict(images, intrinsic, threshold=threshold))
+                self.reason = self._broken(found, len(images))
+                if not self.reason:
+                    return found
+            except Exception as error:  # whatever a stranger's detector raises
+                if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
+                    raise
+                text = " ".join(str(error).split())
+                self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
+        nothing, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+        solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
+        return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
+
+    def _broken(self, found: Sequence[Detections], images: int) -> str:
+        if len(found) != images:
+            return "broken promise: predict answers for each image"
+        for one in found:
+            for kept, promise in promises(one, classes=len(self.detector.classes), three=True):
+                if not kept:
+                    return f"broken promise: {promise}"
+        return ""
+
+
+@lru_cache(maxsize=8)
+def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
+    torch.set_num_threads(threads)
+    return detector_of(name, weights, device)
+
+
+def shifter_of(examination: Examination, data: NuScenes, scene: ShiftedScene) -> SceneShifter | None:
+    """The scene through its shift; None for the clean one."""
+    if scene.shift is None:
+        return None
+    drawn = scene.severity == "random"
+    severity = 1 if drawn else int(scene.severity)
+    spec = ShiftSpec(scene.shift, severity, seed=examination.seed, calibration=examination.calibration)
+    return SceneShifter(examination.root, data.scene(scene.scene), spec, random=drawn)
+
+
+def find_boxes(examination: Examination, scene: ShiftedScene, detectors: Sequence[str]) -> None:
+    """Writes the boxes that detectors find in a scene, unless they are there; all are shown the same pictures.
+
+    A detector that raises, or breaks a promise, leaves the reason in place of its boxes. Memory that is used up, and a
+    device that is lost, raise.
+
+    Raises:
+        SSADError: the data are broken.
+    """
+    folder = examination.folder
+    names = [name for name in detectors if not boxes_path(folder, name, scene).is_file()]
+    if not names:
+        return
+    with NuScenes(examination.root, examination.version) as data:
+        shifter = shifter_of(examination, data, scene)
+        applied: Counter[str] = Counter()
+
+        def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
+            assert shifter is not None
+            device = None if examination.device == "cpu" else examination.device
+            images, done = shifter.images(frames, device=device)
+            applied.update("applied" if one.applied else "not applied" for one in done)
+            for one in done:
+                applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
+            return images
+
+        weights = dict(examination.detectors)
+        watched: list[Any] = [
+            Watched(_loaded(name, weights[name], examination.device, examination.threads)) for name in names
+        ]
+        found = detect_with(
+            watched, examination.root, data.scene(scene.scene), device=examination.device,
+            look=None if shifter is None else look,
+        )  # fmt: skip
+    for name, samples, one in zip(names, found, watched, strict=True):
+        _write(boxes_path(folder, name, scene), samples, one.reason, applied)
+
+
+def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, applied: Mapping[str, int]) -> None:
+    columns: dict[str, Any] = {"failed": np.array(reason)} if reason else {}
+    if not reason:
+        boxes = [sample.boxes for sample in samples]
+        columns["sample"] = np.array([sample.token for sample in samples])
+        columns["count"] = np.array([len(b) for b in boxes], np.int32)
+        for column in _COLUMNS:
+            columns[column] = np.concatenate([getattr(b, column) for b in boxes])
+        columns["attribute"] = np.array([a for b in boxes for a in b.attribute], "U40")
+        columns["applied"] = np.array(safeio.dump_json(dict(sorted(applied.items()))))
+    file = io.BytesIO()
+    np.savez_compressed(file, **columns)
+    safeio.write_atomic(path, file.getvalue())
+
+
+class DetectorFailed(SSADError):
+    """A detector failed on a scene; why."""
+
+
+def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, int]]:
+    """Boxes by sample, and how often the shift was applied.
+
+    Raises:
+        DetectorFailed: it has a reason instead.
+        FormatError: a broken file.
+    """
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            if "failed" in file:
+                raise DetectorFailed(str(file["failed"]))
+            ends = np.cumsum(file["count"])
+            parts = {c: np.split(file[c], ends[:-1]) for c in (*_COLUMNS, "attribute")}
+            tokens = [str(token) for token in file["sample"]]
+            applied = safeio.parse_json(str(file["applied"]))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
+    names = parts.pop("attribute")
+    found = [
+        SampleBoxes(token, WorldBoxes(**{c: parts[c][k] for c in _COLUMNS}, attribute=tuple(map(str, names[k]))))
+        for k, token in enumerate(tokens)
+    ]
+    return found, {str(k): int(v) for k, v in applied.items()}
+
+
+def forget_failures(paths: Sequence[Path]) -> None:
+    """Takes away files in which a detector's reason stands, so that they are made anew. FormatError: broken."""
+    for path in paths:
+        if path.is_file():
+            try:
+                read_boxes(path)
+            except DetectorFailed:
+                path.unlink()
+
+
+@lru_cache(maxsize=2)
+def _truth(root: Path, version: str, scenes: tuple[str, ...]) -> GroundTruth:
+    return read_truth(root, version, scenes=frozenset(scenes))
+
+
+def score_scenes(
+    examination: Examination, detector: str, scenes: Sequence[ShiftedScene], *, replicates: int
+) -> dict[str, Any]:
+    """Metrics of a detector over scenes whose boxes are there, for a record.
+
+    Args:
+        examination: of the run.
+        detector: name.
+        scenes: one shift and severity each.
+        replicates: of the bootstrap over scenes; the draws are the same for every detector and shift, so that
+            differences are paired. Scenes of equal truth are copies: they are drawn, and count, together.
+
+    Returns:
+        metrics, intervals (95 %, percentile), replicates, n (samples of different scenes), scenes, applied.
+
+    Raises:
+        DetectorFailed: it failed on a scene.
+    """
+    truth = _truth(examination.root, examination.version, tuple(one.scene for one in scenes))
+    found: list[SampleBoxes] = []
+    applied: Counter[str] = Counter()
+    for one in scenes:
+        try:
+            boxes, counts = read_boxes(boxes_path(examination.folder, detector, one))
+        except DetectorFailed as error:
+            raise DetectorFailed(f"{one.scene}: {error}") from None
+        found += boxes
+        applied.update(counts)
+    matches = match_boxes(found, truth)
+    case = distinct_scenes(truth)
+    count = int(case.max()) + 1
+    draws: list[dict[str, float]] = []
+    if count > 1:
+        chance = generator("detection suite", examination.seed, count)  # the same draws for every cell
+        for draw in chance.multinomial(count, np.full(count, 1.0 / count), size=replicates):
+            draws.append(numbers(matches.scores(draw[case[truth.scene]]), few=True))
+    values = {name: [round(d[name], 5) for d in draws] for name in (draws[0] if draws else {})}
+    first = np.unique(case, return_index=True)[1]
+    return {
+        "metrics": numbers(matches.scores()),
+        "intervals": {name: [round(v, 5) for v in percentile_interval(np.array(r))] for name, r in values.items()},
+        "replicates": values, "n": int(np.isin(truth.scene, first).sum()), "scenes": count,
+        "applied": dict(sorted(applied.items())),
+    }  # fmt: skip
+
+
+def distinct_scenes(truth: GroundTruth) -> Any:
+    """Number [scenes] of the case that each scene shows: scenes whose true boxes are equal, sample by sample, are
+    copies of one drive."""
+    names: dict[str, int] = {}
+    found = []
+    boxes = truth.boxes
+    for scene in range(len(truth.scenes)):
+        samples = np.flatnonzero(truth.scene == scene)
+        rows = np.flatnonzero(np.isin(boxes.sample, samples))
+        values = [boxes.sample[rows] - (samples[0] if len(samples) else 0), boxes.label[rows], boxes.translation[rows]]
+        values += [boxes.size[rows], boxes.rotation[rows]]
+        text = digest(len(samples), *[np.ascontiguousarray(v).tobytes().hex() for v in values])
+        found.append(names.setdefault(text if len(rows) else f"empty {scene}", len(names)))
+    return np.array(found)

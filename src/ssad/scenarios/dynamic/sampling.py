@@ -1,0 +1,77 @@
+"""Draws of a scenario: its parameters, its ego's start and target speed, within a box around its own values."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from ssad.core.errors import ConfigError
+from ssad.core.types import Scenario
+from ssad.scenarios.dynamic.catalog import scenario_type
+from ssad.scenarios.dynamic.knowledge._kind import TARGET_SPEED_SPREAD
+from ssad.scenarios.dynamic.schema import MAX_SPEED
+
+TARGET_SPEED = "target_speed"
+"""Name of the ego's target speed among the ranges; it is a key of the scenario, not one of its parameters."""
+_LEAST_SPEED = 0.1  # of the target speed: no spread makes an ego crawl
+
+
+def sampling_ranges(scenario: Scenario, *, spread: float = 1.0) -> dict[str, tuple[float, float]]:
+    """The box that draws of a scenario come from.
+
+    Its centre is the scenario itself: the parameters that it gives, the defaults of the others, its target speed.
+
+    Args:
+        scenario: The nominal scenario.
+        spread: Size of the box: 1 is the natural spread that `Parameter.spread` declares, 2 twice that, 0 a point.
+
+    Returns:
+        Name -> (least, greatest) of all that is drawn, in the unit of the parameter, and of `target_speed` in m/s;
+        never beyond what the parameter allows.
+
+    Raises:
+        ConfigError: The spread is negative or not finite, or a parameter of the scenario is not valid.
+    """
+    if not (math.isfinite(spread) and spread >= 0.0):
+        raise ConfigError(f"spread {spread:g} is not valid; give 0 (the nominal case) or more (1: the natural spread)")
+    kind = scenario_type(scenario.type)
+    value = kind.values(scenario.parameters)
+    ranges = {
+        name: (max(parameter.low, value[name] - reach), min(parameter.high, value[name] + reach))
+        for name, parameter in kind.box.items()
+        if (reach := spread * parameter.spread) > 0.0
+    }
+    target, share = scenario.target_speed, spread * TARGET_SPEED_SPREAD
+    if share > 0.0:
+        ranges[TARGET_SPEED] = target * max(1.0 - share, _LEAST_SPEED), min(target * (1.0 + share), MAX_SPEED)
+    return ranges
+
+
+def sample_parameters(scenario: Scenario, generator: np.random.Generator, *, spread: float = 1.0) -> Scenario:
+    """A scenario drawn evenly from the box of `sampling_ranges`.
+
+    The draw is an ordinary scenario: it can be saved, and `build_episode` without spread makes the episode of just
+    these values. It takes as many numbers from the generator as there are ranges, in their order. Whether its actors
+    have room at the start is known only on a lane graph: `build_episode` finds out. Traffic is not drawn here; it
+    depends on the seeds.
+
+    Args:
+        scenario: The nominal scenario.
+        generator: Random numbers, as `ssad.core.seeding.generator` gives them.
+        spread: Size of the box, as in `sampling_ranges`.
+
+    Returns:
+        The scenario with the drawn parameters and target speed, under the same name.
+
+    Raises:
+        ConfigError: As in `sampling_ranges`.
+    """
+    ranges = sampling_ranges(scenario, spread=spread)
+    values = {
+        name: min(max(low + share * (high - low), low), high)
+        for (name, (low, high)), share in zip(ranges.items(), generator.random(len(ranges)).tolist(), strict=True)
+    }
+    target_speed = values.pop(TARGET_SPEED, scenario.target_speed)
+    return dataclasses.replace(scenario, parameters={**scenario.parameters, **values}, target_speed=target_speed)
