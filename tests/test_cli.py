@@ -146,7 +146,6 @@ def test_list(kind: str, name: str) -> None:
 
 def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first run as a process of its own, with a driving system of an installed package; the rest in this one."""
-    monkeypatch.setenv("COLUMNS", "120")  # for whole names in the table
     settings = ("--set", "scenarios=[StraightObstacle/00,RightTurn/01]", "--set", "name=little")
     settings += ("--set", "systems=[acme-coast,blind]")
     site = tmp_path / "site-packages"
@@ -154,7 +153,7 @@ def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     path = os.pathsep.join(filter(None, [str(install(site)), os.environ.get("PYTHONPATH")]))
     first = ssad_process("run", "quick", *settings, "--workers", "2", cwd=tmp_path, PYTHONPATH=path)
     assert first.returncode == 0, first.stderr
-    assert "StraightObstacle" in first.stdout
+    assert "Straight Obstacle" in first.stdout
     assert "report: runs/little/report.html" in first.stdout
     folder = tmp_path / "runs" / "little"
     results = (folder / "results.jsonl").read_bytes()
