@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from helpers.command import ssad
 
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
 from ssad.toolbox.contact_sheet import pick_frame
 
 

@@ -34,8 +34,8 @@ from ssad.jobs.local import WORKER_MEMORY
 from ssad.metrics.detection import score_detections
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.report import write_report
-from ssad.report.detection import left_table, load_detection_run, main_table, robustness_table
-from ssad.report.load import load_header
+from ssad.report.kinds.detection import left_table, load_detection_run, main_table, robustness_table
+from ssad.report.load import load_run
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
 from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
@@ -165,12 +165,12 @@ def test_cells_are_scored_as_soon_as_their_boxes_are_there(
 
 
 def test_the_tables_say_what_the_records_say(folder: Path) -> None:
-    run = load_detection_run(folder, load_header(folder))
+    run = load_detection_run(load_run(folder))
     rows = {(row.head, row.published): row for row in main_table(run).rows}
     drawn = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     ours = rows[("Environment", "fog"), False].cells
     assert ours[0].mean == pytest.approx(100 * drawn["metrics"]["mAP"])
-    assert ours[1].low == pytest.approx(100 * drawn["intervals"]["NDS"][0])
+    assert (ours[1].n, ours[1].clusters, ours[1].interval) == (drawn["n"], drawn["scenes"], "")  # too few scenes
     table = robustness_table(run)
     assert table is not None
     cells = dict(zip(table.columns, table.rows[0].cells, strict=True))
@@ -181,8 +181,7 @@ def test_the_tables_say_what_the_records_say(folder: Path) -> None:
     share = next(row for row in left_table(run).rows if row.head[1] == "fog").cells[1]
     clean = next(r for r in lines(folder) if r["shift"] is None)
     assert share.mean == pytest.approx(100 * drawn["metrics"]["NDS"] / clean["metrics"]["NDS"])
-    pairs = zip(drawn["replicates"]["NDS"], clean["replicates"]["NDS"], strict=True)
-    assert [share.low, share.high] == pytest.approx(list(np.percentile([100 * a / b for a, b in pairs], [2.5, 97.5])))
+    assert share.interval == ""
     with open(folder / "tables" / "shifts.csv", encoding="utf-8") as file:
         read = list(csv.DictReader(file))
     assert {row["shift"] for row in read} == {"clean", "gaussian noise", "fog"}
@@ -201,18 +200,17 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
     kept = [line for line in (copy / "results.jsonl").read_text().splitlines(True) if '"severity":"random"' not in line]
     assert len(kept) == len(lines(folder)) - 2
     (copy / "results.jsonl").write_text("".join(kept).replace(ORACLE, "fcos3d-light"))
-    table = main_table(load_detection_run(copy, load_header(copy)))
+    table = main_table(load_detection_run(load_run(copy)))
     told = {row.head[1]: row for row in table.rows if row.published}
     assert told["gaussian noise"].cells[0].mean == PUBLISHED["gaussian"]["FCOS3D"][0]
     found = [r["metrics"]["mAP"] for r in lines(copy) if r["shift"] == "fog"]
     ours = next(row for row in table.rows if row.head[1] == "fog" and not row.published)
     assert len(found) == 3
     assert ours.cells[0].mean == pytest.approx(100 * float(np.mean(found)))
-    shares = {(row.head[1], row.published): row.cells for row in left_table(load_detection_run(copy, header)).rows}
+    shares = {(row.head[1], row.published): row.cells for row in left_table(load_detection_run(load_run(copy))).rows}
     assert shares["fog", True][0].mean == pytest.approx(100 * 17.97 / 29.8)
     clean = next(r["metrics"]["mAP"] for r in lines(copy) if r["shift"] is None)
     assert shares["fog", False][0].mean == pytest.approx(100 * float(np.mean(found)) / clean)
-    assert shares["fog", False][0].low <= shares["fog", False][0].mean <= shares["fog", False][0].high + 0.01
 
 
 def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None:

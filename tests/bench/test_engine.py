@@ -68,14 +68,14 @@ BAD = {
     "raise": ("failed", "ValueError: this one raises"), "exit": ("failed", "SystemExit: this one leaves"),
     "die": ("crashed", "exit code 3): last words"), "segfault": ("crashed", "SIGSEGV"),
     "liar": ("failed", "other cells"), "object": ("failed", "not plain data"), "nan": ("failed", "not plain data"),
-    "hang": ("timeout", "took longer than 2 s"), "spin": ("timeout", "took longer than 2 s"),
+    "hang": ("timeout", "took longer than 4 s"), "spin": ("timeout", "took longer than 4 s"),
     "memory": ("crashed", "out of memory: it held"),
 }  # fmt: skip
 
 
 def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -> None:
     good = ["a", "b", "c", "d"]
-    records = go(dice([*good[:2], *BAD, *good[2:]], batch=7, timeout_s=2), folder, workers, ray=ray)
+    records = go(dice([*good[:2], *BAD, *good[2:]], batch=7, timeout_s=4), folder, workers, ray=ray)
     found = {r["number"]: r for r in records}
     assert [found[name]["status"] for name in good] == ["ok"] * 4
     for deed, (status, reason) in BAD.items():

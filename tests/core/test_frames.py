@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.core.frames import Boxes3D, Camera, Frame, camera_to_world, pose_matrix, rotation_matrix
+from ssad.core.frames import Boxes3D, Camera, Frame, camera_to_world
+from ssad.core.rotations import pose_matrix, quaternion_to_matrix
 
 HALF = np.sqrt(0.5)
 
@@ -26,7 +27,7 @@ HALF = np.sqrt(0.5)
 def test_rotations_take_the_axes_where_they_belong(
     quaternion: tuple[float, ...], x: tuple[int, ...], y: tuple[int, ...], z: tuple[int, ...]
 ) -> None:
-    assert rotation_matrix(np.array(quaternion, float)) == pytest.approx(np.stack([x, y, z], 1), abs=1e-12)
+    assert quaternion_to_matrix(np.array(quaternion, float)) == pytest.approx(np.stack([x, y, z], 1), abs=1e-12)
 
 
 part = st.floats(-1.0, 1.0)
@@ -35,10 +36,10 @@ part = st.floats(-1.0, 1.0)
 @given(st.tuples(part, part, part, part).filter(lambda q: sum(v * v for v in q) > 0.01))
 def test_rotations_are_rotations_and_batched(quaternion: tuple[float, ...]) -> None:
     q = np.array(quaternion)
-    matrix = rotation_matrix(q)
+    matrix = quaternion_to_matrix(q)
     assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-9)
     assert np.linalg.det(matrix) == pytest.approx(1.0)
-    assert (rotation_matrix(np.stack([[q, -q]])) == matrix).all(), "q and -q are one rotation"
+    assert (quaternion_to_matrix(np.stack([[q, -q]])) == matrix).all(), "q and -q are one rotation"
 
 
 def test_a_pose_turns_and_then_moves() -> None:

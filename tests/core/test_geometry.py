@@ -7,41 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world, wrap_angle
+from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world
 
 angle = st.floats(-50.0, 50.0)
 place = st.floats(-100.0, 100.0)
 size = st.floats(0.2, 12.0)
 box = st.tuples(place, place, angle, size, size).map(np.array)
-
-
-@given(angle, st.integers(-9, 9))
-def test_wrap_is_in_range_and_the_same_direction(value: float, turns: int) -> None:
-    wrapped = float(wrap_angle(value + 2 * np.pi * turns))
-    assert -np.pi <= wrapped < np.pi
-    assert np.isclose(np.cos(wrapped), np.cos(value), atol=1e-9)
-    assert np.isclose(np.sin(wrapped), np.sin(value), atol=1e-9)
-
-
-def test_wrap_takes_pi_to_minus_pi() -> None:
-    assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi])) == pytest.approx([-np.pi] * 3)
-    assert wrap_angle(np.float32(np.pi)).dtype == np.float32
-
-
-@pytest.mark.parametrize("value", [np.nextafter(-np.pi, -4.0), np.float32(-3.1415932)])
-def test_wrap_just_under_minus_pi_never_rounds_up_to_pi(value: np.floating) -> None:
-    """The remainder of -1e-16 by 2 pi is 2 pi itself, to the last digit."""
-    for angles in (value, [value, 1.0, value - 2 * np.pi]):
-        wrapped = wrap_angle(np.array(angles, np.asarray(value).dtype))
-        assert (wrapped < np.pi).all()
-        assert (wrapped >= -np.pi).all()
-    assert float(wrap_angle(np.nextafter(-np.pi, -4.0))) == -np.pi
-
-
-def test_whole_numbers_become_floats() -> None:
-    assert wrap_angle(4) == pytest.approx(4 - 2 * np.pi)
-    assert wrap_angle(np.array([4, 1])).dtype == np.float64
-    assert corners(0, 0, 0, 3, 1)[0] == pytest.approx([1.5, 0.5])
 
 
 def test_rotate_and_frames_closed_form() -> None:

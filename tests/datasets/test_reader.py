@@ -19,17 +19,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.rotations import quaternion_to_matrix, slerp
 from ssad.datasets.nuscenes import index
-from ssad.datasets.nuscenes.reader import (
-    Annotations,
-    NuScenes,
-    SceneData,
-    points_bytes,
-    read_points,
-    rotation_matrices,
-    slerp,
-)
-from ssad.datasets.nuscenes.schema import CAMERAS, TABLES
+from ssad.datasets.nuscenes.reader import Annotations, NuScenes, SceneData, points_bytes, read_points
+from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
@@ -218,9 +212,9 @@ def test_slerp_turns_evenly_on_the_shorter_arc(start: float, turn: float, share:
         return
     end = about_z(start + turn) * (-1.0 if flipped else 1.0)
     between = slerp(about_z(start), end, share)
-    expected = rotation_matrices(about_z(start + share * way))
+    expected = quaternion_to_matrix(about_z(start + share * way))
     # below 3.6 degrees it is linear, as in pyquaternion, which is off by up to 5e-6
-    np.testing.assert_allclose(rotation_matrices(between), expected, atol=1e-5)
+    np.testing.assert_allclose(quaternion_to_matrix(between), expected, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(between), 1.0, atol=1e-12)
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.core.detections import Detections, Solids, Truth
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.training.batches import fill
 from ssad.training.data import nuscenes_items
 
@@ -19,7 +20,7 @@ class Oracle:
     """Finds the picture of the data set that is most like what it is shown, and tells its truth; the more the two
     differ, the fewer objects."""
 
-    name, task, classes = "oracle", "3d", CLASSES_3D
+    name, task, classes = "oracle", "3d", MMDET3D_CLASSES
 
     def __init__(self, root: Path) -> None:
         items = list(nuscenes_items(root, None, "all"))

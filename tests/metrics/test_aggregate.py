@@ -83,7 +83,7 @@ def test_fifty_copies_of_two_motions_are_two_cases():
     hit, free = episode(hit=True), episode()
     runs = [Outcome(e, "LaneChanging", "LaneChanging/00", case) for e, case in ((hit, "x"), (free, "y"))] * 25
     result = aggregate(runs)
-    assert (result["CR"].n, result["CR"].clusters, result["CR"].mean, result["CR"].method) == (2, 1, 0.5, "range")
+    assert (result["CR"].n, result["CR"].clusters, result["CR"].mean, result["CR"].method) == (2, 1, 0.5, "none")
 
 
 def test_groups_and_their_average():

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import CLASSES
 from ssad.core.seeding import generator
-from ssad.datasets.nuscenes.schema import CLASSES
 from ssad.metrics.detection import (
     CVPR_2019,
     BikeRacks,

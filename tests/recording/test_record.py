@@ -18,18 +18,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.assets.street import cached_street
 from ssad.core.errors import ConfigError, MapError, StoreError
-from ssad.core.frames import rotation_matrix
 from ssad.core.geometry import obb_distance
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, CLASSES
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes, read_points
-from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS, CLASSES
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
-from ssad.recording.nuscenes_recorder import AHEAD, CATEGORY, Recording, drive, record_nuscenes
+from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
 from ssad.recording.scene_objects import place_objects
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
@@ -60,7 +61,7 @@ def test_the_reader_finds_what_was_recorded(recorded: Path) -> None:
                 assert read_image(recorded / frame.filename).shape == (90, 160, 3)
             else:
                 assert len(read_points(recorded / frame.filename)) > 3000
-    assert {CATEGORY_TO_CLASS[c] for c in CATEGORY.values()} == set(CLASSES)
+    assert {CATEGORY_TO_CLASS[c] for c in BODY_CATEGORIES.values()} == set(CLASSES)
 
 
 def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(recorded: Path) -> None:
@@ -76,7 +77,7 @@ def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(recorded: Path) ->
             found = scene.annotations(frame.sample_token)
             boxes += len(found)
             for n in range(len(found)):
-                local = np.abs((world - found.centre[n]) @ rotation_matrix(found.rotation[n]))
+                local = np.abs((world - found.centre[n]) @ quaternion_to_matrix(found.rotation[n]))
                 half = found.size[n][[1, 0, 2]] / 2
                 least, most = ((local <= half + margin).all(1).sum() for margin in (-0.01, 0.01))
                 assert least <= found.lidar_points[n] <= most, "those on a face may fall either way"
@@ -145,7 +146,7 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another(recorded: Path) -> 
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
         walkers = [b for b in cast.bodies if b.kind == "pedestrian" and len(b.track) > 1]
         assert any(np.hypot(*np.diff(b.track[:30, :2], axis=0).T).sum() > 1.0 for b in walkers), "they walk"
-    assert set(kinds) >= set(CATEGORY) - {"bus", "trailer"}
+    assert set(kinds) >= set(BODY_CATEGORIES) - {"bus", "trailer"}
     assert kinds["bus"] + kinds["trailer"] > 0
 
 

@@ -12,7 +12,7 @@ import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.errors import RouteError
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import LaneType, Pose, Route
 from ssad.roads import LaneGraph, LaneQuery, random_route, route_along

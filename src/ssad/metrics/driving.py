@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, Contact, EpisodeTrace
 from ssad.metrics.criticality import min_distance, min_ttc, post_encroachment_time
 

@@ -135,9 +135,10 @@ def replicate_estimate(
         bounded: whether the score lies in [0, 1]; else it is at least 0.
     """
     known = np.array([r for r in replicates if not math.isnan(r)])
-    if clusters < MIN_CLUSTERS or len(known) < 2 or math.isnan(value) or not (bounded or value > 0.0):
+    variance = float(known.var(ddof=1)) if len(known) > 1 else math.nan
+    if clusters < MIN_CLUSTERS or math.isnan(value + variance) or not (bounded or min(value, variance) > 0.0):
         return Estimate(value, math.nan, math.nan, n, clusters=clusters)
-    low, high = replicate_limits(np.asarray(value), np.asarray(known.var(ddof=1)), clusters, bounded=bounded)
+    low, high = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=bounded)
     return Estimate(value, float(low), float(high), n, 0, "beta" if bounded else "t", clusters)
 
 
@@ -186,7 +187,7 @@ def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.int
 
 
 def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
-    """The interval, or the range of the clusters' means where there is none."""
+    """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
     if len(sums) >= MIN_CLUSTERS:
         if kind == "mean":
             found = mean_limits(sums, clusters)
@@ -195,4 +196,7 @@ def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
         if not math.isnan(float(found.low)):
             return replace(found, low=np.maximum(found.low, least))
     means = sums / clusters.size
-    return Limits(np.asarray(means @ clusters.weight), means.min(), means.max(), "range")
+    mean = np.asarray(means @ clusters.weight)
+    if len(means) == 1:
+        return Limits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
+    return Limits(mean, means.min(), means.max(), "range")
