@@ -126,8 +126,8 @@ def summary_table(run: DrivingRun) -> Table:
         if (values := run.numbers.get((system, group)))
     ]
     note = (
-        "CR: collisions per episode, in brackets its 95 % interval, else the range of the scenarios;\n"
-        "OR: m driven off the road; DR: m from the route; RC: share of the route"
+        "CR: collisions per episode; [a, b]: its 95 % interval, a–b: range\n"
+        "OR: m driven off the road, DR: m from the route, RC: share of the route"
     )
     return Table("summary", run.run.title, ("Scenario", "System"), SHOWN, tuple(rows), note)
 

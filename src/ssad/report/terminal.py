@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import rich.table
 from rich import box
+from rich.markup import escape
 
 from ssad.report.load import load_run
 from ssad.report.pages import kind_module
+
+MODULE = re.compile(r"^[\w.]+:(?=\w+$)")  # of "module:Class"
 
 
 def summary(folder: Path | str) -> rich.table.Table:
@@ -20,20 +24,27 @@ def summary(folder: Path | str) -> rich.table.Table:
     run = load_run(folder)
     table = kind_module(run.kind).summary(run)
     result = rich.table.Table(
-        title=run.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False
-    )
+        title=run.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
     for name in table.heads:
-        result.add_column(name.lower(), overflow="fold")
+        result.add_column(name.lower(), no_wrap=True)
     first, *others = table.columns
     for name in ("n", first, "", *others):
-        result.add_column(name, justify="right", no_wrap=True)
+        result.add_column(name, justify="right", min_width=4)
     rows = [row for row in table.rows if not row.published]
-    for row, after in zip(rows, [*rows[1:], None], strict=True):
+    for before, row, after in zip([None, *rows], rows, [*rows[1:], None], strict=False):
         one, *rest = row.cells
-        heads = (head.rsplit(":", maxsplit=1)[-1] for head in row.head)
-        ends = after is not None and len(row.head) > 1 and after.head[0] != row.head[0]
-        result.add_row(*heads, str(one.n or ""), one.text, one.interval, *(c.text for c in rest), end_section=ends)
+        same = before is not None and len(row.head) > 1 and before.head[0] == row.head[0]
+        heads = ["" if same else row.head[0], *row.head[1:]]
+        average = row.head[0].startswith("Avg.")
+        values = [str(one.n or ""), one.text, one.interval, *(cell.text for cell in rest)]
+        result.add_row(
+            *(MODULE.sub("", head) for head in heads), *(escape(value) for value in values),
+            style="bold" if average else None,
+            end_section=after is not None and after.head[0].startswith("Avg.") and not average,
+        )  # fmt: skip
     failed = len(run.failures)
     notes = [table.note, f"{failed} of {len(run.lines)} cells failed and count" if failed else ""]
-    result.caption, result.caption_justify = "\n".join(filter(None, notes)), "left"
+    result.caption, result.caption_justify = escape("\n".join(filter(None, notes))), "left"
     return result
