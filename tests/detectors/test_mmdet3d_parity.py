@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pytest
 import torch
 from helpers import mono3d_case as case
+from torch.nn import functional
 
 from ssad.core.detections import Detections, Solids, Truth
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -123,8 +124,7 @@ def check_training(detector: Mono3D, reference: Reference, *, seed: int, size: t
     wanted = reference["gradient"]
     cell = gradient.shape[2] // wanted.shape[2]
     gradient = gradient.reshape(*gradient.shape[:2], wanted.shape[2], cell, wanted.shape[3], cell).sum((3, 5))
-    assert np.abs(gradient - wanted).max() <= 1e-3 * np.abs(wanted).max()
-    assert np.linalg.norm(gradient - wanted) <= 1e-3 * np.linalg.norm(wanted)
+    assert np.abs(gradient - wanted).max() <= 1e-5 * np.abs(wanted).max()  # single precision in the file
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(kind, seed) for kind, seeds in SEEDS.items() for seed in seeds])
@@ -135,6 +135,21 @@ def test_equals_the_stored_answer(kind: str, seed: int) -> None:
     check_maps(maps, reference)
     check_boxes(boxes, reference)
     check_training(detector, reference, seed=seed, size=SMALL)
+
+
+@pytest.mark.parametrize(("kind", "seed"), [(kind, seed) for kind, seeds in SEEDS.items() for seed in seeds])
+def test_no_rounding_decides_a_stored_answer(kind: str, seed: int) -> None:
+    """The largest value of a window of the max pooling lies well above the others, whatever computes the convolution:
+    in double precision convolutions differ by 1e-14."""
+    detector = small(kind, seed)
+    pictures = np.stack([case.picture(*SMALL, seed=seed + k) for k in range(3)])
+    images = torch.from_numpy(pictures).permute(0, 3, 1, 2).double().contiguous() - detector.get_buffer("mean")
+    trunk = detector.backbone
+    windows = functional.unfold(functional.pad(trunk.bn1(trunk.conv1(images)).relu(), (1, 1, 1, 1)), 3, stride=2)
+    best, second = windows.unflatten(1, (-1, 9)).topk(2, 2)[0].unbind(2)
+    live = best > 0  # where nothing passes the ReLU, no gradient does
+    assert int(live.sum()) > 10_000
+    assert float((best - second)[live].min()) > 1e-9
 
 
 def test_the_stored_answers_show_what_they_are_for() -> None:

@@ -278,6 +278,39 @@ def test_resizing_moves_no_box() -> None:
     torch.testing.assert_close(two.box, 2 * one.box)
 
 
+@pytest.mark.parametrize("width", [None, 320])
+def test_rays_are_tangents_to_the_right_and_down(width: int | None) -> None:
+    """Four times the tangents, as the regression's first layer gets them; 45 degrees to the right is 4."""
+    detector = Mono3D(replace(TINY, rays=True, input_width=width))
+    seen: list[Tensor] = []
+    first = detector.bbox_head.get_submodule("reg_convs.0.conv")
+    first.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    k = torch.tensor([[40.0, 0, 100], [0, 80, 20], [0, 0, 1]])
+    if width is not None:  # twice as wide: the same ray stands at the same part of the picture, counted from its edge
+        k[:2, :2] /= 2
+        k[:2, 2] = (k[:2, 2] + 0.5) / 2 - 0.5
+    detector.dense(torch.zeros(1, 3, 96, 160) if width is None else torch.zeros(1, 3, 80, 160), k[None])
+    right, down = seen[0][0, -2:]  # of stride 8: places at 4, 12, 20, ... of the network's input
+    assert right[5, 17].item() == pytest.approx(4.0)  # (140 - 100) / 40
+    assert right[2, 7].item() == pytest.approx(-4.0)  # (60 - 100) / 40
+    assert down[2, 7].item() == pytest.approx(0.0, abs=1e-6)  # (20 - 20) / 80
+    assert down[7, 3].item() == pytest.approx(2.0)  # (60 - 20) / 80
+    assert seen[1][0, -1, 0, 0].item() == pytest.approx(4 * (8 - 20) / 80)  # of stride 16
+
+
+def test_a_resized_picture_has_a_scale_of_its_own_in_each_direction() -> None:
+    """160 x 3 pixels become 64 x 1: by 0.4 to the right, but by a third down."""
+    detector = Mono3D(replace(TINY, input_width=64))
+    k = torch.tensor([[90.0, 0, 70], [0, 90, 2], [0, 0, 1]])
+    dense = detector.dense(torch.zeros(1, 3, 3, 160), k[None])
+    torch.testing.assert_close(
+        dense.place[:9], torch.tensor([[(8 * c + 4) / 0.4, 4 * 3] for c in range(8)] + [[10.0, 36]])
+    )
+    torch.testing.assert_close(dense.stride[:8], torch.full((8,), 20.0))
+    wanted = torch.tensor([[90 * 0.4, 0, 70.5 * 0.4 - 0.5], [0, 30, 2.5 / 3 - 0.5], [0, 0, 1]])
+    torch.testing.assert_close(dense.maps["intrinsic"][0][0], wanted)
+
+
 def test_mixed_precision_keeps_digits_where_they_count() -> None:
     detector = lively(TINY_PGD)
     images, truth = pictures(1, 3, *SIZE), some_truth(4, size=SIZE, focal=90.0)

@@ -25,7 +25,13 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-@BOTH
+VIRTUAL = 400 / 1.2  # the lens of `some_truth` has 1.2 times this focal length
+
+
+@pytest.mark.parametrize(
+    "config", [TINY, TINY_PGD, replace(TINY, virtual_focal=VIRTUAL), replace(TINY_PGD, virtual_focal=VIRTUAL)],
+    ids=["fcos3d", "pgd", "fcos3d, other lens", "pgd, other lens"],
+)  # fmt: skip
 def test_the_truth_costs_nothing(config: Mono3DConfig) -> None:
     detector = Mono3D(config).double()
     dense, assignment = perfect(detector, some_truth(), (225, 400))
@@ -67,6 +73,16 @@ def test_each_part_is_smooth_l1_with_its_weight(
     assert float(found[name]) == pytest.approx(wanted)
     for other in set(found) - {name, "centerness"}:
         assert float(found[other]) == pytest.approx(0.0, abs=1e-9)
+
+
+@BOTH
+def test_depth_is_compared_as_a_camera_of_the_virtual_focal_length_sees_it(config: Mono3DConfig) -> None:
+    """1.2 m too far before a lens of 1.2 times the virtual focal length is 1 m too far."""
+    detector = Mono3D(replace(config, virtual_focal=VIRTUAL)).double()
+    dense, assignment = perfect(detector, some_truth(), (225, 400))
+    share = float(detector.bbox_head.fuse_lambda.double().sigmoid()) if config.pgd else 1.0
+    found = detector.losses(nudge(dense, 2, 1.2 / share), assignment)
+    assert float(found["depth"]) == pytest.approx(0.2 * (1.0 - 1 / 18))
 
 
 def test_yaw_is_compared_by_the_sine_of_the_difference(told: tuple[Mono3D, Dense, Assignment]) -> None:

@@ -210,4 +210,24 @@ def test_projection_inverts() -> None:
     torch.testing.assert_close(project(back, K), points[:, :2])
     behind = torch.tensor([1.0, 2.0, -4.0], dtype=torch.float64)
     assert bool((project(behind, K, near=None) == (K @ behind)[:2] / -4.0).all())
-    assert bool(project(behind, K).isfinite().all())
+
+
+@pytest.mark.parametrize(
+    ("depth", "held", "anything_but_zero"),
+    [
+        (0.11, 0.11, 0.11),
+        (0.09, 0.1, 0.09),
+        (0.0, 0.1, 1e-4),
+        (-5e-5, 0.1, 1e-4),
+        (-2e-4, 0.1, -2e-4),
+        (-3.0, 0.1, -3.0),
+    ],
+)
+def test_projection_near_the_camera_divides_by_a_depth_that_is_held(
+    depth: float, held: float, anything_but_zero: float
+) -> None:
+    """A tenth of a metre for boxes; in the loss any depth but zero, as the source has it."""
+    point = torch.tensor([0.2, -0.3, depth], dtype=torch.float64)
+    above = torch.tensor([300 * 0.2 + 208 * depth, 300 * -0.3 + 128 * depth], dtype=torch.float64)
+    torch.testing.assert_close(project(point, K), above / held)
+    torch.testing.assert_close(project(point, K, near=None), above / anything_but_zero)

@@ -107,6 +107,21 @@ def test_a_resized_picture_gives_boxes_of_its_own_pixels(spec) -> None:  # type:
         torch.testing.assert_close(value, detector.losses(expected, theirs)[name], rtol=1e-4, atol=1e-5)
 
 
+@EVERY
+def test_a_resized_picture_has_a_scale_of_its_own_in_each_direction(spec) -> None:  # type: ignore[no-untyped-def]
+    """160 x 3 pixels become 64 x 1: by 0.4 to the right, but by a third down. Raw zeros are the anchors themselves."""
+    detector = Yolo(spec, CLASSES, input_width=64)
+    for head in detector.network.outputs():
+        head.weight.data.zero_()
+        head.bias.data.zero_()  # type: ignore[union-attr]
+    dense = detector.dense(torch.zeros(1, 3, 3, 160))
+    stride = spec.strides[0]
+    torch.testing.assert_close(dense.place[0], torch.tensor([stride / 2 / 0.4, stride / 2 * 3]))
+    width, height = spec.anchors[0][0]
+    middle, half = torch.tensor([stride / 2 / 0.4, stride / 2 * 3]), torch.tensor([width / 0.4, height * 3]) / 2
+    torch.testing.assert_close(dense.box[0, 0], torch.cat([middle - half, middle + half]))
+
+
 def frozen_loss(detector: Yolo, base: Dense, dense: Dense, assignment) -> Tensor:  # type: ignore[no-untyped-def]
     """The loss with what the detector detaches (targets of objectness, weight of the aspect) held at `base`."""
     values = detector.losses(dense, assignment)
@@ -190,6 +205,18 @@ def test_selection_equals_suppression_class_by_class() -> None:
     assert torch.equal(few.score, found.score[:5])
     none = select(score, box, threshold=1.0, iou=0.45, limit=5, size=(90, 100))
     assert none.box.shape == (0, 4)
+
+
+def test_the_best_30_000_candidates_are_compared_and_no_more() -> None:
+    """Of 40,000, all in one place but for two: the last that counts and the first that does not."""
+    rank = torch.randperm(40_000, generator=torch.Generator().manual_seed(0))
+    score = 1 - (rank.double() + 1) / 50_000
+    box = torch.tensor([[0.0, 0, 10, 10]]).repeat(40_000, 1)
+    box[rank == 29_999] = torch.tensor([40.0, 0, 50, 10])
+    box[rank == 30_000] = torch.tensor([80.0, 0, 90, 10])
+    found = select(score[:, None], box, threshold=0.1, iou=0.5, limit=300, size=(100, 100))
+    assert found.box[:, 0].tolist() == [0, 40]
+    assert found.score.tolist() == pytest.approx([1 - 1 / 50_000, 1 - 30_000 / 50_000])
 
 
 def test_scores_are_objectness_times_class() -> None:

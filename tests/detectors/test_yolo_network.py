@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.errors import ConfigError, FormatError
@@ -191,6 +191,21 @@ def test_the_official_tiny_weights_have_their_anchors() -> None:
     detector = yolov3_tiny(("car",), spec=YOLOV3_TINY_OFFICIAL)
     assert detector.anchors[0].tolist() == [[23, 27], [37, 58], [81, 82]]
     assert detector.anchors[1].tolist() == yolov3_tiny(("car",)).anchors[1].tolist()
+
+
+@pytest.mark.parametrize(
+    ("spec", "epsilon"), [(YOLOV5N, 1e-3), (YOLOV3_TINY, 1e-5)], ids=["yolov5", "darknet"]
+)  # fmt: skip
+def test_batch_norms_have_the_published_epsilon(spec: YoloSpec, epsilon: float) -> None:
+    """Where the variance is 0, a norm divides by the root of its epsilon and nothing else."""
+    network = Yolo(replace(spec, width=0.125)).network
+    norms = [part for part in network.modules() if isinstance(part, nn.BatchNorm2d)]
+    assert len(norms) > 10
+    for norm in norms:
+        assert norm.running_var is not None
+        norm.running_var.zero_()
+        x = torch.full((1, norm.num_features, 1, 1), 2.0)
+        torch.testing.assert_close(norm(x), x / epsilon**0.5)
 
 
 def yolov5_names(detector: Yolo) -> dict[str, str]:

@@ -82,7 +82,11 @@ def _range(name: str, shape: tuple[int, ...], pgd: bool) -> tuple[float, float]:
 
 
 def picture(width: int, height: int, *, seed: int) -> U8:
-    """A picture [height, width, 3] of soft blobs and hard-edged rectangles, uint8 BGR."""
+    """A picture [height, width, 3] of soft blobs and hard-edged rectangles under noise, uint8 BGR.
+
+    Without the noise, even areas would give equal values in a window of the max pooling; which of them the gradient
+    takes then depends on the rounding of the convolution, and so on the processor.
+    """
     rng = np.random.default_rng([seed, 1])
     found = np.repeat(np.repeat(rng.integers(0, 256, (height // 16 + 2, width // 16 + 2, 3)), 16, 0), 16, 1)
     total = np.cumsum(np.cumsum(np.pad(found, ((1, 0), (1, 0), (0, 0))), 0), 1)  # box filter of 15 x 15, in integers
@@ -92,6 +96,7 @@ def picture(width: int, height: int, *, seed: int) -> U8:
     end = corner + 4 + rng.integers(0, [width // 4, height // 3], (12, 2))
     for (left, top), (right, bottom), colour in zip(corner, end, rng.integers(0, 256, (12, 3)), strict=True):
         found[top:bottom, left:right] = colour
+    found = 16 + found * 223 // 255 + rng.integers(-16, 17, found.shape)  # within 0..255: nothing is cut off and even
     return found.astype(np.uint8)
 
 
