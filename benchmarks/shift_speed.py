@@ -26,9 +26,10 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext
+from ssad.core.boxes import TrackedBoxes
+from ssad.core.frames import FORWARD, Camera, Frame, SceneContext
 from ssad.core.images import decode_image, encode_jpeg
-from ssad.core.rotations import quaternion_to_matrix
+from ssad.core.rotations import yaw_to_quaternion
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_images
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
 
@@ -59,15 +60,14 @@ def street() -> tuple[np.ndarray, Frame]:
     side = np.linspace(-6.2, 6.2, 8)
     centre = np.stack([np.full(8, 12.5) + np.arange(8) % 2, side, np.full(8, 0.8)], 1)
     yaw = np.linspace(-0.3, 0.3, 8)
-    rotation = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1)
-    size = np.tile([1.9, 3.4, 1.6], (8, 1))
+    rotation = yaw_to_quaternion(yaw)
+    size = np.tile([3.4, 1.9, 1.6], (8, 1))
     velocity = np.stack([0 * yaw, np.where(np.arange(8) % 2, 6.0, -6.0), 0 * yaw], 1)
-    boxes = Boxes3D(tuple(f"car {n}" for n in range(8)), centre, size, rotation, velocity, np.ones(8))
+    boxes = TrackedBoxes(centre, size, rotation, velocity, tuple(f"car {n}" for n in range(8)), np.ones(8))
     to_camera = np.linalg.inv(FORWARD)
-    cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    corners = boxes.corners()
     for n in np.argsort(-centre[:, 0], kind="stable"):
-        corners = (quaternion_to_matrix(rotation[n]) * size[n][[1, 0, 2]]) @ cube.T
-        points = to_camera[:3, :3] @ (corners + centre[n][:, None]) + to_camera[:3, 3:]
+        points = to_camera[:3, :3] @ corners[n].T + to_camera[:3, 3:]
         pixels = (points[:2] / points[2] * 1266.4 + [[816.3], [491.5]]).T
         hull = cv2.convexHull(pixels.astype(np.float32)).astype(np.int32)
         cv2.fillConvexPoly(image, hull, rng.integers(40, 230, 3).tolist())

@@ -28,7 +28,7 @@ def perfect(root: Path, file: Path, **meta: str) -> Path:
                 {
                     "sample_token": sample.token,
                     "translation": found.centre[n].tolist(),
-                    "size": found.size[n].tolist(),
+                    "size": found.size_wlh[n].tolist(),
                     "rotation": found.rotation[n].tolist(),
                     "velocity": found.velocity[n, :2].tolist(),
                     "detection_name": CATEGORY_TO_CLASS[found.category[n]],

@@ -15,8 +15,8 @@ from ssad.assets.mesh import Material, Mesh, box, build, sphere
 from ssad.assets.street.model import Street
 from ssad.camera.lidar import HDL32E, Lidar, points_in_boxes, sweep
 from ssad.camera.scene import Scene, Thing
+from ssad.core.boxes import TrackedBoxes, WorldBoxes
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Boxes3D
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 
@@ -341,19 +341,17 @@ def test_points_in_boxes_equal_a_plain_count(seed: int, n: int, p: int) -> None:
     points = rng.uniform(-5, 5, (p, 5))
     rotation = rng.normal(size=(n, 4))
     size = rng.uniform(0.2, 6, (n, 3))
-    boxes = Boxes3D(tuple(map(str, range(n))), rng.uniform(-6, 6, (n, 3)), size, rotation, np.zeros((n, 3)), np.ones(n))
+    boxes = WorldBoxes(rng.uniform(-6, 6, (n, 3)), size, rotation, np.zeros((n, 3)))
     counts = points_in_boxes(points, boxes)
     assert counts.dtype == np.int32
     for row in range(n):
         local = (points[:, :3] - boxes.centre[row]) @ quaternion_to_matrix(rotation[row])
-        width, length, height = size[row]
-        assert counts[row] == (np.abs(local) <= np.array([length, width, height]) / 2).all(1).sum()
+        assert counts[row] == (np.abs(local) <= size[row] / 2).all(1).sum()
 
 
 def test_points_in_boxes_at_the_surface() -> None:
-    boxes = Boxes3D(("a",), np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]]), np.array([[1.0, 0, 0, 0]]),
-                    np.zeros((1, 3)), np.ones(1))  # fmt: skip
+    boxes = WorldBoxes(np.array([[1.0, 2, 3]]), np.array([[4.0, 2, 6]]), np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)))
     points = np.array([[3.0, 3, 6], [3.001, 3, 6], [-1, 1, 0], [1, 3.001, 3], [np.nan, 2, 3]])
     assert points_in_boxes(points, boxes).tolist() == [2]
     assert points_in_boxes(np.zeros((0, 3)), boxes).tolist() == [0]
-    assert points_in_boxes(points, Boxes3D.empty()).shape == (0,)
+    assert points_in_boxes(points, TrackedBoxes.empty()).shape == (0,)

@@ -152,7 +152,7 @@ def test_boxes_between_key_frames(tmp_path: Path) -> None:
         np.testing.assert_allclose(boxes.centre[0], [4 + 6 * share, -2, 1], atol=1e-9)
         half = math.radians(15.0 * (1 + share))
         np.testing.assert_allclose(boxes.rotation[0], [math.cos(half), 0, 0, math.sin(half)], atol=1e-12)
-        assert boxes.size.tolist() == [[2, 4, 1.5]]
+        assert boxes.size_wlh.tolist() == [[2, 4, 1.5]]
     tokens = [scene.annotations(sample.token).token for sample in scene.samples]
     assert scene.annotations_at(START + 500_001).token == tokens[2]
     assert scene.annotations_at(START + 500_000).token == tokens[1]

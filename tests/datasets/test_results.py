@@ -61,7 +61,7 @@ def test_whole_numbers_missing_scores_and_points(tmp_path: Path) -> None:
     short = box(translation=[1, 2, 3], num_pts=7)
     del short["detection_score"]
     found = read_results(write(tmp_path, {"s": [box(velocity=[1, 0]), short]}))
-    assert found.boxes.translation.tolist() == [[1.0, 2.0, 3.0]] * 2
+    assert found.boxes.centre.tolist() == [[1.0, 2.0, 3.0]] * 2
     assert found.boxes.velocity.tolist() == [[1.0, 0.0], [0.5, -0.5]]
     assert found.boxes.score.tolist() == [0.5, -1.0]
     assert found.points.tolist() == [-1, 7]
@@ -174,10 +174,10 @@ def test_truth_is_that_of_the_tables(tmp_path: Path) -> None:
     first = [
         a for a, k in zip(own, kinds, strict=True) if a["sample_token"] == found.samples[0] and k.startswith("veh")
     ]
-    assert found.boxes.translation[found.boxes.sample == 0].tolist() == [a["translation"] for a in first]
+    assert found.boxes.centre[found.boxes.sample == 0].tolist() == [a["translation"] for a in first]
     assert found.visibility[found.boxes.sample == 0].tolist() == [int(a["visibility_token"]) for a in first]
     assert (np.diff(found.boxes.sample) >= 0).all()
-    offset = found.boxes.translation[:, :2] - found.ego[found.boxes.sample, :2]
+    offset = found.boxes.centre[:, :2] - found.ego[found.boxes.sample, :2]
     assert np.array_equal(found.boxes.ego_distance, np.sqrt((offset**2).sum(axis=1)))
 
 

@@ -109,7 +109,7 @@ def test_point_counts_are_those_of_the_sweeps(scenes: list[SceneData], root: Pat
             turns = quaternion_to_matrix(boxes.rotation)
             for i in range(len(boxes)):
                 local = (world - boxes.centre[i]) @ turns[i]
-                half = boxes.size[i][[1, 0, 2]] / 2
+                half = boxes.size_lwh[i] / 2
                 least = np.count_nonzero((np.abs(local) < half - 1e-4).all(axis=1))
                 most = np.count_nonzero((np.abs(local) < half + 1e-4).all(axis=1))
                 assert least <= boxes.lidar_points[i] <= most

@@ -505,7 +505,7 @@ class WithoutSolids(Base3D):
 @breaks("sizes are above 0")
 class WithFlatSolids(Base3D):
     def alter(self, solid: Any) -> Any:
-        return replace(solid, size=solid.size * torch.tensor([1.0, 0.0, 1.0]))
+        return replace(solid, size_lhw=solid.size_lhw * torch.tensor([1.0, 0.0, 1.0]))
 
 
 @breaks("Solids.centre is ['N', 3]")

@@ -174,8 +174,9 @@ def check_export(reference: Reference, *, seed: int) -> None:
     assert len(found) == len(reference["score"]) < sum(len(one.score) for one in seen)
     np.testing.assert_array_equal(found.label, reference["label"])
     assert list(found.attribute) == reference["attribute"].tolist()
-    for name in ("score", "translation", "size", "velocity"):
-        np.testing.assert_allclose(getattr(found, name), reference[name], rtol=1e-6, atol=2e-5, err_msg=name)
+    mine = {"score": found.score, "translation": found.centre, "size": found.size_wlh, "velocity": found.velocity}
+    for name, value in mine.items():
+        np.testing.assert_allclose(value, reference[name], rtol=1e-6, atol=2e-5, err_msg=name)
     sign = np.sign((found.rotation * reference["rotation"]).sum(1, keepdims=True))
     np.testing.assert_allclose(found.rotation * sign, reference["rotation"], atol=2e-6)
 

@@ -174,7 +174,7 @@ def test_an_image_does_not_depend_on_the_batch(config: Mono3DConfig) -> None:
 def same(a: Detections, b: Detections) -> None:
     for name in ("score", "label", "box"):
         torch.testing.assert_close(getattr(a, name), getattr(b, name))
-    for name in ("centre", "size", "yaw", "velocity", "attribute"):
+    for name in ("centre", "size_lhw", "yaw", "velocity", "attribute"):
         torch.testing.assert_close(getattr(a.solid, name), getattr(b.solid, name))
 
 
@@ -207,7 +207,7 @@ def test_predictions_are_in_order_and_above_the_threshold(config: Mono3DConfig) 
     (fewer,) = detector.predict(images, K[None], threshold=least)
     assert bool((fewer.score > least).all())
     assert found.solid is not None
-    assert bool((found.solid.size > 0).all())
+    assert bool((found.solid.size_lhw > 0).all())
     assert detector.predict(images, K[None], threshold=0.999)[0].score.shape == (0,)
 
 

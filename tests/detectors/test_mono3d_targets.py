@@ -161,7 +161,7 @@ def test_maps_that_say_the_truth_decode_to_it(config: Mono3DConfig, seed: int) -
     for k in owners:
         near = (found.solid.centre - truth.solid.centre[k]).norm(dim=1).argmin()
         assert found.label[near] == truth.label[k]
-        for name in ("centre", "size", "velocity"):
+        for name in ("centre", "size_lhw", "velocity"):
             assert getattr(found.solid, name)[near].tolist() == pytest.approx(
                 getattr(truth.solid, name)[k].tolist(), abs=1e-6
             )
@@ -193,8 +193,8 @@ def test_yaw_comes_back_from_all_around() -> None:
 def test_corners_are_half_the_diagonal_from_the_centre() -> None:
     solid = some_truth(4, seed=3).solid
     assert solid is not None
-    away = (corners(solid.centre, solid.size, solid.yaw) - solid.centre[:, None]).norm(dim=-1)
-    torch.testing.assert_close(away, 0.5 * solid.size.norm(dim=1)[:, None].expand(4, 8))
+    away = (corners(solid.centre, solid.size_lhw, solid.yaw) - solid.centre[:, None]).norm(dim=-1)
+    torch.testing.assert_close(away, 0.5 * solid.size_lhw.norm(dim=1)[:, None].expand(4, 8))
 
 
 def test_corners_follow_the_convention_of_yaw() -> None:

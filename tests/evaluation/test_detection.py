@@ -93,7 +93,7 @@ def test_a_gpu_finds_the_same_boxes(recorded: Path, name: str, monkeypatch: pyte
         assert abs(int(sure.sum()) - int(same.sum())) <= 1, "but for one at the threshold"
         for k in np.flatnonzero(sure):
             alike = other.boxes.label == one.boxes.label[k]
-            alike &= np.linalg.norm(other.boxes.translation - one.boxes.translation[k], axis=1) < 0.05
+            alike &= np.linalg.norm(other.boxes.centre - one.boxes.centre[k], axis=1) < 0.05
             alike &= np.abs(other.boxes.score - one.boxes.score[k]) < 0.01
             assert alike.any()
 
@@ -123,7 +123,7 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
         assert set(Small.calls) <= {1, 2}
         assert sum(Small.calls) == len(key)
         for one, other in zip(whole, parts, strict=True):
-            assert (one.boxes.translation == other.boxes.translation).all()
+            assert (one.boxes.centre == other.boxes.centre).all()
         Small.room = 0
         with pytest.raises(torch.OutOfMemoryError):
             detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]

@@ -45,7 +45,9 @@ class Oracle:
 def told(truth: Truth, rows: Tensor) -> Detections:
     solid = truth.solid
     assert solid is not None
-    part = Solids(solid.centre[rows], solid.size[rows], solid.yaw[rows], solid.velocity[rows], solid.attribute[rows])
+    part = Solids(
+        solid.centre[rows], solid.size_lhw[rows], solid.yaw[rows], solid.velocity[rows], solid.attribute[rows]
+    )
     return Detections(torch.linspace(0.9, 0.5, len(rows)), truth.label[rows], truth.box[rows], part)
 
 
@@ -62,7 +64,7 @@ class Bad(Oracle):
             raise ZeroDivisionError("on\npurpose")
         for one in found if os.environ["ORACLE_WAY"] == "breaks a promise" else ():
             assert one.solid is not None
-            one.solid.size.neg_()
+            one.solid.size_lhw.neg_()
         return found
 
 

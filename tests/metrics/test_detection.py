@@ -38,8 +38,8 @@ def boxes(rows: list[tuple[Any, ...]], **columns: Any) -> BoxTable:
         BoxTable.empty(n),
         sample=np.array([row[0] for row in rows], np.int32),
         label=np.array([row[1] for row in rows], np.int8),
-        translation=np.stack([x, y, np.zeros(n)], axis=-1) if n else np.zeros((0, 3)),
-        size=np.tile([2.0, 4.0, 1.5], (n, 1)),
+        centre=np.stack([x, y, np.zeros(n)], axis=-1) if n else np.zeros((0, 3)),
+        size_lwh=np.tile([4.0, 2.0, 1.5], (n, 1)),
         rotation=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
         velocity=np.zeros((n, 2)),
         score=np.array([row[4] if len(row) > 4 else -1.0 for row in rows], np.float64),
@@ -88,7 +88,7 @@ def greedy(truth: BoxTable, found: BoxTable, label: int, threshold: float) -> li
         best, pick = math.inf, None
         for g in range(len(truth)):
             if truth.label[g] == label and truth.sample[g] == found.sample[i] and g not in taken:
-                distance = float(np.linalg.norm(found.translation[i, :2] - truth.translation[g, :2]))
+                distance = float(np.linalg.norm(found.centre[i, :2] - truth.centre[g, :2]))
                 if distance < best:
                     best, pick = distance, g
         if best < threshold and pick is not None:
@@ -109,7 +109,7 @@ def test_matches_are_those_of_the_greedy_rule(key: int, grid: float, levels: int
             pairs = greedy(truth, found, label, threshold)
             assert rank[hits].tolist() == [i for i, _ in pairs]
         pairs = greedy(truth, found, label, CVPR_2019.dist_th_tp)
-        expected = [float(np.linalg.norm(found.translation[i, :2] - truth.translation[g, :2])) for i, g in pairs]
+        expected = [float(np.linalg.norm(found.centre[i, :2] - truth.centre[g, :2])) for i, g in pairs]
         np.testing.assert_allclose(matches.classes[label].errors[0], expected, rtol=1e-14, atol=0)
 
 
@@ -212,8 +212,9 @@ def test_racks_take_the_cycles_of_their_sample() -> None:
     turn = math.radians(90.0) / 2
     racks = BikeRacks(
         sample=np.array([1, 0], np.int32),
-        translation=np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]),
-        size=np.array([[2.0, 6.0, 2.0], [2.0, 6.0, 2.0]]),
+        centre=np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]),
+        size_lwh=np.array([[6.0, 2.0, 2.0], [6.0, 2.0, 2.0]]),
+        velocity=np.zeros((2, 2)),
         rotation=np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(turn), 0.0, 0.0, math.sin(turn)]]),
     )
     rows = [
@@ -239,10 +240,10 @@ def test_too_many_boxes_name_the_sample() -> None:
 
 def test_a_flat_box_is_refused_where_it_matches() -> None:
     truth = boxes([(0, CAR, 0.0, 0.0)])
-    flat = boxes([(0, CAR, 0.0, 0.0, 0.5)], size=np.array([[1.0, 0.0, 1.0]]))
+    flat = boxes([(0, CAR, 0.0, 0.0, 0.5)], size_lwh=np.array([[0.0, 1.0, 1.0]]))
     with pytest.raises(FormatError, match="sample s: a prediction box"):
         match(truth, flat, samples=1, names=["s"])
-    away = replace(flat, translation=flat.translation + 30.0)
+    away = replace(flat, centre=flat.centre + 30.0)
     assert match(truth, away, samples=1).scores().mean_ap == 0.0
 
 

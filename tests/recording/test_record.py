@@ -78,7 +78,7 @@ def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(recorded: Path) ->
             boxes += len(found)
             for n in range(len(found)):
                 local = np.abs((world - found.centre[n]) @ quaternion_to_matrix(found.rotation[n]))
-                half = found.size[n][[1, 0, 2]] / 2
+                half = found.size_lwh[n] / 2
                 least, most = ((local <= half + margin).all(1).sum() for margin in (-0.01, 0.01))
                 assert least <= found.lidar_points[n] <= most, "those on a face may fall either way"
     assert boxes > 5
@@ -266,7 +266,7 @@ def test_the_official_toolkit_scores_true_boxes_as_perfect(recorded: Path, tmp_p
                 there[name] += 1
                 own.append(
                     {"sample_token": sample.token, "translation": found.centre[n].tolist(),
-                     "size": found.size[n].tolist(), "rotation": found.rotation[n].tolist(),
+                     "size": found.size_wlh[n].tolist(), "rotation": found.rotation[n].tolist(),
                      "velocity": np.nan_to_num(found.velocity[n, :2]).tolist(), "detection_name": name,
                      "detection_score": 1.0, "attribute_name": (*found.attributes[n], "")[0]}
                 )  # fmt: skip

@@ -14,8 +14,9 @@ from helpers.boxes import cars
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.frames import FORWARD, Camera, Frame, SceneContext, camera_to_world
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.core.types import U8
@@ -43,16 +44,16 @@ GREY = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 BOTH = ("physical", "paper")
 
 
-def outline(boxes: Boxes3D, n: int = 0) -> Any:
+def outline(boxes: TrackedBoxes, n: int = 0) -> Any:
     """Corners of a box [8, 2] in the picture of CAMERA at the origin."""
     cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    world = (quaternion_to_matrix(boxes.rotation[n]) * boxes.size[n][[1, 0, 2]] @ cube.T).T + boxes.centre[n]
+    world = (quaternion_to_matrix(boxes.rotation[n]) * boxes.size_lwh[n] @ cube.T).T + boxes.centre[n]
     local = (world - FORWARD[:3, 3]) @ FORWARD[:3, :3]
     k = CAMERA.intrinsic
     return local[:, :2] / local[:, 2:] * [k[0, 0], k[1, 1]] + [k[0, 2], k[1, 2]]
 
 
-def drawn(boxes: Boxes3D, colours: list[tuple[int, int, int]]) -> U8:
+def drawn(boxes: TrackedBoxes, colours: list[tuple[int, int, int]]) -> U8:
     """The boxes as flat shapes on grey, the last in front."""
     image = GREY.copy()
     for n, colour in enumerate(colours):
@@ -262,7 +263,7 @@ def test_weather_agrees_between_cameras_and_changes_with_the_scene(street: NuSce
         black, sky = [], np.full((270, 480, 3), 0, np.uint8)
         for frame in first:
             view = replace(
-                shifter.camera_frame(frame), depth=np.full((68, 120), np.inf, np.float32), boxes=Boxes3D.empty()
+                shifter.camera_frame(frame), depth=np.full((68, 120), np.inf, np.float32), boxes=TrackedBoxes.empty()
             )
             out, _ = shift_images(sky, view, ShiftSpec(name, 5), contexts={shifter.context.scene: shifter.context})
             black.append(np.median(out.reshape(-1, 3), axis=0))
@@ -486,7 +487,7 @@ def test_labels_follow_the_objects(severity: int, seed: int, yaw: float, name: s
     boxes = replace(cars((9.0, 2.0, 0.8)), rotation=np.array([[np.cos(half), 0, 0, np.sin(half)]]))
     spec = ShiftSpec(name, severity, seed)
     new = transformed_boxes(spec, boxes, scene="s", sample="t")
-    bottom = new.centre[0, 2] - new.size[0, 2] / 2
+    bottom = new.centre[0, 2] - new.size_lwh[0, 2] / 2
     assert abs(bottom) < 1e-9, "objects stay on the ground"
     d = deformations(spec, boxes, scene="s", sample="t")[0]
     if name == "scale":
@@ -500,7 +501,7 @@ def test_labels_follow_the_objects(severity: int, seed: int, yaw: float, name: s
     if name == "shear":
         cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * [4.0, 1.8, 1.6]
         world = cube @ d.T @ quaternion_to_matrix(boxes.rotation[0]).T + [9.0, 2.0, 0.0]
-        local = (world - new.centre[0]) @ quaternion_to_matrix(new.rotation[0]) / new.size[0][[1, 0, 2]]
+        local = (world - new.centre[0]) @ quaternion_to_matrix(new.rotation[0]) / new.size_lwh[0]
         assert np.abs(local).max() == pytest.approx(0.5, abs=1e-9)
 
 

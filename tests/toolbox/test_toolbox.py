@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 import pytest
 
+from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, FormatError, SSADError, StoreError
-from ssad.core.frames import Boxes3D
 from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -263,13 +263,14 @@ def test_transformed_labels_are_the_moved_boxes_with_their_points(clean: Path, t
         before, after = old.scene(name), new.scene(name)
         for sample in before.samples:
             one, two = before.annotations(sample.token), after.annotations(sample.token)
-            boxes = Boxes3D(one.instance, one.centre, one.size, one.rotation, one.velocity, np.ones(len(one.instance)))
+            visible = np.ones(len(one))
+            boxes = TrackedBoxes(one.centre, one.size_lwh, one.rotation, one.velocity, one.instance, visible)
             drawn = transformed_boxes(
                 chosen.shards((name,))[0].spec(), boxes, scene=sample.scene_token, sample=sample.token
             )
-            np.testing.assert_allclose(two.size, drawn.size, rtol=1e-12)
+            np.testing.assert_allclose(two.size_lwh, drawn.size_lwh, rtol=1e-12)
             np.testing.assert_allclose(two.centre, drawn.centre, rtol=1e-12)
-            ratio = two.size / one.size
+            ratio = two.size_lwh / one.size_lwh
             np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1], ratio.shape), rtol=1e-9)
             ratios += list(ratio[:, 0])
             assert one.token == two.token
@@ -280,7 +281,7 @@ def test_transformed_labels_are_the_moved_boxes_with_their_points(clean: Path, t
             pose = frame.ego_to_world @ frame.sensor_to_ego
             counted = [
                 _count(points @ pose[:3, :3].T + pose[:3, 3], *row)
-                for row in zip(two.centre, two.size, two.rotation, strict=True)
+                for row in zip(two.centre, two.size_wlh, two.rotation, strict=True)
             ]
             assert two.lidar_points.tolist() == counted
     assert min(np.abs(np.array(ratios) - 1)) > 0.01

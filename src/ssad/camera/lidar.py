@@ -16,8 +16,8 @@ import warp as wp
 
 from ssad.camera.kernels import lidar as kernels
 from ssad.camera.scene import Scene, Thing
+from ssad.core.boxes import WorldBoxes
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Boxes3D
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32
@@ -288,14 +288,14 @@ def _columns(directions: F32, spheres: tuple[F64, F64], lidar: Lidar, moves: tup
     return order[thing].astype(np.int32), starts.astype(np.int32)
 
 
-def points_in_boxes(points_world: F64, boxes: Boxes3D) -> I32:
+def points_in_boxes(points_world: F64, boxes: WorldBoxes) -> I32:
     """Points [P, 3 or more] (world, m) in each of N boxes [N], those on its surface among them."""
     points = np.asarray(points_world, np.float64)[:, :3]
     counts = np.zeros(len(boxes), np.int32)
     points = points[np.argsort(points[:, 0], kind="stable")]
-    half = boxes.size[:, [1, 0, 2]] / 2
+    half = boxes.size_lwh / 2
     reach = np.linalg.norm(half, axis=1)
-    turn = quaternion_to_matrix(boxes.rotation) if len(boxes) else np.zeros((0, 3, 3))
+    turn = boxes.axes()
     low = np.searchsorted(points[:, 0], boxes.centre[:, 0] - reach, "left")
     high = np.searchsorted(points[:, 0], boxes.centre[:, 0] + reach, "right")
     for n in range(len(boxes)):

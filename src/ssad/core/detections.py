@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Solids:
-    """3D boxes in the camera frame: centre [N, 3] (of gravity), size [N, 3] (length, height, width), yaw [N],
+    """3D boxes in the camera frame: centre [N, 3] (of gravity), size_lhw [N, 3] (length, height, width), yaw [N],
     velocity [N, 2] (x, z; NaN where unknown), attribute [N] index into
     `MMDET3D_ATTRIBUTES`."""
 
     centre: Tensor
-    size: Tensor
+    size_lhw: Tensor
     yaw: Tensor
     velocity: Tensor
     attribute: Tensor

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ssad.core.boxes import TrackedBoxes
 from ssad.core.types import F32, F64
 
 # camera looking forward, upright, 1.5 m above the road: x right = -y, y down = -z, z forward = x
@@ -38,31 +39,6 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class Boxes3D:
-    """3D boxes in the world frame, columns of N rows.
-
-    instance: who it is, over time and sensors; centre [N, 3]; size [N, 3] (width, length, height); rotation [N, 4]
-    quaternions (w, x, y, z); velocity [N, 3] m/s, NaN where unknown; visible [N] least fraction that is seen over all
-    cameras, 1 where unknown.
-    """
-
-    instance: tuple[str, ...]
-    centre: F64
-    size: F64
-    rotation: F64
-    velocity: F64
-    visible: F64
-
-    def __len__(self) -> int:
-        return len(self.instance)
-
-    @staticmethod
-    def empty() -> Boxes3D:
-        """No boxes."""
-        return Boxes3D((), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), np.zeros(0))
-
-
-@dataclass(frozen=True, slots=True)
 class Frame:
     """One exposure of one camera, without its pixels.
 
@@ -79,7 +55,7 @@ class Frame:
     time: float = 0.0
     ego_to_world: F64 = field(default_factory=lambda: np.eye(4))
     ego_velocity: F64 = field(default_factory=lambda: np.zeros(3))
-    boxes: Boxes3D = field(default_factory=Boxes3D.empty)
+    boxes: TrackedBoxes = field(default_factory=TrackedBoxes.empty)
     depth: F32 | None = None
     points: F32 | None = None
     sun: float | None = None
@@ -95,7 +71,7 @@ class SweepFrame:
     to_ego: F64 = field(default_factory=lambda: np.eye(4))
     ego_to_world: F64 = field(default_factory=lambda: np.eye(4))
     ego_velocity: F64 = field(default_factory=lambda: np.zeros(3))
-    boxes: Boxes3D = field(default_factory=Boxes3D.empty)
+    boxes: TrackedBoxes = field(default_factory=TrackedBoxes.empty)
 
 
 @dataclass(frozen=True, slots=True)

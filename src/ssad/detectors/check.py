@@ -167,13 +167,19 @@ def promises(found: Detections, *, classes: int, three: bool, least: float = 0.0
 
 
 def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
-    shapes = {"centre": (count, 3), "size": (count, 3), "yaw": (count,), "velocity": (count, 2), "attribute": (count,)}
+    shapes = {
+        "centre": (count, 3),
+        "size_lhw": (count, 3),
+        "yaw": (count,),
+        "velocity": (count, 2),
+        "attribute": (count,),
+    }
     for name, shape in shapes.items():
         value = getattr(solid, name)
         yield tuple(value.shape) == shape, f"Solids.{name} is {['N', *shape[1:]]}"
         finite = not value.is_floating_point() or bool(value.isfinite().all())
         yield finite or name == "velocity", f"Solids.{name} is finite"
-    yield bool((solid.size > 0).all()), "sizes are above 0"
+    yield bool((solid.size_lhw > 0).all()), "sizes are above 0"
     inside = bool(((solid.attribute >= 0) & (solid.attribute < len(MMDET3D_ATTRIBUTES))).all())
     yield inside, "attributes are within ssad.core.nuscenes_names.MMDET3D_ATTRIBUTES"
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ssad.core.boxes import bottom_centre
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
 from ssad.detectors.checkpoints import fit_state, load_weights
@@ -74,9 +75,9 @@ def infer(
     centre = solid.centre
     if lens.shape == (4, 4):  # a shift in the last column moves all boxes alike
         centre = centre - torch.linalg.solve(lens[:3, :3], lens[:3, 3]).to(centre)
-    bottom = torch.stack([centre[:, 0], centre[:, 1] + 0.5 * solid.size[:, 1], centre[:, 2]], -1)
+    bottom = bottom_centre(centre, solid.size_lhw)
     boxes = {
-        "bboxes_3d": torch.cat([bottom, solid.size, solid.yaw[:, None], solid.velocity], 1),
+        "bboxes_3d": torch.cat([bottom, solid.size_lhw, solid.yaw[:, None], solid.velocity], 1),
         "scores_3d": found.score, "labels_3d": found.label, "attr_labels": solid.attribute,
     }  # fmt: skip
     return {name: dense.maps[name] for name in _NAMES if name in dense.maps}, boxes

@@ -7,17 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from ssad.core.boxes import camera_yaw, size_columns
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, NO_ATTRIBUTE
-from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, Bool
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SensorFrame
 from ssad.datasets.nuscenes.splits import scenes_of_split
-
-CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-
 
 NEAR = 0.1  # m in front of the camera at which boxes are cut
 
@@ -51,8 +48,9 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     wanted &= (middle[:, 0] < frame.width - 0.5) & (middle[:, 1] < frame.height - 0.5)
     box, seen = _hulls(frame, found, turn)
     rows = np.flatnonzero(wanted & seen)
-    ahead = turn[:3, :3] @ quaternion_to_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
-    speed = found.velocity[rows] @ turn[:3, :3].T
+    own = found.take(rows)
+    ahead = own.axes()[:, :, 0] @ turn[:3, :3].T
+    speed = own.velocity @ turn[:3, :3].T
     label = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
     attribute = [_attribute(found.attributes[r]) for r in rows]
 
@@ -60,7 +58,7 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
         return torch.from_numpy(np.array(values, np.float32))
 
     solid = Solids(
-        floats(centre[rows]), floats(found.size[rows][:, [1, 2, 0]]), floats(np.arctan2(-ahead[2], ahead[0])),
+        floats(centre[rows]), floats(own.size_lwh[:, size_columns("lwh", "lhw")]), floats(camera_yaw(ahead)),
         floats(speed[:, [0, 2]]), torch.tensor(attribute, dtype=torch.int64),
     )  # fmt: skip
     return Truth(torch.tensor(label, dtype=torch.int64), floats(box[rows]), solid, floats(frame.intrinsic))
@@ -72,9 +70,7 @@ def _attribute(names: Sequence[str]) -> int:
 
 def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
-    corners = CORNERS * found.size[:, None, [1, 0, 2]]
-    world = np.einsum("nij,nkj->nki", quaternion_to_matrix(found.rotation), corners) + found.centre[:, None]
-    local = world @ turn[:3, :3].T + turn[:3, 3]
+    local = found.corners() @ turn[:3, :3].T + turn[:3, 3]
     local[..., 2] = np.maximum(local[..., 2], NEAR)
     assert frame.intrinsic is not None
     flat = local @ frame.intrinsic.T

@@ -21,7 +21,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.results import with_ego
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.detectors.mono3d.multi_camera import WorldBoxes, merge_cameras
+from ssad.detectors.mono3d.multi_camera import DetectedBoxes, merge_cameras
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
@@ -41,7 +41,7 @@ class SampleBoxes:
     """What was found in one sample."""
 
     token: str
-    boxes: WorldBoxes
+    boxes: DetectedBoxes
 
 
 def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tensor:
@@ -54,7 +54,7 @@ def to_host(found: Sequence[Detections]) -> list[Detections]:
     """Detections of a batch on the CPU: a copy a column, as each copy waits for the device. ConfigError: no tensors."""
     flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
     solids = [one.solid for one in found if one.solid is not None]
-    names = ("centre", "size", "yaw", "velocity", "attribute")
+    names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
     moved = zip(*(_host([getattr(one, name) for one in solids]) for name in names), strict=True)
     rows = [None if one.solid is None else Solids(*next(moved)) for one in found]
     return [Detections(score, label, box, solid) for (score, label, box), solid in zip(flat, rows, strict=True)]
@@ -174,8 +174,8 @@ def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
     attributes = [_ATTRIBUTE[name] for p in parts for name in p.attribute]
     table = BoxTable(
         sample=np.repeat([place[one.token] for one in chosen], [len(p) for p in parts]).astype(np.int32),
-        label=LABEL[column("label").astype(int)].astype(np.int8), translation=column("translation"),
-        size=column("size"), rotation=column("rotation"), velocity=column("velocity"),
+        label=LABEL[column("label").astype(int)].astype(np.int8), centre=column("centre"),
+        size_lwh=column("size_lwh"), rotation=column("rotation"), velocity=column("velocity"),
         attribute=np.array(attributes, np.int8), score=column("score"), ego_distance=np.full(len(attributes), np.nan),
     )  # fmt: skip
     return with_ego(table, truth.ego)

@@ -100,7 +100,7 @@ def _draw(
     """Edges of boxes that lie before the camera."""
     if solid is None or not len(solid.yaw):
         return
-    points = corners(solid.centre.double(), solid.size.double(), solid.yaw.double()).cpu().numpy()
+    points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
     for box in points[(points[..., 2] > 0.5).all(1)]:
         flat = box @ intrinsic.T
         place = np.rint((flat[:, :2] / flat[:, 2:] + 0.5) * scale * 8).clip(-1e6, 1e6).astype(int)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ssad.core import safeio
+from ssad.core.boxes import size_columns
 from ssad.core.detections import Detections, Solids
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.seeding import digest, generator
@@ -26,14 +27,14 @@ from ssad.datasets.nuscenes.scene import SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.check import promises
-from ssad.detectors.mono3d.multi_camera import WorldBoxes
+from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
 FOLDER = "detections"
-_COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label")
+_COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label", "attribute")  # as nuScenes has them
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,13 +187,25 @@ def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, applied: Map
         boxes = [sample.boxes for sample in samples]
         columns["sample"] = np.array([sample.token for sample in samples])
         columns["count"] = np.array([len(b) for b in boxes], np.int32)
-        for column in _COLUMNS:
-            columns[column] = np.concatenate([getattr(b, column) for b in boxes])
-        columns["attribute"] = np.array([a for b in boxes for a in b.attribute], "U40")
+        for name, parts in zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True):
+            columns[name] = np.concatenate(parts)
         columns["applied"] = np.array(safeio.dump_json(dict(sorted(applied.items()))))
     file = io.BytesIO()
     np.savez_compressed(file, **columns)
     safeio.write_atomic(path, file.getvalue())
+
+
+def _to_columns(boxes: DetectedBoxes) -> tuple[Any, ...]:
+    """What a file holds of the boxes of a sample."""
+    names = np.array(boxes.attribute, "U40")
+    return boxes.centre, boxes.size_wlh, boxes.rotation, boxes.velocity, boxes.score, boxes.label, names
+
+
+def _from_columns(translation: Any, size_wlh: Any, *others: Any) -> DetectedBoxes:
+    """The boxes of a sample from a file's columns."""
+    rotation, velocity, score, label, names = others
+    size_lwh = size_wlh[:, size_columns("wlh", "lwh")]
+    return DetectedBoxes(translation, size_lwh, rotation, velocity, score, label, tuple(map(str, names)))
 
 
 class DetectorFailed(SSADError):
@@ -211,16 +224,12 @@ def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, int]]:
             if "failed" in file:
                 raise DetectorFailed(str(file["failed"]))
             ends = np.cumsum(file["count"])
-            parts = {c: np.split(file[c], ends[:-1]) for c in (*_COLUMNS, "attribute")}
+            parts = [np.split(file[c], ends[:-1]) for c in _COLUMNS]
             tokens = [str(token) for token in file["sample"]]
             applied = safeio.parse_json(str(file["applied"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
-    names = parts.pop("attribute")
-    found = [
-        SampleBoxes(token, WorldBoxes(**{c: parts[c][k] for c in _COLUMNS}, attribute=tuple(map(str, names[k]))))
-        for k, token in enumerate(tokens)
-    ]
+    found = [SampleBoxes(token, _from_columns(*(part[k] for part in parts))) for k, token in enumerate(tokens)]
     return found, {str(k): int(v) for k, v in applied.items()}
 
 
@@ -298,8 +307,8 @@ def distinct_scenes(truth: GroundTruth) -> Any:
     for scene in range(len(truth.scenes)):
         samples = np.flatnonzero(truth.scene == scene)
         rows = np.flatnonzero(np.isin(boxes.sample, samples))
-        values = [boxes.sample[rows] - (samples[0] if len(samples) else 0), boxes.label[rows], boxes.translation[rows]]
-        values += [boxes.size[rows], boxes.rotation[rows]]
+        values = [boxes.sample[rows] - (samples[0] if len(samples) else 0), boxes.label[rows], boxes.centre[rows]]
+        values += [boxes.size_lwh[rows], boxes.rotation[rows]]
         text = digest(len(samples), *[np.ascontiguousarray(v).tobytes().hex() for v in values])
         found.append(names.setdefault(text if len(rows) else f"empty {scene}", len(names)))
     return np.array(found)

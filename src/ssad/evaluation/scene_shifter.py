@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import FormatError
-from ssad.core.frames import Applied, Boxes3D, Camera, Frame, SceneContext, SweepFrame
+from ssad.core.frames import Applied, Camera, Frame, SceneContext, SweepFrame
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.safeio import read_bytes
@@ -31,16 +32,15 @@ from ssad.scenarios.static.shifts import (
 from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_depth, sun_direction, sun_in_picture
 
 
-def boxes_of(found: Annotations) -> tuple[Boxes3D, npt.NDArray[np.intp]]:
+def boxes_of(found: Annotations) -> tuple[TrackedBoxes, npt.NDArray[np.intp]]:
     """Annotations as boxes, and their rows [N]; an unknown visibility counts as visible.
 
     Boxes without a volume are left out: no shift of an object can be made of them.
     """
-    rows = np.flatnonzero((found.size > 0).all(axis=1))
-    visible = np.array([VISIBILITY.get(found.visibility[n], 1.0) for n in rows])
-    instance = tuple(found.instance[n] for n in rows)
-    boxes = Boxes3D(instance, found.centre[rows], found.size[rows], found.rotation[rows], found.velocity[rows], visible)
-    return boxes, rows
+    rows = np.flatnonzero((found.size_lwh > 0).all(axis=1))
+    own = found.take(rows)
+    visible = np.array([VISIBILITY.get(token, 1.0) for token in own.visibility])
+    return TrackedBoxes(own.centre, own.size_lwh, own.rotation, own.velocity, own.instance, visible), rows
 
 
 class SceneShifter:
@@ -176,7 +176,9 @@ class SceneShifter:
             raise FormatError(f"{path}: not a depth map of 16 bits")
         return np.where(values == 65535, np.inf, values / 64).astype(np.float32)
 
-    def _frame(self, frame: SensorFrame, boxes: Boxes3D, points: F32 | None = None, depth: F32 | None = None) -> Frame:
+    def _frame(
+        self, frame: SensorFrame, boxes: TrackedBoxes, points: F32 | None = None, depth: F32 | None = None
+    ) -> Frame:
         if frame.intrinsic is None or not _has_lens(frame):
             raise FormatError(f"{frame.filename}: the camera {frame.channel} has no focal length")
         camera = Camera(frame.width, frame.height, frame.intrinsic, frame.sensor_to_ego, frame.channel)
@@ -207,7 +209,7 @@ class SceneShifter:
         None when it stands in none that can be read."""
         if sample_token not in self._suns:
             toward = sun_direction(self.base, self.context)
-            views = [(f, self._frame(f, Boxes3D.empty())) for f in self._cameras(sample_token) if _has_lens(f)]
+            views = [(f, self._frame(f, TrackedBoxes.empty())) for f in self._cameras(sample_token) if _has_lens(f)]
             views = [(f, view) for f, view in views if sun_in_picture(view, toward)]
             self._suns[sample_token] = "", None
             for f, bare in sorted(views, key=lambda pair: sun_angle(pair[1], toward)):
@@ -227,7 +229,7 @@ class SceneShifter:
     def _view(self, frame: SensorFrame) -> Frame:
         """The same by its own picture alone."""
         objects = self.base.family == "object" or self._uses_depth
-        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
+        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else TrackedBoxes.empty()
         if not self._uses_depth:
             return self._frame(frame, boxes)
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
@@ -272,7 +274,7 @@ class SceneShifter:
     def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
         """The shifted points [P, 5] of a LiDAR frame. FormatError."""
         objects = self.base.family == "object"
-        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else Boxes3D.empty()
+        boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else TrackedBoxes.empty()
         sweep = SweepFrame(
             frame.scene_token,
             frame.sample_token if self.base.family == "object" else frame.token,
@@ -300,19 +302,19 @@ class SceneShifter:
             return found
         old, rows = boxes_of(found)
         boxes = transformed_boxes(self.spec(frame), old, scene=frame.scene_token, sample=sample_token)
-        centre, size, rotation = found.centre.copy(), found.size.copy(), found.rotation.copy()
-        centre[rows], size[rows], rotation[rows] = boxes.centre, boxes.size, boxes.rotation
+        centre, size, rotation = found.centre.copy(), found.size_lwh.copy(), found.rotation.copy()
+        centre[rows], size[rows], rotation[rows] = boxes.centre, boxes.size_lwh, boxes.rotation
         points, sweep = found.lidar_points.copy(), self.key_sweep(sample_token)
         if sweep is not None and lidar is not None:
             points[rows] = _count(self.points(sweep)[0] if lidar else self.cloud(sweep), sweep, boxes)
-        return replace(found, centre=centre, size=size, rotation=rotation, lidar_points=points)
+        return replace(found, centre=centre, size_lwh=size, rotation=rotation, lidar_points=points)
 
 
 def _has_lens(frame: SensorFrame) -> bool:
     return frame.intrinsic is not None and min(frame.intrinsic[0, 0], frame.intrinsic[1, 1]) > 0
 
 
-def _count(cloud: F32, sweep: SensorFrame, boxes: Boxes3D) -> npt.NDArray[np.int32]:
+def _count(cloud: F32, sweep: SensorFrame, boxes: TrackedBoxes) -> npt.NDArray[np.int32]:
     """Points in each box."""
     from ssad.scenarios.static.shifts.lidar import inside
     from ssad.scenarios.static.shifts.objects import affine

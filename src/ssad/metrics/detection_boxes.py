@@ -6,15 +6,15 @@ Source: nuscenes-devkit 1.2.0, eval/common/loaders.py (`filter_eval_boxes`) and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.boxes import WorldBoxes
 from ssad.core.errors import FormatError
 from ssad.core.nuscenes_names import RANGES
-from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, I32, Bool
 
 I8 = npt.NDArray[np.int8]
@@ -25,30 +25,18 @@ RACKED: Final = ("bicycle", "motorcycle")
 
 
 @dataclass(frozen=True)
-class BoxTable:
+class BoxTable(WorldBoxes):
     """Boxes of a set, one row a box; the rows of a sample stand together, in the order of the devkit's lists.
 
-    sample [N]: index of the sample; label [N]: index of the class; translation [N, 3] global, m; size [N, 3] width,
-    length, height, m; rotation [N, 4] quaternion w, x, y, z; velocity [N, 2] global, m/s, NaN where not known;
-    attribute [N]: index, -1 for none; score [N], -1 for ground truth; ego_distance [N]: in the plane, m.
+    velocity [N, 2]; sample [N]: index of the sample; label [N]: index of the class; attribute [N]: index, -1 for none;
+    score [N], -1 for ground truth; ego_distance [N]: in the plane, m.
     """
 
     sample: I32
     label: I8
-    translation: F64
-    size: F64
-    rotation: F64
-    velocity: F64
     attribute: I8
     score: F64
     ego_distance: F64
-
-    def __len__(self) -> int:
-        return len(self.sample)
-
-    def take(self, index: npt.NDArray[Any]) -> BoxTable:
-        """The rows that `index` (positions or a mask) names."""
-        return BoxTable(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @staticmethod
     def empty(n: int = 0) -> BoxTable:
@@ -56,8 +44,8 @@ class BoxTable:
         return BoxTable(
             sample=np.zeros(n, np.int32),
             label=np.zeros(n, np.int8),
-            translation=np.zeros((n, 3)),
-            size=np.zeros((n, 3)),
+            centre=np.zeros((n, 3)),
+            size_lwh=np.zeros((n, 3)),
             rotation=np.zeros((n, 4)),
             velocity=np.full((n, 2), np.nan),
             attribute=np.full(n, -1, np.int8),
@@ -67,13 +55,10 @@ class BoxTable:
 
 
 @dataclass(frozen=True)
-class BikeRacks:
-    """Bicycle racks: sample [R], translation [R, 3] global, size [R, 3] (w, l, h), rotation [R, 4] (w, x, y, z)."""
+class BikeRacks(WorldBoxes):
+    """Bicycle racks; sample [N]: index of the sample."""
 
     sample: I32
-    translation: F64
-    size: F64
-    rotation: F64
 
 
 @dataclass(frozen=True)
@@ -143,7 +128,7 @@ def keep_boxes(
     if racks is not None and len(racks.sample):
         racked = np.array([name in RACKED for name in config.classes])
         rows = np.flatnonzero(keep & racked[boxes.label])
-        keep[rows[_in_racks(boxes.sample[rows], boxes.translation[rows], racks)]] = False
+        keep[rows[_in_racks(boxes.sample[rows], boxes.centre[rows], racks)]] = False
     return keep
 
 
@@ -166,12 +151,12 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
     point = np.repeat(np.arange(len(sample)), count)
     rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - low, count)]
 
-    w, length, h = 0.5 * racks.size[rack].T
-    turn = quaternion_to_matrix(racks.rotation[rack])
+    near = racks.take(rack)
+    half, turn = 0.5 * near.size_lwh, near.axes()
     corner = np.empty((4, len(rack), 3))
     for i, (a, b, c) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
-        local = np.stack([a * length, b * w, c * h], axis=-1)
-        corner[i] = np.einsum("nij,nj->ni", turn, local) + racks.translation[rack]
+        local = [a, b, c] * half
+        corner[i] = np.einsum("nij,nj->ni", turn, local) + near.centre
     offset = centre[point] - corner[0]
     inside = np.ones(len(rack), np.bool_)
     for edge in corner[1:] - corner[0]:

@@ -58,9 +58,9 @@ def match_class(
 
     pred, box, distance = _near_pairs(
         sample,
-        predictions.translation[rank, :2],
+        predictions.centre[rank, :2],
         truth.sample[real],
-        truth.translation[real, :2],
+        truth.centre[real, :2],
         samples=samples,
         limit=max(config.dist_ths),
     )
@@ -152,21 +152,21 @@ def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequen
 def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, names: Sequence[str] | None) -> None:
     """The devkit refuses a matched box one of whose sides is not positive."""
     for what, boxes, rows in (("prediction", predictions, rank), ("ground truth", truth, real)):
-        flat: Bool = np.asarray(~(boxes.size[rows] > 0.0).all(axis=-1))
+        flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=-1))
         if flat.any():
             row = int(rows[flat.argmax()])
             sample = int(boxes.sample[row])
             raise FormatError(
                 f"sample {sample if names is None else names[sample]}: a {what} box has the size "
-                f"{boxes.size[row].tolist()}; all sides must be positive"
+                f"{boxes.size_wlh[row].tolist()}; all sides must be positive"
             )
 
 
 def _errors(truth: BoxTable, found: BoxTable, period: float) -> F64:
     """Errors [5, T] of matched pairs: translation m, 1 - IoU of the sizes, yaw rad, velocity m/s, attribute 0 or 1."""
-    dx, dy = (found.translation[:, :2] - truth.translation[:, :2]).T
-    shared = np.prod(np.minimum(truth.size, found.size), axis=-1)
-    union = np.prod(truth.size, axis=-1) + np.prod(found.size, axis=-1) - shared
+    dx, dy = (found.centre[:, :2] - truth.centre[:, :2]).T
+    shared = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=-1)
+    union = np.prod(truth.size_lwh, axis=-1) + np.prod(found.size_lwh, axis=-1) - shared
     off = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
     turn = np.abs((off + period / 2) % period - period / 2)
     vx, vy = (found.velocity - truth.velocity).T

@@ -24,8 +24,9 @@ from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene
 from ssad.core import safeio
+from ssad.core.boxes import WorldBoxes
 from ssad.core.errors import ConfigError, StoreError
-from ssad.core.frames import Boxes3D, Camera
+from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.nuscenes_names import visibility_token
@@ -299,13 +300,12 @@ def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[in
     if not near:
         return []
     centre = np.array([s.pose[:3, 3] + [0, 0, s.body.size[2] / 2] for s in near])
-    size = np.array([[s.body.size[1], s.body.size[0], s.body.size[2]] for s in near])
+    size_lwh = np.array([s.body.size for s in near])
     rotation = matrix_to_quaternion([s.pose[:3, :3] for s in near])
-    boxes = Boxes3D(tuple(str(s.body.tag) for s in near), centre, size, rotation, np.zeros_like(centre),
-                    np.ones(len(near)))  # fmt: skip
+    boxes = WorldBoxes(centre, size_lwh, rotation, np.zeros_like(centre))
     pose = ego @ HDL32E.to_ego
     world = np.asarray(points[:, :3], np.float64) @ pose[:3, :3].T + pose[:3, 3]
-    counts = points_in_boxes(world, boxes)
+    counts, size = points_in_boxes(world, boxes), boxes.size_wlh
     found = []
     for n, who in enumerate(near):
         share = shares.get(who.body.tag, 0.0)

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Boxes3D, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.frames import Camera, Frame, SceneContext, camera_to_world
 from ssad.core.images import captioned, read_image, save_picture
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -23,7 +24,7 @@ from ssad.scenarios.static.shifts import SEVERITIES, SHIFTS, Calibration, ShiftS
 from ssad.scenarios.static.shifts.sun import choose_sun
 
 
-def box_at(camera: Camera, rectangle: Sequence[float]) -> Boxes3D:
+def box_at(camera: Camera, rectangle: Sequence[float]) -> TrackedBoxes:
     """A 3D box for a rectangle (x0, y0, x1, y1) in the picture of a level camera: it stands on the road where the
     rectangle ends, faces the camera, and is as deep as 1.6 of its width. ConfigError when it ends above the horizon."""
     x0, y0, x1, y1 = map(float, rectangle)
@@ -37,11 +38,11 @@ def box_at(camera: Camera, rectangle: Sequence[float]) -> Boxes3D:
     deep = 1.6 * wide
     across = ((x0 + x1) / 2 - k[0, 2]) / k[0, 0] * near
     place = camera.to_ego @ np.array([across, height - tall / 2, near + deep / 2, 1.0])
-    size = np.array([[wide, deep, tall]])
+    size_lwh = np.array([[deep, wide, tall]])
     rotation = np.array([[1.0, 0, 0, 0]])
     # drives away a little to the left, so that there is something to blur
     velocity = np.array([[2.0, 4.0, 0.0]])
-    return Boxes3D((f"box {x0:g},{y0:g}",), place[None, :3], size, rotation, velocity, np.ones(1))
+    return TrackedBoxes(place[None, :3], size_lwh, rotation, velocity, (f"box {x0:g},{y0:g}",), np.ones(1))
 
 
 def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
@@ -51,8 +52,10 @@ def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
     frame = Frame(camera, "picture", "picture", 3.0)
     if not found:
         return frame
-    columns = {n: np.concatenate([getattr(b, n) for b in found]) for n in ("centre", "size", "rotation", "velocity")}
-    boxes = Boxes3D(tuple(b.instance[0] for b in found), **columns, visible=np.ones(len(found)))
+    columns = {
+        n: np.concatenate([getattr(b, n) for b in found]) for n in ("centre", "size_lwh", "rotation", "velocity")
+    }
+    boxes = TrackedBoxes(**columns, instance=tuple(b.instance[0] for b in found), visible=np.ones(len(found)))
     return replace(frame, boxes=boxes)
 
 
@@ -87,7 +90,7 @@ def _in_view(frame: Frame) -> float:
     z = np.maximum(points[:, 2], 0.1)
     x, y = k[0, 0] * points[:, 0] / z + k[0, 2], k[1, 1] * points[:, 1] / z + k[1, 2]
     inside = (points[:, 2] > 4) & (x > 0) & (x < frame.camera.width) & (y > 0) & (y < frame.camera.height)
-    return float(np.minimum(k[1, 1] * frame.boxes.size[:, 2] / z, 300)[inside].sum())
+    return float(np.minimum(k[1, 1] * frame.boxes.size_lwh[:, 2] / z, 300)[inside].sum())
 
 
 def contact_sheet(

@@ -233,10 +233,11 @@ def _boxes(shard: Shard, shifter: SceneShifter, sample: str, done: dict[str, dic
         kept = {name: done[sweep.filename][name] for name in ("file", "kind", "token")}
         done[sweep.filename] = _failed(shard, kept, str(error))
         found = shifter.labels(sample, lidar=None)
+    sizes = found.size_wlh
     return {
         token: {
             "translation": found.centre[n].tolist(),
-            "size": found.size[n].tolist(),
+            "size": sizes[n].tolist(),
             "rotation": found.rotation[n].tolist(),
             "num_lidar_pts": int(found.lidar_points[n]),
         }

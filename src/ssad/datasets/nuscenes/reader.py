@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.core.rotations import pose_matrix
@@ -241,7 +242,7 @@ class NuScenes:
                 attributes=tuple(tuple(self._attribute(name) for name in row.attribute_tokens) for row in own),
                 visibility=tuple(row.visibility_token for row in own),
                 centre=frozen(centre[chosen]),
-                size=_columns([row.size for row in own], 3),
+                size_lwh=frozen(_columns([row.size for row in own], 3)[:, size_columns("wlh", "lwh")]),
                 rotation=self._rotations(own),
                 velocity=frozen(velocity[chosen]),
                 lidar_points=_counts([row.num_lidar_pts for row in own]),

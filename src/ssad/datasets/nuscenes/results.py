@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.boxes import size_columns
 from ssad.core.errors import FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES
 from ssad.core.types import F64, I32
@@ -107,7 +108,7 @@ def read_results(
 def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
     """The boxes with their distance in the plane from the ego; ego [S, 3]: its global position at each sample."""
     with np.errstate(over="ignore"):
-        dx, dy = (boxes.translation[:, :2] - ego[boxes.sample, :2]).T
+        dx, dy = (boxes.centre[:, :2] - ego[boxes.sample, :2]).T
         return replace(boxes, ego_distance=np.sqrt(dx * dx + dy * dy))
 
 
@@ -152,8 +153,8 @@ def _columns(
     result = BoxTable(
         sample=sample,
         label=np.concatenate(labels) if labels else np.zeros(0, np.int8),
-        translation=table[:, _TRANSLATION],
-        size=table[:, _SIZE],
+        centre=table[:, _TRANSLATION],
+        size_lwh=table[:, _SIZE][:, size_columns("wlh", "lwh")],
         rotation=table[:, _ROTATION],
         velocity=table[:, _VELOCITY],
         attribute=np.concatenate(attributes) if attributes else np.zeros(0, np.int8),

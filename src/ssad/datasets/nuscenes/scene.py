@@ -7,11 +7,12 @@ Frames of reference as in `ssad.datasets.nuscenes.schema`. Boxes and velocities 
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.boxes import WorldBoxes
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import slerp
 from ssad.core.types import F64, I32
@@ -44,12 +45,11 @@ class SensorFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Annotations:
-    """Boxes at one time, N rows, in table order.
+class Annotations(WorldBoxes):
+    """Boxes at one time in table order.
 
-    token of the annotation, instance token, category and attribute names, visibility token; centre [N, 3] m, world;
-    size [N, 3] m (width, length, height); rotation [N, 4] (w, x, y, z); velocity [N, 3] m/s, world, NaN where unknown;
-    lidar_points, radar_points [N] points in the box.
+    token of the annotation, instance token, category and attribute names, visibility token; velocity [N, 3];
+    lidar_points, radar_points [N] in the box.
     """
 
     token: tuple[str, ...]
@@ -57,15 +57,8 @@ class Annotations:
     category: tuple[str, ...]
     attributes: tuple[tuple[str, ...], ...]
     visibility: tuple[str, ...]
-    centre: F64
-    size: F64
-    rotation: F64
-    velocity: F64
     lidar_points: I32
     radar_points: I32
-
-    def __len__(self) -> int:
-        return len(self.token)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +116,7 @@ class SceneData:
         centre, rotation = now.centre.copy(), now.rotation.copy()
         centre[new] = then.centre[old] + share * (now.centre[new] - then.centre[old])
         rotation[new] = slerp(then.rotation[old], now.rotation[new], share)
-        return _replaced(now, centre, rotation)
+        return replace(now, centre=frozen(centre), rotation=frozen(rotation))
 
 
 def velocities(centre: F64, time: npt.NDArray[np.int64], before: I32, after: I32) -> F64:
@@ -141,19 +134,3 @@ def frozen(array: F64) -> F64:
     """The array, which can no longer be written."""
     array.setflags(write=False)
     return array
-
-
-def _replaced(now: Annotations, centre: F64, rotation: F64) -> Annotations:
-    return Annotations(
-        now.token,
-        now.instance,
-        now.category,
-        now.attributes,
-        now.visibility,
-        frozen(centre),
-        now.size,
-        frozen(rotation),
-        now.velocity,
-        now.lidar_points,
-        now.radar_points,
-    )

@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 
+from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, BICYCLE_RACK, CATEGORY_TO_CLASS, CLASSES, LIDAR, VISIBILITY
 from ssad.core.types import F64, I32
@@ -210,6 +211,7 @@ def _annotations(
     values = np.concatenate(numbers) if numbers else np.zeros((0, 10))
     columns = np.concatenate(whole) if whole else np.zeros((0, 6), np.int64)
     velocity = _velocity(path, tokens, (before, after), values[:, :3], columns[:, 5])
+    size = values[:, 3:6][:, size_columns("wlh", "lwh")]
     order = np.argsort(columns[:, 0], kind="stable")
     order = order[columns[order, 0] >= 0]
     real = order[columns[order, 1] < _RACK_LABEL]
@@ -217,15 +219,15 @@ def _annotations(
     boxes = BoxTable(
         sample=columns[real, 0].astype(np.int32),
         label=columns[real, 1].astype(np.int8),
-        translation=values[real, :3],
-        size=values[real, 3:6],
+        centre=values[real, :3],
+        size_lwh=size[real],
         rotation=values[real, 6:],
         velocity=velocity[real],
         attribute=columns[real, 2].astype(np.int8),
         score=np.full(len(real), -1.0),
         ego_distance=np.full(len(real), np.nan),
     )
-    racks = BikeRacks(columns[rack, 0].astype(np.int32), values[rack, :3], values[rack, 3:6], values[rack, 6:])
+    racks = BikeRacks(values[rack, :3], size[rack], values[rack, 6:], velocity[rack], columns[rack, 0].astype(np.int32))
     return boxes, columns[real, 4].astype(np.int32), columns[real, 3].astype(np.int8), racks
 
 

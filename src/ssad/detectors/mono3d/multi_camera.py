@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ssad.core.boxes import WorldBoxes, camera_axes, size_columns
 from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, RANGES, USUAL_ATTRIBUTE
@@ -21,24 +22,18 @@ OVERLAP, LEAST, MOST = 0.05, 0.01, 500
 
 
 @dataclass(frozen=True, slots=True)
-class WorldBoxes:
-    """Boxes of one moment in the world: translation [N, 3]; size [N, 3] width, length, height; rotation [N, 4]
-    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into MMDET3D_CLASSES; attribute: names, ""
-    for none."""
+class DetectedBoxes(WorldBoxes):
+    """What was found at one moment: velocity [N, 2]; score [N]; label [N] index into MMDET3D_CLASSES; attribute: names,
+    "" for none."""
 
-    translation: F64
-    size: F64
-    rotation: F64
-    velocity: F64
     score: F64
     label: I32
     attribute: tuple[str, ...]
 
-    def __len__(self) -> int:
-        return len(self.score)
 
-
-def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]) -> WorldBoxes:
+def merge_cameras(
+    found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]
+) -> DetectedBoxes:
     """Detections of the cameras of one moment as boxes in the world, by class and falling score.
 
     As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are taken
@@ -56,12 +51,12 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
             raise ConfigError("merge_cameras: detections without 3D boxes")
         solid = one.solid
         centre, size, yaw, velocity = (
-            v.detach().cpu().double().numpy() for v in (solid.centre, solid.size, solid.yaw, solid.velocity)
+            v.detach().cpu().double().numpy() for v in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
         )
         score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
         near = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
-        rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ _upright(yaw),
+        rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ camera_axes(yaw),
                 _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
         columns.append(tuple(r[near] for r in rows))
     world, size, axes, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
@@ -78,15 +73,16 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
         rows = rows[np.argsort(-score[rows], kind="stable")[:MOST]]
     moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
     names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
-    return WorldBoxes(
-        world[rows], size[rows][:, [2, 0, 1]], matrix_to_quaternion(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
+    rotation = matrix_to_quaternion(pose[:3, :3] @ camera_axes(yaw[rows]))
+    return DetectedBoxes(
+        world[rows], size[rows][:, size_columns("lhw", "lwh")], rotation, moved[:, :2],
         score[rows], label[rows].astype(np.int32), names,
     )  # fmt: skip
 
 
-def _empty() -> WorldBoxes:
+def _empty() -> DetectedBoxes:
     none = np.zeros((0, 3))
-    return WorldBoxes(none, none, np.zeros((0, 4)), none[:, :2], none[:, 0], np.zeros(0, np.int32), ())
+    return DetectedBoxes(none, none, np.zeros((0, 4)), none[:, :2], none[:, 0], np.zeros(0, np.int32), ())
 
 
 def _distance(centre: F64, to_ego: F64) -> F64:
@@ -97,15 +93,6 @@ def _distance(centre: F64, to_ego: F64) -> F64:
 def _flat(velocity: F64) -> F64:
     """Velocities [N, 3] of x and z [N, 2] in a camera's frame."""
     return np.stack([velocity[:, 0], np.zeros(len(velocity)), velocity[:, 1]], -1)
-
-
-def _upright(yaw: F64) -> F64:
-    """Axes [N, 3, 3] (forward, left, up) of boxes in the camera frame, as columns."""
-    cos, sin, none = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
-    return np.stack(
-        [np.stack([cos, none, -sin], -1), np.stack([sin, none, cos], -1), np.tile([0.0, -1.0, 0.0], (len(yaw), 1))],
-        -1,
-    )
 
 
 def _attribute(label: int, attribute: int) -> str:

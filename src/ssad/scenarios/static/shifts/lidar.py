@@ -94,7 +94,7 @@ def _objects(cloud: F32, frame: SweepFrame, spec: ShiftSpec, draws: np.random.Ge
     old_centre, new_centre = (old_centre - place) @ turn.T, (new_centre - place) @ turn.T
     free = np.ones(len(cloud), bool)
     result, moved, done, still = cloud.copy(), 0, 0, 0
-    reach = np.linalg.norm(boxes.size, axis=1) / 2 + 0.5
+    reach = np.linalg.norm(boxes.size_lwh, axis=1) / 2 + 0.5
     for n in range(len(boxes)):
         near = np.flatnonzero(free & (np.abs(cloud[:, :2] - old_centre[n, :2]).max(1) < reach[n]))
         mine = near[inside(cloud[near], old[n], old_centre[n])]

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Boxes3D, Frame, camera_to_world
+from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
+from ssad.core.frames import Applied, Frame, camera_to_world
 from ssad.core.nuscenes_names import VISIBILITY
 from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
@@ -32,7 +33,6 @@ LEAST_PIXELS = 6.0
 NEAREST = 0.3  # m before the camera
 LONGEST = 200.0  # px of a streak
 MARGIN = 8
-_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
 @lru_cache(maxsize=65536)
@@ -66,7 +66,7 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
     return tuple(tuple(float(v) for v in row) for row in matrix)
 
 
-def deformations(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, lidar: bool = False) -> F64:
+def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> F64:
     """[N, 3, 3]: what happens to each object, in its own axes. The paper draws anew for the LiDAR."""
     if spec.calibration == "paper":
         return np.broadcast_to(
@@ -76,43 +76,43 @@ def deformations(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, li
     return np.array(found).reshape(-1, 3, 3)
 
 
-def affine(boxes: Boxes3D) -> tuple[F64, F64]:
+def affine(boxes: TrackedBoxes) -> tuple[F64, F64]:
     """Unit cube -> box in the world: matrices [N, 3, 3] and centres [N, 3]; the axes are length, width, height."""
-    return quaternion_to_matrix(boxes.rotation) * boxes.size[:, None, [1, 0, 2]], boxes.centre
+    return boxes.axes() * boxes.size_lwh[:, None], boxes.centre
 
 
-def deformed(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, lidar: bool = False) -> tuple[F64, F64]:
+def deformed(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> tuple[F64, F64]:
     """The same after the shift: about the middle of the base; the paper's cameras, about the centre."""
     if not len(boxes):
         return np.zeros((0, 3, 3)), np.zeros((0, 3))
     d = deformations(spec, boxes, scene=scene, sample=sample, lidar=lidar)
-    rotation = quaternion_to_matrix(boxes.rotation)
-    matrix = rotation @ (d * boxes.size[:, None, [1, 0, 2]])
+    rotation = boxes.axes()
+    matrix = rotation @ (d * boxes.size_lwh[:, None])
     if spec.calibration == "paper" and not lidar:
         return matrix, boxes.centre
     foot = np.zeros((len(boxes), 3))
-    foot[:, 2] = -boxes.size[:, 2] / 2
+    foot[:, 2] = -boxes.size_lwh[:, 2] / 2
     moved = foot - np.einsum("nij,nj->ni", d, foot)
     return matrix, boxes.centre + np.einsum("nij,nj->ni", rotation, moved)
 
 
-def transformed_boxes(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str) -> Boxes3D:
+def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str) -> TrackedBoxes:
     """The boxes after an object shift (labels "transformed"): exact for scale and rotation; for shear the least box
     that keeps the direction of the length and holds the sheared corners. Other shifts leave boxes as they are."""
     if spec.family != "object" or spec.name == "motion_blur" or spec.severity == 0 or not len(boxes):
         return boxes
     matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
     length = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
-    rotation = quaternion_to_matrix(boxes.rotation)
+    rotation = boxes.axes()
     turn = np.arctan2(
         np.einsum("ni,ni->n", length, rotation[:, :, 1]), np.einsum("ni,ni->n", length, rotation[:, :, 0])
     )
     quaternion = quaternion_product(boxes.rotation, yaw_to_quaternion(turn))
     axes = quaternion_to_matrix(quaternion)
-    corners = np.einsum("nji,nkj->nki", axes, np.einsum("nij,kj->nki", matrix, _CUBE))
+    corners = np.einsum("nji,nkj->nki", axes, np.einsum("nij,kj->nki", matrix, UNIT_CORNERS))
     low, high = corners.min(1), corners.max(1)
     middle = np.einsum("nij,nj->ni", axes, (low + high) / 2)
-    return replace(boxes, centre=centre + middle, size=(high - low)[:, [1, 0, 2]], rotation=quaternion)
+    return replace(boxes, centre=centre + middle, size_lwh=high - low, rotation=quaternion)
 
 
 def _outline(points: F64) -> F64:
@@ -164,8 +164,8 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
         new, new_centre = deformed(spec, boxes, scene=frame.scene, sample=frame.sample)
         old, new = turn @ old, turn @ new
         old_centre, new_centre = (old_centre - place) @ turn.T, (new_centre - place) @ turn.T
-        before = np.einsum("nij,kj->nki", old, _CUBE) + old_centre[:, None]
-        after = np.einsum("nij,kj->nki", new, _CUBE) + new_centre[:, None]
+        before = np.einsum("nij,kj->nki", old, UNIT_CORNERS) + old_centre[:, None]
+        after = np.einsum("nij,kj->nki", new, UNIT_CORNERS) + new_centre[:, None]
         pixels, moved = _pixels(before, k), _pixels(after, k)
         ahead = before[..., 2].max(1) > NEAREST
         seen = ahead & (pixels.max(1) > 0).all(1) & (pixels.min(1) < [width, height]).all(1)
@@ -210,7 +210,7 @@ def _plan_frame(plan: _Plan, index: int, frame: Frame, spec: ShiftSpec) -> Appli
     return Applied(done > 0, {"objects": done}, dict(skipped))
 
 
-def _streaks(frame: Frame, spec: ShiftSpec, boxes: Boxes3D, centre: F64, turn: F64) -> tuple[F64, list[str]]:
+def _streaks(frame: Frame, spec: ShiftSpec, boxes: TrackedBoxes, centre: F64, turn: F64) -> tuple[F64, list[str]]:
     """Displacement [N, 2] of each object's centre in the image over the exposure, and why there is none."""
     count = len(boxes)
     streaks, why = np.zeros((count, 2)), [""] * count

@@ -1,0 +1,106 @@
+"""3D boxes in the world, and the conventions of others by name.
+
+================  ===================================  ==============================  ===========  ==========
+who               frame                                origin                          size         turn
+================  ===================================  ==============================  ===========  ==========
+`WorldBoxes`      world: x east, y north, z up         middle                          l, w, h      quaternion
+nuScenes          world                                middle                          w, l, h      quaternion
+`Solids`          camera: x right, y down, z forward   middle                          l, h, w      yaw
+mmdetection3d     camera                               middle of the bottom            l, h, w      yaw
+KITTI             camera                               middle of the bottom            h, w, l      rotation_y
+================  ===================================  ==============================  ===========  ==========
+
+Length lies along where the box looks, width to its left, height up. Yaw in the camera's frame turns about its y axis:
+0 looks along x, positive from z towards x; KITTI's rotation_y is the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.rotations import quaternion_to_matrix
+from ssad.core.types import F64
+
+UNIT_CORNERS: F64 = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+
+@dataclass(frozen=True, slots=True)
+class WorldBoxes:
+    """N boxes in the world, columns.
+
+    centre [N, 3] m: the middle; size_lwh [N, 3] m: along the box's x (forward), y (left) and z (up); rotation [N, 4]
+    quaternions (w, x, y, z) of these axes; velocity [N, 2 or 3] m/s, NaN where unknown.
+    """
+
+    centre: F64
+    size_lwh: F64
+    rotation: F64
+    velocity: F64
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+    @property
+    def size_wlh(self) -> F64:
+        """Sizes [N, 3] in the order of nuScenes."""
+        return self.size_lwh[:, size_columns("lwh", "wlh")]
+
+    def axes(self) -> F64:
+        """Axes [N, 3, 3] of the boxes as columns: forward, left, up."""
+        return quaternion_to_matrix(self.rotation)
+
+    def corners(self) -> F64:
+        """Corners [N, 8, 3] in the order of `UNIT_CORNERS`."""
+        local: F64 = UNIT_CORNERS * self.size_lwh[:, None]
+        return np.asarray(np.einsum("nij,nkj->nki", self.axes(), local) + self.centre[:, None])
+
+    def take(self, index: npt.NDArray[Any]) -> Self:
+        """The rows that `index` (positions or a mask) names."""
+        rows = np.arange(len(self))[index]
+        columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        for name, column in columns.items():
+            columns[name] = tuple(column[i] for i in rows) if isinstance(column, tuple) else column[rows]
+        return type(self)(**columns)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedBoxes(WorldBoxes):
+    """Boxes of known objects. instance: who each is, over time and sensors; visible [N]: least fraction that is seen
+    over all cameras, 1 where unknown."""
+
+    instance: tuple[str, ...]
+    visible: F64
+
+    @staticmethod
+    def empty() -> TrackedBoxes:
+        """No boxes."""
+        return TrackedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), (), np.zeros(0))
+
+
+def size_columns(given: str, wanted: str) -> list[int]:
+    """Columns that bring sizes of one order into another: from "wlh" to "lwh" they are 1, 0, 2."""
+    return [given.index(side) for side in wanted]
+
+
+def bottom_centre(centre: Any, size_lhw: Any) -> Any:
+    """Middle of the bottom [N, 3] of boxes in a camera's frame (arrays or tensors): where mmdetection3d and KITTI place
+    them."""
+    bottom = centre + 0.0
+    bottom[..., 1] += 0.5 * size_lhw[..., 1]
+    return bottom
+
+
+def camera_axes(yaw: F64) -> F64:
+    """Axes [N, 3, 3] (forward, left, up, as columns) in the camera's frame of boxes that stand upright in it."""
+    cos, sin, none = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    up = np.tile([0.0, -1.0, 0.0], (len(yaw), 1))
+    return np.stack([np.stack([cos, none, -sin], -1), np.stack([sin, none, cos], -1), up], -1)
+
+
+def camera_yaw(forward: F64) -> F64:
+    """Yaw [N] in the camera's frame of boxes that look along `forward` [N, 3]."""
+    return np.asarray(np.arctan2(-forward[:, 2], forward[:, 0]))
