@@ -135,8 +135,8 @@ def detectors() -> list[str]:
         "",
         "Measured by `benchmarks/detector_speed.py`: images/s (medians), and in brackets the ratio to torchvision's",
         "FCOS (ResNet-50), which ran alternately on images of the same size. Where ultralytics is installed, its",
-        "models of similar size were measured too. Attack: losses and their gradient with respect to the image, float32.",
-        "Training steps use bfloat16 on a GPU.",
+        "models of similar size were measured too. Attack: losses and their gradient with respect to the image,",
+        "float32. Training steps use bfloat16 on a GPU.",
         "",
     ]
     for path in sorted((ROOT / "benchmarks" / "results").glob("detectors-*.json")):
