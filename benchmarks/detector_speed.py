@@ -19,8 +19,9 @@ from typing import Any
 
 import torch
 
-from ssad.core.detections import CLASSES_3D, Solids, Truth
+from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.detectors import make_detector
 from ssad.detectors.adapters.torchvision_models import torchvision_detector
 
@@ -128,17 +129,17 @@ def main() -> None:
     rows = []
     for case in args.only:
         h, w = CASES[case]
-        options = {} if "fcos3d" in case or "pgd" in case else {"classes": CLASSES_3D}
+        options = {} if "fcos3d" in case or "pgd" in case else {"classes": MMDET3D_CLASSES}
         ours = make_detector(case, weights="random", device=args.device, **options)
         beside = torchvision_detector(
-            "fcos_resnet50_fpn", classes=CLASSES_3D, min_size=min(h, w), max_size=max(h, w)
+            "fcos_resnet50_fpn", classes=MMDET3D_CLASSES, min_size=min(h, w), max_size=max(h, w)
         ).to(args.device)
         pair = {case: ours, BESIDE: beside}
         if case.startswith("yolov5"):
             try:
                 from ssad.detectors.adapters.ultralytics import ultralytics_detector
 
-                pair[f"ultralytics:{case}u"] = ultralytics_detector(f"{case}u", classes=CLASSES_3D).to(args.device)
+                pair[f"ultralytics:{case}u"] = ultralytics_detector(f"{case}u", classes=MMDET3D_CLASSES).to(args.device)
             except ConfigError:
                 pass
         speed = compare(pair, (h, w), batch, args.device, repeats)

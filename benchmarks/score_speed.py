@@ -29,9 +29,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.devkit_sets import PIXEL, SIZES, VERSION  # noqa: E402
 
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES  # noqa: E402
 from ssad.core.safeio import write_atomic  # noqa: E402
 from ssad.core.seeding import digest, generator  # noqa: E402
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES  # noqa: E402
 
 # about the shares of the classes in nuScenes
 SHARE = np.array([0.43, 0.08, 0.015, 0.023, 0.013, 0.20, 0.011, 0.01, 0.09, 0.13])

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.report.detection import title_of
+from ssad.report.kinds.detection import title_of
 from ssad.report.paper import SHIFTS as PUBLISHED
 
 ROOT = Path(__file__).parents[1]

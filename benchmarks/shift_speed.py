@@ -26,8 +26,9 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, rotation_matrix
+from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext
 from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_images
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
 
@@ -65,7 +66,7 @@ def street() -> tuple[np.ndarray, Frame]:
     to_camera = np.linalg.inv(FORWARD)
     cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     for n in np.argsort(-centre[:, 0], kind="stable"):
-        corners = (rotation_matrix(rotation[n]) * size[n][[1, 0, 2]]) @ cube.T
+        corners = (quaternion_to_matrix(rotation[n]) * size[n][[1, 0, 2]]) @ cube.T
         points = to_camera[:3, :3] @ (corners + centre[n][:, None]) + to_camera[:3, 3:]
         pixels = (points[:2] / points[2] * 1266.4 + [[816.3], [491.5]]).T
         hull = cv2.convexHull(pixels.astype(np.float32)).astype(np.int32)

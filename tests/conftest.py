@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+# One thread a process: as many as there are cores in each of several test workers only wait for each other. The
+# libraries read this when they are first imported, and child processes inherit it.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    os.environ.setdefault(_name, "1")
+
 ROOT = Path(__file__).resolve().parent.parent
+
+# A folder that a fixture shares between test workers: its name, and what fills it
+Shared = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--run-slow", action="store_true", help="run the tests marked slow as well")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """An $SSAD_HOME for this run: what the developer has imported must not decide a test. Workers inherit it."""
+    if not hasattr(config, "workerinput"):
+        home = tempfile.mkdtemp(prefix="ssad-tests-")
+        os.environ["SSAD_HOME"] = home
+        config.add_cleanup(lambda: shutil.rmtree(home, ignore_errors=True))
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -48,3 +68,65 @@ def ssad_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     monkeypatch.setenv("SSAD_HOME", str(folder))
     return folder
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """`shared(name, make)`: the folder `name`, filled by `make(folder)` once a run, whatever the number of workers.
+
+    What is in it must be left as it is: other tests read it too.
+    """
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent
+
+    def get(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = base / name, base / f"{name}.done"
+        with (base / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                make(folder)
+                done.touch()
+        return folder
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def recorded(shared: Shared) -> Path:
+    """What `ssad record` writes: a second in Twinford (train) and one in Oldmarket (val), by a process each."""
+    from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+
+    def make(out: Path) -> None:
+        towns = ("Twinford", "Oldmarket")
+        record_nuscenes(Recording(out, towns, towns[1:], scenes=1, seconds=1.0, width=160, sweeps=1), workers=2)
+
+    return shared("recorded", make)
+
+
+@pytest.fixture(scope="session")
+def tiny_set(shared: Shared) -> Path:
+    """A data set in the nuScenes schema: two scenes of two samples, pictures of 320 x 180, one sweep between them."""
+    from ssad.datasets.nuscenes.tiny import make_tiny
+
+    return shared("tiny", lambda out: make_tiny(out, size=(320, 180), scenes=2, samples=2, sweeps=1))
+
+
+@pytest.fixture(scope="session")
+def carla_home(shared: Shared, data_dir: Path) -> Path:
+    """An $SSAD_HOME into which CARLA's maps and SafeBench's and FREA's routes were imported by `ssad import`."""
+    pytest.importorskip("carla", reason="reading OpenDRIVE needs the extra carla")
+    from helpers.command import ssad
+
+    def make(home: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("SSAD_HOME", str(home))
+            for town in ("Town_Safebench_Light", "Town02", "Town05"):
+                done = ssad("import", "map", data_dir / "maps" / f"{town}.xodr")
+                assert f"town {town}: " in done.stdout, done.stderr
+            for name, count in (("safebench", 32), ("frea", 150)):
+                done = ssad("import", "routes", data_dir / "routes" / name)
+                assert f"set {name}: {count} scenarios" in done.stdout, done.stderr
+
+    return shared("carla", make)

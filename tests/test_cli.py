@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
+from helpers.command import ssad, ssad_process
+from helpers.plugin import install
 
 COMMANDS = ("run", "report", "replay", "shift", "score", "record", "list", "import", "doctor")
 
 
-def ssad(*arguments: str, cwd: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "ssad.cli", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=cwd,
-        env=os.environ | environment,
-        timeout=300,
-    )
-
-
-def fails(done: subprocess.CompletedProcess[str], *parts: str) -> None:
+def fails(done: CompletedProcess[str], *parts: str) -> None:
     """Exit code 2, one line that begins with error:, and nothing else."""
     lines = done.stderr.strip().splitlines()
     assert done.returncode == 2, done
@@ -36,7 +28,7 @@ def fails(done: subprocess.CompletedProcess[str], *parts: str) -> None:
 
 
 def test_help_names_every_command() -> None:
-    done = ssad("--help")
+    done = ssad_process("--help")
     assert done.returncode == 0
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
 
@@ -69,14 +61,23 @@ def test_nothing_heavy_is_imported_for_help() -> None:
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(
-    tmp_path: Path, arguments: tuple[str, ...], parts: tuple[str, ...]
+    arguments: tuple[str, ...], parts: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home = tmp_path / "home"
     work = tmp_path / "work"
     work.mkdir()
-    fails(ssad(*arguments, cwd=work, SSAD_HOME=str(home)), *parts)
+    monkeypatch.chdir(work)
+    monkeypatch.setenv("SSAD_HOME", str(home))
+    fails(ssad(*arguments), *parts)
     assert os.listdir(work) == []
     assert not home.exists()
+
+
+def test_a_process_ends_with_the_same_line_and_code(tmp_path: Path) -> None:
+    """What the tests above run in their own process, as a user runs it."""
+    done = ssad_process("run", "quick", "--set", "systems=[not_here:X]", cwd=tmp_path)
+    fails(done, "not_here", "looked in", str(tmp_path))
+    assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize(
@@ -105,9 +106,12 @@ route: [{x: 0, y: 0}, {x: 50, y: 0}]
         (("town: ProvingGround", "town: [*a, *a]"), ("mine.yaml", "not valid YAML")),
     ],
 )
-def test_a_bad_scenario_file_is_one_line(tmp_path: Path, change: tuple[str, str], parts: tuple[str, ...]) -> None:
+def test_a_bad_scenario_file_is_one_line(
+    change: tuple[str, str], parts: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "mine.yaml").write_text(SCENARIO.replace(*change))
-    fails(ssad("run", "quick", "--set", "scenarios=mine.yaml", cwd=tmp_path), *parts)
+    monkeypatch.chdir(tmp_path)
+    fails(ssad("run", "quick", "--set", "scenarios=mine.yaml"), *parts)
     assert os.listdir(tmp_path) == ["mine.yaml"]
 
 
@@ -141,34 +145,42 @@ def test_list(kind: str, name: str) -> None:
     assert name in [line.split()[0] for line in done.stdout.splitlines()]
 
 
-def test_run_report_and_replay(tmp_path: Path) -> None:
+def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first run as a process of its own, with a driving system of an installed package; the rest in this one."""
     settings = ("--set", "scenarios=[StraightObstacle/00,RightTurn/01]", "--set", "name=little")
-    first = ssad("run", "quick", *settings, "--workers", "2", cwd=tmp_path)
+    settings += ("--set", "systems=[acme-coast,blind]")
+    site = tmp_path / "site-packages"
+    site.mkdir()
+    path = os.pathsep.join(filter(None, [str(install(site)), os.environ.get("PYTHONPATH")]))
+    first = ssad_process("run", "quick", *settings, "--workers", "2", cwd=tmp_path, PYTHONPATH=path)
     assert first.returncode == 0, first.stderr
     assert "StraightObstacle" in first.stdout
     assert "report: runs/little/report.html" in first.stdout
     folder = tmp_path / "runs" / "little"
     results = (folder / "results.jsonl").read_bytes()
-    assert results.count(b"\n") == 4
+    rows = [json.loads(line) for line in results.splitlines()]
+    assert sorted((row["system"], row["status"]) for row in rows) == [("acme-coast", "ok")] * 2 + [("blind", "ok")] * 2
     assert {p.suffix for p in (folder / "tables").iterdir()} == {".csv", ".md", ".tex"}
 
-    again = ssad("run", "quick", *settings, cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(site)
+    again = ssad("run", "quick", *settings)
     assert again.returncode == 0
     assert again.stdout == first.stdout
     assert (folder / "results.jsonl").read_bytes() == results
-    fails(ssad("run", "quick", *settings, "--set", "seed=5", cwd=tmp_path), "differs in seed", "--out")
+    fails(ssad("run", "quick", *settings, "--set", "seed=5"), "differs in seed", "--out")
 
     page = (folder / "report.html").read_bytes()
     (folder / "report.html").unlink()
-    assert ssad("report", "runs/little", cwd=tmp_path).returncode == 0
+    assert ssad("report", "runs/little").returncode == 0
     assert (folder / "report.html").read_bytes() == page
 
-    replayed = ssad("replay", "runs/little", "blind/StraightObstacle/00", cwd=tmp_path)
+    replayed = ssad("replay", "runs/little", "blind/StraightObstacle/00")
     assert replayed.returncode == 0, replayed.stderr
     assert "identical" in replayed.stdout
     assert {p.suffix for p in (folder / "replays").iterdir()} == {".mp4", ".npz"}
     assert all(p.stat().st_size > 1000 for p in (folder / "replays").iterdir())
-    fails(ssad("replay", "runs/little", "blind/StraightObstacle/01", cwd=tmp_path), "closest: blind/Str")
+    fails(ssad("replay", "runs/little", "blind/StraightObstacle/01"), "closest: blind/Str")
 
 
 @pytest.mark.parametrize(
@@ -180,11 +192,5 @@ def test_run_report_and_replay(tmp_path: Path) -> None:
     ],
 )
 def test_record_refuses_options_that_would_do_nothing(words: list[str], message: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "ssad.cli", "record", str(tmp_path / "x"), *words],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
+    fails(ssad("record", tmp_path / "x", *words), message)
     assert not (tmp_path / "x").exists()

@@ -9,26 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.command import ssad
 
-from ssad import cli
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
-from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.toolbox.contact_sheet import pick_frame
-
-
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str, str]:
-    """Exit code, output and errors of the command in this process."""
-    monkeypatch.setattr("sys.argv", ["ssad", *arguments])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    out, err = capsys.readouterr()
-    return int(end.value.code or 0), out, err
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_tiny(tmp_path_factory.mktemp("data") / "tiny", scenes=2, samples=2, sweeps=0, size=(320, 180))
 
 
 def perfect(root: Path, file: Path, **meta: str) -> Path:
@@ -58,20 +43,20 @@ def perfect(root: Path, file: Path, **meta: str) -> Path:
     return file
 
 
-def test_a_folder_is_shifted_scored_and_verified(
-    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    go = lambda *a: run(capsys, monkeypatch, *map(str, a))  # noqa: E731
+def test_a_folder_is_shifted_scored_and_verified(tiny_set: Path, tmp_path: Path) -> None:
+    def go(*words: str | Path) -> tuple[int, str, str]:
+        done = ssad(*words)
+        return done.returncode, done.stdout, done.stderr
+
     out = tmp_path / "n"
-    code, text, _ = go(
-        "shift", tiny, out, "--shifts", "gaussian,scale", "--severity", "2", "--workers", "1", "--labels", "transformed"
-    )
+    words = ("--shifts", "gaussian,scale", "--severity", "2", "--workers", "1", "--labels", "transformed")
+    code, text, _ = go("shift", tiny_set, out, *words)
     assert code == 0
     assert text.count("files shifted") == 2
     assert go("shift", out, out, "--verify")[0] == 0
-    results = perfect(tiny, tmp_path / "results.json")
+    results = perfect(tiny_set, tmp_path / "results.json")
     score = ("--version", "v1.0-mini", "--split", "mini_val", "--json", tmp_path / "score.json")
-    code, text, _ = go("score", results, "--dataroot", tiny, *score)
+    code, text, _ = go("score", results, "--dataroot", tiny_set, *score)
     assert code == 0
     assert "data: clean" in text
     clean = json.loads((tmp_path / "score.json").read_text())
@@ -85,16 +70,16 @@ def test_a_folder_is_shifted_scored_and_verified(
     assert scaled["ssad"]["data"] == "shifted"
 
     # a results file that says which data it saw is believed only for those
-    named = perfect(tiny, tmp_path / "named.json", ssad_manifest=scaled["ssad"]["manifest"])
+    named = perfect(tiny_set, tmp_path / "named.json", ssad_manifest=scaled["ssad"]["manifest"])
     assert go("score", named, "--dataroot", out / "scale-2", *score)[0] == 0
-    for root in (out / "gaussian-2", tiny):
+    for root in (out / "gaussian-2", tiny_set):
         code, _, err = go("score", named, "--dataroot", root, *score)
         assert code == 2
         assert "the results were made on" in err
 
     # clean files in the place of shifted ones
     victim = next((out / "gaussian-2" / "samples" / "CAM_FRONT").iterdir())
-    shutil.copy(tiny / "samples" / "CAM_FRONT" / victim.name, victim)
+    shutil.copy(tiny_set / "samples" / "CAM_FRONT" / victim.name, victim)
     code, _, err = go("score", results, "--dataroot", out / "gaussian-2", *score)
     assert code == 2
     assert victim.name in err
@@ -103,11 +88,8 @@ def test_a_folder_is_shifted_scored_and_verified(
     assert victim.name in text
 
 
-def test_contact_sheets(
-    tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    code, text, _ = run(capsys, monkeypatch, "shift", str(tiny), str(tmp_path / "sheet.png"))
-    assert code == 0
+def test_contact_sheets(tiny_set: Path, tmp_path: Path) -> None:
+    assert ssad("shift", tiny_set, tmp_path / "sheet.png").returncode == 0
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     rows, columns = 4, 3
     tall, wide = sheet.shape[0] // rows, sheet.shape[1] // columns
@@ -117,19 +99,17 @@ def test_contact_sheets(
     for panel in panels[1:]:
         assert np.abs(panel.astype(int) - panels[0]).mean() > 0.05, "every panel differs from the clean one"
     assert (tmp_path / "sheet-severities.png").is_file()
-    with NuScenes(tiny) as data:
+    with NuScenes(tiny_set) as data:
         other = data.scenes()[1].name
         suns = [pick_frame(data, seed=seed)[2].sun for seed in (0, 1, 0)]
     assert suns[0] == suns[2] != suns[1], "the seed moves the sun"
-    assert run(capsys, monkeypatch, "shift", str(tiny), str(tmp_path / "two.png"), "--scenes", other)[0] == 0
+    assert ssad("shift", tiny_set, tmp_path / "two.png", "--scenes", other).returncode == 0
     assert (cv2.imread(str(tmp_path / "two.png")) != sheet).any(), "the scene that was named"
-    picture = next((tiny / "samples" / "CAM_BACK").iterdir())
+    picture = next((tiny_set / "samples" / "CAM_BACK").iterdir())
     own = tmp_path / "own.jpg"
-    code, text, _ = run(
-        capsys, monkeypatch, "shift", str(picture), str(own), "--box", "120,80,200,130", "--severity", "5"
-    )
-    assert code == 0
-    assert str(own) in text
+    done = ssad("shift", picture, own, "--box", "120,80,200,130", "--severity", "5")
+    assert done.returncode == 0
+    assert str(own) in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -162,16 +142,14 @@ def test_contact_sheets(
 def test_wrong_use_ends_in_one_line(
     arguments: tuple[str, ...],
     parts: tuple[str, ...],
-    tiny: Path,
+    tiny_set: Path,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    names = {"tiny": str(tiny), "tmp": str(tmp_path), "picture": str(next((tiny / "samples" / "CAM_BACK").iterdir()))}
-    code, out, err = run(capsys, monkeypatch, *(a.format(**names) for a in arguments))
-    assert code == 2
-    assert out == ""
-    assert err.startswith("error: ")
-    assert len(err.strip().splitlines()) == 1
+    picture = next((tiny_set / "samples" / "CAM_BACK").iterdir())
+    done = ssad(*(a.format(tiny=tiny_set, tmp=tmp_path, picture=picture) for a in arguments))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.strip().splitlines()) == 1
     for part in parts:
-        assert part in err
+        assert part in done.stderr

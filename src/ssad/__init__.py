@@ -56,10 +56,12 @@ __all__ = ["__version__", *_WHERE]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for."""
     if name in _WHERE:
         return getattr(import_module(f"ssad.{_WHERE[name]}"), name)
     raise AttributeError(f"module 'ssad' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:
+    """Name what is public."""
     return sorted(__all__)

@@ -61,8 +61,8 @@ def run(
     from ssad.bench.kind import Resources
     from ssad.bench.run import run as run_plan
     from ssad.bench.suite import kind_of, load_suite
-    from ssad.bench.summary import summary_table
     from ssad.jobs.machine import pick_device
+    from ssad.report.terminal import summary
 
     chosen = load_suite(suite, settings or [])
     folder = out or Path("runs") / chosen.name
@@ -77,7 +77,7 @@ def run(
         print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
         raise typer.Exit(130) from None
     console = Console()
-    console.print(summary_table(plan, records))
+    console.print(summary(folder))
     failed = [r for r in records if r["status"] != "ok"]
     for record in failed[:5]:
         console.print(f"{record['status']}: {names[record['key']]}: {record['reason']}", markup=False, soft_wrap=True)
@@ -91,12 +91,18 @@ def run(
 
 @app.command()
 def report(folder: Dir) -> None:
-    """Write DIR/report.html and DIR/tables from the results in DIR."""
+    """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed."""
     from ssad.jobs.store import read_run
-    from ssad.report import write_report
+    from ssad.report import check_artefacts, write_report
 
     read_run(folder)
     print(f"report: {write_report(folder)}")
+    problems = check_artefacts(folder)
+    for problem in problems[:5]:
+        print(problem)
+    if problems:
+        print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
+        raise typer.Exit(1)
 
 
 @app.command()

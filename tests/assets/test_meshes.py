@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from ssad.assets.bodies import BODIES, PAINT_SHARES, PAINTS, draw_paint, draw_size, make_body
 from ssad.assets.bodies.parts import MARGIN, Chart, pack
 from ssad.assets.mesh import Material, Mesh, box, lathe, loft, merge, prism, ring, sphere, triangulate, tube
-from ssad.assets.obj import load_mesh, save_obj
+from ssad.assets.mesh_files import load_mesh
+from ssad.assets.obj import save_obj
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.seeding import generator
 

@@ -39,7 +39,8 @@ def ground(name: str) -> Ground:
 
 @cache
 def street(name: str) -> Street:
-    return build_street(town(name))
+    """Built in this run, by whichever test asks first."""
+    return cached_street(town(name))
 
 
 def corners(scene: Street) -> npt.NDArray[np.float64]:
@@ -244,18 +245,30 @@ def test_styles_differ() -> None:
         build_street(graph, style="suburbs")
 
 
-def test_cache(ssad_home: Path) -> None:
-    graph = town("Twinford")
+def test_cache(ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, built = town("Twinford"), street("Twinford")
+    asked: list[tuple[int, str]] = []
+
+    def build(graph: LaneGraph, *, seed: int, style: str) -> Street:
+        asked.append((seed, style))
+        return built
+
+    monkeypatch.setattr("ssad.assets.street.build.build_street", build)
     one = cached_street(graph)
     (path,) = (ssad_home / "cache" / "streets").glob("*.npz")
-    stamp = path.stat().st_mtime_ns
     two = cached_street(graph)
-    assert path.stat().st_mtime_ns == stamp
+    assert asked == [(0, "town")]
+    assert one is built
     assert np.array_equal(one.vertices, two.vertices)
     assert one.materials == two.materials
     path.write_bytes(path.read_bytes()[:1000])  # cut short: built again
     assert np.array_equal(cached_street(graph).faces, one.faces)
+    assert asked == [(0, "town")] * 2
     assert load_street(path).name == "Twinford"
+    cached_street(graph, seed=1)
+    cached_street(graph, style="city")
+    cached_street(town("Crossgate"))
+    assert asked[2:] == [(1, "town"), (0, "city"), (0, "city")], "each is another street"
 
 
 def test_bad_input(tmp_path: Path) -> None:

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssad.assets.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
 from ssad.assets.bodies import BODIES
 from ssad.bench.kinds.driving import make_pictures
 from ssad.camera.rig import RIG, rig_camera
-from ssad.datasets.nuscenes.schema import CLASSES as NUSCENES
-from ssad.recording.camera_sheets import CLASSES, class_sheet
-from ssad.recording.onboard import BODY, above, body_of, moments, onboard_sheet, pick_trace, things_at
+from ssad.core.nuscenes_names import CLASSES as NUSCENES
+from ssad.recording.camera_sheets import SHOWN, class_sheet
+from ssad.recording.onboard import above, body_of, moments, onboard_sheet, pick_trace, things_at
 from ssad.roads import load_town
 from ssad.world.models import MODELS
 from ssad.world.rollout import rollout
@@ -21,13 +22,13 @@ pytest.importorskip("cv2")
 
 
 def test_every_class_and_every_model_has_a_body() -> None:
-    assert {name.replace(" ", "_") for name in CLASSES} == set(NUSCENES)
-    for kind, styles in CLASSES.values():
+    assert {class_of(kind) for kind in BODY_CATEGORIES} == set(NUSCENES)
+    for kind, styles in (*SHOWN.items(), *ACTOR_BODIES.values()):
         assert set(styles) <= set(BODIES[kind].styles)
     for name, model in MODELS.items():
         low, high = body_of(name, 0).bounds()
         assert high - low == pytest.approx([model.length, model.width, model.height], rel=0.1)
-    assert set(BODY) < set(MODELS)
+    assert set(ACTOR_BODIES) == set(MODELS) - {"vending_machine", "barrier"}  # which are plain boxes
     sheet = class_sheet(60)
     assert sheet.std() > 20
 

@@ -19,11 +19,11 @@ from ssad.bench.kind import Plan, Resources
 from ssad.bench.kinds.driving import Driving, DrivingSuite
 from ssad.bench.replay import replay
 from ssad.bench.run import run
-from ssad.bench.summary import table
 from ssad.core.errors import ConfigError, RouteError, SSADError, StoreError
+from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace, save_trace
-from ssad.jobs.store import read_lines
+from ssad.report.terminal import summary
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
 
@@ -149,9 +149,9 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     assert "exit code 7" in records["LaneChanging"]["reason"]
     assert "not finite" in records["VehiclePassing"]["reason"]
     console = Console(file=io.StringIO(), width=100)
-    console.print(table("t", list(records.values())))
+    console.print(summary(tmp_path / "run"))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "4 of 5 episodes failed and count" in shown
+    assert "4 of 5 cells failed and count" in shown
     with pytest.raises(StoreError, match="left no trace: failed"):
         replay(tmp_path / "run", "wicked_system:Wicked/StraightObstacle/00")
     again = run(plan(chosen), tmp_path / "run", Resources(1, console=console), retry=True)

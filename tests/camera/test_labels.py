@@ -13,11 +13,12 @@ from hypothesis.extra.numpy import arrays
 
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, box
-from ssad.camera.labels import Labels, extents, label_picture, visibility_token, visible_share
+from ssad.camera.labels import Labels, extents, label_picture, visible_share
 from ssad.camera.render import Picture, View, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.nuscenes_names import visibility_token
 from ssad.core.seeding import generator
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0

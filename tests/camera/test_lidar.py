@@ -16,7 +16,8 @@ from ssad.assets.street.model import Street
 from ssad.camera.lidar import HDL32E, Lidar, points_in_boxes, sweep
 from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Boxes3D, rotation_matrix
+from ssad.core.frames import Boxes3D
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
@@ -344,7 +345,7 @@ def test_points_in_boxes_equal_a_plain_count(seed: int, n: int, p: int) -> None:
     counts = points_in_boxes(points, boxes)
     assert counts.dtype == np.int32
     for row in range(n):
-        local = (points[:, :3] - boxes.centre[row]) @ rotation_matrix(rotation[row])
+        local = (points[:, :3] - boxes.centre[row]) @ quaternion_to_matrix(rotation[row])
         width, length, height = size[row]
         assert counts[row] == (np.abs(local) <= np.array([length, width, height]) / 2).all(1).sum()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.registry import names, resolve
+from ssad.core.registry import describe, names, resolve
 
 TABLE = {"loads": "json:loads", "dumps": "json:dumps"}
 
@@ -50,4 +50,27 @@ def test_errors_are_one_line(folder: Path, source: str | None, name: str, messag
         resolve("thing", TABLE, name)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert ("looked in" in str(caught.value)) == (name == "not_there_at_all:X"), "not of what another module lacks"
     assert isinstance(caught.value, UnknownNameError) == (source is None and ":" not in name)
+
+
+def test_an_error_says_where_the_user_can_mend_it(folder: Path) -> None:
+    (folder / "deep_a.py").write_text("import deep_b\n")
+    (folder / "deep_b.py").write_text("\n\nvalue = {}['key']\n")
+    with pytest.raises(ConfigError) as caught:
+        resolve("thing", TABLE, "deep_a:X")
+    assert str(caught.value) == f"thing 'deep_a:X': importing deep_a failed: KeyError: 'key' ({folder}/deep_b.py:3)"
+    assert describe(ValueError("two\n  lines")) == "ValueError: two lines"
+    assert describe(StopIteration()) == "StopIteration"
+
+
+def test_the_working_folder_is_looked_in_first_and_once(folder: Path) -> None:
+    (folder / "json_like.py").write_text("class A:\n    _hidden = 1\n    shown = 2\n")
+    for _ in range(2):
+        assert resolve("thing", TABLE, "json_like:A.shown") == 2
+    assert sys.path[0] == str(folder)
+    assert sys.path.count(str(folder)) == 1
+    with pytest.raises(ConfigError, match=r"json_like has no 'hidden'; closest: shown$"):
+        resolve("thing", TABLE, "json_like:A.hidden")
+    with pytest.raises(ConfigError, match=r"json_like has no 'zzz'$"):
+        resolve("thing", TABLE, "json_like:A.zzz")

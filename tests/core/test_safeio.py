@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import os
 import pickle
@@ -217,3 +218,129 @@ def test_home(monkeypatch: pytest.MonkeyPatch) -> None:
     assert safeio.home() == Path("/somewhere")
     monkeypatch.delenv("SSAD_HOME")
     assert safeio.home() == Path.home() / ".local/share/ssad"
+
+
+def test_limits(tmp_path: Path) -> None:
+    """A file of the limit is read, a byte more is not; and the limits that hold unless others are given."""
+    (tmp_path / "a").write_bytes(b"x" * 100)
+    assert safeio.read_bytes(tmp_path / "a", limit=100) == b"x" * 100
+    with pytest.raises(FormatError, match=r"a: larger than the limit of 9\.44138e-05 MiB"):
+        safeio.read_bytes(tmp_path / "a", limit=99)
+    mebibytes = {
+        function: inspect.signature(function).parameters["limit"].default / 2**20
+        for function in (
+            safeio.read_bytes, safeio.read_text, safeio.read_yaml, safeio.read_yaml_document, safeio.read_json,
+            safeio.read_xml, safeio.load_npz,
+        )
+    }  # fmt: skip
+    assert list(mebibytes.values()) == [64, 64, 16, 16, 256, 256, 2048]
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(16 * 2**20 + 1)
+    with pytest.raises(FormatError, match="larger than the limit of 16 MiB"):
+        safeio.read_yaml(tmp_path / "large")
+
+
+def test_files_are_read_as_their_texts_are(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf{"a": [1, 2.5]}')
+    assert safeio.read_json(tmp_path / "a.json") == {"a": [1, 2.5]}, "with a byte order mark"
+    (tmp_path / "a.xml").write_text("<a b='1'/>")
+    assert safeio.read_xml(tmp_path / "a.xml").get("b") == "1"
+    (tmp_path / "a.yaml").write_text("a: 1\nb:\n  - 2")
+    document = safeio.read_yaml_document(tmp_path / "a.yaml")
+    assert document.data == safeio.read_yaml(tmp_path / "a.yaml") == {"a": 1, "b": [2]}
+    assert str(document.error(("b", 0), "bad")) == f"{tmp_path / 'a.yaml'}:3: b[0]: bad"
+    (tmp_path / "bad.json").write_text('{"a": 1,\n"b" 2}')
+    with pytest.raises(FormatError, match=r"bad\.json:2: not valid JSON"):
+        safeio.read_json(tmp_path / "bad.json")
+    with pytest.raises(FormatError, match="key 'b' appears twice"):
+        safeio.parse_json('{"a": 1, "b": 2, "c": 3, "b": 4}')
+
+
+@pytest.mark.parametrize(
+    "text", [b'<?xml version="1.0" encoding="nope"?><a/>', b"<?xml version='1.0' encoding='utf-16'?><a/>"]
+)
+def test_xml_of_an_encoding_that_is_not_there(text: bytes) -> None:
+    with pytest.raises(FormatError, match=r"f\.xml.* not valid XML"):
+        safeio.parse_xml(text, "f.xml")
+
+
+def test_an_archive_says_nothing_of_the_machine_it_was_made_on() -> None:
+    with zipfile.ZipFile(io.BytesIO(safeio.npz_bytes({"a": np.zeros(5000), "b": np.ones(3)}))) as archive:
+        for member in archive.infolist():
+            assert member.date_time == (1980, 1, 1, 0, 0, 0)
+            assert (member.create_system, member.external_attr) == (3, 0o644 << 16)
+            assert member.compress_type == zipfile.ZIP_DEFLATED
+        assert [member.filename for member in archive.infolist()] == ["a.npy", "b.npy"]
+        assert archive.infolist()[0].compress_size < 500
+    with pytest.raises(TypeError, match="array 'b' holds Python objects"):
+        safeio.npz_bytes({"a": np.zeros(1), "b": np.array([{}], dtype=object)})
+
+
+def test_arrays_keep_their_order_in_memory_only_as_values(tmp_path: Path) -> None:
+    array = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    np.savez(tmp_path / "f.npz", a=array, b=np.arange(24).reshape(2, 3, 4).T)
+    found = safeio.load_npz(tmp_path / "f.npz")
+    assert np.array_equal(found["a"], array)
+    assert np.array_equal(found["b"], np.arange(24).reshape(2, 3, 4).T)
+
+
+def test_a_folder_is_made_with_its_parents_and_left_clean(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert safeio.make_folder(tmp_path / "a" / "b") == tmp_path / "a" / "b"
+        assert os.listdir(tmp_path / "a" / "b") == []
+
+
+def test_a_whole_file_or_none_and_no_other_beside_it(tmp_path: Path) -> None:
+    safeio.write_atomic(tmp_path / "x" / "a.txt", "é")
+    assert (tmp_path / "x" / "a.txt").read_bytes() == "é".encode()
+    with safeio.atomic_path(tmp_path / "x" / "b.mp4") as temporary:
+        assert (temporary.parent, temporary.suffix) == (tmp_path / "x", ".mp4")
+        temporary.write_bytes(b"film")
+    assert sorted(os.listdir(tmp_path / "x")) == ["a.txt", "b.mp4"]
+    with pytest.raises(StoreError, match="cannot be written"), safeio.atomic_path(tmp_path / "x" / "c"):
+        pass  # nothing was written
+    assert sorted(os.listdir(tmp_path / "x")) == ["a.txt", "b.mp4"]
+
+
+def test_aliases_up_to_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(safeio, "MAX_ALIASED_NODES", 6)
+    assert safeio.parse_yaml("a: &x [1, 2]\nb: *x\nc: *x") == {"a": [1, 2], "b": [1, 2], "c": [1, 2]}
+    with pytest.raises(FormatError, match=r":4: aliases expand|:1: aliases expand"):
+        safeio.parse_yaml("a: &x [1, 2]\nb: *x\nc: *x\nd: *x")
+
+
+def test_depth_up_to_the_limit() -> None:
+    deepest = "[" * safeio.MAX_DEPTH + "]" * safeio.MAX_DEPTH
+    assert safeio.parse_yaml(deepest) is not None
+    assert len(safeio.parse_yaml(f"[{deepest[1:-1]}, {deepest[1:-1]}]")) == 2
+    with pytest.raises(FormatError, match="nested deeper than 64 levels"):
+        safeio.parse_yaml(f"[{deepest}]")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("!!set {a, b}", "tag tag:yaml.org,2002:set is not allowed"),
+        ("!!omap [a: 1]", "tag tag:yaml.org,2002:omap is not allowed"),
+        ("!!binary aGVsbG8=", "is not allowed"),
+        ("!!int twelve", "'twelve' is not a valid int"),
+        ("!!bool maybe", "is not allowed"),
+        ("a: &x {b: *x}", "contains it"),
+    ],
+)
+def test_yaml_tags(text: str, message: str) -> None:
+    with pytest.raises(FormatError, match=r"^f\.yaml:1: ") as caught:
+        safeio.parse_yaml(text, "f.yaml")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("0o17", 15), ("+7", 7), ("-0x1F", "-0x1F"), (".inf", np.inf), (".5", 0.5), ("1.", 1.0), ("1e3", 1000.0),
+     ("True", True), ("FALSE", False), ("Null", None), ("!!str 5", "5"), ("<<", "<<"), ("yes", "yes"),
+     ("1_000", "1_000"), ("0o8", "0o8")],
+)  # fmt: skip
+def test_more_yaml_scalars(text: str, value: object) -> None:
+    found = safeio.parse_yaml(text)
+    assert found == value
+    assert type(found) is type(value)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from ssad.core import safeio
 from ssad.core.errors import FormatError
 from ssad.core.traces import first_difference, load_trace, save_trace, trace_hash
 from ssad.core.types import EpisodeTrace
 
 T, A, S = 5, 3, 2
+SMALL_HASH = "cca9d38a0c85684b7807bc25da3ced9dd663ef93e79f3a1f4a76fe7a1d871678"
 
 
 def make_trace(seed: int = 0) -> EpisodeTrace:
@@ -84,3 +87,55 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     save_trace(tmp_path / "t.npz", replace(make_trace(), x=np.zeros((2, 2), np.float32)))
     with pytest.raises(FormatError, match="x has shape"):
         load_trace(tmp_path / "t.npz")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": np.zeros((T, A))}, "not a whole episode trace (x)"),  # float64
+        ({"kind": np.zeros(A, np.int32)}, "not a whole episode trace (kind)"),
+        ({"active": np.ones((T, A), np.uint8)}, "not a whole episode trace (active)"),
+        ({"speed": None}, "not a whole episode trace (speed)"),
+        ({"yaw": np.zeros((A, T), np.float32)}, "yaw has shape (3, 5)"),
+        ({"active": np.zeros((T, A + 1), bool)}, "active has shape (5, 4)"),
+        ({"meta": np.frombuffer(b'{"format":1}', np.uint8)}, "dt, end, key, models, names, town"),
+        ({"meta": np.frombuffer(b'{"format":2}', np.uint8)}, "of another format"),
+        ({"meta": np.frombuffer(b"[1]", np.uint8)}, "of another format"),
+        ({"meta": np.frombuffer(b"{", np.uint8)}, "not valid JSON"),
+    ],
+)
+def test_a_trace_with_a_wrong_part_is_refused_by_its_name(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    """A file of other types would be read as other numbers, and its hash would be another's."""
+    save_trace(tmp_path / "t.npz", make_trace())
+    arrays = {k: v for k, v in (safeio.load_npz(tmp_path / "t.npz") | changes).items() if v is not None}
+    safeio.save_npz(tmp_path / "t.npz", arrays)
+    with pytest.raises(FormatError) as caught:
+        load_trace(tmp_path / "t.npz")
+    assert message in str(caught.value)
+    assert "t.npz" in str(caught.value)
+
+
+def test_what_is_read_cannot_be_changed(tmp_path: Path) -> None:
+    save_trace(tmp_path / "t.npz", make_trace())
+    loaded = load_trace(tmp_path / "t.npz")
+    assert loaded.names == ("ego", "a", "b")
+    assert loaded.models == ("car",) * 3
+    with pytest.raises(ValueError, match="read-only"):
+        loaded.x[0, 0] = 1.0
+
+
+def test_the_hash_is_the_same_for_ever() -> None:
+    """Results on disk hold it."""
+    small = {f.name: np.zeros(0) for f in fields(EpisodeTrace)}
+    small |= {"key": "k", "town": "Town", "dt": 0.1, "names": ("ego",), "models": ("car",), "end": "complete"}
+    assert trace_hash(EpisodeTrace(**small)) == SMALL_HASH  # type: ignore[arg-type]
+
+
+def test_a_difference_is_told_by_name_values_and_step() -> None:
+    trace = make_trace()
+    assert first_difference(trace, replace(trace, town="Else")) == "town: 'Town' against 'Else'"
+    shorter = replace(trace, accel=trace.accel[:-2], x=trace.x + 1)
+    assert str(first_difference(trace, shorter)).startswith("step 0: x: ")
+    assert first_difference(trace, replace(trace, accel=trace.accel[:-2])) == "step 3: accel: shape (5,) against (3,)"

@@ -15,9 +15,10 @@ import pytest
 
 from ssad.core.errors import StoreError
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
-from ssad.datasets.nuscenes.reader import NuScenes, SceneData, SensorFrame, read_points, rotation_matrices
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS
+from ssad.datasets.nuscenes.reader import NuScenes, SceneData, SensorFrame, read_points
 from ssad.datasets.nuscenes.tiny import RIG, make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
@@ -105,7 +106,7 @@ def test_point_counts_are_those_of_the_sweeps(scenes: list[SceneData], root: Pat
             matrix = frame.ego_to_world @ frame.sensor_to_ego
             world = points[:, :3].astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
             boxes = scene.annotations(sample.token)
-            turns = rotation_matrices(boxes.rotation)
+            turns = quaternion_to_matrix(boxes.rotation)
             for i in range(len(boxes)):
                 local = (world - boxes.centre[i]) @ turns[i]
                 half = boxes.size[i][[1, 0, 2]] / 2
@@ -136,7 +137,7 @@ def test_velocities_are_those_of_the_objects(scenes: list[SceneData]) -> None:
         for sample in scene.samples:
             boxes = scene.annotations(sample.token)
             speed = np.linalg.norm(boxes.velocity, axis=1)
-            heading = rotation_matrices(boxes.rotation)[:, :, 0]
+            heading = quaternion_to_matrix(boxes.rotation)[:, :, 0]
             for i, names in enumerate(boxes.attributes):
                 if any(name.endswith((".moving", "with_rider")) for name in names):
                     assert speed[i] > 1.0

@@ -14,10 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import FormatError, StoreError
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORIES, CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS, TABLES
+from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.tables import read_table
-from ssad.datasets.nuscenes.writer import CATEGORIES, NuScenesWriter
+from ssad.datasets.nuscenes.writer import NuScenesWriter
 
 VERSION = "v1.0-mini"
 NOW = 1_500_000_000_000_000

@@ -15,7 +15,8 @@ import pytest
 import torch
 from helpers import mono3d_case as case
 
-from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.core.detections import Detections, Solids, Truth
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.detectors.mono3d.config import FCOS3D, PGD_DET
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.mono3d.multi_camera import merge_cameras
@@ -101,8 +102,8 @@ def check_training(detector: Mono3D, reference: Reference, *, seed: int, size: t
     truths = [truth_of(reference, k, lens[k]) for k in range(3)]
     assignment = detector.assign(dense, truths)
     label = reference["targets/label"]
-    np.testing.assert_array_equal(assignment.label.numpy(), np.where(label == len(CLASSES_3D), -1, label))
-    found = label < len(CLASSES_3D)
+    np.testing.assert_array_equal(assignment.label.numpy(), np.where(label == len(MMDET3D_CLASSES), -1, label))
+    found = label < len(MMDET3D_CLASSES)
     assert found[:2].any(1).all()
     assert not found[2].any()
     reg = assignment.extra["reg"].numpy()[found][:, : reference["targets/reg"].shape[2]]

@@ -10,8 +10,9 @@ import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, one_thread, some_truth, truth_of
 from torch import Tensor
 
-from ssad.core.detections import CLASSES_3D, Detections, Truth
+from ssad.core.detections import Detections, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.protocols import Detector
 from ssad.detectors import make_detector
 from ssad.detectors.fcos3d import fcos3d
@@ -129,7 +130,7 @@ def test_what_fresh_weights_say() -> None:
 def test_it_is_a_detector(config: Mono3DConfig) -> None:
     detector = Mono3D(config)
     assert isinstance(detector, Detector)
-    assert (detector.name, detector.task, detector.classes) == (config.name, "3d", CLASSES_3D)
+    assert (detector.name, detector.task, detector.classes) == (config.name, "3d", MMDET3D_CLASSES)
 
 
 @BOTH

@@ -19,7 +19,6 @@ from ssad.evaluation.camera_truth import camera_truth
 from ssad.evaluation.detection import detect_scene, joined, match_boxes, score_2d, to_host
 from ssad.jobs.machine import gpu_workers
 from ssad.metrics.detection_boxes import TP_METRICS
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.training.batches import PictureSet
 from ssad.training.data import nuscenes_items
 
@@ -38,31 +37,27 @@ class Oracle:
         return [Detections(torch.linspace(1, 0.5, len(t.label)), t.label, t.box, t.solid) for t in found]
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("detect") / "set"
-    todo = Recording(out, towns=("Larkhill",), held_out=("Larkhill",), scenes=1, seconds=1.5, width=160)
-    return record_nuscenes(todo, workers=1)
-
-
-def test_perfect_cameras_score_one(root: Path) -> None:
+def test_perfect_cameras_score_one(recorded: Path) -> None:
     """All that the cameras see, six of them merged, is found again: AP 1 but for what only the LiDAR hits."""
-    with NuScenes(root) as data:
-        scene = data.scene("scene-larkhill-000")
-        truths = [
-            camera_truth(f, scene.annotations(f.sample_token))
-            for f in scene.frames
-            if f.modality == "camera" and f.key_frame
-        ]
-        # frames come by time: put those of a sample together, as the detector is shown them
-        keys = [f.sample_token for f in scene.frames if f.modality == "camera" and f.key_frame]
-        ordered = [t for s in scene.samples for t, k in zip(truths, keys, strict=True) if k == s.token]
-        found = detect_scene(Oracle(iter(ordered)), root, scene)  # type: ignore[arg-type]
-    scores = match_boxes(found, read_truth(root, "v1.0-ssad")).scores()
+    found = []
+    with NuScenes(recorded) as data:
+        for record in data.scenes():
+            scene = data.scene(record.name)
+            truths = [
+                camera_truth(f, scene.annotations(f.sample_token))
+                for f in scene.frames
+                if f.modality == "camera" and f.key_frame
+            ]
+            # frames come by time: put those of a sample together, as the detector is shown them
+            keys = [f.sample_token for f in scene.frames if f.modality == "camera" and f.key_frame]
+            ordered = [t for s in scene.samples for t, k in zip(truths, keys, strict=True) if k == s.token]
+            found += detect_scene(Oracle(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
+    scores = match_boxes(found, read_truth(recorded, "v1.0-ssad")).scores()
     there = scores.truth > 0
     assert there.sum() >= 3
     assert scores.ap[there].mean() > 0.9
-    errors = dict(zip(TP_METRICS, np.nanmean(scores.errors[there], axis=0), strict=True))
+    several = scores.truth > 1  # what is there in one sample alone has no velocity
+    errors = dict(zip(TP_METRICS, np.nanmean(scores.errors[several], axis=0), strict=True))
     assert errors["trans_err"] < 0.4, "cameras fire up to 43 ms before the sweep"
     assert errors["scale_err"] < 1e-3
     assert errors["orient_err"] < 0.02
@@ -70,8 +65,8 @@ def test_perfect_cameras_score_one(root: Path) -> None:
     assert errors["attr_err"] < 0.01
 
 
-def test_2d_truth_scores_one_and_noise_does_not(root: Path) -> None:
-    truths = tuple(item.truth for item in nuscenes_items(root, None, "all"))
+def test_2d_truth_scores_one_and_noise_does_not(recorded: Path) -> None:
+    truths = tuple(item.truth for item in nuscenes_items(recorded, None, "all"))
     bank = PictureSet(torch.zeros(len(truths), 90, 160, 3, dtype=torch.uint8), truths)
     perfect = Oracle(iter(truths))
     perfect.classes = tuple(str(k) for k in range(10))  # type: ignore[assignment]
@@ -84,12 +79,13 @@ def test_2d_truth_scores_one_and_noise_does_not(root: Path) -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("name", ["fcos3d-light", "pgd-det-light"])
-def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_finds_the_same_boxes(recorded: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
-    with NuScenes(root) as data:
-        scene = data.scene("scene-larkhill-000")
+    with NuScenes(recorded) as data:
+        scene = data.scene("scene-oldmarket-000")
         here, there = (
-            detect_scene(make_detector(name, device=device), root, scene, device=device) for device in ("cpu", "cuda")
+            detect_scene(make_detector(name, device=device), recorded, scene, device=device)
+            for device in ("cpu", "cuda")
         )
     assert sum(int((one.boxes.score > 0.1).sum()) for one in here) > 3
     for one, other in zip(here, there, strict=True):
@@ -102,7 +98,7 @@ def test_a_gpu_finds_the_same_boxes(root: Path, name: str, monkeypatch: pytest.M
             assert alike.any()
 
 
-def test_fewer_pictures_at_a_time_where_memory_is_short(root: Path) -> None:
+def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
     class Small(Oracle):
         """A detector on a small device."""
 
@@ -115,22 +111,22 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(root: Path) -> None:
             self.calls.append(len(images))
             return super().predict(images, intrinsic)
 
-    with NuScenes(root) as data:
-        scene = data.scene("scene-larkhill-000")
+    with NuScenes(recorded) as data:
+        scene = data.scene("scene-oldmarket-000")
         key = [f for f in scene.frames if f.modality == "camera" and f.key_frame]
         ordered = [
             camera_truth(f, scene.annotations(f.sample_token))
             for s in scene.samples for f in key if f.sample_token == s.token
         ]  # fmt: skip
-        whole = detect_scene(Oracle(iter(ordered)), root, scene)  # type: ignore[arg-type]
-        parts = detect_scene(Small(iter(ordered)), root, scene)  # type: ignore[arg-type]
+        whole = detect_scene(Oracle(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
+        parts = detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
         assert set(Small.calls) <= {1, 2}
         assert sum(Small.calls) == len(key)
         for one, other in zip(whole, parts, strict=True):
             assert (one.boxes.translation == other.boxes.translation).all()
         Small.room = 0
         with pytest.raises(torch.OutOfMemoryError):
-            detect_scene(Small(iter(ordered)), root, scene)  # type: ignore[arg-type]
+            detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
 
 
 def test_processes_share_the_memory_of_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:

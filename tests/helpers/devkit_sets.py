@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES
 from ssad.core.seeding import generator
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES
 
 VERSION = "v1.0-mini"
 SPLIT = "mini_val"

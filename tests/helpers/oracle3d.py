@@ -4,12 +4,14 @@ not."""
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.core.detections import Detections, Solids, Truth
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.training.batches import fill
 from ssad.training.data import nuscenes_items
 
@@ -18,7 +20,7 @@ class Oracle:
     """Finds the picture of the data set that is most like what it is shown, and tells its truth; the more the two
     differ, the fewer objects."""
 
-    name, task, classes = "oracle", "3d", CLASSES_3D
+    name, task, classes = "oracle", "3d", MMDET3D_CLASSES
 
     def __init__(self, root: Path) -> None:
         items = list(nuscenes_items(root, None, "all"))
@@ -62,6 +64,47 @@ class Bad(Oracle):
             assert one.solid is not None
             one.solid.size.neg_()
         return found
+
+
+class Deadly(Oracle):
+    """Does to its process what it is made for."""
+
+    def __init__(self, root: Path, deed: str) -> None:
+        super().__init__(root)
+        self.deed = deed
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        if self.deed == "die":
+            os._exit(9)
+        if self.deed == "hang":
+            time.sleep(1e6)
+        if self.deed == "raise":
+            raise ZeroDivisionError("on purpose")
+        held = []
+        while True:
+            held.append(bytearray(b"x" * (64 << 20)))
+
+
+def build_dying() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "die")
+
+
+def build_hanging() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "hang")
+
+
+def build_raising() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "raise")
+
+
+def build_hungry() -> Deadly:
+    """For the data set that ORACLE_DATA names."""
+    return Deadly(Path(os.environ["ORACLE_DATA"]), "eat")
 
 
 def build_bad() -> Bad:

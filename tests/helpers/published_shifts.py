@@ -25,9 +25,12 @@ def picture() -> Any:
 def statistics(out: Any, image: Any) -> list[float]:
     """Mean grey level; slope of the line from the picture's grey levels to those after the shift; and the logarithms of
     the deviation of what that line leaves, under 2, from 2 to 12 and over 12 pixels."""
-    before, after = (v.astype(np.float64).mean(2) for v in (image, out))
-    slope, start = np.polyfit(before.ravel(), after.ravel(), 1)
-    rest = (after - slope * before - start).astype(np.float32)
+    grey = np.full((1, 3), 1 / 3, np.float32)
+    before, after = (cv2.transform(v.astype(np.float32), grey).astype(np.float64) for v in (image, out))
+    before -= before.mean()
+    mean = after.mean()
+    slope = np.vdot(before, after) / np.vdot(before, before)
+    rest = (after - mean - slope * before).astype(np.float32)
     low, lower = (cv2.GaussianBlur(rest, (0, 0), sigma) for sigma in (2.0, 12.0))
     bands = [float(np.log(v.std())) for v in (rest - low, low - lower, lower)]
-    return [float(after.mean()), float(slope), *bands]
+    return [float(mean), float(slope), *bands]

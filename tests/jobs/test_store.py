@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import StoreError
-from ssad.jobs.store import Store, read_lines, read_run
+from ssad.core.jsonl import read_lines
+from ssad.jobs.store import Store, read_run
 
 RUN: dict[str, Any] = {"identity": "a", "suite": {"name": "s", "seed": 0}}
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import CLASSES
 from ssad.core.seeding import generator
-from ssad.datasets.nuscenes.schema import CLASSES
 from ssad.metrics.detection import (
     CVPR_2019,
     BikeRacks,
@@ -268,10 +268,8 @@ def test_intervals_over_scenes() -> None:
     scores = matches.scores()
     assert limits["mean_ap"][0] < scores.mean_ap < limits["mean_ap"][1]
     assert limits["nd_score"][0] < limits["nd_score"][1]
-    narrow = scene_intervals(matches, scene, generator=generator("s"), replicates=60, level=0.5)
-    assert narrow["mean_ap"][1] - narrow["mean_ap"][0] < limits["mean_ap"][1] - limits["mean_ap"][0]
-    single = scene_intervals(matches, np.zeros(40, np.int64), generator=generator("s"))
-    assert all(math.isnan(v) for pair in single.values() for v in pair)
+    few = scene_intervals(matches, scene % 4, generator=generator("s"))
+    assert all(math.isnan(v) for pair in few.values() for v in pair)
 
 
 def test_the_settings_are_the_official_ones() -> None:

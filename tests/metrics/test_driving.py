@@ -94,11 +94,14 @@ def test_distance_to_route_leaves_out_the_start():
 
 
 def test_counts():
-    m = episode_metrics(
-        make_trace(5, red_light=[0, 1, 0, 1, 0], stop_sign=[0, 0, 1, 0, 0], lane_invasion=[0, 1, 1, 1, 0])
-    )
+    trace = make_trace(5, red_light=[0, 1, 0, 1, 0], stop_sign=[0, 0, 1, 0, 0], lane_invasion=[0, 1, 1, 1, 0])
+    m = episode_metrics(trace, stop_signs=True)
     assert (m.red_lights, m.stop_signs, m.lane_invasions) == (2, 1, 3)
     assert m.driving_score == pytest.approx(100 * 0.7**2 * 0.8)
+    # a world without stop signs measures none, and scores without them
+    m = episode_metrics(trace)
+    assert m.stop_signs is None
+    assert m.driving_score == pytest.approx(100 * 0.7**2)
 
 
 def test_acceleration_along_and_across():
@@ -164,8 +167,10 @@ def test_no_rows_is_an_error():
         episode_metrics(make_trace(0))
 
 
-def test_dict_round_trip_ignores_other_keys_and_names_a_missing_one():
+def test_dict_round_trip_ignores_other_keys_and_leaves_out_what_is_absent():
     m = episode_metrics(make_trace(5, [(0, 0, 0, 0), (20, 0, 0, 0)], route_complete=55))
     assert EpisodeMetrics.from_dict(m.as_dict() | {"later": 1}) == m
-    with pytest.raises(KeyError, match="driven"):
-        EpisodeMetrics.from_dict({k: v for k, v in m.as_dict().items() if k != "driven"})
+    less = EpisodeMetrics.from_dict({k: v for k, v in m.as_dict().items() if k not in ("driven", "stop_signs")})
+    assert math.isnan(less.driven)
+    assert less.stop_signs is None
+    assert EpisodeMetrics.from_dict(m.as_dict() | {"stop_signs": 2}).stop_signs == 2

@@ -1,145 +1,153 @@
-"""Intervals: known values, coverage on a seeded simulation, edge cases."""
+"""Estimates: copies, clusters, strata, failed cases, what is not measured, paired differences, scores."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.metrics.uncertainty import (
-    Estimate,
-    cluster_estimate,
-    mean_estimate,
-    mean_of_estimates,
-    paired_difference,
-    wilson,
-)
+from ssad.metrics.uncertainty import CaseValue, estimate, paired_difference, replicate_estimate
+
+NAN = math.nan
 
 
-@pytest.mark.parametrize(
-    ("successes", "n", "low", "high"),
-    # statsmodels proportion_confint(method="wilson"), also in Newcombe (1998) for 81 of 263 and 15 of 148
-    [
-        (0, 10, 0.0, 0.27753),
-        (5, 10, 0.23659, 0.76341),
-        (10, 10, 0.72247, 1.0),
-        (81, 263, 0.2553, 0.3662),
-        (15, 148, 0.0624, 0.1605),
-    ],
-)
-def test_wilson_known_values(successes, n, low, high):
-    e = wilson(successes, n)
-    assert e.mean == successes / n
-    assert e.low == pytest.approx(low, abs=5e-5)
-    assert e.high == pytest.approx(high, abs=5e-5)
+def cases(values, per_cluster=1, stratum=""):
+    """Case values in clusters of `per_cluster`, one after the other."""
+    return [
+        CaseValue(float(v), f"{stratum}c{k // per_cluster}", f"{stratum}{k}", stratum) for k, v in enumerate(values)
+    ]
 
 
-@given(st.integers(1, 200), st.data())
-def test_wilson_limits_solve_the_score_equation(n, data):
-    successes = data.draw(st.integers(0, n))
-    e = wilson(successes, n)
-    assert 0.0 <= e.low <= e.mean <= e.high <= 1.0
-    for limit in (e.low, e.high):
-        if 0.0 < limit < 1.0:
-            z = (e.mean - limit) / math.sqrt(limit * (1 - limit) / n)
-            assert abs(z) == pytest.approx(1.959964, abs=1e-4)
+@st.composite
+def samples(draw):
+    """Values of some clusters in some strata, some of them failed or not measured."""
+    kind = draw(st.sampled_from(["share", "bounded", "mean"]))
+    number = st.sampled_from([0.0, 1.0]) if kind == "share" else st.floats(0.0, 1.0)
+    rows = draw(
+        st.lists(st.tuples(st.integers(0, 9), st.integers(0, 2), number, st.integers(0, 9)), min_size=1, max_size=40)
+    )
+    return kind, [
+        CaseValue(NAN if chance < 2 else value, f"c{cluster}", f"case{k}", f"s{stratum}", failed=chance == 0)
+        for k, (cluster, stratum, value, chance) in enumerate(rows)
+    ]
 
 
-def test_wilson_with_unknown_outcomes_holds_whatever_they_were():
-    e = wilson(3, 12, failed=2)
-    assert e.mean == 3 / 12
-    assert e.low == wilson(3, 12).low
-    assert e.high == wilson(5, 12).high
-    assert (e.n, e.failed) == (12, 2)
+@settings(max_examples=200, deadline=None)
+@given(samples(), st.data())
+def test_copies_and_order_change_nothing(sample, data):
+    kind, values = sample
+    copies = data.draw(st.lists(st.sampled_from(values), max_size=60))
+    mixed = data.draw(st.permutations([*values, *copies]))
+    # compared as text, since NaN differs from itself
+    assert repr(estimate(mixed, kind)) == repr(estimate(values, kind))
 
 
-def test_wilson_of_nothing_and_of_nonsense():
-    assert math.isnan(wilson(0, 0).mean)
-    with pytest.raises(ValueError, match="11 successes"):
-        wilson(11, 10)
-    with pytest.raises(ValueError, match="2 failed"):
-        wilson(9, 10, failed=2)
+@settings(max_examples=200, deadline=None)
+@given(samples())
+def test_limits_hold_the_mean_and_stay_in_bounds(sample):
+    kind, values = sample
+    e = estimate(values, kind, least=0.0)
+    if math.isnan(e.mean):
+        assert e.n == 0
+        return
+    if e.clusters == 1:
+        assert (e.method, math.isnan(e.low), math.isnan(e.high)) == ("none", True, True)
+        return
+    assert 0.0 <= e.low <= e.mean <= e.high
+    assert kind == "mean" or e.high <= 1.0
+    if e.clusters < 5:
+        assert e.method == "range"
 
 
-def test_mean_edge_cases():
-    empty = mean_estimate([], failed=3)
-    assert math.isnan(empty.mean)
-    assert (empty.n, empty.failed) == (0, 3)
-    one = mean_estimate([2.5])
-    assert one.mean == 2.5
-    assert math.isnan(one.low)
-    assert math.isnan(one.high)
-    same = mean_estimate([2.0, 2.0, 2.0])
-    assert (same.low, same.high, same.method) == (2.0, 2.0, "constant")
-    assert mean_estimate([1.0, math.nan, 3.0]).n == 2
+def test_fewer_than_five_clusters_give_their_range():
+    e = estimate(cases([0, 1, 1, 1, 0, 0, 0, 0], per_cluster=2), "share")
+    assert (e.mean, e.low, e.high, e.method, e.n, e.clusters) == (3 / 8, 0.0, 1.0, "range", 8, 4)
+    five = estimate(cases([0, 1, 1, 1, 0, 0, 0, 0, 0, 0], per_cluster=2), "share")
+    assert (five.method, five.clusters) == ("beta", 5)
 
 
-def test_mean_interval_does_not_depend_on_the_order():
-    values = np.random.Generator(np.random.Philox(1)).normal(size=30)
-    assert mean_estimate(values) == mean_estimate(values[::-1])
+def test_a_share_counts_failed_cases_as_unknown():
+    values = cases([1, 0, 0, 0, 0, 1, 0, 0])
+    lost = [replace(v, value=NAN, failed=True) for v in values[1:3]]
+    e = estimate([values[0], *lost, *values[3:]], "share")
+    assert (e.mean, e.n, e.failed) == (2 / 8, 8, 2)
+    assert e.low == estimate(values, "share").low
+    known = [replace(v, value=1.0) if k in (1, 2) else v for k, v in enumerate(values)]
+    assert e.high == estimate(known, "share").high
 
 
-def test_mean_interval_moves_and_scales_with_the_data():
-    values = np.random.Generator(np.random.Philox(2)).exponential(size=30)
-    base, other = mean_estimate(values), mean_estimate(3.0 * values + 7.0)
-    assert other.low == pytest.approx(3.0 * base.low + 7.0)
-    assert other.high == pytest.approx(3.0 * base.high + 7.0)
+def test_what_is_not_measured_is_left_out():
+    e = estimate([*cases([1.0, 3.0]), CaseValue(NAN, "x", "x"), CaseValue(NAN, "y", "y", failed=True)], "mean")
+    assert (e.mean, e.n, e.failed, e.clusters) == (2.0, 2, 1, 2)
+    nothing = estimate([CaseValue(NAN, "x", "x")], "share")
+    assert (nothing.n, nothing.failed, nothing.method) == (0, 0, "none")
+    assert math.isnan(nothing.mean)
+    assert estimate([], "mean").n == 0
 
 
-def test_bootstrap_coverage():
-    # 95 % nominal; 300 samples of 40 skewed values; the binomial standard error is 1.3 %
-    rng = np.random.Generator(np.random.Philox(3))
-    inside = 0
-    for _ in range(300):
-        e = mean_estimate(rng.exponential(size=40))
-        inside += e.low <= 1.0 <= e.high
-    assert 0.89 <= inside / 300 <= 0.98
+def test_strata_weigh_the_same():
+    values = [*cases([1, 1, 1, 1, 1, 1, 1, 1], stratum="a"), *cases([0, 0], stratum="b")]
+    e = estimate(values, "share")
+    assert e.mean == 0.5
+    assert (e.n, e.clusters) == (10, 10)
+    assert 0.1 < e.low < 0.5 < e.high < 0.9
 
 
-def test_bootstrap_is_about_as_wide_as_the_normal_interval():
-    values = np.random.Generator(np.random.Philox(4)).normal(size=200)
-    e = mean_estimate(values)
-    normal = 2 * 1.96 * values.std(ddof=1) / math.sqrt(200)
-    assert e.high - e.low == pytest.approx(normal, rel=0.1)
+def test_the_same_case_in_two_strata_counts_in_both():
+    values = [CaseValue(1.0, "c", "same", "a"), CaseValue(1.0, "c", "same", "b"), CaseValue(0.0, "d", "other", "b")]
+    assert estimate(values, "share").mean == pytest.approx(0.75)
+
+
+def test_scale_and_least():
+    values = [0.2, 0.4, 0.9, 1.0, 0.7, 0.3, 0.5, 0.8, 0.1, 0.6]
+    one, hundred = estimate(cases(values), "bounded"), estimate(cases(np.multiply(100, values)), "bounded", scale=100.0)
+    assert (hundred.low, hundred.high) == (pytest.approx(100 * one.low), pytest.approx(100 * one.high))
+    skewed = [0.0, 0.01, 0.0, 0.02, 0.03, 9.0, 0.04, 0.05, 0.06, 0.07]
+    assert estimate(cases(skewed), "mean").low < 0.0
+    assert estimate(cases(skewed), "mean", least=0.0).low == 0.0
+    mirrored = one.scaled(-2.0, 1.0)
+    assert (mirrored.low, mirrored.high) == (pytest.approx(1 - 2 * one.high), pytest.approx(1 - 2 * one.low))
+    assert mirrored.mean == pytest.approx(1 - 2 * one.mean)
 
 
 def test_paired_difference_is_tighter_than_unpaired():
-    rng = np.random.Generator(np.random.Philox(6))
-    hard = rng.normal(size=50) * 10
-    a = {str(i): float(v) for i, v in enumerate(hard + rng.normal(size=50) + 1)}
-    b = {str(i): float(v) for i, v in enumerate(hard)}
-    e = paired_difference(a, b)
-    assert e.n == 50
+    random = np.random.Generator(np.random.Philox(6))
+    hard = random.normal(size=50) * 10
+    first = dict(enumerate(cases(hard + random.normal(size=50) + 1)))
+    second = dict(enumerate(cases(hard)))
+    e = paired_difference(first, second)
+    assert (e.n, e.clusters) == (50, 50)
     assert e.low < 1.0 < e.high
-    assert e.high - e.low < 1.0 < mean_estimate(list(b.values())).high - mean_estimate(list(b.values())).low
+    alone = estimate(second.values(), "mean")
+    assert e.high - e.low < 1.0 < alone.high - alone.low
 
 
-def test_paired_difference_uses_shared_scenarios_only():
-    e = paired_difference({"a": 1.0, "b": 2.0, "c": None, "d": 5.0}, {"a": 0.5, "b": 1.0, "c": 1.0, "e": 2.0})
-    assert e.mean == pytest.approx(0.75)
-    assert (e.n, e.failed) == (2, 3)
-    assert paired_difference({"a": 1.0}, {"a": math.nan}).n == 0
+def test_paired_difference_follows_the_rules():
+    first = {str(k): v for k, v in enumerate(cases(range(20), per_cluster=2))}
+    second = {str(k): v for k, v in enumerate(cases([0.5 * k for k in range(20)], per_cluster=2))}
+    e = paired_difference(first, second)
+    assert (e.n, e.clusters, e.failed) == (20, 10, 0)
+    # a copy of both halves is a copy, a copy of one is not
+    again = paired_difference(first | {"copy": first["3"]}, second | {"copy": second["3"]})
+    assert again == e
+    assert paired_difference(first | {"copy": first["3"]}, second | {"copy": replace(second["3"], case="x")}).n == 21
+    # cells of one alone, failed, not measured
+    lost = replace(second["4"], value=NAN, failed=True)
+    other = paired_difference(first | {"only": first["0"]}, second | {"4": lost, "5": replace(lost, failed=False)})
+    assert (other.n, other.failed) == (18, 3)
 
 
-def test_clusters_widen_the_interval_of_repeated_values():
-    values = np.random.Generator(np.random.Philox(7)).normal(size=10)
-    repeated = np.repeat(values, 8)
-    clusters = np.repeat(np.arange(10), 8).tolist()
-    wide, narrow = cluster_estimate(repeated, clusters), mean_estimate(repeated)
-    assert wide.mean == pytest.approx(narrow.mean)
-    assert wide.n == 80
-    assert wide.high - wide.low > 2 * (narrow.high - narrow.low)
-    assert math.isnan(cluster_estimate([1.0, 2.0], ["a", "a"]).low)
-    assert math.isnan(cluster_estimate([], []).mean)
-
-
-def test_mean_of_estimates():
-    e = mean_of_estimates([Estimate(1.0, 0.7, 1.4, 10), Estimate(3.0, 2.6, 3.3, 20, 1)])
-    assert e.mean == 2.0
-    assert e.low == pytest.approx(2.0 - 0.25)
-    assert e.high == pytest.approx(2.0 + 0.25)
-    assert (e.n, e.failed) == (30, 1)
-    nan = math.nan
-    assert mean_of_estimates([Estimate(nan, nan, nan, 0, 4), Estimate(1.0, 0.5, 1.5, 3)]).mean == 1.0
-    assert math.isnan(mean_of_estimates([]).mean)
+def test_scores_by_replicates():
+    replicates = list(np.random.Generator(np.random.Philox(2)).normal(0.4, 0.02, size=200))
+    e = replicate_estimate(0.4, replicates, n=500, clusters=24)
+    assert (e.n, e.clusters, e.method) == (500, 24, "beta")
+    assert e.high - e.low == pytest.approx(2 * 2.069 * 0.02 * math.sqrt(24 / 23), rel=0.15)
+    assert math.isnan(replicate_estimate(0.4, replicates, n=8, clusters=4).low)
+    assert math.isnan(replicate_estimate(0.4, [0.4], n=8, clusters=24).low)
+    assert math.isnan(replicate_estimate(0.4, [], n=8, clusters=24).low)
+    ratio = replicate_estimate(1.1, [v / 0.4 for v in replicates], n=500, clusters=24, bounded=False)
+    assert ratio.low < 1.1 < ratio.high
+    assert ratio.low * ratio.high == pytest.approx(1.21)
+    assert math.isnan(replicate_estimate(1.0, [1.0] * 50, n=500, clusters=24, bounded=False).low)

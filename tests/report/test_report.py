@@ -15,16 +15,18 @@ import pytest
 
 from ssad.bench.kinds.driving import plain
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.errors import ConfigError, StoreError
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
 from ssad.report import write_report, write_video
+from ssad.report.driving_tables import precrash_table
 from ssad.report.embed import SCALE, episode_data, origin, pack, unpack
+from ssad.report.episodes import load_episodes
 from ssad.report.lanes import thin
 from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
-from ssad.report.tables import precrash_table, tex, to_csv, to_latex, to_markdown
+from ssad.report.tables import tex, to_csv, to_latex, to_markdown
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.rollout import rollout
@@ -68,7 +70,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_precrash_table_counts_failed_episodes_and_holds_the_papers_rows(run_folder: Path) -> None:
-    table = precrash_table(load_run(run_folder))
+    table = precrash_table(load_episodes(load_run(run_folder)))
     assert table is not None
     rows = {row.head: row for row in table.rows}
     column = list(SCENARIOS).index("StraightObstacle")
@@ -76,7 +78,7 @@ def test_precrash_table_counts_failed_episodes_and_holds_the_papers_rows(run_fol
     assert (ours.n, ours.failed, ours.mean) == (3, 1, 0.0)
     assert rows["RC", "autopilot"].cells[column].mean == pytest.approx(2 / 3, abs=1e-6)
     assert rows["CR", "blind"].cells[column].mean == 1.0
-    assert rows["CR", "blind"].cells[list(SCENARIOS).index("RightTurn")].text == "-"
+    assert rows["CR", "blind"].cells[list(SCENARIOS).index("RightTurn")].text == "n/a"
     assert rows["CR", "TD3"].published
     assert rows["CR", "TD3"].cells[-1].mean == 0.75
     read = list(csv.DictReader(io.StringIO(to_csv(table))))
@@ -86,7 +88,7 @@ def test_precrash_table_counts_failed_episodes_and_holds_the_papers_rows(run_fol
 
 
 def test_latex_is_balanced_and_escaped(run_folder: Path) -> None:
-    table = precrash_table(load_run(run_folder))
+    table = precrash_table(load_episodes(load_run(run_folder)))
     assert table is not None
     text = to_latex(table)
     body = [line for line in text.splitlines() if line.endswith(r"\\") and "multicolumn" not in line]
@@ -132,7 +134,7 @@ def test_page_is_well_formed_self_contained_and_escapes_names(run_folder: Path) 
     assert all((run_folder / link).is_file() for link in page.loads)
     assert HOSTILE not in text
     assert "A &lt;b&gt;title" in text
-    assert sorted(page.keys) == sorted(r.key for r in load_run(run_folder).records)
+    assert sorted(page.keys) == sorted(line["key"] for line in load_run(run_folder).lines)
     assert "no answer &lt;script&gt;" in text
 
 
@@ -141,7 +143,7 @@ def test_embedded_replay_gives_back_the_trace(run_folder: Path) -> None:
     found = re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)
     assert found
     data = json.loads(found[1])
-    assert set(data["episodes"]) == {r.key for r in load_run(run_folder).records if r.trace}
+    assert set(data["episodes"]) == {line["key"] for line in load_run(run_folder).lines if line.get("artefacts")}
     for key, episode in data["episodes"].items():
         trace = load_trace(run_folder / "traces" / f"{key}.npz")
         agents = len(trace.names)
@@ -203,8 +205,8 @@ def test_bad_folders_and_suffixes_end_in_one_line(run_folder: Path, tmp_path: Pa
     (tmp_path / "run.json").write_text("{}")
     with pytest.raises(StoreError, match="no results yet"):
         write_report(tmp_path)
-    (tmp_path / "results.jsonl").write_text("nonsense\n")
-    with pytest.raises(FormatError, match=r"results\.jsonl:1"):
+    (tmp_path / "results.jsonl").write_text('nonsense\n{"key": "a"}\n')
+    with pytest.raises(StoreError, match=r"results\.jsonl:1"):
         write_report(tmp_path)
     trace = load_trace(run_folder / "traces" / "blind0.npz")
     with pytest.raises(ConfigError, match=r"\.mp4 or \.gif"):
@@ -216,6 +218,7 @@ def test_a_lost_trace_costs_only_its_replay(run_folder: Path, tmp_path: Path) ->
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
     text = write_report(tmp_path).read_text()
     assert "8 episodes have no replay" in text
+    assert "Missing or altered files: 8" in text
     assert (tmp_path / "tables" / "precrash.csv").is_file()
 
 

@@ -23,12 +23,15 @@ carla = pytest.importorskip("carla", reason="the extra carla is not installed (n
 def centre_distance(graph: LaneGraph, points: np.ndarray) -> np.ndarray:
     """Distance [n] of each point from the nearest driving centre line."""
     seg, _, _, _ = segments(graph, (LaneType.DRIVING,))
-    a, d = seg[:, :2].astype(float), (seg[:, 2:] - seg[:, :2]).astype(float)
-    square = (d * d).sum(1)
+    order = np.argsort(seg[:, 0])
+    a, d = seg[order, :2].astype(float), (seg[order, 2:] - seg[order, :2]).astype(float)
+    reach = np.hypot(*d.T).max() + 1.0  # segments that begin further off are further off than a metre
+    first, last = (np.searchsorted(a[:, 0], points[:, 0] + side) for side in (-reach, reach))
     least = []
-    for p in points:
-        t = np.clip(((p - a) * d).sum(1) / square, 0, 1)
-        least.append(np.hypot(*(p - a - t[:, None] * d).T).min())
+    for p, i, j in zip(points, first, last, strict=True):
+        start, way = a[i:j], d[i:j]
+        t = np.clip(((p - start) * way).sum(1) / (way * way).sum(1), 0, 1)
+        least.append(np.hypot(*(p - start - t[:, None] * way).T).min(initial=np.inf))
     return np.array(least)
 
 
@@ -75,9 +78,9 @@ def check_against_carla(graph: LaneGraph, text: str) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", IMPORTED)
-def test_baked_lanes_are_where_carla_has_them(data_dir: Path, name: str) -> None:
+def test_baked_lanes_are_where_carla_has_them(carla_home: Path, data_dir: Path, name: str) -> None:
     text = (data_dir / "maps" / f"{name}.xodr").read_text(encoding="utf-8")
-    check_against_carla(imported(data_dir, name), text)
+    check_against_carla(imported(carla_home, name), text)
 
 
 @pytest.mark.parametrize("name", ["Twinford", "Crossgate", "ProvingGround"])
@@ -86,17 +89,17 @@ def test_own_towns_are_where_carla_has_them(name: str) -> None:
 
 
 @pytest.mark.data
-def test_facts_of_carla_towns(data_dir: Path) -> None:
-    two = imported(data_dir, "Town02")
+def test_facts_of_carla_towns(carla_home: Path) -> None:
+    two = imported(carla_home, "Town02")
     assert (two.kind == LaneType.DRIVING).sum() == 88
     assert len(two.signal_phase) == 24
     assert not two.signal_virtual.any()
     assert np.unique(two.speed_limit[two.kind == LaneType.DRIVING]) == pytest.approx([25 * 0.44704])
-    five = imported(data_dir, "Town05")
+    five = imported(carla_home, "Town05")
     assert five.signal_virtual.all()
     limits = np.unique(five.speed_limit[five.kind == LaneType.DRIVING])
     assert limits == pytest.approx(np.array([35, 55, 65]) * 0.44704, rel=1e-5)
-    light = imported(data_dir, "Town_Safebench_Light")
+    light = imported(carla_home, "Town_Safebench_Light")
     assert light.signal_virtual.all()
     assert len(np.unique(light.signal_junction)) == 12
     for graph in (two, five, light):
@@ -106,8 +109,8 @@ def test_facts_of_carla_towns(data_dir: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", IMPORTED)
-def test_every_approach_of_a_signalled_junction_has_a_stop_line(data_dir: Path, name: str) -> None:
-    graph = imported(data_dir, name)
+def test_every_approach_of_a_signalled_junction_has_a_stop_line(carla_home: Path, name: str) -> None:
+    graph = imported(carla_home, name)
     stopped = set(graph.stop_lane.tolist())
     signalled = set(graph.signal_junction.tolist())
     for lane in np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0)):

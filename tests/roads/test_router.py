@@ -12,7 +12,7 @@ import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.errors import RouteError
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import LaneType, Pose, Route
 from ssad.roads import LaneGraph, LaneQuery, random_route, route_along
@@ -180,13 +180,13 @@ def read_routes(path: Path) -> list[tuple[str, list[Pose]]]:
 
 @pytest.mark.data
 @pytest.mark.parametrize("source", ["safebench", "frea"])
-def test_published_routes(data_dir: Path, source: str) -> None:
+def test_published_routes(carla_home: Path, data_dir: Path, source: str) -> None:
     count = 0
     for path in sorted((data_dir / "routes" / source / "route").glob("*/*.xml")):
         for town, points in read_routes(path):
             if town not in IMPORTED:
                 continue
-            graph = imported(data_dir, town)
+            graph = imported(carla_home, town)
             route = route_along(graph, points)
             # CARLA's towns have turns of 2 m radius
             check(graph, route, turn=TURN if town == "Town_Safebench_Light" else 0.6)
@@ -202,8 +202,8 @@ def test_published_routes(data_dir: Path, source: str) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", IMPORTED)
-def test_routes_between_random_places_of_carla_towns(data_dir: Path, name: str) -> None:
-    graph = imported(data_dir, name)
+def test_routes_between_random_places_of_carla_towns(carla_home: Path, name: str) -> None:
+    graph = imported(carla_home, name)
     rng = generator("router", name)
     for start, end in zip(places(graph, rng, 12), places(graph, rng, 12), strict=True):
         check(graph, route_along(graph, [pose(graph, *start), pose(graph, *end)]), turn=0.7)

@@ -11,7 +11,7 @@ import pytest
 from roads.towns import BUILT_IN, built_in
 
 from ssad.core.errors import MapError, UnknownNameError
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, bake, load_town, town_names
 from ssad.roads.generate import TOWNS, generate_town

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssad.core.geometry import wrap_angle
 from ssad.core.lane_graph import load_graph, save_graph
+from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import Controller, LaneType
 from ssad.roads import LaneGraph, bake, random_route

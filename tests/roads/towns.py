@@ -1,19 +1,19 @@
-"""Towns for the tests of roads: built-in ones, and CARLA's, baked once a session."""
+"""Towns for the tests of roads: built-in ones, and CARLA's, as the fixture `carla_home` has imported them."""
 
 from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
 
-from ssad.roads import LaneGraph, bake, load_town
+from ssad.roads import LaneGraph, load_graph, load_town
 
 BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
 IMPORTED = ("Town_Safebench_Light", "Town02", "Town05")
 
 
 @cache
-def imported(folder: Path, name: str) -> LaneGraph:
-    return bake(folder / "maps" / f"{name}.xodr")
+def imported(home: Path, name: str) -> LaneGraph:
+    return load_graph(home / "towns" / f"{name}.npz")
 
 
 def built_in(name: str) -> LaneGraph:

@@ -14,7 +14,7 @@ import pytest
 
 from ssad.core.errors import FormatError
 from ssad.core.types import Pose
-from ssad.roads import bake
+from ssad.roads import load_graph
 from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios
 
 ROUTE = (
@@ -202,9 +202,9 @@ def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["safebench", "frea"])
-def test_every_imported_scenario_becomes_an_episode(data_dir: Path, name: str) -> None:
+def test_every_imported_scenario_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
     found = import_routes(data_dir / "routes" / name)
-    graphs = {town: bake(data_dir / "maps" / f"{town}.xodr", town) for town in sorted({s.town for s in found})}
+    graphs = {town: load_graph(carla_home / "towns" / f"{town}.npz") for town in sorted({s.town for s in found})}
     for scenario in found:
         graph = graphs[scenario.town]
         ego, *others = build_episode(scenario, graph, seed=0).agents
@@ -225,8 +225,8 @@ def test_every_imported_scenario_becomes_an_episode(data_dir: Path, name: str) -
 
 
 @pytest.mark.data
-def test_safebench_actors_stand_where_its_classes_put_them(data_dir: Path) -> None:
-    graph = bake(data_dir / "maps" / "Town_Safebench_Light.xodr", "Town_Safebench_Light")
+def test_safebench_actors_stand_where_its_classes_put_them(data_dir: Path, carla_home: Path) -> None:
+    graph = load_graph(carla_home / "towns" / "Town_Safebench_Light.npz")
     found = {s.name.removeprefix("safebench/"): s for s in import_routes(data_dir / "routes" / "safebench")}
 
     def poses(name: str) -> list[tuple[float, float, float]]:

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world, rotation_matrix
+from ssad.core.frames import FORWARD, Boxes3D, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -45,7 +46,7 @@ BOTH = ("physical", "paper")
 def outline(boxes: Boxes3D, n: int = 0) -> Any:
     """Corners of a box [8, 2] in the picture of CAMERA at the origin."""
     cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    world = (rotation_matrix(boxes.rotation[n]) * boxes.size[n][[1, 0, 2]] @ cube.T).T + boxes.centre[n]
+    world = (quaternion_to_matrix(boxes.rotation[n]) * boxes.size[n][[1, 0, 2]] @ cube.T).T + boxes.centre[n]
     local = (world - FORWARD[:3, 3]) @ FORWARD[:3, :3]
     k = CAMERA.intrinsic
     return local[:, :2] / local[:, 2:] * [k[0, 0], k[1, 1]] + [k[0, 2], k[1, 2]]
@@ -440,6 +441,14 @@ def test_dealt_severities_differ_by_shift_and_seed() -> None:
     assert first == {1, 2, 3, 4, 5}
 
 
+def test_a_deal_begins_anywhere() -> None:
+    """Else a single scene would always have severity 1, and of six scenes two."""
+    alone = [dealt_severities(ShiftSpec("fog", seed=seed), ["scene"])["scene"] for seed in range(200)]
+    assert {alone.count(severity) > 20 for severity in (1, 2, 3, 4, 5)} == {True}
+    six = [list(dealt_severities(ShiftSpec("fog", seed=seed), "abcdef").values()) for seed in range(60)]
+    assert {severity for dealt in six for severity in dealt if dealt.count(severity) == 2} == {1, 2, 3, 4, 5}
+
+
 # ---------------------------------------------------------------- objects
 
 
@@ -484,14 +493,14 @@ def test_labels_follow_the_objects(severity: int, seed: int, yaw: float, name: s
         assert new.size[0] == pytest.approx(boxes.size[0] * d[0, 0])
         assert abs(d[0, 0] - 1) == pytest.approx(table.SCALE[severity - 1])
     if name == "rotation":
-        turned = rotation_matrix(new.rotation[0]) @ rotation_matrix(boxes.rotation[0]).T
+        turned = quaternion_to_matrix(new.rotation[0]) @ quaternion_to_matrix(boxes.rotation[0]).T
         angle = np.degrees(np.arccos((np.trace(turned) - 1) / 2))
         assert abs(angle - table.ROTATION[severity - 1]) <= table.ROTATION_SPREAD + 1e-6
         assert new.size[0] == pytest.approx(boxes.size[0])
     if name == "shear":
         cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * [4.0, 1.8, 1.6]
-        world = cube @ d.T @ rotation_matrix(boxes.rotation[0]).T + [9.0, 2.0, 0.0]
-        local = (world - new.centre[0]) @ rotation_matrix(new.rotation[0]) / new.size[0][[1, 0, 2]]
+        world = cube @ d.T @ quaternion_to_matrix(boxes.rotation[0]).T + [9.0, 2.0, 0.0]
+        local = (world - new.centre[0]) @ quaternion_to_matrix(new.rotation[0]) / new.size[0][[1, 0, 2]]
         assert np.abs(local).max() == pytest.approx(0.5, abs=1e-9)
 
 

@@ -10,7 +10,8 @@ import pytest
 from helpers.boxes import cars
 
 from ssad.core.errors import ConfigError
-from ssad.core.frames import SceneContext, SweepFrame, rotation_matrix
+from ssad.core.frames import SceneContext, SweepFrame
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_points, transformed_boxes
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.lidar import fog_response, inside
@@ -145,7 +146,7 @@ def test_the_lidar_is_blind_towards_the_same_sun() -> None:
     points[:, 2] = (np.linalg.norm(points[:, :2], axis=1) * np.tan(np.arcsin(sun[2]))).astype(np.float32)
     half = 0.25
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(np.array([np.cos(half), 0, 0, np.sin(half)]))
+    pose[:3, :3] = quaternion_to_matrix(np.array([np.cos(half), 0, 0, np.sin(half)]))
     frame = SweepFrame("s", "a", ego_to_world=pose)
     out, done = shift_points(points, frame, spec, contexts={"s": context})
     assert done.details["lost"] > 100

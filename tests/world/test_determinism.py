@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ssad.core.types import Controller
 from ssad.roads import load_town
@@ -48,18 +49,18 @@ def test_hashes_after_1000_steps_do_not_depend_on_batch_order_or_processes() -> 
         assert _hashes([k]) == {k: batch[k]}
 
 
-def test_four_processes_give_the_bits_of_one() -> None:
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_several_processes_give_the_bits_of_one(count: int) -> None:
     here = _hashes(list(range(COUNT)))
     root = str(Path(__file__).parents[2])
     code = (
         "import json, sys; sys.path.insert(0, sys.argv[1]); from tests.world.test_determinism import _hashes; "
         "print(json.dumps(_hashes(json.loads(sys.argv[2]))))"
     )
+    shares = [json.dumps(list(range(COUNT))[k::count]) for k in range(count)]
     processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, root, json.dumps(list(range(COUNT))[k::4])], stdout=subprocess.PIPE, text=True
-        )
-        for k in range(4)
+        subprocess.Popen([sys.executable, "-c", code, root, share], stdout=subprocess.PIPE, text=True)
+        for share in shares
     ]
     found: dict[int, str] = {}
     for process in processes:

@@ -16,10 +16,11 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
+from ssad.assets.face_list import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
 from ssad.assets.mesh import F64, Material
-from ssad.assets.obj import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
 from ssad.core import safeio
 from ssad.core.errors import FormatError
+from ssad.core.rotations import pose_matrix
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -70,7 +71,7 @@ class _Reader:
     def __init__(self, file: Path, tree: dict[str, Any], chunk: bytes | None) -> None:
         self.file, self.tree, self.chunk = file, tree, chunk
         self.buffers: dict[int, bytes] = {}
-        self.soup = FaceList()
+        self.triangles = FaceList()
         self.faces = self.visited = 0
 
     def fail(self, message: str) -> FormatError:
@@ -89,7 +90,9 @@ class _Reader:
         needed = [e for e in self.tree.get("extensionsRequired", []) if not str(e).startswith(_HARMLESS)]
         if needed:
             raise self.fail(f"requires the extension {str(needed[0])[:60]}; export without it")
-        self.soup.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [DEFAULT]
+        self.triangles.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [
+            DEFAULT
+        ]
         scenes = self.tree.get("scenes", [])
         nodes = self.tree.get("nodes", [])
         if scenes:
@@ -99,7 +102,7 @@ class _Reader:
             roots = [k for k in range(len(nodes)) if k not in children]
         for root in roots:
             self.node(root, np.eye(4), ())
-        return self.soup
+        return self.triangles
 
     def node(self, index: int, parent: F64, above: tuple[int, ...]) -> None:
         self.visited += 1
@@ -150,14 +153,14 @@ class _Reader:
         placed = points @ linear.T + matrix[:3, 3]
         turned = normals @ np.linalg.inv(linear)
         turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-        look = len(self.soup.materials) - 1
+        look = len(self.triangles.materials) - 1
         if "material" in data:
             self.item("materials", data["material"])
             look = data["material"]
-        if name not in self.soup.groups:
-            self.soup.groups.append(name)
-        group = self.soup.groups.index(name)
-        self.soup.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
+        if name not in self.triangles.groups:
+            self.triangles.groups.append(name)
+        group = self.triangles.groups.index(name)
+        self.triangles.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
 
     def accessor(self, index: int, kind: str, where: str) -> F64:
         """Values [n, width] of an accessor as float64."""
@@ -232,16 +235,8 @@ def _local(node: dict[str, Any]) -> F64:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = (float(v) for v in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
-    norm = max(float(np.sqrt(x * x + y * y + z * z + w * w)), 1e-12)
-    x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    matrix = np.eye(4)
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    matrix[:3, :3] = turn * np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
-    matrix[:3, 3] = np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3)
+    matrix = pose_matrix(np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3), (w, x, y, z))
+    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
     return matrix
 
 

@@ -19,7 +19,9 @@ from rich.console import Console
 from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import digest
+from ssad.core.types import EpisodeTrace
 
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
 
@@ -124,6 +126,16 @@ class Job:
     settings: Mapping[str, Any]
 
 
+@dataclass(frozen=True)
+class Replay:
+    """A cell run again. difference: None when equal to the bit, else where the two part; trace, graph: of a drive."""
+
+    cell: Cell
+    difference: str | None
+    trace: EpisodeTrace
+    graph: LaneGraph
+
+
 class CellError(SSADError):
     """Why a cell has no result, in words for the record."""
 
@@ -192,6 +204,14 @@ class Kind(ABC):
 
     def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default
         """In the main process, when all cells have run: pictures for the report."""
+
+    def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
+        """Run a finished cell again, alone, and compare it with its record.
+
+        Raises:
+            ConfigError: the kind's cells cannot be replayed.
+        """
+        raise ConfigError(f"{folder}: cells of kind '{self.name}' cannot be replayed")
 
     def code(self) -> str:
         """12 hex digits over the source that results depend on."""

@@ -1,29 +1,14 @@
-"""`ssad replay`: run one driving cell again, alone, and compare every bit with what was recorded."""
+"""`ssad replay`: run one cell again, alone, and compare every bit with what was recorded."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-from ssad.bench.kind import Cell, find_cell
-from ssad.bench.kinds.driving import Driving, drive, town
+from ssad.bench.kind import Replay, find_cell
 from ssad.bench.run import read_plan
-from ssad.core.errors import ConfigError, StoreError
-from ssad.core.lane_graph import LaneGraph
-from ssad.core.traces import first_difference, load_trace
-from ssad.core.types import EpisodeTrace
-from ssad.jobs.machine import quiet_warp
-from ssad.jobs.store import RESULTS, read_lines
-
-
-@dataclass(frozen=True)
-class Replay:
-    """A cell run again. difference: None when equal to the bit, else where the two part."""
-
-    cell: Cell
-    trace: EpisodeTrace
-    graph: LaneGraph
-    difference: str | None
+from ssad.core.errors import StoreError
+from ssad.core.jsonl import read_lines
+from ssad.jobs.store import RESULTS
 
 
 def replay(folder: str | Path, name: str) -> Replay:
@@ -31,12 +16,9 @@ def replay(folder: str | Path, name: str) -> Replay:
 
     Raises:
         StoreError: it was not recorded.
-        ConfigError: there is no such cell, it is no drive, or the code has changed since.
+        ConfigError: there is no such cell, its kind has no replay, or the code has changed since.
     """
-    quiet_warp()
     plan = read_plan(folder)
-    if not isinstance(plan.kind, Driving):
-        raise ConfigError(f"{folder}: a run of kind '{plan.kind.name}'; only drives can be replayed")
     cell = find_cell(plan.cells, name)
     record = next((r for r in read_lines(Path(folder) / RESULTS) if r["key"] == cell.key), None)
     if record is None:
@@ -45,6 +27,4 @@ def replay(folder: str | Path, name: str) -> Replay:
         raise StoreError(
             f"{folder}: cell {cell.key} ({cell.name}) left no trace: {record['status']}, {record['reason']}"
         )
-    recorded = load_trace(Path(folder) / record["artefacts"]["trace"])
-    _, traces = drive([cell], device=plan.device)
-    return Replay(cell, traces[0], town(traces[0].town), first_difference(recorded, traces[0]))
+    return plan.kind.replay(plan, cell, record, Path(folder))

@@ -84,6 +84,7 @@ class _Schedule:
         self.users: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
         self.data: dict[str, Any] = {}
         self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
+        self.alone: set[str] = set()  # systems that share no pieces any more
         self.trouble: Counter[str] = Counter()  # system -> its crashes and time-outs
         self.given_up: dict[str, Outcome] = {}
         self.pool: Pool
@@ -129,18 +130,18 @@ class _Schedule:
 
     def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
         """Lets go the cells that waited; a piece that failed for several systems is done again for each alone."""
-        alone = len(systems) == 1
-        if outcome.status == "ok" or alone:
-            if outcome.status in ("timeout", "crashed"):
-                self._blame(systems[0], outcome)
+        if outcome.status != "ok" and len(systems) > 1:
             for system in systems:
-                self._release(name, system, outcome.seconds / len(systems))
-        else:
-            for system in systems:
-                if self.trouble[system]:
+                if system in self.alone:
                     self._release(name, system)
                 else:
                     self._add_piece(name, [system], first=True)
+            return
+        for system in systems:
+            self._release(name, system, outcome.seconds / len(systems))
+        if outcome.status != "ok":
+            self._share_no_more(systems[0])
+            self._blame(systems[0], outcome)
 
     def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
         waiting = self.users.pop((name, system), [])
@@ -170,21 +171,25 @@ class _Schedule:
             if outcome.status == "timeout":
                 reason = f"took longer than {self.timeout:g} s"
             self._record(batch[0], outcome.status, reason, {}, outcome.seconds + self.shared.get(batch[0].key, 0.0))
-            if outcome.status in ("timeout", "crashed"):
-                self._blame(batch[0].system, outcome)
+            self._blame(batch[0].system, outcome)
+
+    def _share_no_more(self, system: str) -> None:
+        """A system failed alone: its cells do without shared pieces from now on."""
+        if system in self.alone:
+            return
+        self.alone.add(system)
+        for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
+            name, systems = task.label
+            others = [one for one in systems if one != system]
+            if others:
+                self._add_piece(name, others)
+            self._release(name, system)
 
     def _blame(self, system: str, outcome: Outcome) -> None:
-        """A system has hung or died alone: it shares no pieces any more, and after some time it is given up."""
-        if self.kind.patience is None:
+        """A system has hung or died alone; after some times it is given up."""
+        if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
             return
         self.trouble[system] += 1
-        if self.trouble[system] == 1:
-            for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
-                name, systems = task.label
-                others = [one for one in systems if one != system]
-                if others:
-                    self._add_piece(name, others)
-                self._release(name, system)
         if self.trouble[system] == self.kind.patience:
             self.given_up[system] = outcome
             for task in self.pool.drop(lambda task: isinstance(task.label, list) and task.label[0].system == system):

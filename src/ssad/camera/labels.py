@@ -24,7 +24,6 @@ from ssad.core.types import F64, I32
 CROP = 64  # pixels a side of a crop
 BEYOND = 2.0  # what lies further outside than this many widths or heights of the picture does not count
 BATCH = 256  # crops at a time
-LEVELS = ((0.4, "1"), (0.6, "2"), (0.8, "3"))
 
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
 _bounds: WeakKeyDictionary[Scene, dict[int, tuple[F64, F64]]] = WeakKeyDictionary()
@@ -65,11 +64,6 @@ def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *,
     labels = label_picture(stage, view, picture, index, scale=scale)
     shares = dict.fromkeys(sorted({t.tag for t in view.things if t.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))
-
-
-def visibility_token(share: float) -> str:
-    """nuScenes' level of visibility: '1' up to 40 %, '2' up to 60, '3' up to 80, '4' above."""
-    return next((token for limit, token in LEVELS if share <= limit), "4")
 
 
 def extents(tags: I32) -> tuple[I32, F64, I32]:

@@ -17,7 +17,8 @@ import warp as wp
 from ssad.camera.kernels import lidar as kernels
 from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
-from ssad.core.frames import Boxes3D, rotation_matrix
+from ssad.core.frames import Boxes3D
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32
 
@@ -219,7 +220,7 @@ def _path(first: F64, last: F64, share: F64) -> tuple[F64, F64]:
     long = float(np.linalg.norm(axis))
     axis = axis / long if long > 1e-12 else np.array([0.0, 0.0, 1.0])
     half = -share * angle / 2
-    partly = rotation_matrix(np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * axis], 1))
+    partly = quaternion_to_matrix(np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * axis], 1))
     return partly @ last[:3, :3], share[:, None] * (last[:3, 3] - first[:3, 3])
 
 
@@ -294,7 +295,7 @@ def points_in_boxes(points_world: F64, boxes: Boxes3D) -> I32:
     points = points[np.argsort(points[:, 0], kind="stable")]
     half = boxes.size[:, [1, 0, 2]] / 2
     reach = np.linalg.norm(half, axis=1)
-    turn = rotation_matrix(boxes.rotation) if len(boxes) else np.zeros((0, 3, 3))
+    turn = quaternion_to_matrix(boxes.rotation) if len(boxes) else np.zeros((0, 3, 3))
     low = np.searchsorted(points[:, 0], boxes.centre[:, 0] - reach, "left")
     high = np.searchsorted(points[:, 0], boxes.centre[:, 0] + reach, "right")
     for n in range(len(boxes)):

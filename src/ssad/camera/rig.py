@@ -1,11 +1,11 @@
-"""The camera rig of nuScenes, and poses of what stands upright."""
+"""The camera rig of nuScenes."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ssad.core.frames import FORWARD, Camera
-from ssad.core.types import F64
+from ssad.core.rotations import upright_pose
 
 # rig of nuScenes: channel -> place on the ego (m), heading (degrees), focal length at a width of 1600
 RIG = {
@@ -18,18 +18,10 @@ RIG = {
 }
 
 
-def place(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
-    """Pose [4, 4] of something upright."""
-    pose = np.eye(4)
-    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    pose[:3, 3] = x, y, z
-    return pose
-
-
 def rig_camera(channel: str, width: int) -> Camera:
     """A camera of the nuScenes rig, its picture scaled to `width` pixels (16:9)."""
     at, heading, focal = RIG[channel]
-    to_ego = place(at[0], at[1], np.radians(heading), at[2])
+    to_ego = upright_pose(at[0], at[1], np.radians(heading), at[2])
     to_ego[:3, :3] = to_ego[:3, :3] @ FORWARD[:3, :3]
     f = focal * width / 1600
     height = width * 9 // 16

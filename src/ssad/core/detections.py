@@ -16,20 +16,12 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
-CLASSES_3D = (
-    "car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian", "traffic_cone",
-    "barrier",
-)  # fmt: skip
-ATTRIBUTES = (
-    "cycle.with_rider", "cycle.without_rider", "pedestrian.moving", "pedestrian.standing",
-    "pedestrian.sitting_lying_down", "vehicle.moving", "vehicle.parked", "vehicle.stopped", "none",
-)  # fmt: skip
-
 
 @dataclass(frozen=True, slots=True)
 class Solids:
     """3D boxes in the camera frame: centre [N, 3] (of gravity), size [N, 3] (length, height, width), yaw [N],
-    velocity [N, 2] (x, z; NaN where unknown), attribute [N] index into `ATTRIBUTES`."""
+    velocity [N, 2] (x, z; NaN where unknown), attribute [N] index into
+    `MMDET3D_ATTRIBUTES`."""
 
     centre: Tensor
     size: Tensor

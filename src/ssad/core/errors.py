@@ -7,7 +7,13 @@ from collections.abc import Iterable
 
 
 class SSADError(Exception):
-    """An error that the user can fix. Its message is one line: what is wrong, where, and what to do."""
+    """An error that the user can fix; the base of all errors below.
+
+    The command line prints the message alone and ends with exit code 2.
+
+    Args:
+        message: What is wrong, where (file, line, key), and what to do. It becomes one line.
+    """
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(message.split()))
@@ -42,7 +48,7 @@ LISTED = ("suite", "kind", "scenario", "system", "detector", "recipe", "shift", 
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """The error for a name that does not exist. It shows the three closest names and where to find all of them.
+    """Make the error for a name that does not exist: the three closest names, and all names or where to find them.
 
     Args:
         kind: What the name stands for, in the singular, such as "system".
@@ -60,5 +66,12 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
 
 
 def install_extra(extra: str) -> str:
-    """How to install an optional dependency ("extra") of pyproject.toml, for the end of a message."""
+    """Say how to install an optional dependency, for the end of a message.
+
+    Args:
+        extra: Name in `[project.optional-dependencies]` of pyproject.toml.
+
+    Returns:
+        The hint, without a final stop.
+    """
     return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"

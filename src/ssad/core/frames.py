@@ -123,27 +123,6 @@ class Applied:
     skipped: Mapping[str, int] = field(default_factory=dict)
 
 
-def rotation_matrix(quaternion: F64) -> F64:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (w, x, y, z); they are normalised first."""
-    q = np.asarray(quaternion, np.float64)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
-
-
-def pose_matrix(translation: F64, quaternion: F64) -> F64:
-    """4 x 4 matrix of a translation [3] and a quaternion [4] (w, x, y, z)."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_matrix(quaternion)
-    matrix[:3, 3] = translation
-    return matrix
-
-
 def camera_to_world(frame: Frame) -> F64:
     """4 x 4 pose of the camera of a frame in the world."""
     return np.asarray(frame.ego_to_world @ frame.camera.to_ego, np.float64)

@@ -1,4 +1,4 @@
-"""Plane geometry on arrays: angles, frames and oriented boxes. Metres, radians, right-handed."""
+"""Plane geometry on arrays: frames and oriented boxes. Metres, radians, right-handed."""
 
 from __future__ import annotations
 
@@ -9,14 +9,6 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.floating[Any]]
 ArrayLike = npt.ArrayLike
-
-
-def wrap_angle(angle: ArrayLike) -> Floats:
-    """Angles brought into [-pi, pi)."""
-    value = _floats(angle)
-    wrapped = (value + np.pi) % (2.0 * np.pi) - np.pi
-    # rounding of the remainder may give exactly +pi
-    return np.where(wrapped >= np.pi, -np.pi, wrapped).astype(value.dtype)
 
 
 def rotate(xy: ArrayLike, angle: ArrayLike) -> Floats:

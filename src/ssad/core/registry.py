@@ -1,4 +1,8 @@
-"""Names to objects: a built-in table, entry points of other packages, or "module:object" by the user."""
+"""Names to objects: a built-in table, entry points of other packages, or "module:object" typed by the user.
+
+A package offers objects of a kind through the entry-point group `ssad.<kind>s`, such as `ssad.systems`. Built-in names
+cannot be taken by a package.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +19,21 @@ from ssad.core.errors import ConfigError, unknown_name
 
 
 def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
-    """The object behind `name`.
+    """Import the object behind a name.
 
-    kind: singular noun for messages and the entry-point group ("system" -> group `ssad.systems`);
-    table: built-in names -> "module:object". A name with a colon is imported, the working folder on the path.
-    UnknownNameError shows the three closest names; ConfigError says why a module of the user does not import.
+    A name with a colon is imported with the working folder on the path, as Python's own command does it.
+
+    Args:
+        kind: Singular noun for messages and for the group of entry points: "system" means `ssad.systems`.
+        table: Built-in names and where they are, as "module:object".
+        name: A name of the table, one that a package offers, or "module:object".
+
+    Returns:
+        The object, of whatever type it is.
+
+    Raises:
+        UnknownNameError: Nobody offers the name; the message has the three closest.
+        ConfigError: The module of a package or of the user does not import, or does not have the object.
     """
     if name in table:
         module, _, attribute = table[name].partition(":")
@@ -33,8 +47,17 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
 
 
 def names(kind: str, table: Mapping[str, str]) -> dict[str, str]:
-    """All names of a kind -> where they come from ("module:object"), built-in ones first."""
-    return dict(table) | {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+    """List all names of a kind.
+
+    Args:
+        kind: As for `resolve`.
+        table: As for `resolve`.
+
+    Returns:
+        Name -> "module:object", built-in ones first.
+    """
+    plugins = {point.name: point.value for point in entry_points(group=f"ssad.{kind}s")}
+    return dict(table) | {name: where for name, where in plugins.items() if name not in table}
 
 
 def _import(kind: str, name: str, target: str) -> Any:
@@ -61,7 +84,14 @@ def _import(kind: str, name: str, target: str) -> Any:
 
 
 def describe(error: BaseException) -> str:
-    """One line: the kind of error, its text, and the innermost file and line of it."""
+    """Put an error into one line.
+
+    Args:
+        error: What was raised.
+
+    Returns:
+        Its type, its text, and the innermost file and line that is not of the import machinery.
+    """
     if isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {error.msg} ({error.filename}:{error.lineno})"
     frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]

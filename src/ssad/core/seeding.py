@@ -1,4 +1,8 @@
-"""The only source of randomness: a key gives a generator, so nothing depends on order, workers or batch size."""
+"""The only source of randomness: a key gives a generator, so nothing depends on order, workers or batch size.
+
+A key is a row of plain values, from the general to the particular, such as (root seed, cell key, "traffic"). Its parts
+count with their types: 1, 1.0, True and "1" are four keys.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,37 @@ import numpy as np
 
 
 def digest(*key: object) -> str:
-    """64 hex digits that depend on the key's parts and their types alone (stable over processes and versions)."""
+    """Turn a key into a name that is the same in every process, on every machine and in every version.
+
+    Args:
+        *key: Parts whose `repr` says all that there is to them: texts, numbers, tuples of these.
+
+    Returns:
+        64 hex digits (SHA-256).
+    """
     text = "\x1f".join(f"{type(part).__name__}:{part!r}" for part in key)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def seed32(*key: object) -> int:
-    """A seed in [0, 2^31) for the key."""
+    """Turn a key into a seed for what takes only a whole number.
+
+    Args:
+        *key: As for `digest`.
+
+    Returns:
+        A number in [0, 2^31).
+    """
     return int(digest(*key)[:8], 16) & 0x7FFFFFFF
 
 
 def generator(*key: object) -> np.random.Generator:
-    """A generator of its own for the key, e.g. (root seed, cell key, "traffic")."""
+    """Make the generator of a key: a new one at each call, that begins at the same place.
+
+    Args:
+        *key: As for `digest`.
+
+    Returns:
+        A generator whose draws are independent of those of any other key (Philox, the key as its key).
+    """
     return np.random.Generator(np.random.Philox(key=int(digest(*key)[:32], 16)))

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ssad.core.detections import ATTRIBUTES, Assignment, Detections, Solids, Truth
+from ssad.core.detections import Assignment, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES
 from ssad.core.protocols import Detector
 from ssad.detectors.check_cases import BATCH, CheckCase, modules_of
 
@@ -173,8 +174,8 @@ def _solid_promises(solid: Solids, count: int) -> Iterator[tuple[bool, str]]:
         finite = not value.is_floating_point() or bool(value.isfinite().all())
         yield finite or name == "velocity", f"Solids.{name} is finite"
     yield bool((solid.size > 0).all()), "sizes are above 0"
-    inside = bool(((solid.attribute >= 0) & (solid.attribute < len(ATTRIBUTES))).all())
-    yield inside, "attributes are within ssad.core.detections.ATTRIBUTES"
+    inside = bool(((solid.attribute >= 0) & (solid.attribute < len(MMDET3D_ATTRIBUTES))).all())
+    yield inside, "attributes are within ssad.core.nuscenes_names.MMDET3D_ATTRIBUTES"
 
 
 def _check_batch(trial: CheckCase) -> None:

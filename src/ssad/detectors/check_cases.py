@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ssad.core.detections import ATTRIBUTES, Dense, Detections, Solids, Truth
+from ssad.core.detections import Dense, Detections, Solids, Truth
+from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.core.registry import describe
 from ssad.core.seeding import seed32
 from ssad.detectors.mono3d.decode import corners, hull, project
@@ -102,7 +103,7 @@ class CheckCase:
         extent = torch.tensor([[4.2, 1.6, 1.9], [4.8, 1.9, 2.0]], device=device)[:count]
         yaw = torch.tensor([0.4, -2.0], device=device)[:count]
         velocity = torch.tensor([[1.0, -3.0], [torch.nan, torch.nan]], device=device)[:count]
-        attribute = torch.tensor([5, len(ATTRIBUTES) - 1], device=device)[:count]
+        attribute = torch.tensor([5, NO_ATTRIBUTE], device=device)[:count]
         box = hull(project(corners(centre, extent, yaw), lens[0]))
         limit = torch.tensor([width, height] * 2, dtype=box.dtype, device=device)
         solid = Solids(centre, extent, yaw, velocity, attribute)

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Solids, Truth
+from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
-from ssad.core.frames import rotation_matrix
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, NO_ATTRIBUTE
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, Bool
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SensorFrame
-from ssad.datasets.nuscenes.schema import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.splits import scenes_of_split
 
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -39,7 +39,7 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     """
     if frame.intrinsic is None:
         raise ConfigError(f"{frame.channel} is no camera")
-    wanted = np.array([CATEGORY_TO_CLASS.get(c) in CLASSES_3D for c in found.category], bool)
+    wanted = np.array([CATEGORY_TO_CLASS.get(c) in MMDET3D_CLASSES for c in found.category], bool)
     if hit and len(found):
         wanted &= found.lidar_points > 0
     turn: F64 = np.asarray(np.linalg.inv(frame.ego_to_world @ frame.sensor_to_ego), np.float64)
@@ -51,9 +51,9 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     wanted &= (middle[:, 0] < frame.width - 0.5) & (middle[:, 1] < frame.height - 0.5)
     box, seen = _hulls(frame, found, turn)
     rows = np.flatnonzero(wanted & seen)
-    ahead = turn[:3, :3] @ rotation_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
+    ahead = turn[:3, :3] @ quaternion_to_matrix(found.rotation[rows])[:, :, 0].T  # heading of each box, [3, n]
     speed = found.velocity[rows] @ turn[:3, :3].T
-    label = [CLASSES_3D.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
+    label = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
     attribute = [_attribute(found.attributes[r]) for r in rows]
 
     def floats(values: F64) -> torch.Tensor:
@@ -67,13 +67,13 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
 
 
 def _attribute(names: Sequence[str]) -> int:
-    return ATTRIBUTES.index(names[0]) if names and names[0] in ATTRIBUTES else len(ATTRIBUTES) - 1
+    return MMDET3D_ATTRIBUTES.index(names[0]) if names and names[0] in MMDET3D_ATTRIBUTES else NO_ATTRIBUTE
 
 
 def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
     corners = CORNERS * found.size[:, None, [1, 0, 2]]
-    world = np.einsum("nij,nkj->nki", rotation_matrix(found.rotation), corners) + found.centre[:, None]
+    world = np.einsum("nij,nkj->nki", quaternion_to_matrix(found.rotation), corners) + found.centre[:, None]
     local = world @ turn[:3, :3].T + turn[:3, 3]
     local[..., 2] = np.maximum(local[..., 2], NEAR)
     assert frame.intrinsic is not None

@@ -11,15 +11,15 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ssad.core.detections import CLASSES_3D, Detections, Solids, Truth
+from ssad.core.detections import Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES, MMDET3D_CLASSES
 from ssad.core.protocols import Detector
 from ssad.core.types import F64, U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.results import with_ego
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CLASSES
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors.mono3d.multi_camera import WorldBoxes, merge_cameras
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
@@ -27,7 +27,7 @@ from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
 
 Look = Callable[[Sequence[SensorFrame]], Sequence[U8]]
-LABEL = np.array([CLASSES.index(name) for name in CLASSES_3D])
+LABEL = np.array([CLASSES.index(name) for name in MMDET3D_CLASSES])
 _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
 AT_ONCE = 6  # samples that a GPU is shown at once
 FLOOR = 0.001  # least score that counts for AP of 2D boxes

@@ -29,7 +29,7 @@ from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import WorldBoxes
 from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
-from ssad.metrics.uncertainty import percentile_interval
+from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
 FOLDER = "detections"
@@ -252,7 +252,8 @@ def score_scenes(
             differences are paired. Scenes of equal truth are copies: they are drawn, and count, together.
 
     Returns:
-        metrics, intervals (95 %, percentile), replicates, n (samples of different scenes), scenes, applied.
+        metrics, intervals (95 %, see `replicate_estimate`), replicates, n (samples of different scenes), scenes,
+        applied.
 
     Raises:
         DetectorFailed: it failed on a scene.
@@ -277,10 +278,13 @@ def score_scenes(
             draws.append(numbers(matches.scores(draw[case[truth.scene]]), few=True))
     values = {name: [round(d[name], 5) for d in draws] for name in (draws[0] if draws else {})}
     first = np.unique(case, return_index=True)[1]
+    samples = int(np.isin(truth.scene, first).sum())
+    metrics = numbers(matches.scores())
+    limits = {k: replicate_estimate(metrics[k], v, n=samples, clusters=count) for k, v in values.items()}
     return {
-        "metrics": numbers(matches.scores()),
-        "intervals": {name: [round(v, 5) for v in percentile_interval(np.array(r))] for name, r in values.items()},
-        "replicates": values, "n": int(np.isin(truth.scene, first).sum()), "scenes": count,
+        "metrics": metrics,
+        "intervals": {k: [round(e.low, 5), round(e.high, 5)] for k, e in limits.items() if np.isfinite(e.low)},
+        "replicates": values, "n": samples, "scenes": count,
         "applied": dict(sorted(applied.items())),
     }  # fmt: skip
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ import numpy.typing as npt
 from ssad.core.errors import FormatError
 from ssad.core.frames import Applied, Boxes3D, Camera, Frame, SceneContext, SweepFrame
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.safeio import read_bytes
 from ssad.core.types import F32, F64, U8
 from ssad.datasets.nuscenes.files import read_points
@@ -30,10 +30,6 @@ from ssad.scenarios.static.shifts import (
 )
 from ssad.scenarios.static.shifts.sun import choose_sun, free_sun, sun_angle, sun_depth, sun_direction, sun_in_picture
 
-# least visible fraction for a visibility token
-VISIBLE: Final = {"1": 0.0, "2": 0.4, "3": 0.6, "4": 0.8}
-LIDAR: Final = "LIDAR_TOP"
-
 
 def boxes_of(found: Annotations) -> tuple[Boxes3D, npt.NDArray[np.intp]]:
     """Annotations as boxes, and their rows [N]; an unknown visibility counts as visible.
@@ -41,7 +37,7 @@ def boxes_of(found: Annotations) -> tuple[Boxes3D, npt.NDArray[np.intp]]:
     Boxes without a volume are left out: no shift of an object can be made of them.
     """
     rows = np.flatnonzero((found.size > 0).all(axis=1))
-    visible = np.array([VISIBLE.get(found.visibility[n], 1.0) for n in rows])
+    visible = np.array([VISIBILITY.get(found.visibility[n], 1.0) for n in rows])
     instance = tuple(found.instance[n] for n in rows)
     boxes = Boxes3D(instance, found.centre[rows], found.size[rows], found.rotation[rows], found.velocity[rows], visible)
     return boxes, rows

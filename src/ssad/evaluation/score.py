@@ -101,7 +101,8 @@ def tables(summary: dict[str, Any]) -> list[Table]:
     head.add_row("", *(f"{value:.4f}" for value in means))
     for which, place in (("from", 0), ("to (95 %)", 1)):
         if limits:
-            head.add_row(which, *(f"{limits[key][place]:.4f}" for key in ("mean_ap", "nd_score")))
+            ends = (limits[key][place] for key in ("mean_ap", "nd_score"))
+            head.add_row(which, *("n/a" if np.isnan(end) else f"{end:.4f}" for end in ends))
     rows = Table(box=box.SIMPLE, pad_edge=False, padding=(0, 1, 0, 0))
     rows.add_column("class", no_wrap=True)
     for name in ("AP", "ATE", "ASE", "AOE", "AVE", "AAE", "truth", "found"):

@@ -12,7 +12,6 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Sequence
 from typing import Any
 
 from ssad.core.errors import ConfigError, SSADError, StoreError, install_extra
@@ -25,10 +24,9 @@ AHEAD = 2  # tasks at hand for each place of the cluster, so that none waits for
 _BACKENDS: dict[str, LocalProcesses] = {}  # of this Ray worker, by start
 
 
-def _on_node(parts: tuple[Any, Any, float], start: Start | None, path: Sequence[str], threads: int) -> Any:
+def _on_node(parts: tuple[Any, Any, float], start: Start | None, threads: int) -> Any:
     """What a Ray worker does with a task: has its child process do it, and says how that ended."""
     function, argument, timeout_s = parts
-    sys.path[:] = list(dict.fromkeys([*path, *sys.path]))
     name = repr(start)
     if name not in _BACKENDS:
         for other in _BACKENDS.values():
@@ -78,11 +76,12 @@ class RayCluster:
             raise ConfigError(f"no Ray cluster at '{address}': {text}") from None
         path = [p or os.getcwd() for p in sys.path]
         environment = {name: os.environ[name] for name in os.environ if name.startswith("SSAD_")}
+        environment["PYTHONPATH"] = os.pathsep.join(path)  # what is handed over is imported there before anything runs
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": LOST_NODES, "runtime_env": {"env_vars": environment}}
         if gpu_share:
             options["num_gpus"] = gpu_share
         self._remote = ray.remote(**options)(_on_node)
-        self._arguments = ray.put(start), path, threads
+        self._arguments = ray.put(start), threads
         self._tasks: dict[Any, Task] = {}
 
     @property

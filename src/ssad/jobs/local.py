@@ -19,7 +19,10 @@ from ssad.core.registry import describe
 from ssad.jobs.task import Outcome, Status, Task
 
 START_S = 600.0  # a worker may compile kernels when it starts
-SCARCE = 0.04  # share of the memory below which the largest worker is ended
+SCARCE, SCARCE_S = (
+    0.04,
+    2.0,
+)  # share of the memory that must not be lacking for so many seconds: the largest worker ends
 WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: bytes that a worker may hold
 LOOK_S = 0.2  # from one look at the memory to the next
 
@@ -159,6 +162,7 @@ class LocalProcesses:
         self._unsent: list[Outcome] = []
         self._started = 0
         self._looked = 0.0
+        self._plenty = (0, time.monotonic())  # memory of the machine, and when there was enough of it
 
     @property
     def busy(self) -> int:
@@ -216,8 +220,12 @@ class LocalProcesses:
         limit = int(os.environ.get(WORKER_MEMORY) or 0)
         too_large = [(held, w) for held, w in working if limit and held > limit]
         total, left = memory_left()
-        if working and not too_large and total and left < SCARCE * total:
+        now = time.monotonic()
+        if left >= SCARCE * total or total != self._plenty[0]:  # a virtual machine may grow with its use
+            self._plenty = total, now
+        elif working and not too_large and now - self._plenty[1] > SCARCE_S:
             too_large = [max(working, key=lambda pair: pair[0])]
+            self._plenty = total, now
         found = []
         for held, worker in too_large:
             why = f"its limit is {limit / 2**30:.1f}" if limit and held > limit else "the machine has none left"

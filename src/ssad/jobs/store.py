@@ -16,7 +16,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from ssad.core import safeio
-from ssad.core.errors import FormatError, StoreError
+from ssad.core.errors import StoreError
+from ssad.core.jsonl import scan_lines
 
 RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
 
@@ -30,34 +31,6 @@ def read_run(folder: str | Path) -> dict[str, Any]:
     if not isinstance(data, dict) or "identity" not in data:
         raise StoreError(f"{path}: not written by ssad run")
     return data
-
-
-def read_lines(path: str | Path) -> list[dict[str, Any]]:
-    """Whole lines of a JSONL file; a torn last line is left out. StoreError for a broken line elsewhere."""
-    return _scan(Path(path))[0]
-
-
-def _scan(path: Path) -> tuple[list[dict[str, Any]], list[int]]:
-    """Records, and the offset at which each of them ends."""
-    records: list[dict[str, Any]] = []
-    ends: list[int] = []
-    if not path.exists():
-        return records, ends
-    lines = safeio.read_bytes(path, limit=1 << 34).split(b"\n")
-    whole, offset = lines[:-1], 0
-    for number, line in enumerate(whole, 1):
-        offset += len(line) + 1
-        try:
-            record = safeio.parse_json(line.decode(), f"{path}:{number}")
-            if not isinstance(record, dict) or "key" not in record:
-                raise FormatError(f"{path}:{number}: not a record")
-        except (FormatError, UnicodeDecodeError):
-            if number == len(whole):  # the last line may be torn even if it ends (blocks lost in a power cut)
-                break
-            raise StoreError(f"{path}:{number}: this line is broken; mend or remove it, then run again") from None
-        records.append(record)
-        ends.append(offset)
-    return records, ends
 
 
 class Store:
@@ -93,7 +66,7 @@ class Store:
     def _begin(self, run: Mapping[str, Any], *, retry: bool) -> None:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
-        results, ends = _scan(self.folder / RESULTS)
+        results, ends = scan_lines(self.folder / RESULTS)
         _cut(self.folder / RESULTS, ends[-1] if ends else 0)
         for record in results:
             if record["key"] in self.results:
@@ -104,7 +77,7 @@ class Store:
             self.results = {key: record for key, record in self.results.items() if not _failed(record)}
             lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
             safeio.write_atomic(self.folder / RESULTS, "".join(lines))
-        episodes, ends = _scan(self.folder / EPISODES)
+        episodes, ends = scan_lines(self.folder / EPISODES)
         while episodes and episodes[-1]["key"] not in self.results:  # its result was never written
             episodes.pop()
             ends.pop()

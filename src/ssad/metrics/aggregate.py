@@ -1,47 +1,47 @@
 """From episodes to the numbers of a table, with the denominator always in sight.
 
-A failed episode (None) is never dropped in silence: it counts in the denominator of every proportion as "not known"
-(the mean takes it as no event, the upper limit of the interval as an event), its route completion and driving score
-are 0, and every other mean is over the episodes that ran, whose number is `Estimate.n`.
+A failed episode is never dropped in silence: it counts in the denominator of every proportion as "not known" (the mean
+takes it as no event, the upper limit of the interval as an event), its route completion and driving score are 0, and
+every other mean is over the episodes that ran, whose number is `Estimate.n`. What was not measured is left out.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-import numpy as np
-
-from ssad.core.types import F64
 from ssad.metrics.driving import DIVISORS, WEIGHTS, EpisodeMetrics, overall_score
-from ssad.metrics.uncertainty import (
-    Estimate,
-    mean_estimate,
-    mean_of_estimates,
-    percentile_interval,
-    resample_counts,
-    wilson,
-)
+from ssad.metrics.uncertainty import NOTHING, CaseValue, Estimate, Kind, estimate
 
-AVERAGE = "Avg."
+PRECRASH_GROUPS = (
+    "StraightObstacle", "TurningObstacle", "LaneChanging", "VehiclePassing", "RedlightRunning", "UnprotectedLeftTurn",
+    "RightTurn", "CrossingNegotiation",
+)  # fmt: skip
+"""The eight scenarios of the paper's table of pre-crash scenarios, whose mean is its column Avg."""
+
+FAMILIES = {"pre-crash": "Avg.", "natural": "Avg. natural", "other": "Avg. other"}
+"""Families of groups, each with the name of its average: the unweighted mean of the family's groups."""
 
 
 @dataclass(frozen=True)
 class Metric:
     """A column of a table: its symbol, the field of `EpisodeMetrics` behind it, its unit and which way is better.
 
-    kind: `share` of episodes where the field is not 0, `mean` over the episodes that ran, or `mean0`, where a failed
-    episode counts as 0.
+    Attributes:
+        kind: "share" of episodes where the field is not 0, "bounded" by 0 and `scale`, or "mean".
+        failed: what a failed episode counts as; NaN: not at all, or as unknown in a share.
     """
 
     symbol: str
     field: str
     unit: str
     better: Literal["lower", "higher", ""]
-    kind: Literal["share", "mean", "mean0"]
+    kind: Kind
     title: str
+    scale: float = 1.0
+    failed: float = math.nan
 
 
 METRICS: dict[str, Metric] = {
@@ -50,11 +50,11 @@ METRICS: dict[str, Metric] = {
         Metric("CR", "collision", "", "lower", "share", "collision rate"),
         Metric("OR", "off_road", "m", "lower", "mean", "distance driven off the road"),
         Metric("DR", "distance_to_route", "m", "lower", "mean", "distance to the route"),
-        Metric("RC", "route_completion", "", "higher", "mean0", "route completion"),
+        Metric("RC", "route_completion", "", "higher", "bounded", "route completion", failed=0.0),
         Metric("TS", "time", "s", "lower", "mean", "time spent"),
         Metric("RR", "red_lights", "", "lower", "mean", "red lights run"),
         Metric("SS", "stop_signs", "", "lower", "mean", "stop signs run"),
-        Metric("RF", "route_following", "", "higher", "mean", "route following"),
+        Metric("RF", "route_following", "", "higher", "bounded", "route following"),
         Metric("ACC", "acceleration", "m/s^2", "lower", "mean", "acceleration"),
         Metric("YV", "yaw_velocity", "rad/s", "lower", "mean", "yaw velocity"),
         Metric("LI", "lane_invasions", "", "lower", "mean", "lane invasions"),
@@ -64,9 +64,9 @@ METRICS: dict[str, Metric] = {
         Metric("CR_cyclist", "collisions_cyclist", "", "lower", "share", "episodes that hit a cyclist"),
         Metric("CR_static", "collisions_static", "", "lower", "share", "episodes that hit something else"),
         Metric("IF", "in_route_failure", "", "lower", "share", "episodes that left the route"),
-        Metric("DS", "driving_score", "", "higher", "mean0", "CARLA driving score"),
-        Metric("TTC", "min_ttc", "s", "higher", "mean", "least time to collision"),
-        Metric("PET", "pet", "s", "higher", "mean", "least post-encroachment time"),
+        Metric("DS", "driving_score", "", "higher", "bounded", "CARLA driving score", scale=100.0, failed=0.0),
+        Metric("TTC", "min_ttc", "s", "higher", "bounded", "least time to collision", scale=10.0),
+        Metric("PET", "pet", "s", "higher", "bounded", "least post-encroachment time", scale=10.0),
         Metric("MD", "min_distance", "m", "higher", "mean", "least distance to another agent"),
         Metric("OS", "", "", "lower", "mean", "SafeBench overall score"),
     )
@@ -74,61 +74,124 @@ METRICS: dict[str, Metric] = {
 
 
 @dataclass(frozen=True)
+class Outcome:
+    """What one episode gave, and what tells it from others.
+
+    Attributes:
+        metrics: None if the episode failed.
+        group: what it is shown under: the pre-crash scenario, the town.
+        cluster: what episodes share: the scenario or route.
+        case: names the motion; two outcomes of one system with the same case are copies.
+        family: a key of `FAMILIES`.
+    """
+
+    metrics: EpisodeMetrics | None
+    group: str
+    cluster: str
+    case: str
+    family: str = "other"
+
+    @classmethod
+    def from_record(cls, line: Mapping[str, Any], trace_hash: str = "") -> Outcome:
+        """From a line of results.jsonl; `trace_hash` stands in for the case where the line names none.
+
+        Runs from before lines named their case wrote 0 stop signs without a world that has any: not measured.
+        """
+        scenario = line["spec"]["scenario"]
+        metrics = EpisodeMetrics.from_dict(line["metrics"]) if line["status"] == "ok" else None
+        if metrics is not None and "case" not in line:
+            metrics = replace(metrics, stop_signs=None)
+        group = str(line["group"])
+        natural = "natural" if scenario.get("type") == "NaturalJunction" else "other"
+        return cls(
+            metrics, group, str(line.get("cluster") or scenario["name"]),
+            str(line.get("case") or trace_hash or line["key"]), "pre-crash" if group in PRECRASH_GROUPS else natural,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
 class GroupRow:
-    """One system in one group of scenarios (`Avg.`: the mean of its groups' values)."""
+    """One system in one group of scenarios, or the average of the groups of a family."""
 
     system: str
     group: str
     values: dict[str, Estimate]
 
 
-def aggregate(episodes: Sequence[EpisodeMetrics | None]) -> dict[str, Estimate]:
-    """symbol of `METRICS` -> Estimate over the episodes; None is a failed episode. The order does not matter."""
-    ran = [e for e in episodes if e is not None]
-    failed = len(episodes) - len(ran)
-    result = {symbol: _estimate(metric, ran, failed) for symbol, metric in METRICS.items() if metric.field}
-    result["OS"] = _overall(ran, failed, {name: result[name].mean for name in ("CR", "OR", "DR", "RC", "TS")})
-    return result
+def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
+    """symbol of `METRICS` -> Estimate of one system; the order does not matter.
+
+    Over one group, the mean of its distinct episodes; over several, the unweighted mean of the groups' means. This is
+    the one place where numbers of driving come from: tables, cards, figures and files all show what it gives.
+    """
+    result = {}
+    for symbol, metric in METRICS.items():
+        if metric.field:
+            values = [_value(o, metric) for o in outcomes]
+            result[symbol] = estimate(values, metric.kind, scale=metric.scale, least=0.0)
+    return {symbol: result.get(symbol) or _overall(outcomes) for symbol in METRICS}
 
 
-def aggregate_groups(episodes: Iterable[tuple[str, str, EpisodeMetrics | None]]) -> list[GroupRow]:
-    """Rows for (system, group, episode) triples: each system's groups as they come, then their average."""
-    found: dict[str, dict[str, list[EpisodeMetrics | None]]] = {}
-    for system, group, episode in episodes:
-        found.setdefault(system, {}).setdefault(group, []).append(episode)
+def aggregate_groups(outcomes: Iterable[tuple[str, Outcome]]) -> list[GroupRow]:
+    """Rows for (system, outcome) pairs: each system's groups as they come, then the averages of their families.
+
+    A family other than the paper's has an average only if it has several groups.
+    """
+    found: dict[str, list[Outcome]] = {}
+    for system, outcome in outcomes:
+        found.setdefault(system, []).append(outcome)
     rows = []
-    for system, groups in found.items():
-        own = [GroupRow(system, group, aggregate(members)) for group, members in groups.items()]
-        average = {symbol: mean_of_estimates([row.values[symbol] for row in own]) for symbol in METRICS}
-        rows += [*own, GroupRow(system, AVERAGE, average)]
+    for system, own in found.items():
+        for group in dict.fromkeys(o.group for o in own):
+            rows.append(GroupRow(system, group, aggregate([o for o in own if o.group == group])))
+        for family, name in FAMILIES.items():
+            members = [o for o in own if o.family == family]
+            if len({o.group for o in members}) > (family != "pre-crash"):
+                rows.append(GroupRow(system, name, aggregate(members)))
     return rows
 
 
-def _estimate(metric: Metric, ran: Sequence[EpisodeMetrics], failed: int) -> Estimate:
-    values = [float(getattr(e, metric.field)) for e in ran]
-    if metric.kind == "share":
-        return wilson(sum(v > 0.0 for v in values), len(ran) + failed, failed=failed)
-    if metric.kind == "mean0":
-        values += [0.0] * failed
-    return mean_estimate(values, failed=failed)
+def _value(outcome: Outcome, metric: Metric) -> CaseValue:
+    """What an episode gives to a metric."""
+    number = None if outcome.metrics is None else getattr(outcome.metrics, metric.field)
+    if outcome.metrics is None:
+        number = metric.failed
+    value = math.nan if number is None else float(number)
+    if metric.kind == "share" and not math.isnan(value):
+        value = float(value > 0.0)
+    return CaseValue(value, outcome.cluster, outcome.case, outcome.group, outcome.metrics is None)
 
 
-def _overall(ran: Sequence[EpisodeMetrics], failed: int, means: dict[str, float]) -> Estimate:
-    """SafeBench's score of the means; its interval resamples whole episodes and rounds nothing."""
-    n = len(ran) + failed
-    if any(math.isnan(value) for value in means.values()):
-        return Estimate(math.nan, math.nan, math.nan, n, failed)
-    score = overall_score(means)
-    if n < 2:
-        return Estimate(score, math.nan, math.nan, n, failed)
-    rows = [(float(e.collision), e.off_road, e.distance_to_route, 1.0 - e.route_completion, e.time) for e in ran]
-    table: F64 = np.array(sorted(rows) + [(0.0, math.nan, math.nan, 1.0, math.nan)] * failed)
-    known = ~np.isnan(table)
-    counts = resample_counts(n)
-    weight = counts @ known.astype(np.float64)
-    # a resample of failed episodes alone has no mean of some terms and is left out
-    usable = (weight > 0.0).all(axis=1)
-    mean = (counts @ np.where(known, table, 0.0))[usable] / weight[usable]
-    scale = np.array([WEIGHTS[name] / DIVISORS[name] for name in ("CR", "OR", "DR", "IR", "TS")])
-    low, high = percentile_interval(mean @ scale)
-    return Estimate(score, min(low, score), max(high, score), n, failed, "percentile")
+def _overall(outcomes: Sequence[Outcome]) -> Estimate:
+    """SafeBench's score of the means, averaged over the groups; the interval is that of the unrounded score.
+
+    The score is a weighted sum of means, so an episode has one too: its collision, distances, incomplete route and
+    time. Of a failed episode the distances and the time are taken as the group's mean; whether it collided is unknown.
+    """
+    groups: dict[str, list[Outcome]] = {}
+    for o in outcomes:
+        groups.setdefault(o.group, []).append(o)
+    scores: list[float] = []
+    least: list[CaseValue] = []
+    most: list[CaseValue] = []
+    for group, members in groups.items():
+        means = {
+            name: estimate([_value(o, METRICS[name]) for o in members], METRICS[name].kind).mean
+            for name in ("CR", "OR", "DR", "RC", "TS")
+        }
+        if any(math.isnan(value) for value in means.values()):
+            continue
+        scores.append(overall_score(means))
+        for into, unknown in ((least, 0.0), (most, 1.0)):
+            for o in members:
+                own = dict(means) | {"CR": unknown, "RC": 0.0}
+                if o.metrics is not None:
+                    own = {name: float(getattr(o.metrics, METRICS[name].field)) for name in means}
+                own["IR"] = 1.0 - own["RC"]
+                score = math.fsum(WEIGHTS[name] * own[name] / DIVISORS[name] for name in WEIGHTS)
+                into.append(CaseValue(score, o.cluster, o.case, group, o.metrics is None))
+    if not scores:
+        return replace(NOTHING, failed=sum(o.metrics is None for o in outcomes))
+    mean = math.fsum(scores) / len(scores)
+    first, second = estimate(least, "mean", least=0.0), estimate(most, "mean", least=0.0)
+    return replace(first, mean=mean, low=min(first.low, mean), high=max(second.high, mean))

@@ -30,7 +30,7 @@ from ssad.metrics.detection_boxes import (
     keep_boxes,
 )
 from ssad.metrics.detection_match import ClassMatches, match_class
-from ssad.metrics.uncertainty import percentile_interval
+from ssad.metrics.uncertainty import replicate_estimate
 
 __all__ = [
     "CVPR_2019",
@@ -203,21 +203,21 @@ def scene_intervals(
     *,
     generator: np.random.Generator,
     replicates: int = 200,
-    level: float = 0.95,
 ) -> dict[str, tuple[float, float]]:
-    """Limits of mean_ap and nd_score by the percentile bootstrap over scenes (key frames of a scene are alike).
+    """Limits of mean_ap and nd_score by the bootstrap over scenes (key frames of a scene are alike).
 
-    scene_of_sample [S]: index of the scene of each sample. With a single scene there is no interval: both are NaN.
+    scene_of_sample [S]: index of the scene of each sample. With fewer than five scenes there is no interval: both are
+    NaN.
     """
     scenes, scene = np.unique(scene_of_sample, return_inverse=True)
-    if len(scenes) < 2:
-        return {"mean_ap": (np.nan, np.nan), "nd_score": (np.nan, np.nan)}
     draws = generator.multinomial(len(scenes), np.full(len(scenes), 1.0 / len(scenes)), size=replicates)
-    found = [matches.scores(draw[scene]) for draw in draws]
-    return {
-        "mean_ap": percentile_interval([s.mean_ap for s in found], level),
-        "nd_score": percentile_interval([s.nd_score for s in found], level),
-    }
+    own, found = matches.scores(), [matches.scores(draw[scene]) for draw in draws]
+    limits = {}
+    for name in ("mean_ap", "nd_score"):
+        values = [float(getattr(s, name)) for s in found]
+        e = replicate_estimate(float(getattr(own, name)), values, n=len(scene), clusters=len(scenes))
+        limits[name] = (e.low, e.high)
+    return limits
 
 
 @dataclass(frozen=True)

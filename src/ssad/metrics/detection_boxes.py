@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import RANGES
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64, I32, Bool
 
 I8 = npt.NDArray[np.int8]
@@ -21,18 +22,6 @@ I64 = npt.NDArray[np.int64]
 
 TP_METRICS: Final = ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")
 RACKED: Final = ("bicycle", "motorcycle")
-_RANGES: Final = {
-    "car": 50.0,
-    "truck": 50.0,
-    "bus": 50.0,
-    "trailer": 50.0,
-    "construction_vehicle": 50.0,
-    "pedestrian": 40.0,
-    "motorcycle": 40.0,
-    "bicycle": 40.0,
-    "traffic_cone": 30.0,
-    "barrier": 30.0,
-}
 
 
 @dataclass(frozen=True)
@@ -94,7 +83,7 @@ class DetectionConfig:
     class_range: class -> range in metres, in the order of the labels; dist_ths: thresholds of a match, m.
     """
 
-    class_range: Mapping[str, float] = field(default_factory=lambda: MappingProxyType(_RANGES))
+    class_range: Mapping[str, float] = field(default_factory=lambda: RANGES)
     dist_ths: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     dist_th_tp: float = 2.0
     min_recall: float = 0.1
@@ -178,7 +167,7 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
     rack = order[np.arange(len(point)) - np.repeat(np.cumsum(count) - count - low, count)]
 
     w, length, h = 0.5 * racks.size[rack].T
-    turn = rotation_matrix(racks.rotation[rack])
+    turn = quaternion_to_matrix(racks.rotation[rack])
     corner = np.empty((4, len(rack), 3))
     for i, (a, b, c) in enumerate(((1, 1, 1), (-1, 1, 1), (1, -1, 1), (1, 1, -1))):
         local = np.stack([a * length, b * w, c * h], axis=-1)
@@ -189,21 +178,3 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
         along = (edge * offset).sum(axis=-1)
         inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=-1))
     return np.bincount(point[inside], minlength=len(sample)) > 0
-
-
-def rotation_matrix(quaternion: F64) -> F64:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] (w, x, y, z), brought to unit length (0 stays 0)."""
-    norm = np.sqrt((quaternion * quaternion).sum(axis=-1, keepdims=True))
-    w, x, y, z = (quaternion / np.where(norm > 0.0, norm, 1.0)).T
-    rows = (
-        (w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def yaw(quaternion: F64) -> F64:
-    """Heading [N] of quaternions [N, 4]: direction of the turned x axis in the plane, radians."""
-    w, x, y, z = quaternion.T
-    return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))

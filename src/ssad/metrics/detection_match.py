@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssad.core.errors import FormatError
+from ssad.core.rotations import quaternion_to_yaw
 from ssad.core.types import F64, I32, Bool
-from ssad.metrics.detection_boxes import I64, BoxTable, DetectionConfig, yaw
+from ssad.metrics.detection_boxes import I64, BoxTable, DetectionConfig
 
 PAIRS = 1 << 16  # pairs looked at together: bounds the memory
 
@@ -166,7 +167,8 @@ def _errors(truth: BoxTable, found: BoxTable, period: float) -> F64:
     dx, dy = (found.translation[:, :2] - truth.translation[:, :2]).T
     shared = np.prod(np.minimum(truth.size, found.size), axis=-1)
     union = np.prod(truth.size, axis=-1) + np.prod(found.size, axis=-1) - shared
-    turn = np.abs((yaw(truth.rotation) - yaw(found.rotation) + period / 2) % period - period / 2)
+    off = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
+    turn = np.abs((off + period / 2) % period - period / 2)
     vx, vy = (found.velocity - truth.velocity).T
     wrong = np.where(truth.attribute < 0, np.nan, truth.attribute != found.attribute)
     return np.stack([np.sqrt(dx * dx + dy * dy), 1.0 - shared / union, turn, np.sqrt(vx * vx + vy * vy), wrong])

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Bool, Contact, EpisodeTrace
 from ssad.metrics.criticality import min_distance, min_ttc, post_encroachment_time
 
@@ -50,11 +50,12 @@ PLACE_FORGOTTEN = 5.0
 
 @dataclass(frozen=True)
 class EpisodeMetrics:
-    """Raw metrics of one episode; NaN where the trace has nothing to measure.
+    """Raw metrics of one episode; NaN where the trace has nothing to measure, None where the world has not.
 
     collision; collision_events and collisions_* (events by what was hit); off_road m driven off the road;
     off_road_fraction of the metres driven; distance_to_route m; route_completion and route_following in [0, 1]; time s;
-    driven m; red_lights, stop_signs, lane_invasions (counts); acceleration m/s^2; yaw_velocity rad/s;
+    driven m; red_lights, stop_signs, lane_invasions (counts; stop_signs is None in a world without stop signs, and the
+    driving score then leaves them out); acceleration m/s^2; yaw_velocity rad/s;
     in_route_failure; driving_score in [0, 100]; min_ttc s and pet s (10: none); min_distance m (NaN: nobody else).
     """
 
@@ -72,7 +73,7 @@ class EpisodeMetrics:
     time: float
     driven: float
     red_lights: int
-    stop_signs: int
+    stop_signs: int | None
     acceleration: float
     yaw_velocity: float
     lane_invasions: int
@@ -88,16 +89,26 @@ class EpisodeMetrics:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> EpisodeMetrics:
-        """From `as_dict` or its JSON form: None is NaN, other keys are ignored. KeyError names a missing field."""
-        read: dict[str, Any] = {"bool": bool, "int": int, "float": float}
-        values: dict[str, Any] = {
-            f.name: math.nan if data[f.name] is None else read[str(f.type)](data[f.name]) for f in fields(cls)
-        }
+        """From `as_dict` or its JSON form: None or absent is NaN (stop_signs: None); other keys are ignored."""
+        read: dict[str, Any] = {"bool": bool, "int": int, "int | None": int, "float": float}
+        values: dict[str, Any] = {}
+        for f in fields(cls):
+            value = data.get(f.name)
+            missing = None if f.type == "int | None" else math.nan
+            values[f.name] = missing if value is None else read[str(f.type)](value)
         return cls(**values)
 
 
-def episode_metrics(trace: EpisodeTrace) -> EpisodeMetrics:
-    """All metrics of one episode. ValueError if the trace has no row."""
+def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> EpisodeMetrics:
+    """All metrics of one episode.
+
+    Args:
+        trace: what happened.
+        stop_signs: whether the world that the trace is from has stop signs (the embedded one has none yet).
+
+    Raises:
+        ValueError: the trace has no row.
+    """
     if len(trace.contact) == 0:
         raise ValueError(f"trace {trace.key}: no rows")
     events = collision_events(trace)
@@ -108,7 +119,8 @@ def episode_metrics(trace: EpisodeTrace) -> EpisodeMetrics:
     deviation = _mean(trace.route_distance[1:])
     # bodies may touch between two rows
     touched = bool((trace.contact_agent >= 0).any())
-    infractions = kinds | {"red_lights": int(trace.red_light.sum()), "stop_signs": int(trace.stop_sign.sum())}
+    infractions = kinds | {"red_lights": int(trace.red_light.sum())}
+    signs = int(trace.stop_sign.sum()) if stop_signs else None
     return EpisodeMetrics(
         collision=collided(trace),
         collision_events=int(events.sum()),
@@ -123,10 +135,11 @@ def episode_metrics(trace: EpisodeTrace) -> EpisodeMetrics:
         yaw_velocity=mean_yaw_velocity(trace),
         lane_invasions=int(trace.lane_invasion.sum()),
         in_route_failure=in_route_failure(trace),
-        driving_score=driving_score(completion, infractions, fraction),
+        driving_score=driving_score(completion, infractions | {"stop_signs": signs or 0}, fraction),
         min_ttc=0.0 if touched else min_ttc(trace),
         pet=0.0 if touched else post_encroachment_time(trace),
         min_distance=0.0 if touched else min_distance(trace),
+        stop_signs=signs,
         **infractions,
     )
 

@@ -1,31 +1,65 @@
-"""How sure a mean is: intervals for proportions, means and paired differences. Seeded, so the same data give the
-same interval, whatever their order."""
+"""How sure a number is: means, scores and paired differences with their 95 % intervals.
+
+Every estimate takes values with their case and cluster. Copies of one case count once, cases of one cluster are alike,
+and the interval comes from how the clusters vary. Nothing is drawn at random, so the same data give the same interval,
+whatever their order. The methods in plain words: docs/metrics.md.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import lru_cache
-from statistics import NormalDist
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.seeding import generator
 from ssad.core.types import F64
+from ssad.metrics.intervals import (
+    MIN_CLUSTERS,
+    Clusters,
+    Limits,
+    bounded_limits,
+    mean_limits,
+    replicate_limits,
+)
 
-RESAMPLES = 2000
-LEVEL = 0.95
+Kind = Literal["share", "bounded", "mean"]
+
+
+@dataclass(frozen=True)
+class CaseValue:
+    """What one case gave.
+
+    Attributes:
+        value: the number; NaN where it was not measured, or is unknown because the case failed.
+        cluster: what cases share (scenario, route, drive).
+        case: names the case; values of the same case and stratum are copies.
+        stratum: the group it belongs to where several are averaged; groups weigh the same.
+        failed: the case failed.
+    """
+
+    value: float
+    cluster: str
+    case: str
+    stratum: str = ""
+    failed: bool = False
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its interval at 95 %; NaN where the data do not give one.
+    """A mean and how sure it is; NaN where the data do not give it.
 
-    n: values behind the mean; failed: episodes that gave no value because they failed; method: how the interval was
-    found (`wilson`, `bca`, `percentile`, `cluster`, `mover`, `constant`, `none`).
+    Attributes:
+        mean: the mean over the distinct cases, or over the strata's means.
+        low: lower limit, or the least cluster mean where method is "range".
+        high: upper limit, or the greatest cluster mean where method is "range".
+        n: distinct cases behind the mean (copies count once).
+        failed: cases that gave no value because they failed.
+        method: what low and high are: "beta", "t" (95 % intervals), "range" (over the clusters, which are too few or
+            too alike for an interval), "none".
+        clusters: distinct clusters behind the mean.
     """
 
     mean: float
@@ -34,132 +68,122 @@ class Estimate:
     n: int
     failed: int = 0
     method: str = "none"
+    clusters: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """Field name -> value."""
         return asdict(self)
 
+    def scaled(self, factor: float, offset: float = 0.0) -> Estimate:
+        """The estimate of factor x value + offset."""
+        ends = sorted((factor * self.low + offset, factor * self.high + offset))
+        return replace(self, mean=factor * self.mean + offset, low=ends[0], high=ends[1])
 
-def wilson(successes: int, n: int, *, failed: int = 0, level: float = LEVEL) -> Estimate:
-    """Proportion successes / n with Wilson's score interval (Wilson 1927).
 
-    failed: how many of the n have an unknown outcome. They count in n as no success, and the upper limit is that of
-    all of them being one, so the interval holds whatever they were.
+NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
+
+
+def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, least: float = -math.inf) -> Estimate:
+    """Mean of case values with its 95 % interval; with several strata, the unweighted mean of their means.
+
+    Args:
+        values: what the cases gave. Copies (same case, same stratum) count once; NaN is left out.
+        kind: "share": values are 0 or 1, and a failed case without a value counts in n after all, as 0 in the mean and
+            the lower limit and as 1 in the upper one, so the interval holds whatever it was. "bounded": values lie in
+            [0, `scale`]. "mean": any values.
+        scale: upper bound of a bounded value.
+        least: lower bound of a mean; the interval does not go below it.
+
+    Returns:
+        The estimate. Fewer than five clusters, or clusters too alike for an interval: low and high are the range.
     """
-    if not 0 <= successes <= n - failed:
-        raise ValueError(f"{successes} successes and {failed} failed of {n}")
-    if n == 0:
-        return Estimate(math.nan, math.nan, math.nan, 0, failed)
-    low = _score_limits(successes, n, level)[0]
-    high = _score_limits(successes + failed, n, level)[1]
-    return Estimate(successes / n, low, high, n, failed, "wilson")
+    distinct = _distinct(values)
+    failed = sum(v.failed for v in distinct)
+    unknown = [v.failed and math.isnan(v.value) and kind == "share" for v in distinct]
+    used = [v for v, known in zip(distinct, unknown, strict=True) if known or not math.isnan(v.value)]
+    if not used:
+        return replace(NOTHING, failed=failed)
+    clusters, index = _clusters(used)
+    found = []
+    for outcome in (0.0, 1.0) if any(unknown) else (0.0,):
+        numbers = np.array([outcome if math.isnan(v.value) else v.value for v in used]) / scale
+        sums = np.bincount(index, numbers, len(clusters.size)).astype(np.float64)
+        found.append(_ends(sums, clusters, kind, least / scale))
+    mean, low, method = float(found[0].mean), float(found[0].low), found[0].method
+    high = float(found[-1].high)
+    return Estimate(
+        scale * mean, scale * min(low, mean), scale * max(high, mean), len(used), failed, method, len(clusters.size)
+    )
 
 
-def mean_estimate(values: npt.ArrayLike, *, failed: int = 0, level: float = LEVEL) -> Estimate:
-    """Mean of the values that are not NaN, with a bias-corrected accelerated bootstrap interval (Efron 1987).
-
-    One value has no interval; equal values have an interval of no width (`constant`), which shows only that the data
-    do not vary.
-    """
-    data = np.asarray(values, np.float64).ravel()
-    data = np.sort(data[~np.isnan(data)])
-    n = len(data)
-    if n == 0:
-        return Estimate(math.nan, math.nan, math.nan, 0, failed)
-    mean = float(data.mean())
-    if n == 1:
-        return Estimate(mean, math.nan, math.nan, 1, failed)
-    if data[0] == data[-1] or not np.isfinite(data).all():
-        return Estimate(mean, mean, mean, n, failed, "constant" if np.isfinite(mean) else "none")
-    means = resample_counts(n) @ data / n
-    low, high = _bca(means, data, mean, level)
-    return Estimate(mean, low, high, n, failed, "bca")
-
-
-def cluster_estimate(
-    values: npt.ArrayLike, clusters: Sequence[Hashable], *, failed: int = 0, level: float = LEVEL
+def replicate_estimate(
+    value: float, replicates: Sequence[float], *, n: int, clusters: int, bounded: bool = True
 ) -> Estimate:
-    """Mean of the values, resampled by cluster (episodes of one scenario are alike): percentile bootstrap.
+    """A score that is no mean (mAP, NDS and what is made of them), its interval from bootstrap replicates.
 
-    values [n] and clusters [n]; NaN values are left out.
+    Args:
+        value: the score.
+        replicates: the score of resamples of whole clusters (scenes).
+        n: cases behind the score.
+        clusters: how many clusters were resampled; fewer than five give no interval.
+        bounded: whether the score lies in [0, 1]; else it is at least 0.
     """
-    data = np.asarray(values, np.float64).ravel()
-    groups: dict[Hashable, list[float]] = {}
-    for value, cluster in zip(data.tolist(), clusters, strict=True):
-        if not math.isnan(value):
-            groups.setdefault(cluster, []).append(value)
-    if len(groups) < 2:
-        mean = math.nan if not groups else float(np.mean(next(iter(groups.values()))))
-        return Estimate(mean, math.nan, math.nan, sum(map(len, groups.values())), failed)
-    sums = np.array(sorted((math.fsum(group), len(group)) for group in groups.values()))
-    counts = resample_counts(len(sums))
-    low, high = percentile_interval(counts @ sums[:, 0] / (counts @ sums[:, 1]), level)
-    return Estimate(sums[:, 0].sum() / sums[:, 1].sum(), low, high, int(sums[:, 1].sum()), failed, "cluster")
+    known = np.array([r for r in replicates if not math.isnan(r)])
+    variance = float(known.var(ddof=1)) if len(known) > 1 else math.nan
+    if clusters < MIN_CLUSTERS or math.isnan(value + variance) or not (bounded or min(value, variance) > 0.0):
+        return Estimate(value, math.nan, math.nan, n, clusters=clusters)
+    low, high = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=bounded)
+    return Estimate(value, float(low), float(high), n, 0, "beta" if bounded else "t", clusters)
 
 
-def paired_difference(
-    first: Mapping[str, float | None], second: Mapping[str, float | None], *, level: float = LEVEL
-) -> Estimate:
-    """Mean of first - second over the scenarios (keys) that both have, with its bootstrap interval.
+def paired_difference(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> Estimate:
+    """Mean of first - second over the cells that both have, by the rules of `estimate`.
 
-    failed: keys that only one has, or whose value is None or NaN in either.
+    Args:
+        first: values of one system by what was put to it (scenario and repetition); the clusters count, strata do not.
+        second: those of the other system. Two pairs are copies if both halves are.
+
+    Returns:
+        The estimate; failed: cells that only one has, or that failed or were not measured in either.
     """
-    keys = sorted(set(first) | set(second))
-    pairs = [(first.get(key), second.get(key)) for key in keys]
-    difference = [a - b for a, b in pairs if a is not None and b is not None and not math.isnan(a - b)]
-    return mean_estimate(difference, failed=len(keys) - len(difference), level=level)
+    pairs = [
+        CaseValue(a.value - b.value, a.cluster, f"{a.case}\n{b.case}")
+        for key in sorted(set(first) & set(second))
+        if not ((a := first[key]).failed or (b := second[key]).failed or math.isnan(a.value - b.value))
+    ]
+    missing = len(set(first) | set(second)) - len(pairs)
+    return replace(estimate(pairs, "mean"), failed=missing)
 
 
-def mean_of_estimates(estimates: Sequence[Estimate]) -> Estimate:
-    """Unweighted mean of independent estimates (the paper's Avg. column); those without a mean are left out.
-
-    The limits' distances from the mean add as squares (MOVER, Zou and Donner 2008).
-    """
-    known = [e for e in estimates if not math.isnan(e.mean)]
-    n, failed = sum(e.n for e in estimates), sum(e.failed for e in estimates)
-    if not known:
-        return Estimate(math.nan, math.nan, math.nan, n, failed)
-    mean = math.fsum(e.mean for e in known) / len(known)
-    below = math.sqrt(math.fsum((e.mean - e.low) ** 2 for e in known)) / len(known)
-    above = math.sqrt(math.fsum((e.high - e.mean) ** 2 for e in known)) / len(known)
-    method = "none" if math.isnan(below + above) else "mover"
-    return Estimate(mean, mean - below, mean + above, n, failed, method)
+def _distinct(values: Iterable[CaseValue]) -> list[CaseValue]:
+    """One value a case and stratum, in an order that does not depend on theirs."""
+    found: dict[tuple[str, str], CaseValue] = {}
+    # should copies disagree, one that ran counts before one that failed or was not measured
+    for v in sorted(values, key=lambda v: (v.stratum, v.case, math.isnan(v.value), v.failed, v.cluster, str(v.value))):
+        found.setdefault((v.stratum, v.case), v)
+    return list(found.values())
 
 
-@lru_cache(maxsize=16)
-def resample_counts(n: int) -> F64:
-    """[RESAMPLES, n] how often each of n values is drawn in each resample; read-only, the same in every process."""
-    counts = generator("bootstrap", n).multinomial(n, np.full(n, 1.0 / n), size=RESAMPLES).astype(np.float64)
-    counts.setflags(write=False)
-    return counts
+def _clusters(values: Sequence[CaseValue]) -> tuple[Clusters, npt.NDArray[np.intp]]:
+    """The clusters of the values, and the cluster of each value."""
+    strata = {name: k for k, name in enumerate(dict.fromkeys(v.stratum for v in values))}
+    names = {name: k for k, name in enumerate(dict.fromkeys((v.stratum, v.cluster) for v in values))}
+    index = np.array([names[v.stratum, v.cluster] for v in values])
+    size = np.bincount(index).astype(np.float64)
+    return Clusters(size, np.array([strata[stratum] for stratum, _ in names])), index
 
 
-def percentile_interval(samples: npt.ArrayLike, level: float = LEVEL) -> tuple[float, float]:
-    """Limits that leave (1 - level) / 2 of the samples on each side."""
-    tail = 0.5 * (1.0 - level)
-    low, high = np.quantile(np.asarray(samples, np.float64), [tail, 1.0 - tail])
-    return float(low), float(high)
-
-
-def _score_limits(successes: int, n: int, level: float) -> tuple[float, float]:
-    z = NormalDist().inv_cdf(0.5 + 0.5 * level)
-    share = successes / n
-    centre = (share + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(share * (1 - share) / n + z * z / (4 * n * n))
-    # rounding must not move the limits that are 0 and 1 exactly
-    low = 0.0 if successes == 0 else max(centre - half, 0.0)
-    return low, 1.0 if successes == n else min(centre + half, 1.0)
-
-
-def _bca(means: F64, data: F64, mean: float, level: float) -> tuple[float, float]:
-    normal = NormalDist()
-    below = float(((means < mean) + 0.5 * (means == mean)).mean())
-    bias = normal.inv_cdf(min(max(below, 0.5 / len(means)), 1.0 - 0.5 / len(means)))
-    # a mean with one value left out differs from the mean by -(value - mean) / (n - 1)
-    deviation = data - mean
-    acceleration = float((deviation**3).sum() / (6.0 * (deviation**2).sum() ** 1.5))
-    limits = []
-    for tail in (0.5 - 0.5 * level, 0.5 + 0.5 * level):
-        z = bias + normal.inv_cdf(tail)
-        limits.append(float(np.quantile(means, normal.cdf(bias + z / max(1.0 - acceleration * z, 1e-6)))))
-    return min(limits[0], mean), max(limits[1], mean)
+def _ends(sums: F64, clusters: Clusters, kind: Kind, least: float) -> Limits:
+    """The interval, or the range of the clusters' means where there is none; one cluster has neither."""
+    if len(sums) >= MIN_CLUSTERS:
+        if kind == "mean":
+            found = mean_limits(sums, clusters)
+        else:
+            found = bounded_limits(sums, clusters, cap=2.0 * clusters.size.sum() if kind == "share" else math.inf)
+        if not math.isnan(float(found.low)):
+            return replace(found, low=np.maximum(found.low, least))
+    means = sums / clusters.size
+    mean = np.asarray(means @ clusters.weight)
+    if len(means) == 1:
+        return Limits(mean, np.asarray(math.nan), np.asarray(math.nan), "none")
+    return Limits(mean, means.min(), means.max(), "range")

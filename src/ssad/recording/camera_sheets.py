@@ -7,32 +7,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ssad.assets.bodies import draw_paint, make_body
+from ssad.assets.actor_bodies import BODY_CATEGORIES, class_of
+from ssad.assets.bodies import BODIES, draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, build
 from ssad.assets.street import cached_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.rig import RIG, place, rig_camera
+from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene, Thing
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.images import captioned, save_picture
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, LaneType
 from ssad.jobs.machine import quiet_warp
 from ssad.roads import load_town
 
-# the ten classes of nuScenes and the kinds and styles of bodies that play them
-CLASSES = {
-    "car": ("car", ("sedan", "hatchback", "estate", "suv", "van", "pickup")),
-    "truck": ("truck", ("box", "flatbed", "tractor", "tipper")),
-    "bus": ("bus", ("city", "coach", "bendy")),
-    "trailer": ("trailer", ("box", "tank", "utility")),
-    "construction vehicle": ("construction", ("excavator", "wheel_loader")),
-    "motorcycle": ("motorcycle", ("ridden", "parked")),
-    "bicycle": ("bicycle", ("ridden", "parked")),
-    "pedestrian": ("pedestrian", ("adult", "child", "standing")),
-    "traffic cone": ("traffic_cone", ("cone", "tall", "drum")),
-    "barrier": ("barrier", ("jersey", "fence", "water")),
-}
+# styles of a kind of body that the sheet of classes shows, where they are not its first three
+SHOWN = {"trailer": ("box", "tank", "utility"), "barrier": ("jersey", "fence", "water")}
 WEATHERS = {
     "clear, noon": Weather(1.0, 0.9, 0.2),
     "overcast": Weather(0.7, 0.9, 1.0),
@@ -55,10 +46,10 @@ def _floor() -> Mesh:
 def class_sheet(width: int = 240) -> U8:
     """The ten classes, one row each kind of body."""
     meshes, cells = [_floor()], []
-    for name, (kind, styles) in CLASSES.items():
-        for style in styles[:3]:
+    for kind in BODY_CATEGORIES:
+        for style in SHOWN.get(kind, tuple(BODIES[kind].styles)[:3]):
             meshes.append(make_body(kind, style=style, generator=generator("gallery", kind, style)))
-            cells.append((f"{name}: {style.replace('_', ' ')}", len(meshes) - 1))
+            cells.append((f"{class_of(kind)}: {style}".replace("_", " "), len(meshes) - 1))
     stage = Scene(None, meshes)
     camera = Camera.typical(width * 2, width * 3 // 2)
     views = []
@@ -66,7 +57,7 @@ def class_sheet(width: int = 240) -> U8:
         low, high = meshes[mesh].bounds()
         away = 1.15 * float(np.linalg.norm(high - low)) + 0.6
         yaw = np.radians(-145.0)
-        pose = place(np.cos(yaw + np.pi) * away, np.sin(yaw + np.pi) * away, yaw, 0.45 * away)
+        pose = upright_pose(np.cos(yaw + np.pi) * away, np.sin(yaw + np.pi) * away, yaw, 0.45 * away)
         tilt = np.arctan2(0.45 * away - high[2] / 2, away)
         turn = np.array([[1, 0, 0], [0, np.cos(tilt), np.sin(tilt)], [0, -np.sin(tilt), np.cos(tilt)]])
         pose[:3, :3] = pose[:3, :3] @ FORWARD[:3, :3] @ turn
@@ -89,17 +80,17 @@ def street_scene(town: str = "Twinford") -> tuple[Scene, F64, tuple[Thing, ...]]
     lanes = [k for k in range(len(graph.kind)) if graph.kind[k] == LaneType.DRIVING and graph.junction[k] < 0]
     start = next(k for k in lanes if graph.s[graph.offset[k + 1] - 1] > 50)
     first = int(graph.offset[start] + 8)
-    ego = place(float(graph.xy[first, 0]), float(graph.xy[first, 1]), float(graph.yaw[first]))
+    ego = upright_pose(float(graph.xy[first, 0]), float(graph.xy[first, 1]), float(graph.yaw[first]))
     draws, things = generator("gallery street"), []
     spots = [i for k in lanes for i in range(graph.offset[k] + 2, graph.offset[k + 1], 13)]
-    poses = [place(float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])) for i in spots]
-    poses += [place(float(q[0]), float(q[1]), float(q[2])) for q in street.parking]
+    poses = [upright_pose(float(graph.xy[i, 0]), float(graph.xy[i, 1]), float(graph.yaw[i])) for i in spots]
+    poses += [upright_pose(float(q[0]), float(q[1]), float(q[2])) for q in street.parking]
     for number, pose in enumerate(poses):
         if 8 < np.hypot(*(pose[:2, 3] - ego[:2, 3])) < 110 and draws.random() < 0.7:
             walker = number % len(kinds) == len(kinds) - 1
             mesh = number % (len(kinds) - 1) if number < len(spots) else (0, 1, 3, 5)[number % 4]
             aside = walker and number < len(spots)  # on the sidewalk
-            where = pose @ place(0.0, -4.2, 0.3) if aside else pose
+            where = pose @ upright_pose(0.0, -4.2, 0.3) if aside else pose
             things.append(Thing(len(kinds) - 1 if aside else mesh, where, draw_paint(draws), number + 1))
     return Scene(street, meshes), ego, tuple(things)
 

@@ -18,15 +18,16 @@ from typing import Any, Final, Literal
 import cv2
 import numpy as np
 
+from ssad.assets.actor_bodies import class_of
 from ssad.assets.bodies import BODIES, draw_paint, draw_size, draw_style, make_body
 from ssad.camera.labels import label_picture
 from ssad.camera.render import Picture, View, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core import safeio
-from ssad.core.detections import CLASSES_3D
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.seeding import digest, generator
 from ssad.core.types import U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
@@ -39,8 +40,7 @@ from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects,
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
 from ssad.roads import load_town, town_names
 
-CLASSES: Final = CLASSES_3D  # category ids are 1 and more in this order
-_LABEL = {"construction": "construction_vehicle"}
+CLASSES: Final = MMDET3D_CLASSES  # category ids are 1 and more in this order
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
 DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
@@ -282,7 +282,7 @@ def _annotate(
         if who.body.kind:
             middle = who.pose[:3, 3] + [0.0, 0.0, who.body.size[2] / 2]
             objects.append(
-                {"label": CLASSES.index(_LABEL.get(who.body.kind, who.body.kind)), "box": labels.box[n].tolist(),
+                {"label": CLASSES.index(class_of(who.body.kind)), "box": labels.box[n].tolist(),
                  "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
                  "visible": round(float(labels.share[n]), 3),
                  "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}

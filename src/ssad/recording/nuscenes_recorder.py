@@ -17,16 +17,19 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from ssad.camera.labels import visibility_token, visible_share
+from ssad.assets.actor_bodies import BODY_CATEGORIES
+from ssad.camera.labels import visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
-from ssad.camera.rig import RIG, place, rig_camera
+from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Boxes3D, Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.nuscenes_names import visibility_token
+from ssad.core.rotations import matrix_to_quaternion, upright_pose, wrap_angle
 from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, Episode, EpisodeTrace
 from ssad.datasets.nuscenes.files import points_bytes
@@ -44,12 +47,6 @@ KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
 REACH: Final = 80.0  # m within which things are annotated
 PART: Final = "part.json"
-CATEGORY: Final = {
-    "car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "trailer": "vehicle.trailer",
-    "construction": "vehicle.construction", "motorcycle": "vehicle.motorcycle", "bicycle": "vehicle.bicycle",
-    "pedestrian": "human.pedestrian.adult", "traffic_cone": "movable_object.trafficcone",
-    "barrier": "movable_object.barrier",
-}  # fmt: skip
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
     "CAM_FRONT_LEFT": 0.0431, "CAM_FRONT": 0.0355, "CAM_FRONT_RIGHT": 0.0276, "CAM_BACK_RIGHT": 0.0201,
@@ -116,16 +113,6 @@ def draw_weather(key: tuple[object, ...]) -> Weather:
     return found[str(kind)]
 
 
-def _quaternion(matrix: F64) -> tuple[float, float, float, float]:
-    """(w, x, y, z) of a rotation."""
-    m = matrix
-    w = np.sqrt(max(0.0, 1 + m[0, 0] + m[1, 1] + m[2, 2])) / 2
-    x = np.copysign(np.sqrt(max(0.0, 1 + m[0, 0] - m[1, 1] - m[2, 2])) / 2, m[2, 1] - m[1, 2])
-    y = np.copysign(np.sqrt(max(0.0, 1 - m[0, 0] + m[1, 1] - m[2, 2])) / 2, m[0, 2] - m[2, 0])
-    z = np.copysign(np.sqrt(max(0.0, 1 - m[0, 0] - m[1, 1] + m[2, 2])) / 2, m[1, 0] - m[0, 1])
-    return float(w), float(x), float(y), float(z)
-
-
 def depth_bytes(depth: Any) -> bytes:
     """A depth map [H, W] at a quarter of the resolution, 16-bit PNG: 64 a metre, 65535 for the sky."""
     small = np.asarray(depth, np.float64)[2::4, 2::4]
@@ -150,9 +137,9 @@ def ego_at(trace: EpisodeTrace, time: float) -> F64:
     exact = min(max(time / trace.dt, 0.0), len(trace.x) - 1.0)
     low = min(int(exact), max(len(trace.x) - 2, 0))
     high, part = min(low + 1, len(trace.x) - 1), exact - low
-    turn = (float(trace.yaw[high, 0] - trace.yaw[low, 0]) + np.pi) % (2 * np.pi) - np.pi
+    turn = float(wrap_angle(float(trace.yaw[high, 0] - trace.yaw[low, 0])))
     x, y = (float(v[low, 0]) + part * float(v[high, 0] - v[low, 0]) for v in (trace.x, trace.y))
-    return place(x, y, float(trace.yaw[low, 0]) + part * turn)
+    return upright_pose(x, y, float(trace.yaw[low, 0]) + part * turn)
 
 
 def _scene(task: tuple[Recording, str, int, str]) -> str:
@@ -313,7 +300,7 @@ def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[in
         return []
     centre = np.array([s.pose[:3, 3] + [0, 0, s.body.size[2] / 2] for s in near])
     size = np.array([[s.body.size[1], s.body.size[0], s.body.size[2]] for s in near])
-    rotation = np.array([_quaternion(s.pose[:3, :3]) for s in near])
+    rotation = matrix_to_quaternion([s.pose[:3, :3] for s in near])
     boxes = Boxes3D(tuple(str(s.body.tag) for s in near), centre, size, rotation, np.zeros_like(centre),
                     np.ones(len(near)))  # fmt: skip
     pose = ego @ HDL32E.to_ego
@@ -324,9 +311,9 @@ def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[in
         share = shares.get(who.body.tag, 0.0)
         if counts[n] or share > 0:
             found.append(
-                {"tag": who.body.tag, "category": CATEGORY[who.body.kind], "attributes": list(attributes_of(who)),
-                 "centre": centre[n].tolist(), "size": size[n].tolist(), "rotation": list(rotation[n]),
-                 "points": int(counts[n]), "visibility": visibility_token(share)}
+                {"tag": who.body.tag, "category": BODY_CATEGORIES[who.body.kind],
+                 "attributes": list(attributes_of(who)), "centre": centre[n].tolist(), "size": size[n].tolist(),
+                 "rotation": list(rotation[n]), "points": int(counts[n]), "visibility": visibility_token(share)}
             )  # fmt: skip
     return found
 
@@ -405,7 +392,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
                 pose = np.array(sensor["pose"])
                 writer.add_sensor(
                     scene, sensor["channel"], modality=sensor["modality"], translation=tuple(pose[:3, 3]),
-                    rotation=_quaternion(pose[:3, :3]), intrinsic=sensor["intrinsic"],
+                    rotation=tuple(matrix_to_quaternion(pose[:3, :3])), intrinsic=sensor["intrinsic"],
                 )  # fmt: skip
             times = {}
             for sample in part["samples"]:
@@ -414,7 +401,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
                 ego = np.array(frame["ego"])
                 token = writer.add_sensor_frame(
                     scene, frame["channel"], timestamp_us=frame["time"], data=folder / frame["file"],
-                    ego_translation=tuple(ego[:3, 3]), ego_rotation=_quaternion(ego[:3, :3]),
+                    ego_translation=tuple(ego[:3, 3]), ego_rotation=tuple(matrix_to_quaternion(ego[:3, :3])),
                     sample=times[frame["sweep"]] if frame["key"] else None, size=tuple(frame["size"]),
                 )  # fmt: skip
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"

@@ -7,35 +7,29 @@ from pathlib import Path
 
 import numpy as np
 
+from ssad.assets.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.assets.bodies import draw_paint, make_body
-from ssad.assets.mesh import Material, Mesh, box
+from ssad.assets.mesh import Mesh
 from ssad.assets.street import build_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.rig import place
 from ssad.camera.scene import Scene, Thing
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.images import captioned
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.world.models import MODELS
-
-# model of the world -> kind and style of body; what is not here is a plain box
-BODY = {
-    "car": ("car", "sedan"), "suv": ("car", "suv"), "coupe": ("car", "sedan"), "compact": ("car", "hatchback"),
-    "van": ("car", "van"), "truck": ("truck", "box"), "bus": ("bus", "city"), "motorcycle": ("motorcycle", "ridden"),
-    "bicycle": ("bicycle", "ridden"), "walker": ("pedestrian", "adult"), "cone": ("traffic_cone", "cone"),
-}  # fmt: skip
 
 
 @lru_cache(maxsize=256)
 def body_of(model: str, key: int) -> Mesh:
     """The body that plays a model of the world, of its size. UnknownNameError."""
     size = MODELS[model].length, MODELS[model].width, MODELS[model].height
-    if model not in BODY:
-        return box(size, material=Material("sheet", (0.5, 0.08, 0.06), gloss=0.4), centre=(0, 0, size[2] / 2))
-    kind, style = BODY[model]
-    return make_body(kind, style=style, size=size, generator=generator("body", model, key))
+    if model not in ACTOR_BODIES:
+        return plain_body(size)
+    kind, styles = ACTOR_BODIES[model]
+    return make_body(kind, style=styles[0], size=size, generator=generator("body", model, key))
 
 
 def cast(trace: EpisodeTrace) -> list[Mesh]:
@@ -48,7 +42,7 @@ def things_at(trace: EpisodeTrace, step: int, *, ego: bool) -> tuple[Thing, ...]
     found = []
     for a in range(0 if ego else 1, len(trace.models)):
         if trace.active[step, a]:
-            pose = place(float(trace.x[step, a]), float(trace.y[step, a]), float(trace.yaw[step, a]))
+            pose = upright_pose(float(trace.x[step, a]), float(trace.y[step, a]), float(trace.yaw[step, a]))
             found.append(Thing(a, pose, draw_paint(generator("paint", trace.key, a)), a + 1))
     return tuple(found)
 
@@ -78,7 +72,7 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
     front = Camera.typical(width, width * 9 // 16)
     rows = []
     for step in moments(trace):
-        pose = place(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
+        pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
         over, over_pose = above(pose, 42.0, front.width, front.height)
         weather = Weather(0.9, 2.2, 0.3)
         seen = render(stage, [View(front, pose @ FORWARD, things_at(trace, step, ego=False), weather)]).image[0]
@@ -90,7 +84,7 @@ def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) ->
 
 def pick_trace(folder: Path) -> Path | None:
     """The recording of a collision of the run, with a walker if there is one; any recording if nobody collides."""
-    from ssad.jobs.store import read_lines
+    from ssad.core.jsonl import read_lines
 
     found = []
     for record in read_lines(folder / "results.jsonl"):

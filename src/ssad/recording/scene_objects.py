@@ -8,12 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ssad.assets.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
-from ssad.assets.mesh import Material, Mesh, box
+from ssad.assets.mesh import Mesh
 from ssad.assets.street.model import Street
-from ssad.camera.rig import place
 from ssad.camera.scene import Thing
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 from ssad.recording.drives import thinned
@@ -25,15 +26,6 @@ PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
 WALKERS = 10  # people of a cast; many walk in more than one place
-# model of the world -> kind of body and its styles; a trailer truck is driven as a bus
-STYLES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "car": ("car", ("sedan", "estate", "sedan", "suv")), "suv": ("car", ("suv",)),
-    "coupe": ("car", ("sedan", "hatchback")), "compact": ("car", ("hatchback",)), "van": ("car", ("van", "pickup")),
-    "truck": ("truck", ("box", "flatbed", "tipper", "box")), "bus": ("bus", ("city", "coach")),
-    "motorcycle": ("motorcycle", ("ridden",)), "bicycle": ("bicycle", ("ridden",)),
-    "walker": ("pedestrian", ("adult",)),
-    "cone": ("traffic_cone", ("cone",)), "barrier": ("barrier", ("board",)),
-}  # fmt: skip
 # what stands at the kerb, how often, and how much of the kerb it takes, m
 PARKED = {
     "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
@@ -92,14 +84,14 @@ class SceneObjects:
             if not (body.active[min(low, len(body.active) - 1)] and body.active[min(high, len(body.active) - 1)]):
                 continue
             a, b = body.track[low], body.track[high]
-            turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
+            turn = wrap_angle(b[2] - a[2])
             x, y, yaw, z = a[0] + part * (b[0] - a[0]), a[1] + part * (b[1] - a[1]), a[2] + part * turn, a[3]
             if np.hypot(x - around[0], y - around[1]) > reach:
                 continue
             speed = float(np.hypot(b[0] - a[0], b[1] - a[1])) / self.dt if high > low else 0.0
             walked = float(body.driven[low] + part * (body.driven[high] - body.driven[low]))
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
-            pose = place(float(x), float(y), float(yaw), float(z))
+            pose = upright_pose(float(x), float(y), float(yaw), float(z))
             found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag)))
         return found
 
@@ -175,19 +167,17 @@ def place_objects(
 
 
 def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
-    """The agents of the world as their traces say; some buses are a tractor with its trailer."""
+    """The agents of the world as their traces say; some buses are drawn as a tractor with its trailer."""
     for a in range(1, len(trace.models)):
         own = generator("record body", *cast.key, a)
         model = MODELS[trace.models[a]]
         track = np.stack([trace.x[:, a], trace.y[:, a], trace.yaw[:, a], 0 * trace.x[:, a]], -1).astype(np.float64)
         active = trace.active[:, a]
         full = model.length, model.width, model.height
-        if trace.models[a] not in STYLES:
-            sheet = Material("sheet", (0.5, 0.08, 0.06), gloss=0.4)
-            number = cast.mesh(box(full, material=sheet, centre=(0, 0, full[2] / 2)))
-            cast.add(("", "", full, (number,)), track, active=active)
+        if trace.models[a] not in ACTOR_BODIES:
+            cast.add(("", "", full, (cast.mesh(plain_body(full)),)), track, active=active)
             continue
-        kind, styles = STYLES[trace.models[a]]
+        kind, styles = ACTOR_BODIES[trace.models[a]]
         style = styles[int(own.integers(len(styles)))]
         if kind == "bus" and own.random() < 0.45:
             _tractor(cast, track, active, own)

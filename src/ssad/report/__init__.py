@@ -3,5 +3,6 @@
 Reads records, traces and baked towns only: a report is rebuilt without the world.
 """
 
-from ssad.report.html import write_report as write_report
+from ssad.report.artefacts import check_artefacts as check_artefacts
+from ssad.report.pages import write_report as write_report
 from ssad.report.video import write_video as write_video

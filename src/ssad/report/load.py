@@ -1,4 +1,4 @@
-"""A run folder as plain records, checked."""
+"""A run folder as its header and its lines, whatever the kind of the run."""
 
 from __future__ import annotations
 
@@ -9,116 +9,68 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import StoreError
-from ssad.metrics import EpisodeMetrics
-from ssad.report.paper import SCENARIOS
-
-TYPES = {"NaturalJunction": "Natural", "Custom": "Own"}
-
-
-@dataclass(frozen=True)
-class Record:
-    """One finished cell: its line of results.jsonl, and why its episode ended."""
-
-    key: str
-    system: str
-    group: str
-    type: str
-    scenario: str
-    town: str
-    status: str
-    reason: str
-    end: str
-    metrics: EpisodeMetrics | None
-    witness: Mapping[str, Any] | None
-    trace: str
-    seed: int
-    repetition: int
-
-    @property
-    def heading(self) -> str:
-        """What the episode is shown under: the paper's name of its scenario, or its type and group."""
-        if self.group in SCENARIOS:
-            return SCENARIOS[self.group]
-        return self.group if self.group in ("", self.type) else f"{TYPES.get(self.type, self.type)}: {self.group}"
+from ssad.core.jsonl import read_lines
 
 
 @dataclass(frozen=True)
 class Run:
-    """All of a run folder that a report needs."""
+    """A run folder.
+
+    Attributes:
+        folder: where it lies.
+        header: run.json.
+        lines: lines of results.jsonl, in the order of the suite.
+        episodes: lines of episodes.jsonl by key; empty for kinds that have none.
+        planned: how many cells the run has when it is whole.
+    """
 
     folder: Path
     header: Mapping[str, Any]
-    records: tuple[Record, ...]
+    lines: tuple[Mapping[str, Any], ...]
+    episodes: Mapping[str, Mapping[str, Any]]
     planned: int
 
     @property
-    def groups(self) -> list[str]:
-        """Headings under which episodes are shown together, in the order of the suite."""
-        return list(dict.fromkeys(r.heading for r in self.records))
+    def suite(self) -> Mapping[str, Any]:
+        """The resolved suite."""
+        found: Mapping[str, Any] = self.header.get("suite", {})
+        return found
 
     @property
-    def systems(self) -> list[str]:
-        """Systems in the order of the suite."""
-        return list(dict.fromkeys(r.system for r in self.records))
+    def kind(self) -> str:
+        """The kind of experiment; runs from before there were several are of kind "driving"."""
+        return str(self.header.get("kind") or self.suite.get("kind") or "driving")
+
+    @property
+    def title(self) -> str:
+        """What the page is called."""
+        return str(self.suite.get("title") or self.suite.get("name") or "SSAD")
+
+    @property
+    def command(self) -> str:
+        """The command that repeats the run."""
+        return str(self.header.get("command") or f"ssad run {self.suite.get('name', 'quick')}")
+
+    @property
+    def failures(self) -> list[Mapping[str, Any]]:
+        """Lines of cells that failed."""
+        return [line for line in self.lines if line["status"] != "ok"]
 
 
-def load_header(folder: Path | str) -> Mapping[str, Any]:
-    """run.json of a run folder. StoreError if it does not hold a run."""
+def load_run(folder: Path | str) -> Run:
+    """Read run.json, results.jsonl and episodes.jsonl.
+
+    Raises:
+        StoreError: the folder does not hold a run, the run has no result yet, or a line in the middle is broken.
+    """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise StoreError(f"{folder}: no run here (run.json is missing); give a folder written by: ssad run")
     header: Mapping[str, Any] = safeio.read_json(folder / "run.json")
-    return header
-
-
-def load_run(folder: Path | str) -> Run:
-    """Read run.json, results.jsonl and episodes.jsonl; a torn last line is left out.
-
-    StoreError if the folder does not hold a run or the run has no result yet.
-    """
-    folder = Path(folder)
-    header = load_header(folder)
-    results = read_records(folder / "results.jsonl")
-    if not results:
+    lines = read_lines(folder / "results.jsonl")
+    if not lines:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
-    ends = {line["key"]: line.get("end", "") for line in read_records(folder / "episodes.jsonl")}
     order = {cell["key"]: k for k, cell in enumerate(header.get("cells", []))}
-    records = [_record(line, ends.get(line["key"], "")) for line in results]
-    records.sort(key=lambda r: order.get(r.key, len(order)))
-    return Run(folder, header, tuple(records), max(len(order), len(records)))
-
-
-def _record(line: Mapping[str, Any], end: str) -> Record:
-    scenario = line["spec"]["scenario"]
-    ok = line["status"] == "ok"
-    return Record(
-        key=line["key"],
-        system=line["system"],
-        group=line["group"],
-        type=scenario["type"],
-        scenario=scenario["name"],
-        town=scenario["town"],
-        status=line["status"],
-        reason=line.get("reason", ""),
-        end=end,
-        metrics=EpisodeMetrics.from_dict(line["metrics"]) if ok else None,
-        witness=line.get("witness"),
-        trace=line.get("artefacts", {}).get("trace", "") if ok else "",
-        seed=int(line.get("seed", 0)),
-        repetition=int(line["spec"].get("repetition", 0)),
-    )
-
-
-def read_records(path: Path) -> list[dict[str, Any]]:
-    """Lines of a JSONL file; what follows the last line end was torn by a kill and does not count."""
-    if not path.is_file():
-        return []
-    whole = path.read_bytes().rpartition(b"\n")[0].decode("utf-8", "replace")
-    out = []
-    for number, text in enumerate(whole.splitlines(), start=1):
-        if text.strip():
-            line = safeio.parse_json(text, f"{path}:{number}")
-            if not isinstance(line, dict) or "key" not in line:
-                raise StoreError(f"{path}:{number}: not a record of a run")
-            out.append(line)
-    return out
+    lines.sort(key=lambda line: order.get(line["key"], len(order)))
+    episodes = {line["key"]: line for line in read_lines(folder / "episodes.jsonl")}
+    return Run(folder, header, tuple(lines), episodes, max(len(order), len(lines)))

@@ -17,12 +17,13 @@ from ssad.core import safeio
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.frames import Applied
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import LIDAR
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.index import fingerprint
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SensorFrame
-from ssad.evaluation.scene_shifter import LIDAR, SceneShifter
+from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.toolbox.manifest import (
     FOLDER,

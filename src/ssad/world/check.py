@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Simulator
 from ssad.core.seeding import generator
+from ssad.world.kernels.data import End, Presence
 
 MakeWorld = Callable[[Sequence[int]], Simulator]
 
@@ -91,13 +92,13 @@ def check_world(make: MakeWorld, *, episodes: int, steps: int = 60) -> None:
 def _check_physics(world: Simulator, order: Sequence[int], steps: int) -> None:
     last = world.array("pose").copy()
     for step in range(steps):
-        ended = world.ended() != 0
+        ended = world.ended() != End.RUNNING
         frozen = np.array(world.hashes())
         world.step(_actions(world, order, step))
         pose = world.array("pose")
         speed = world.array("speed")
         _need(bool(np.isfinite(pose).all() and np.isfinite(speed).all()), "poses and speeds stay finite")
-        here = world.array("active") != 0
+        here = world.array("active") != Presence.ABSENT
         moved = np.hypot(*np.moveaxis(pose[..., :2] - last[..., :2], -1, 0))
         _need(bool((moved[here] <= 60.0 * world.dt).all()), "nobody jumps")
         _need(bool((np.array(world.hashes())[ended] == frozen[ended]).all()), "an ended scene stands still")

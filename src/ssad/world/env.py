@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode
+from ssad.world.kernels.data import End
 from ssad.world.world import ENDS, World
 
 Observation = Literal["safebench", "frea"]
@@ -127,7 +128,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.world.step(to_controls(self._action, actions))
         end = self.world.ended().copy()
         reward = self.world.array("ego.reward").astype(np.float64)
-        terminated = (end == ENDS.index("collision")) | (end == ENDS.index("complete"))
+        terminated = (end == End.COLLISION) | (end == End.COMPLETE)
         truncated = (end != 0) & ~terminated
         info: dict[str, Any] = {}
         done = np.flatnonzero(end != 0)
@@ -187,7 +188,7 @@ class SingleEnv(gym.Env[Any, Any]):
         """One step of 0.1 s."""
         self.world.step(to_controls(self._action, np.asarray(action)[None]))
         end = int(self.world.ended()[0])
-        terminated = end in (ENDS.index("collision"), ENDS.index("complete"))
+        terminated = end in (End.COLLISION, End.COMPLETE)
         reward = float(self.world.array("ego.reward")[0])
         info = {"end": ENDS[end]} if end else {}
         return self._observe(), reward, terminated, end != 0 and not terminated, info

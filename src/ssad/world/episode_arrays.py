@@ -13,22 +13,20 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Route
 from ssad.roads.query import LaneQuery
-from ssad.world.kernels.data import EpisodeArrays, Roads
+from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, TurnRank, When
 from ssad.world.models import MODELS, model
 
-FAR = 1.0e6
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
 SLOW_DOWN = 2.0  # m/s^2 at which a route's speed profile falls towards a bend
 GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
 TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
-WHEN = {"always": 0, "ego_distance": 1, "ego_speed": 2, "travelled": 3, "time": 4}
 
 
 @dataclass(frozen=True)
 class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
-    line, m to the next junction (0 inside), turn rank there (0 straight, 1 right, 2 left); signal [N] or -1; bend [N] m
+    line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m
     that the next 64 m leave the straight line along the point's heading."""
 
     path: F32
@@ -104,7 +102,7 @@ def _junctions(
     runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
     for start, stop in reversed(list(runs)):
         turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
-        kind = 0.0 if abs(turn) < TURN else (2.0 if turn > 0 else 1.0)
+        kind = TurnRank.STRAIGHT if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
         entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
         rank[: start + 1] = kind
         entry[start:stop] = 0.0
@@ -170,7 +168,7 @@ def _put_agent(  # noqa: PLR0917
     a["route"][e, i] = route
     a["phase_count"][e, i] = len(agent.phases)
     for k, phase in enumerate(agent.phases):
-        a["phase_when"][e, i, k] = WHEN[phase.when.kind], phase.when.value, phase.when.actor + 1
+        a["phase_when"][e, i, k] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
         a["phase_speed"][e, i, k] = phase.speed
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ssad.core.protocols import Observation
 from ssad.core.types import AgentKind
-from ssad.world.episode_arrays import FAR
+from ssad.world.kernels.data import FAR, End, Presence
 from ssad.world.world import World, signal_states
 
 AHEAD = 40  # route points
@@ -38,7 +38,7 @@ def make_observation(world: World) -> Observation:
 
     dx, dy = pose[..., 0] - here[:, None, 0], pose[..., 1] - here[:, None, 1]
     distance = np.hypot(dx, dy)
-    there = (world.array("active") != 0) & (world.kind != AgentKind.NONE) & (distance <= SIGHT)
+    there = (world.array("active") != Presence.ABSENT) & (world.kind != AgentKind.NONE) & (distance <= SIGHT)
     there[:, 0] = False
     order = np.argsort(np.where(there, distance, np.inf), axis=1, kind="stable")[:, :NEAREST]
     rows = np.arange(batch)[:, None]
@@ -81,5 +81,5 @@ def make_observation(world: World) -> Observation:
         heading_error=error.astype(np.float32),
         others=others,
         signal=signal,
-        done=world.ended() != 0,
+        done=world.ended() != End.RUNNING,
     )

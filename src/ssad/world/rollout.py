@@ -12,6 +12,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.protocols import DrivingSystem
 from ssad.core.types import Controller, Episode, EpisodeTrace
+from ssad.world.kernels.data import End, Presence
 from ssad.world.observation import make_observation
 from ssad.world.world import ENDS, World, signal_states
 
@@ -41,7 +42,7 @@ def _row(world: World) -> dict[str, npt.NDArray[np.generic]]:
         "y": pose[..., 1].copy(),
         "yaw": pose[..., 2].copy(),
         "speed": world.array("speed").copy(),
-        "active": world.array("active") != 0,
+        "active": world.array("active") != Presence.ABSENT,
         "accel": world.array("ego.accel").copy(),
         "contact": world.array("ego.contact").astype(np.uint8),
         "contact_agent": world.array("ego.contact_agent").copy(),
@@ -86,11 +87,11 @@ def rollout(
                     f"system {system.name}: act returned shape {given.shape}, expected ({world.batch}, 3): "
                     "throttle, brake, steer"
                 )
-            running = world.ended() == 0
+            running = world.ended() == End.RUNNING
             if not np.isfinite(given[running]).all():
                 raise ConfigError(f"system {system.name}: act returned a control that is not finite")
             world.set_actions(np.where(running[:, None], given, 0.0))
-        running = world.ended() == 0
+        running = world.ended() == End.RUNNING
         world.step()
         rows.append(_row(world))
         lengths[running] = step

@@ -17,7 +17,8 @@ import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Condition, Controller, Episode, EpisodeAgent, Phase, Route
-from ssad.world.world import ENDS, World
+from ssad.world.kernels.data import End
+from ssad.world.world import World
 
 Verdict = Literal["harmless", "avoidable", "anticipation", "autopilot", "unavoidable"]
 SHIFT_LENGTH = 12.0  # m over which a swerve is driven
@@ -97,7 +98,7 @@ def _manoeuvres(start: float, target: float) -> Iterator[Manoeuvre]:
 def _run(
     episode: Episode, graphs: Mapping[str, LaneGraph], drivers: list[EpisodeAgent], device: str
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Why each driver's episode ended (index into ENDS) and its route completion in percent."""
+    """Why each driver's episode ended (`End`) and its route completion in percent."""
     bank = [replace(episode, agents=(d, *episode.agents[1:])) for d in drivers]
     world = World(bank, graphs, device=device)
     for _ in range(episode.limits.max_steps):
@@ -122,8 +123,7 @@ def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> 
             trigger = step * blind.dt
         if blind.ended()[0]:
             break
-    collision = ENDS.index("collision")
-    if blind.ended()[0] != collision:
+    if blind.ended()[0] != End.COLLISION:
         return Witness("harmless", trigger, None, float(blind.array("ego.complete")[0]), 1, 1)
     tried = 1
     crash = len(place) * blind.dt
@@ -135,12 +135,12 @@ def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> 
         drivers = [_drive(ego, m, place[min(int(m.start / blind.dt), len(place) - 1)]) for m in options]
         ends, complete = _run(episode, graphs, drivers, device)
         tried += len(options)
-        clear = np.flatnonzero(ends != collision)
+        clear = np.flatnonzero(ends != End.COLLISION)
         if len(clear):
             best = max(clear, key=lambda k: (complete[k] >= 100.0, -abs(options[k].offset), complete[k], -k))
             return Witness(verdict, trigger, options[best], float(complete[best]), len(clear), tried)
     ends, complete = _run(episode, graphs, [replace(ego, controller=Controller.AUTOPILOT)], device)
     tried += 1
-    if ends[0] != collision:
+    if ends[0] != End.COLLISION:
         return Witness("autopilot", trigger, None, float(complete[0]), 1, tried)
     return Witness("unavoidable", trigger, None, float("nan"), 0, tried)

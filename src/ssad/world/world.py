@@ -13,17 +13,17 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Controller, Episode, SignalState
+from ssad.core.types import AgentKind, Controller, Episode, SignalState
 from ssad.world.episode_arrays import agent_kinds, build, signal_programs
-from ssad.world.kernels.data import HORIZON, Ego, State, Work
+from ssad.world.kernels.data import HORIZON, Ego, End, State, Work
 from ssad.world.kernels.drive import drive
-from ssad.world.kernels.look import look
+from ssad.world.kernels.look import OBSERVATION, look
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 
-ENDS = ("", "collision", "complete", "max_steps", "max_distance", "max_time")
-OBSERVATION = 28  # see kernels.look
+# names of `End` in traces; "" while the episode runs
+ENDS = tuple("" if end == End.RUNNING else end.name.lower() for end in End)
 VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE: dict[str, tuple[str, Any]] = {
@@ -239,7 +239,7 @@ class World:
         return out
 
     def ended(self) -> npt.NDArray[np.int32]:
-        """[B] index into ENDS; 0 while the episode runs."""
+        """[B] `End`, index into ENDS."""
         return self.array("end")
 
     def signals(self, scene: int) -> npt.NDArray[np.uint8]:
@@ -269,7 +269,7 @@ class World:
         arrays += [self.array(f"ego.{name}") for name in _EGO]
         out = []
         for b in range(self.batch):
-            live = self.kind[b] > 0
+            live = self.kind[b] != AgentKind.NONE
             h = hashlib.sha256()
             for a in arrays:
                 row = a[b]

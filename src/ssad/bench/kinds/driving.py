@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
@@ -23,7 +23,7 @@ from ssad.core.lane_graph import LaneGraph, load_graph, save_graph
 from ssad.core.protocols import DrivingSystem
 from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
-from ssad.core.traces import load_trace, motion_hash, save_trace, trace_hash
+from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import METRICS, episode_metrics
@@ -160,6 +160,13 @@ class Driving(Kind):
                 result["witness"] = witness(job.folder, episode, speed, job.device)
             results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
         return results
+
+    def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
+        """Drives the episode again and compares every bit of its trace."""
+        quiet_warp()
+        recorded = load_trace(folder / record["artefacts"]["trace"])
+        _, (trace,) = drive([cell], device=plan.device)
+        return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """The pictures that the suite asks for, made once beside its results."""

@@ -14,6 +14,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import F32, F64, U8
 from ssad.datasets.nuscenes.block_street import BLOCK, HALF, PIXEL, BlockObject, Colour, Part, ground_texture
 
@@ -280,8 +281,8 @@ def _hit(part: Part, place: tuple[float, float, float], rays: _Rays) -> None:
     corners = part_corners(part)[:4, :2]
     offset = _turned(corners, x, y, yaw) - rays.origin[:2]
     middle = math.atan2(*offset.mean(axis=0)[::-1])
-    spread = np.abs((np.arctan2(offset[:, 1], offset[:, 0]) - middle + math.pi) % (2 * math.pi) - math.pi).max()
-    columns = np.flatnonzero(np.abs((rays.azimuth - middle + math.pi) % (2 * math.pi) - math.pi) <= spread)
+    spread = np.abs(wrap_angle(np.arctan2(offset[:, 1], offset[:, 0]) - middle)).max()
+    columns = np.flatnonzero(np.abs(wrap_angle(rays.azimuth - middle)) <= spread)
     if not len(columns):
         return
     cos, sin = math.cos(yaw), math.sin(yaw)

@@ -16,6 +16,7 @@ import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import decode_image, encode_jpeg, read_image
+from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.files import points_bytes, read_points
 from ssad.datasets.nuscenes.index import Index, open_index
@@ -24,8 +25,6 @@ from ssad.datasets.nuscenes.scene import (
     SceneData,
     SensorFrame,
     frozen,
-    rotation_matrices,
-    slerp,
     velocities,
 )
 from ssad.datasets.nuscenes.schema import (
@@ -55,8 +54,6 @@ __all__ = [
     "points_bytes",
     "read_image",
     "read_points",
-    "rotation_matrices",
-    "slerp",
 ]
 
 R = TypeVar("R", bound=TableRecord)
@@ -214,16 +211,12 @@ class NuScenes:
 
     def _matrices(self, records: Sequence[CalibratedSensor] | Sequence[EgoPose]) -> dict[str, F64]:
         """Poses [4, 4] by token."""
-        matrices = np.zeros((len(records), 4, 4))
         quaternions = np.array([record.rotation for record in records], np.float64)
         empty = np.flatnonzero(~(np.abs(quaternions).max(axis=1) > 0.0))
         if len(empty):
             record = records[int(empty[0])]
             raise FormatError(f"{self._path(type(record))}: '{record.token}': the rotation has length zero")
-        matrices[:, :3, :3] = rotation_matrices(quaternions)
-        matrices[:, :3, 3] = [record.translation for record in records]
-        matrices[:, 3, 3] = 1.0
-        frozen(matrices)
+        matrices = frozen(pose_matrix([record.translation for record in records], quaternions))
         return {record.token: matrix for record, matrix in zip(records, matrices, strict=True)}
 
     def _boxes(self, samples: Sequence[Sample]) -> dict[str, Annotations]:

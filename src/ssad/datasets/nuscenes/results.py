@@ -22,8 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import ATTRIBUTES, CLASSES
 from ssad.core.types import F64, I32
-from ssad.datasets.nuscenes.schema import ATTRIBUTES, CLASSES
 from ssad.metrics.detection_boxes import BoxTable
 
 BLOCK: Final = 4 << 20

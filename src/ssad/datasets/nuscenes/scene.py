@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import ConfigError
+from ssad.core.rotations import slerp
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.schema import Log, Sample, Scene
 
@@ -123,35 +124,6 @@ class SceneData:
         centre[new] = then.centre[old] + share * (now.centre[new] - then.centre[old])
         rotation[new] = slerp(then.rotation[old], now.rotation[new], share)
         return _replaced(now, centre, rotation)
-
-
-def rotation_matrices(quaternions: F64) -> F64:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (w, x, y, z) of any length but zero."""
-    unit = quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(unit, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def slerp(start: F64, end: F64, share: float) -> F64:
-    """Rotations [N, 4] between two quaternions [N, 4] along the shorter arc; share 0 is start, 1 is end.
-
-    Nearly equal ones (cosine of half the angle over 0.9995) are interpolated linearly, as in pyquaternion.
-    """
-    first = start / np.linalg.norm(start, axis=1, keepdims=True)
-    last = end / np.linalg.norm(end, axis=1, keepdims=True)
-    cosine = np.sum(first * last, axis=1, keepdims=True)
-    first = np.where(cosine < 0.0, -first, first)
-    cosine = np.abs(cosine)
-    angle = np.arccos(np.minimum(cosine, 0.9995))
-    sine = np.sin(angle)
-    arc = np.sin((1.0 - share) * angle) / sine * first + np.sin(share * angle) / sine * last
-    between = np.where(cosine > 0.9995, first + share * (last - first), arc)
-    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
 
 
 def velocities(centre: F64, time: npt.NDArray[np.int64], before: I32, after: I32) -> F64:

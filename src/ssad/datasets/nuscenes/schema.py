@@ -1,4 +1,4 @@
-"""The nuScenes schema: one typed record for each of its 13 tables, and the classes of its detection task.
+"""The nuScenes schema: one typed record for each of its 13 tables.
 
 Tokens are strings (32 hexadecimal digits in the original; any non-empty text here). Frames: global (x east, y north,
 z up, metres), ego (x forward, y left, z up), sensor (camera: x right, y down, z forward). Quaternions are (w, x, y, z),
@@ -10,46 +10,6 @@ from __future__ import annotations
 from typing import Final
 
 import msgspec
-
-CLASSES: Final = (
-    "car",
-    "truck",
-    "bus",
-    "trailer",
-    "construction_vehicle",
-    "pedestrian",
-    "motorcycle",
-    "bicycle",
-    "traffic_cone",
-    "barrier",
-)
-ATTRIBUTES: Final = (
-    "pedestrian.moving",
-    "pedestrian.sitting_lying_down",
-    "pedestrian.standing",
-    "cycle.with_rider",
-    "cycle.without_rider",
-    "vehicle.moving",
-    "vehicle.parked",
-    "vehicle.stopped",
-)
-CATEGORY_TO_CLASS: Final = {
-    "movable_object.barrier": "barrier",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.motorcycle": "motorcycle",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "movable_object.trafficcone": "traffic_cone",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-}
-CAMERAS: Final = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

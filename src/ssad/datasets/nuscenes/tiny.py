@@ -14,12 +14,14 @@ from typing import Any, Final
 import numpy as np
 
 from ssad.core.images import encode_jpeg
+from ssad.core.nuscenes_names import CAMERAS, LIDAR, visibility_token
+from ssad.core.rotations import quaternion_product, yaw_to_quaternion
 from ssad.core.seeding import generator
 from ssad.core.types import F32
 from ssad.datasets.nuscenes.block_street import BlockObject, ego_place, make_street
 from ssad.datasets.nuscenes.drawing import BlockStreet, BlockView, Light
 from ssad.datasets.nuscenes.files import points_bytes
-from ssad.datasets.nuscenes.schema import CAMERAS, Quaternion, Vector
+from ssad.datasets.nuscenes.schema import Vector
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
 # place on the ego (m), yaw (degrees), focal length and principal point at 1600 x 900: about those of the real cars
@@ -31,9 +33,9 @@ RIG: Final[dict[str, tuple[Vector, float, float, float, float]]] = {
     "CAM_BACK_LEFT": ((1.04, 0.48, 1.50), 110.0, 1256.7, 792.1, 492.8),
     "CAM_FRONT_LEFT": ((1.52, 0.49, 1.50), 55.0, 1272.6, 826.6, 479.8),
 }
-LIDAR: Final = "LIDAR_TOP"
 LIDAR_PLACE: Final[Vector] = (0.94, 0.0, 1.84)
 LIDAR_YAW: Final = -math.pi / 2  # its y axis points forward
+AHEAD: Final = (0.5, -0.5, 0.5, -0.5)  # rotation of an upright camera that looks along x
 STEP_US: Final = 500_000  # between key frames
 ANNOTATED: Final = 55.0  # m from the ego
 _START_US: Final = 1_600_000_000_000_000
@@ -90,7 +92,7 @@ class _Drive:
             timestamp_us=self.start_us + offset_us,
             data=data,
             ego_translation=self.point(x, y, 0.0),
-            ego_rotation=_yaw_rotation(yaw + self.heading),
+            ego_rotation=tuple(yaw_to_quaternion(yaw + self.heading)),
             sample=sample,
             size=size,
         )
@@ -108,8 +110,8 @@ class _Drive:
                 instances[thing.key],
                 translation=self.point(x, y, thing.size[2] / 2),
                 size=thing.size,
-                rotation=_yaw_rotation(yaw + self.heading),
-                visibility=str(1 + sum(share >= level for level in (0.4, 0.6, 0.8))),
+                rotation=tuple(yaw_to_quaternion(yaw + self.heading)),
+                visibility=visibility_token(share),
                 attributes=(thing.attribute,) if thing.attribute else (),
                 lidar_points=_count_inside(points, thing, seconds),
             )
@@ -147,9 +149,9 @@ def _mount(writer: NuScenesWriter, scene: str, size: tuple[int, int]) -> None:
     share = size[0] / 1600.0
     for channel, (place, yaw, focal, cx, cy) in RIG.items():
         matrix = ((focal * share, 0, cx * share), (0, focal * share, cy * size[1] / 900.0), (0, 0, 1))
-        rotation = _camera_rotation(math.radians(yaw))
+        rotation = tuple(quaternion_product(yaw_to_quaternion(math.radians(yaw)), AHEAD))
         writer.add_sensor(scene, channel, modality="camera", translation=place, rotation=rotation, intrinsic=matrix)
-    turn = _yaw_rotation(LIDAR_YAW)
+    turn = tuple(yaw_to_quaternion(LIDAR_YAW))
     writer.add_sensor(scene, LIDAR, modality="lidar", translation=LIDAR_PLACE, rotation=turn)
 
 
@@ -203,13 +205,3 @@ def _light(random: np.random.Generator) -> Light:
         haze=(196, 206, 216),
         strength=strength,
     )
-
-
-def _yaw_rotation(yaw: float) -> Quaternion:
-    return math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-
-
-def _camera_rotation(yaw: float) -> Quaternion:
-    """Rotation of an upright camera whose optical axis has this yaw."""
-    c, s = math.cos(yaw / 2) / 2, math.sin(yaw / 2) / 2
-    return c + s, -c - s, c - s, s - c

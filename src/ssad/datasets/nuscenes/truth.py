@@ -16,12 +16,10 @@ import msgspec
 import numpy as np
 
 from ssad.core.errors import ConfigError, FormatError
+from ssad.core.nuscenes_names import ATTRIBUTES, BICYCLE_RACK, CATEGORY_TO_CLASS, CLASSES, LIDAR, VISIBILITY
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.results import uncollected, with_ego
 from ssad.datasets.nuscenes.schema import (
-    ATTRIBUTES,
-    CATEGORY_TO_CLASS,
-    CLASSES,
     Attribute,
     Category,
     Quaternion,
@@ -33,11 +31,8 @@ from ssad.datasets.nuscenes.schema import (
 from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.metrics.detection_boxes import I8, I64, BikeRacks, BoxTable
 
-CHANNEL: Final = "LIDAR_TOP"  # the sensor whose ego pose is that of the sample
-RACK: Final = "static_object.bicycle_rack"
 MAX_TIME: Final = 1.5  # s between frames that give a velocity; twice that for a central difference
 _RACK_LABEL: Final = len(CLASSES)
-_VISIBILITY: Final[dict[str | None, int]] = {"1": 1, "2": 2, "3": 3, "4": 4}
 
 T = TypeVar("T")
 
@@ -152,7 +147,7 @@ class _Tables:
 
 def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
     """Global position [S, 3] of the ego at each sample: the pose of its LiDAR key frame."""
-    sensors = {s.token for s in tables.rows("sensor", Sensor) if s.channel == CHANNEL}
+    sensors = {s.token for s in tables.rows("sensor", Sensor) if s.channel == LIDAR}
     own = {c.token for c in tables.rows("calibrated_sensor", _Calibrated) if c.sensor_token in sensors}
     pose: list[str | None] = [None] * len(index)
     for data in tables.rows("sample_data", _Data):
@@ -160,7 +155,7 @@ def _ego(tables: _Tables, index: Mapping[str, int]) -> F64:
             pose[index[data.sample_token]] = data.ego_pose_token
     if None in pose:
         token = list(index)[pose.index(None)]
-        raise FormatError(f"{tables.folder}/sample_data.json: sample {token} has no key frame of {CHANNEL}")
+        raise FormatError(f"{tables.folder}/sample_data.json: sample {token} has no key frame of {LIDAR}")
     wanted = set(pose)
     found = {p.token: p.translation for p in tables.rows("ego_pose", _Pose) if p.token in wanted}
     missing = next((token for token in pose if token not in found), None)
@@ -174,7 +169,7 @@ def _annotations(
 ) -> tuple[BoxTable, I32, I8, BikeRacks]:
     """Boxes, their points and visibility, and the bicycle racks of the samples."""
     category = {c.token: c.name for c in tables.rows("category", Category)}
-    kinds = {name: CLASSES.index(kind) for name, kind in CATEGORY_TO_CLASS.items()} | {RACK: _RACK_LABEL}
+    kinds = {name: CLASSES.index(kind) for name, kind in CATEGORY_TO_CLASS.items()} | {BICYCLE_RACK: _RACK_LABEL}
     label_of = {
         i.token: kinds.get(tables.find(category, i.category_token, "category"), -1)
         for i in tables.rows("instance", _Instance)
@@ -202,7 +197,7 @@ def _annotations(
                 index.get(a.sample_token, -1),
                 label_of[a.instance_token],
                 _attribute(path, a, attributes),
-                _VISIBILITY.get(a.visibility_token, 0),
+                int(a.visibility_token or 0) if a.visibility_token in VISIBILITY else 0,
                 a.num_lidar_pts + a.num_radar_pts,
                 time[a.sample_token],
             )

@@ -21,11 +21,10 @@ import msgspec
 import numpy as np
 
 from ssad.core.errors import FormatError
+from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORIES
 from ssad.core.safeio import atomic_path, dump_json, make_folder, write_atomic
 from ssad.core.seeding import digest
 from ssad.datasets.nuscenes.schema import (
-    ATTRIBUTES,
-    CATEGORY_TO_CLASS,
     TABLES,
     Attribute,
     CalibratedSensor,
@@ -46,18 +45,6 @@ from ssad.datasets.nuscenes.schema import (
 )
 from ssad.datasets.nuscenes.tables import table_path
 
-CATEGORIES: Final = (
-    *CATEGORY_TO_CLASS,
-    "animal",
-    "human.pedestrian.personal_mobility",
-    "human.pedestrian.stroller",
-    "human.pedestrian.wheelchair",
-    "movable_object.debris",
-    "movable_object.pushable_pullable",
-    "static_object.bicycle_rack",
-    "vehicle.emergency.ambulance",
-    "vehicle.emergency.police",
-)
 MINI_VAL: Final = ("scene-0103", "scene-0916")
 MINI_TRAIN: Final = tuple(f"scene-{i:04d}" for i in (61, 553, 655, 757, 796, 1077, 1094, 1100))
 _LEVELS: Final = ("v0-40", "v40-60", "v60-80", "v80-100")
@@ -391,4 +378,4 @@ def _write_table(path: Path, rows: Iterable[TableRecord]) -> None:
         file.write(b"\n]\n" if separator == b",\n" else b"[]\n")
 
 
-__all__ = ["CATEGORIES", "IDENTITY", "MINI_TRAIN", "MINI_VAL", "NuScenesWriter"]
+__all__ = ["IDENTITY", "MINI_TRAIN", "MINI_VAL", "NuScenesWriter"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from ssad.core.errors import ConfigError
 
-# mean and deviation of depth (m), and mean length, height, width (m), in the order of CLASSES_3D. The bicycle
+# mean and deviation of depth (m), and mean length, height, width (m), in the order of MMDET3D_CLASSES. The bicycle
 # has the size of the construction vehicle: the published weights were trained with these numbers.
 BASE_DEPTHS = (
     (31.99, 21.12), (37.15, 24.63), (39.69, 23.97), (40.91, 26.34), (34.16, 20.11), (22.35, 13.70), (24.28, 16.05),

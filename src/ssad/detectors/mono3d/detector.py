@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.core.detections import CLASSES_3D, Assignment, Dense, Detections, Solids, Truth
+from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.detectors.eval_mode import evaluating
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
@@ -49,7 +50,7 @@ class Mono3D(nn.Module):
         super().__init__()
         self.config = config
         self.name = config.name
-        self.classes = CLASSES_3D
+        self.classes = MMDET3D_CLASSES
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
             self.backbone = Backbone(config.trunk, width=config.width)

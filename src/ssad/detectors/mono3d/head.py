@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.core.detections import ATTRIBUTES, CLASSES_3D
+from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
 
@@ -70,7 +70,7 @@ class Head(nn.Module):
         for name, inside in (("cls_convs", c), ("reg_convs", c + 2 if config.rays else c)):
             self.add_module(name, nn.ModuleList([Unit(inside, c), Unit(c, c, deformable=config.deformable)]))
         self.conv_cls_prev = nn.ModuleList([Unit(c, c)])
-        self.conv_cls = _last(c, len(CLASSES_3D), rare=True)
+        self.conv_cls = _last(c, len(MMDET3D_CLASSES), rare=True)
         self.conv_reg_prevs = nn.ModuleList(
             nn.ModuleList([] if k == 4 else [Unit(c, c)]) for k in range(len(config.groups))
         )
@@ -78,7 +78,7 @@ class Head(nn.Module):
         self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
         self.conv_dir_cls = _last(c, 2, rare=True)
         self.conv_attr_prev = nn.ModuleList([Unit(c, c)])
-        self.conv_attr = _last(c, len(ATTRIBUTES), rare=True)
+        self.conv_attr = _last(c, len(MMDET3D_ATTRIBUTES), rare=True)
         narrow = max(c // 4, 32)
         self.conv_centerness_prev = nn.ModuleList([Unit(c, narrow)])
         self.conv_centerness = _last(narrow, 1)

@@ -8,21 +8,23 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Detections
+from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, RANGES, USUAL_ATTRIBUTE
+from ssad.core.rotations import matrix_to_quaternion
 from ssad.core.types import F64, I32
 from ssad.detectors.mono3d.nms import rotated_nms
 
-# m from the ego within which a class is reported, in the order of CLASSES_3D (the evaluation's ranges)
-RANGES = np.array([50.0, 50.0, 50.0, 50.0, 50.0, 40.0, 40.0, 40.0, 30.0, 30.0])
+# m from the ego within which a label is reported
+REACH = np.array([RANGES[name] for name in MMDET3D_CLASSES])
 OVERLAP, LEAST, MOST = 0.05, 0.01, 500
-_CYCLES, _VEHICLES = (5, 6), (0, 1, 2, 3, 4)
 
 
 @dataclass(frozen=True, slots=True)
 class WorldBoxes:
     """Boxes of one moment in the world: translation [N, 3]; size [N, 3] width, length, height; rotation [N, 4]
-    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into CLASSES_3D; attribute names ("": none)."""
+    quaternion w, x, y, z; velocity [N, 2]; score [N]; label [N] index into MMDET3D_CLASSES; attribute: names, ""
+    for none."""
 
     translation: F64
     size: F64
@@ -57,7 +59,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
             v.detach().cpu().double().numpy() for v in (solid.centre, solid.size, solid.yaw, solid.velocity)
         )
         score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
-        near = (score > LEAST) & (_distance(centre, to_ego) <= RANGES[label])
+        near = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
         rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ _upright(yaw),
                 _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
@@ -68,7 +70,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
     centre = (world - pose[:3, 3]) @ pose[:3, :3]
     turned = pose[:3, :3].T @ axes
     yaw = np.arctan2(turned[:, 0, 1], turned[:, 0, 0])
-    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= RANGES[label])
+    near = np.flatnonzero(_distance(centre, cam_to_ego[ahead]) <= REACH[label])
     ground = torch.from_numpy(np.column_stack([centre[:, [0, 2]], size[:, [0, 2]], -yaw])[near])
     kept = rotated_nms(ground, torch.from_numpy(score[near]), torch.from_numpy(label[near]), threshold=OVERLAP)
     rows = near[kept.numpy()]
@@ -77,7 +79,7 @@ def merge_cameras(found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to
     moved = _flat((velocity[rows] @ pose[:3, :3])[:, [0, 2]]) @ pose[:3, :3].T
     names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
     return WorldBoxes(
-        world[rows], size[rows][:, [2, 0, 1]], _quaternions(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
+        world[rows], size[rows][:, [2, 0, 1]], matrix_to_quaternion(pose[:3, :3] @ _upright(yaw[rows])), moved[:, :2],
         score[rows], label[rows].astype(np.int32), names,
     )  # fmt: skip
 
@@ -106,29 +108,7 @@ def _upright(yaw: F64) -> F64:
     )
 
 
-def _quaternions(m: F64) -> F64:
-    """Unit quaternions [N, 4] (w, x, y, z; w at least 0) of rotation matrices [N, 3, 3]."""
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    four = np.empty((len(m), 4, 4))  # 4 q q^T: its largest column is q times its largest part
-    four[:, 0, 0] = 1 + trace
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        four[:, i + 1, i + 1] = 1 + 2 * m[:, i, i] - trace
-        four[:, 0, i + 1] = four[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
-        four[:, j + 1, k + 1] = four[:, k + 1, j + 1] = m[:, j, k] + m[:, k, j]
-    largest = np.einsum("nii->ni", four).argmax(1)
-    q = four[np.arange(len(m)), largest]
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(np.where(q[:, :1] < 0, -q, q), np.float64)
-
-
 def _attribute(label: int, attribute: int) -> str:
     """The attribute's name where it fits the class, else the class's usual one."""
-    name = ATTRIBUTES[attribute]
-    if label in _VEHICLES:
-        usual = "vehicle.moving" if CLASSES_3D[label] == "bus" else "vehicle.parked"
-        return name if name.startswith("vehicle.") else usual
-    if label in _CYCLES:
-        return name if name.startswith("cycle.") else "cycle.without_rider"
-    if CLASSES_3D[label] == "pedestrian":
-        return name if name.startswith("pedestrian.") else "pedestrian.moving"
-    return ""
+    name, usual = MMDET3D_ATTRIBUTES[attribute], USUAL_ATTRIBUTE[MMDET3D_CLASSES[label]]
+    return name if name.split(".")[0] == usual.split(".")[0] else usual

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ssad.core.detections import ATTRIBUTES, CLASSES_3D, Assignment, Truth
+from ssad.core.detections import Assignment, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import MMDET3D_CLASSES, NO_ATTRIBUTE
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import Places, project
 
@@ -26,14 +27,18 @@ def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: T
     for k, one in enumerate(truth):
         if one.solid is None:
             raise ConfigError(f"{config.name}: the truth of image {k} has no 3D boxes")
-        if one.label.device.type == "cpu" and bool(((one.label < 0) | (one.label >= len(CLASSES_3D))).any()):
+        if one.label.device.type == "cpu" and bool(((one.label < 0) | (one.label >= len(MMDET3D_CLASSES))).any()):
             raise ConfigError(f"{config.name}: a label of image {k} is none of the ten classes")
     count = len(places.stride)
     device, dtype = places.xy.device, places.xy.dtype
     if not any(len(one.label) for one in truth):
         none = torch.full((len(truth), count), -1, dtype=torch.int64, device=device)
         reg = torch.zeros((len(truth), count, 13), dtype=dtype, device=device)
-        extra = {"reg": reg, "attribute": torch.full_like(none, len(ATTRIBUTES) - 1), "centreness": reg[..., 0].clone()}
+        extra = {
+            "reg": reg,
+            "attribute": torch.full_like(none, NO_ATTRIBUTE),
+            "centreness": reg[..., 0].clone(),
+        }
         return Assignment(none, none.clone(), tuple(truth), extra)
     label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale)
     return Assignment(label, owner, tuple(truth), extra)
@@ -100,7 +105,7 @@ def _all(
     relative = picked.norm(dim=-1) / (1.414 * config.radius * places.stride)
     extra = {
         "reg": torch.where(found[..., None], reg, torch.zeros_like(reg)),
-        "attribute": torch.where(found, of(objects.attribute), len(ATTRIBUTES) - 1),
+        "attribute": torch.where(found, of(objects.attribute), NO_ATTRIBUTE),
         "centreness": torch.where(found, torch.exp(-2.5 * relative), torch.zeros_like(relative)),
     }
     return torch.where(found, of(objects.label), -1), torch.where(found, nearest, -1), extra

@@ -1,12 +1,50 @@
 """Arrays that the kernels share, as Warp structs. Legend: B scenes, A agents, E episodes of the bank, K phases,
 N route points of the pool, M lane segments, S signals."""
 
+from enum import IntEnum
+
 import warp as wp
 
-HORIZON = 8  # forecast points
+HORIZON = wp.constant(8)  # forecast points
 STRIDE = wp.constant(0.5)  # seconds between forecast points
-FORECAST = wp.constant(HORIZON)
 FAR = wp.constant(1.0e6)
+
+
+class When(IntEnum):
+    """What starts a phase: the kinds of `ssad.core.types.Condition`."""
+
+    ALWAYS = 0
+    EGO_DISTANCE = 1
+    EGO_SPEED = 2
+    TRAVELLED = 3
+    TIME = 4
+
+
+class Presence(IntEnum):
+    """Whether an agent is there; asleep: until the ego comes near."""
+
+    ABSENT = 0
+    ASLEEP = 1
+    AWAKE = 2
+
+
+class TurnRank(IntEnum):
+    """Where a route turns at a junction, in the order of who goes first."""
+
+    STRAIGHT = 0
+    RIGHT = 1
+    LEFT = 2
+
+
+class End(IntEnum):
+    """Why an episode ended."""
+
+    RUNNING = 0
+    COLLISION = 1
+    COMPLETE = 2
+    MAX_STEPS = 3
+    MAX_DISTANCE = 4
+    MAX_TIME = 5
 
 
 @wp.struct
@@ -14,17 +52,17 @@ class EpisodeArrays:
     """What does not change while an episode runs; scenes refer to it by episode number."""
 
     model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot
-    controller: wp.array2d(dtype=wp.int32)  # [E, A]
+    controller: wp.array2d(dtype=wp.int32)  # [E, A] Controller
     start: wp.array2d(dtype=wp.vec4)  # [E, A] x, y, yaw, speed
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     phase_count: wp.array2d(dtype=wp.int32)  # [E, A]
-    phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] condition kind, value, agent
+    phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] When, value, agent
     phase_speed: wp.array3d(dtype=wp.float32)  # [E, A, K]
     town: wp.array(dtype=wp.int32)  # [E]
-    signal: wp.array2d(dtype=wp.int32)  # [E, S] forced state, -1 none
+    signal: wp.array2d(dtype=wp.int32)  # [E, S] forced SignalState, -1 none
     limits: wp.array(dtype=wp.vec4)  # [E] max steps, max time s, max distance m, override until s
-    kind: wp.array(dtype=wp.int32)  # [models]
+    kind: wp.array(dtype=wp.int32)  # [models] AgentKind
     body: wp.array(dtype=wp.vec4)  # [models] half length, half width, wheelbase, max steer
     power: wp.array(dtype=wp.vec4)  # [models] max accel, max brake, max speed, unused
 
@@ -34,7 +72,7 @@ class Roads:
     """Routes of all agents, lane segments of all towns with their grids, and signals."""
 
     path: wp.array(dtype=wp.vec4)  # [N] x, y, yaw, curvature
-    rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, turn rank there
+    rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, TurnRank there
     bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
@@ -55,12 +93,12 @@ class State:
 
     episode: wp.array(dtype=wp.int32)  # [B]
     step: wp.array(dtype=wp.int32)  # [B]
-    end: wp.array(dtype=wp.int32)  # [B] 0 running, else why it ended
+    end: wp.array(dtype=wp.int32)  # [B] End
     pose: wp.array2d(dtype=wp.vec3)  # [B, A]
     previous: wp.array2d(dtype=wp.vec3)  # [B, A]
     speed: wp.array2d(dtype=wp.float32)  # [B, A]
     wheel: wp.array2d(dtype=wp.float32)  # [B, A] front-wheel angle, rad
-    active: wp.array2d(dtype=wp.int32)  # [B, A] 0 absent, 1 asleep, 2 awake
+    active: wp.array2d(dtype=wp.int32)  # [B, A] Presence
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
     travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
@@ -79,7 +117,7 @@ class State:
 class Ego:
     """The record of each scene's ego in this step; all [B]."""
 
-    contact: wp.array(dtype=wp.int32)  # kinds of contacts that began
+    contact: wp.array(dtype=wp.int32)  # Contact bits of contacts that began
     contact_agent: wp.array(dtype=wp.int32)
     touching: wp.array(dtype=wp.int64)  # agents touched in the step before
     off_road: wp.array(dtype=wp.int32)

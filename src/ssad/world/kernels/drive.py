@@ -5,12 +5,9 @@ The Autopilot is the background traffic and the ego baseline alike; how it react
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, State
-from ssad.world.kernels.shared import C_AUTOPILOT, IDM_ACCEL, KIND_WALKER, wrap
-
-C_NONE = wp.constant(0)
-C_FOLLOW = wp.constant(3)
-C_SCRIPT = wp.constant(4)
+from ssad.core.types import AgentKind, Controller
+from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, State, When
+from ssad.world.kernels.shared import IDM_ACCEL, wrap
 
 
 @wp.func
@@ -24,18 +21,18 @@ def idm_free(v: float, target: float) -> float:
 
 @wp.func
 def condition_holds(state: State, b: int, i: int, when: wp.vec3, time: float) -> bool:
-    """Whether a phase may begin; kinds: 0 always, 1 ego distance, 2 ego speed, 3 travelled, 4 time."""
+    """Whether a phase may begin; when: `When`, value, agent."""
     kind = int(when[0])
-    ok = kind == 0
-    if kind == 1:
+    ok = kind == When.ALWAYS
+    if kind == When.EGO_DISTANCE:
         p = state.pose[b, 0]
         q = state.pose[b, int(when[2])]
         ok = wp.length(wp.vec2(p[0] - q[0], p[1] - q[1])) < when[1]
-    elif kind == 2:
+    elif kind == When.EGO_SPEED:
         ok = state.speed[b, 0] > when[1]
-    elif kind == 3:
+    elif kind == When.TRAVELLED:
         ok = state.travelled[b, i] > when[1]
-    elif kind == 4:
+    elif kind == When.TIME:
         ok = time >= when[1] - 1.0e-4
     return ok
 
@@ -72,14 +69,14 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
 def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, i = wp.tid()
-    if state.end[b] != 0 or state.active[b, i] == 0:
+    if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
         return
     e = state.episode[b]
     m = bank.model[e, i]
     who = bank.controller[e, i]
     time = float(state.step[b]) * dt
     v = state.speed[b, i]
-    if state.active[b, i] == 1:
+    if state.active[b, i] == Presence.ASLEEP:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
         return
     power = bank.power[m]
@@ -96,11 +93,11 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
         state.phase[b, i] = n
         if n > 0:
             target = bank.phase_speed[e, i, n - 1]
-        elif who == C_SCRIPT:
+        elif who == Controller.SCRIPT:
             target = 0.0
-    if who == C_NONE:
+    if who == Controller.NONE:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
-    elif who == C_SCRIPT:
+    elif who == Controller.SCRIPT:
         if count == 0:
             target = 0.0
         steer = float(0.0)
@@ -108,19 +105,19 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
             steer = steer_on_route(bank, roads, state, b, i, e, v)
         throttle = float(0.0)
         brake = float(1.0)
-        if bank.kind[m] == KIND_WALKER:
+        if bank.kind[m] == AgentKind.WALKER:
             throttle = target / power[2]
             brake = 0.0
         elif target > 0.0 and v <= target:
             throttle = 1.0
             brake = 0.0
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
-    elif who == C_AUTOPILOT or who == C_FOLLOW:
+    elif who == Controller.AUTOPILOT or who == Controller.FOLLOW:
         steer = float(0.0)
         accel = float(0.0)
         if bank.route[e, i][1] > 1:
             steer = steer_on_route(bank, roads, state, b, i, e, v)
-        if who == C_AUTOPILOT:
+        if who == Controller.AUTOPILOT:
             free = idm_free(v, state.aim[b, i][1])
             accel = wp.min(free, state.react[b, i])
             if free > 0.0:

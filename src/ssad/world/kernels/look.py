@@ -2,8 +2,11 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import Ego, EpisodeArrays, Roads, State
+from ssad.core.types import AgentKind
+from ssad.world.kernels.data import Ego, EpisodeArrays, Presence, Roads, State
 from ssad.world.kernels.shared import wrap
+
+OBSERVATION = 28  # numbers in a row of `look`
 
 
 @wp.func
@@ -73,13 +76,13 @@ def look(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: int,
     d_second = float(625.0)
     lane = state.lane[b, 0]
     for j in range(1, agents):
-        if state.active[b, j] != 0:
+        if state.active[b, j] != Presence.ABSENT:
             q = state.pose[b, j]
             dx = q[0] - pose[0]
             dy = q[1] - pose[1]
             d2 = dx * dx + dy * dy
             kind = bank.kind[bank.model[e, j]]
-            if d2 < 625.0 and kind < 6:
+            if d2 < 625.0 and kind < AgentKind.WALKER:
                 if d2 < 225.0 and lane >= 0 and state.lane[b, j] == lane and dx * c + dy * s > 0.0:
                     hazard = 1.0
                 if d2 < d_first:

@@ -2,8 +2,9 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FORECAST, STRIDE, EpisodeArrays, Roads, State
-from ssad.world.kernels.shared import C_AUTOPILOT, KIND_WALKER, lane_under, route_at, wrap
+from ssad.core.types import AgentKind, Controller
+from ssad.world.kernels.data import HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State
+from ssad.world.kernels.shared import lane_under, route_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -73,20 +74,20 @@ def bicycle(
 def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int):
     """Advance every agent by dt with its control (external ones with the action) and look where it is now."""
     b, i = wp.tid()
-    if state.end[b] != 0 or state.active[b, i] == 0:
+    if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
         return
     e = state.episode[b]
     m = bank.model[e, i]
     pose = state.pose[b, i]
     state.previous[b, i] = pose
     control = state.control[b, i]
-    if bank.controller[e, i] == 1:
+    if bank.controller[e, i] == Controller.EXTERNAL:
         control = action[b, i]
         state.control[b, i] = control
     speed = state.speed[b, i]
     kind = bank.kind[m]
     power = bank.power[m]
-    if kind == KIND_WALKER:
+    if kind == AgentKind.WALKER:
         # throttle is the wanted speed over the model's top speed; a walker turns and stops at once
         aim = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
@@ -128,8 +129,8 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
             k = k + 1
         at = found
         state.progress[b, i] = at
-        if i > 0 and bank.controller[e, i] == C_AUTOPILOT and at >= route[1] - 3:
-            state.active[b, i] = 0  # background traffic leaves at the end of its route
+        if i > 0 and bank.controller[e, i] == Controller.AUTOPILOT and at >= route[1] - 3:
+            state.active[b, i] = Presence.ABSENT  # background traffic leaves at the end of its route
 
     under = lane_under(roads, bank.town[e], pose[0], pose[1])
     state.lane[b, i] = int(under[0])
@@ -144,7 +145,7 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
     low = wp.vec2(pose[0], pose[1])
     high = low
     if wp.abs(speed) > 0.1:
-        for k in range(FORECAST):
+        for k in range(HORIZON):
             ahead = speed * STRIDE * float(k + 1)
             q = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
             if follows:
@@ -153,6 +154,6 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
             low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
             high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
     else:
-        for k in range(FORECAST):
+        for k in range(HORIZON):
             state.forecast[b, i, k] = pose
     state.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])

@@ -2,19 +2,21 @@
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, Ego, EpisodeArrays, Roads, State, Work
-from ssad.world.kernels.shared import RED, boxes_touch, signal_state, wrap
-
-END_RUNNING = wp.constant(0)
-END_COLLISION = wp.constant(1)
-END_COMPLETE = wp.constant(2)
-END_STEPS = wp.constant(3)
-END_DISTANCE = wp.constant(4)
-END_TIME = wp.constant(5)
-CONTACT_VEHICLE = wp.constant(1)
-CONTACT_WALKER = wp.constant(2)
-CONTACT_CYCLIST = wp.constant(4)
-CONTACT_STATIC = wp.constant(8)
+from ssad.core.types import AgentKind, Contact, SignalState
+from ssad.world.kernels.data import (
+    FAR,
+    HORIZON,
+    STRIDE,
+    Ego,
+    End,
+    EpisodeArrays,
+    Presence,
+    Roads,
+    State,
+    TurnRank,
+    Work,
+)
+from ssad.world.kernels.shared import boxes_touch, signal_state, wrap
 
 
 @wp.func
@@ -29,17 +31,17 @@ def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
     b, i = wp.tid()
     if b == 0 and i == 0:
         work.count[0] = 0  # for the next step's `sight`
-    if state.end[b] != 0:
+    if state.end[b] != End.RUNNING:
         return
     mask = wp.int64(0)
-    if state.active[b, i] != 0:
+    if state.active[b, i] != Presence.ABSENT:
         e = state.episode[b]
         p = state.pose[b, i]
         p0 = state.previous[b, i]
         pb = bank.body[bank.model[e, i]]
         reach = pb[0] + pb[1]
         for j in range(agents):
-            if j != i and state.active[b, j] != 0:
+            if j != i and state.active[b, j] != Presence.ABSENT:
                 q = state.pose[b, j]
                 dx = q[0] - p[0]
                 dy = q[1] - p[1]
@@ -52,23 +54,23 @@ def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
                         hit = boxes_touch(halfway(p0, p), pb[0], pb[1], halfway(q0, q), qb[0], qb[1])
                     if hit:
                         mask = mask | (wp.int64(1) << wp.int64(j))
-        if state.active[b, i] == 1:
+        if state.active[b, i] == Presence.ASLEEP:
             ego = state.pose[b, 0]
             if wp.length(wp.vec2(ego[0] - p[0], ego[1] - p[1])) < bank.cruise[e, i][1]:
-                state.active[b, i] = 2
+                state.active[b, i] = Presence.AWAKE
     state.touch[b, i] = mask
 
 
 @wp.func
 def contact_kind(kind: int) -> int:
     """Contact bit for an agent kind."""
-    bit = CONTACT_VEHICLE
-    if kind == 6:
-        bit = CONTACT_WALKER
-    elif kind == 5:
-        bit = CONTACT_CYCLIST
-    elif kind == 7:
-        bit = CONTACT_STATIC
+    bit = int(Contact.VEHICLE)
+    if kind == AgentKind.WALKER:
+        bit = Contact.WALKER
+    elif kind == AgentKind.BICYCLE:
+        bit = Contact.CYCLIST
+    elif kind == AgentKind.PROP:
+        bit = Contact.STATIC
     return bit
 
 
@@ -76,7 +78,7 @@ def contact_kind(kind: int) -> int:
 def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: int, dt: float):
     """One row of the ego's record, the SafeBench reward, and the end of the episode; one thread a scene."""
     b = wp.tid()
-    if state.end[b] != 0:
+    if state.end[b] != End.RUNNING:
         return
     e = state.episode[b]
     step = state.step[b] + 1
@@ -92,7 +94,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     now = state.touch[b, 0]
     fresh = now & (~ego.touching[b])
     ego.touching[b] = now
-    kinds = int(0)
+    kinds = int(Contact.NONE)
     other = int(-1)
     if fresh != wp.int64(0):
         for j in range(1, agents):
@@ -171,8 +173,8 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
         rule = roads.rule[route[0] + back]
         index = roads.path_signal[route[0] + back]
         if index >= 0 and rule[1] <= wp.max(gone, 0.0) + 0.5 and rule[1] > -0.5:
-            stopped_right = rule[3] == 1.0 and state.waited[b, 0] >= 1.0
-            if signal_state(bank, roads, e, index, time) == RED and not stopped_right:
+            stopped_right = int(rule[3]) == TurnRank.RIGHT and state.waited[b, 0] >= 1.0
+            if signal_state(bank, roads, e, index, time) == SignalState.RED and not stopped_right:
                 ran = 1
     # rule[1] is whole metres: count a line once
     if ran == 1 and ego.red_light[b] == 0:
@@ -185,7 +187,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     # SafeBench's reward
     along = v * wp.cos(wrap(pose[2] - p[2]))
     reward = along
-    if kinds != 0:
+    if kinds != Contact.NONE:
         reward = reward - 1.0
     if along > 8.0:
         reward = reward - 10.0
@@ -194,17 +196,17 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     ego.reward[b] = reward - 5.0 * control[2] * control[2] - 0.2 * wp.abs(control[2]) * along * along
 
     limits = bank.limits[e]
-    end = END_RUNNING
-    if kinds != 0:
-        end = END_COLLISION
+    end = int(End.RUNNING)
+    if kinds != Contact.NONE:
+        end = End.COLLISION
     elif ego.complete[b] >= 100.0:
-        end = END_COMPLETE
+        end = End.COMPLETE
     elif float(step) >= limits[0]:
-        end = END_STEPS
+        end = End.MAX_STEPS
     elif ego.driven[b] >= limits[2]:
-        end = END_DISTANCE
+        end = End.MAX_DISTANCE
     elif time >= limits[1]:
-        end = END_TIME
+        end = End.MAX_TIME
     state.end[b] = end
 
 
@@ -213,7 +215,7 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
     b, i = wp.tid()
     go = mask[b] == 1
-    if ended_too == 1 and state.end[b] != 0:
+    if ended_too == 1 and state.end[b] != End.RUNNING:
         go = True
     if not go:
         return
@@ -234,19 +236,19 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     state.lane[b, i] = -1
     state.aim[b, i] = wp.vec2(0.0, 0.0)
     state.react[b, i] = 0.0
-    awake = int(2)
+    awake = int(Presence.AWAKE)
     if bank.model[e, i] < 0:
-        awake = 0
+        awake = Presence.ABSENT
     elif bank.cruise[e, i][1] > 0.0:
-        awake = 1
+        awake = Presence.ASLEEP
     state.active[b, i] = awake
-    far = start[3] * 4.0
+    far = start[3] * STRIDE * float(HORIZON)
     tip = wp.vec2(pose[0] + far * wp.cos(pose[2]), pose[1] + far * wp.sin(pose[2]))
     state.span[b, i] = wp.vec4(
         wp.min(pose[0], tip[0]), wp.min(pose[1], tip[1]), wp.max(pose[0], tip[0]), wp.max(pose[1], tip[1])
     )
-    for k in range(8):
-        ahead = start[3] * 0.5 * float(k + 1)
+    for k in range(HORIZON):
+        ahead = start[3] * STRIDE * float(k + 1)
         state.forecast[b, i, k] = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
 
 
@@ -257,13 +259,13 @@ def restart_record(
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
     go = mask[b] == 1
-    if ended_too == 1 and state.end[b] != 0:
+    if ended_too == 1 and state.end[b] != End.RUNNING:
         go = True
     if not go:
         return
     mask[b] = 0
     state.step[b] = 0
-    state.end[b] = 0
+    state.end[b] = End.RUNNING
     ego.contact[b] = 0
     ego.contact_agent[b] = -1
     ego.touching[b] = wp.int64(0)

@@ -2,15 +2,10 @@
 
 import warp as wp
 
+from ssad.core.types import SignalState
 from ssad.world.kernels.data import FAR, EpisodeArrays, Roads
 
-C_AUTOPILOT = wp.constant(2)
-KIND_WALKER = wp.constant(6)
 IDM_ACCEL = wp.constant(2.5)
-OFF = wp.constant(0)
-RED = wp.constant(1)
-YELLOW = wp.constant(2)
-GREEN = wp.constant(3)
 
 
 @wp.func
@@ -52,14 +47,14 @@ def signal_state(bank: EpisodeArrays, roads: Roads, e: int, index: int, time: fl
         return forced
     program = roads.signal_program[roads.signal_first[bank.town[e]] + index]
     if program[0] <= 0.0:
-        return OFF
+        return SignalState.OFF
     t = time - program[1]
     t = t - program[0] * wp.floor(t / program[0])
-    state = RED
+    state = int(SignalState.RED)
     if t < program[2]:
-        state = GREEN
+        state = SignalState.GREEN
     elif t < program[2] + program[3]:
-        state = YELLOW
+        state = SignalState.YELLOW
     return state
 
 

@@ -7,13 +7,10 @@ predicted conflict that it must yield to (here).
 
 import warp as wp
 
-from ssad.world.kernels.data import FAR, FORECAST, STRIDE, EpisodeArrays, Roads, State, Work
+from ssad.core.types import AgentKind, Controller, SignalState
+from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State, TurnRank, Work
 from ssad.world.kernels.shared import (
-    C_AUTOPILOT,
     IDM_ACCEL,
-    KIND_WALKER,
-    RED,
-    YELLOW,
     boxes_touch,
     route_frame,
     signal_state,
@@ -24,7 +21,6 @@ IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
 LONGEST = wp.constant(5.2)  # half length of the longest model, m
-RIGHT_TURN = wp.constant(1.0)
 
 
 @wp.func
@@ -101,7 +97,7 @@ def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int
     test. Scripted actors and walkers are not. Straight goes before right before left, then whoever is inside the
     junction, then whoever is nearer to it, then the lower number.
     """
-    if j != 0 and (bank.controller[e, j] != C_AUTOPILOT or state.active[b, j] != 2):
+    if j != 0 and (bank.controller[e, j] != Controller.AUTOPILOT or state.active[b, j] != Presence.AWAKE):
         return False
     ri = bank.route[e, i]
     rj = bank.route[e, j]
@@ -142,12 +138,12 @@ def conflict_gap(
     w = v
     reach = own[0] + other[0] + 2.0
     reach2 = reach * reach
-    for k in range(FORECAST):
+    for k in range(HORIZON):
         after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
         u = u + 0.5 * (w + after) * STRIDE
         w = after
         at = route_frame(roads, route[0], route[1], u0 + u)
-        for n in range(k - 1, wp.min(k + 2, FORECAST)):
+        for n in range(k - 1, wp.min(k + 2, HORIZON)):
             q = state.pose[b, j]
             if n >= 0:
                 q = state.forecast[b, j, n]
@@ -187,7 +183,7 @@ def apart(
 
     lon, lat: where j is now; ahead: metres I can go; off: what bent paths and the bodies' reach add.
     """
-    q = state.forecast[b, j, FORECAST - 1]
+    q = state.forecast[b, j, HORIZON - 1]
     dx = q[0] - pose[0]
     dy = q[1] - pose[1]
     lon1 = dx * c + dy * s
@@ -204,11 +200,11 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     their order does not matter, since only the hardest reaction counts.
     """
     b, i = wp.tid()
-    if state.end[b] != 0 or state.active[b, i] != 2:
+    if state.end[b] != End.RUNNING or state.active[b, i] != Presence.AWAKE:
         return
     e = state.episode[b]
     route = bank.route[e, i]
-    if bank.controller[e, i] != C_AUTOPILOT or route[1] < 2:
+    if bank.controller[e, i] != Controller.AUTOPILOT or route[1] < 2:
         return
     at = state.progress[b, i]
     first = route[0] + at
@@ -228,10 +224,10 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
         ahead = rule[1] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
             light = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
-            stop = light == RED
-            if light == YELLOW:
+            stop = light == SignalState.RED
+            if light == SignalState.YELLOW:
                 stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
-            if light == RED and rule[3] == RIGHT_TURN and state.waited[b, i] >= 1.0:
+            if light == SignalState.RED and int(rule[3]) == TurnRank.RIGHT and state.waited[b, i] >= 1.0:
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
                 react = idm_gap(v, 0.0, ahead + 1.0)
@@ -240,7 +236,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
     # how far ahead anybody matters: 4 s of driving, and the distance to brake in comfort
-    goes = wp.max(target, v) * STRIDE * float(FORECAST)
+    goes = wp.max(target, v) * STRIDE * float(HORIZON)
     sees = wp.min(wp.max(goes, 15.0 + 3.0 * v), SIGHT)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
@@ -255,7 +251,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     low = wp.vec2(low[0] - pad, low[1] - pad)
     high = wp.vec2(high[0] + pad, high[1] + pad)
     for j in range(agents):
-        if j != i and state.active[b, j] != 0:
+        if j != i and state.active[b, j] != Presence.ABSENT:
             box = state.span[b, j]
             if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
                 other = bank.body[bank.model[e, j]]
@@ -308,7 +304,7 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
         v = wp.max(state.speed[b, i], 0.0)
         own = bank.body[bank.model[e, i]]
         other = bank.body[bank.model[e, j]]
-        walks = bank.kind[bank.model[e, j]] == KIND_WALKER
+        walks = bank.kind[bank.model[e, j]] == AgentKind.WALKER
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)

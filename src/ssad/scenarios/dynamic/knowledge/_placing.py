@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ssad.core.errors import RouteError
-from ssad.core.geometry import wrap_angle
+from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Condition, Controller, EpisodeAgent, LaneType, Phase, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 

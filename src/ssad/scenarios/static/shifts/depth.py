@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Frame, camera_to_world, rotation_matrix
+from ssad.core.frames import Frame, camera_to_world
+from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F32
 from ssad.scenarios.static.shifts.batch import Batch
 
@@ -124,7 +125,9 @@ def _boxes(frame: Frame, inverse: F32, weight: F32, lens: tuple[float, float, fl
     pose = camera_to_world(frame)
     half = boxes.size[:, [1, 0, 2]] / 2
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    corners = np.einsum("nij,nkj->nki", rotation_matrix(boxes.rotation), half[:, None] * signs) + boxes.centre[:, None]
+    corners = (
+        np.einsum("nij,nkj->nki", quaternion_to_matrix(boxes.rotation), half[:, None] * signs) + boxes.centre[:, None]
+    )
     local = (corners - pose[:3, 3]) @ pose[:3, :3]
     nearest = local[..., 2].min(1)
     for n in np.argsort(-nearest, kind="stable"):

@@ -17,7 +17,9 @@ import cv2
 import numpy as np
 import warp as wp
 
-from ssad.core.frames import Applied, Boxes3D, Frame, camera_to_world, rotation_matrix
+from ssad.core.frames import Applied, Boxes3D, Frame, camera_to_world
+from ssad.core.nuscenes_names import VISIBILITY
+from ssad.core.rotations import quaternion_product, quaternion_to_matrix, yaw_to_quaternion
 from ssad.core.types import F64
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, on, structs
@@ -25,11 +27,11 @@ from ssad.scenarios.static.shifts.depth import lens
 from ssad.scenarios.static.shifts.kernels import objects as kernels
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
-LEAST_VISIBLE = 0.4  # objects less visible than this (nuScenes: token 1) have no pixels worth moving
+LEAST_VISIBLE = VISIBILITY["2"]  # objects less visible than this have no pixels worth moving
 LEAST_PIXELS = 6.0
 NEAREST = 0.3  # m before the camera
 LONGEST = 200.0  # px of a streak
-MARGIN, STEP = 8, 4
+MARGIN = 8
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -76,7 +78,7 @@ def deformations(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, li
 
 def affine(boxes: Boxes3D) -> tuple[F64, F64]:
     """Unit cube -> box in the world: matrices [N, 3, 3] and centres [N, 3]; the axes are length, width, height."""
-    return rotation_matrix(boxes.rotation) * boxes.size[:, None, [1, 0, 2]], boxes.centre
+    return quaternion_to_matrix(boxes.rotation) * boxes.size[:, None, [1, 0, 2]], boxes.centre
 
 
 def deformed(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, lidar: bool = False) -> tuple[F64, F64]:
@@ -84,7 +86,7 @@ def deformed(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: str, lidar:
     if not len(boxes):
         return np.zeros((0, 3, 3)), np.zeros((0, 3))
     d = deformations(spec, boxes, scene=scene, sample=sample, lidar=lidar)
-    rotation = rotation_matrix(boxes.rotation)
+    rotation = quaternion_to_matrix(boxes.rotation)
     matrix = rotation @ (d * boxes.size[:, None, [1, 0, 2]])
     if spec.calibration == "paper" and not lidar:
         return matrix, boxes.centre
@@ -101,32 +103,16 @@ def transformed_boxes(spec: ShiftSpec, boxes: Boxes3D, *, scene: str, sample: st
         return boxes
     matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
     length = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
-    rotation = rotation_matrix(boxes.rotation)
+    rotation = quaternion_to_matrix(boxes.rotation)
     turn = np.arctan2(
         np.einsum("ni,ni->n", length, rotation[:, :, 1]), np.einsum("ni,ni->n", length, rotation[:, :, 0])
     )
-    half = np.stack([np.cos(turn / 2), np.zeros_like(turn), np.zeros_like(turn), np.sin(turn / 2)], 1)
-    quaternion = _multiply(boxes.rotation, half)
-    axes = rotation_matrix(quaternion)
+    quaternion = quaternion_product(boxes.rotation, yaw_to_quaternion(turn))
+    axes = quaternion_to_matrix(quaternion)
     corners = np.einsum("nji,nkj->nki", axes, np.einsum("nij,kj->nki", matrix, _CUBE))
     low, high = corners.min(1), corners.max(1)
     middle = np.einsum("nij,nj->ni", axes, (low + high) / 2)
     return replace(boxes, centre=centre + middle, size=(high - low)[:, [1, 0, 2]], rotation=quaternion)
-
-
-def _multiply(a: F64, b: F64) -> F64:
-    """Products of quaternions [N, 4]."""
-    w, x, y, z = np.moveaxis(a, -1, 0)
-    s, i, j, k = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            w * s - x * i - y * j - z * k,
-            w * i + x * s + y * k - z * j,
-            w * j - x * k + y * s + z * i,
-            w * k + x * j - y * i + z * s,
-        ],
-        -1,
-    )
 
 
 def _outline(points: F64) -> F64:
@@ -271,7 +257,7 @@ def _add_item(
         high = middle + (both.max(0) - middle) * 1.25 + MARGIN
     low = np.clip(np.floor(low), 0, [size[0] - 1, size[1] - 1]).astype(int)
     high = np.clip(np.ceil(high) + 1, 1, size).astype(int)
-    wide, tall = ((high - low + STEP - 1) // STEP + 2).tolist()
+    wide, tall = ((high - low + kernels.STEP - 1) // kernels.STEP + 2).tolist()
     plan.items.append(
         (
             index, into, -into @ new_centre, old, old_centre, middle, *plan.outline(target), *plan.outline(outline),

@@ -37,8 +37,8 @@ class Item:
     streak: wp.vec2
 
 
-STEP = wp.constant(4)
-DONE = wp.constant(16384)
+STEP = wp.constant(4)  # pixels from one displacement node to the next
+DONE = wp.constant(16384)  # bit of `owner`: the pixel is painted
 
 
 @wp.func
@@ -206,7 +206,7 @@ def paint(
             low = items[k].low_x
             wide = items[k].node_wide
             ny = (y - items[k].low_y) / STEP
-            ty = float(y - items[k].low_y - ny * STEP) * 0.25
+            ty = float(y - items[k].low_y - ny * STEP) / float(STEP)
             first = items[k].node_first + ny * wide
             end = items[k].high_x
             left = nodes[first] * (1.0 - ty) + nodes[first + wide] * ty
@@ -219,7 +219,7 @@ def paint(
                         if x < end:
                             hidden = int(owner[b, y, x])
                             if hidden < DONE and (respect == 0 or hidden <= rank):
-                                n = left + (right - left) * (float(m) * 0.25)
+                                n = left + (right - left) * (float(m) / float(STEP))
                                 inside = n[2] > 0.0
                                 if inside or (n[3] > 0.5 and wp.abs(n[0]) + wp.abs(n[1]) > 0.2):
                                     sx = wp.clamp(float(x) + n[0], 0.0, float(width) - 2.0)

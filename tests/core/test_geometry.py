@@ -7,25 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world, wrap_angle
+from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world
 
 angle = st.floats(-50.0, 50.0)
 place = st.floats(-100.0, 100.0)
 size = st.floats(0.2, 12.0)
 box = st.tuples(place, place, angle, size, size).map(np.array)
-
-
-@given(angle, st.integers(-9, 9))
-def test_wrap_is_in_range_and_the_same_direction(value: float, turns: int) -> None:
-    wrapped = float(wrap_angle(value + 2 * np.pi * turns))
-    assert -np.pi <= wrapped < np.pi
-    assert np.isclose(np.cos(wrapped), np.cos(value), atol=1e-9)
-    assert np.isclose(np.sin(wrapped), np.sin(value), atol=1e-9)
-
-
-def test_wrap_takes_pi_to_minus_pi() -> None:
-    assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi])) == pytest.approx([-np.pi] * 3)
-    assert wrap_angle(np.float32(np.pi)).dtype == np.float32
 
 
 def test_rotate_and_frames_closed_form() -> None:
@@ -62,6 +49,8 @@ def test_corners_keep_area_and_centre(b: np.ndarray) -> None:
         ((0.0, 5.0, 0.0, 4.0, 2.0), 3.0),  # side by side
         ((7.0, 5.0, 0.0, 4.0, 2.0), np.hypot(3.0, 3.0)),  # corner to corner
         ((5.0, 0.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 1.0),  # a corner against a side
+        ((0.0, 3.0, np.pi / 4, np.sqrt(8.0), np.sqrt(8.0)), 0.0),  # a corner touches a side
+        ((1.0, 2.5, np.pi / 4, np.sqrt(2.0), np.sqrt(2.0)), 0.5),  # only the long side's own axis separates them
         ((1.0, 0.5, 0.3, 4.0, 2.0), 0.0),  # overlap
         ((0.0, 0.0, np.pi / 2, 40.0, 0.1), 0.0),  # a cross: no corner inside the other
         ((4.0, 0.0, 0.0, 4.0, 2.0), 0.0),  # touching

@@ -1,24 +1,23 @@
-"""The report of a suite of kind `detection`: 3D detectors under shifts, the paper's numbers beside ours."""
+"""The page of a detection run: 3D detectors under shifts, the paper's numbers beside ours."""
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
-from pathlib import Path
 from typing import Any
 
-from ssad.core import safeio
-from ssad.core.errors import ConfigError, StoreError
+from ssad.core.errors import ConfigError
+from ssad.metrics import replicate_estimate
+from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
-from ssad.metrics.uncertainty import percentile_interval
-from ssad.report.load import read_records
-from ssad.report.pages import template
+from ssad.report.artefacts import pictures
+from ssad.report.load import Run
+from ssad.report.pages import render
 from ssad.report.paper import DETECTORS
 from ssad.report.paper import SHIFTS as PUBLISHED
-from ssad.report.tables import Cell, Row, Table, write_tables
+from ssad.report.tables import Cell, Row, Table
 
 SOURCE = "published by the paper: nuScenes val, severities drawn from 1 to 5"
 FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "clean": "Clean"}
@@ -32,18 +31,20 @@ ERRORS = {"mATE": "m", "mASE": "1 - IoU", "mAOE": "rad", "mAVE": "m/s", "mAAE": 
 
 @dataclass(frozen=True)
 class DetectionRun:
-    """A run folder: its header, and its records by detector, shift ("": clean) and severity."""
+    """A detection run: its folder, and its records by detector, shift ("": clean) and severity."""
 
-    folder: Path
-    header: Mapping[str, Any]
+    run: Run
     records: Mapping[tuple[str, str, str], Mapping[str, Any]]
-    planned: int
 
     @property
     def suite(self) -> Mapping[str, Any]:
         """The resolved suite."""
-        found: Mapping[str, Any] = self.header["suite"]
-        return found
+        return self.run.suite
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes were resampled for the intervals."""
+        return max(int(r.get("scenes", 0)) for r in self.records.values())
 
     @property
     def detectors(self) -> list[str]:
@@ -71,49 +72,63 @@ class DetectionRun:
         return FAMILIES[own["family"]] if own else ""
 
 
-def load_detection_run(folder: Path, header: Mapping[str, Any]) -> DetectionRun:
-    """Records of a run folder. StoreError: it has no result yet."""
-    lines = read_records(folder / "results.jsonl")
-    if not lines:
-        raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
-    records = {(r["detector"], r["shift"] or "", str(r["severity"])): r for r in lines}
-    return DetectionRun(folder, header, records, len(header.get("cells", [])))
+def load_detection_run(run: Run) -> DetectionRun:
+    """The records of a run folder."""
+    records = {(r["detector"], r["shift"] or "", str(r["severity"])): r for r in run.lines}
+    return DetectionRun(run, records)
 
 
-def cell_of(record: Mapping[str, Any] | None, metric: str, *, scale: float = 100.0) -> Cell:
-    """A metric in percent with its interval; a dash where there is none."""
-    if record is None or metric not in record["metrics"]:
+def score_cell(run: DetectionRun, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
+    """A score in percent with its interval: the one place where intervals of this page come from."""
+    return Cell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
+
+
+def cell_of(run: DetectionRun, record: Mapping[str, Any] | None, metric: str) -> Cell:
+    """A metric in percent with its interval; n/a where there is none."""
+    value = None if record is None else record["metrics"].get(metric)
+    if record is None or value is None:
         return Cell(math.nan)
-    low, high = record["intervals"].get(metric, (math.nan, math.nan))
-    return Cell(scale * record["metrics"][metric], scale * low, scale * high, record["n"])
+    replicates, given = _replicates(record, metric), (record.get("intervals") or {}).get(metric)
+    if not replicates and given:
+        return Cell(100 * value, 100 * given[0], 100 * given[1], record["n"], method="given")
+    return score_cell(run, value, replicates, record["n"])
+
+
+def _replicates(record: Mapping[str, Any], metric: str) -> list[float]:
+    """A metric's bootstrap replicates; empty if the record has none."""
+    return (record.get("replicates") or {}).get(metric) or []
 
 
 def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
     """A shift's number: at the random severity if that ran, else the mean over severities."""
     if not shift or run.record(detector, shift, "random") is not None:
-        return cell_of(run.record(detector, shift, "random"), metric)
+        return cell_of(run, run.record(detector, shift, "random"), metric)
     found = [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
-    if not found or len(found) < len(run.numbers):
+    if not found or len(found) < len(run.numbers) or any(r["metrics"].get(metric) is None for r in found):
         return Cell(math.nan)
     mean = math.fsum(r["metrics"][metric] for r in found) / len(found)
-    draws = [r["replicates"].get(metric, []) for r in found]
-    low = high = math.nan
-    if all(draws):
-        low, high = percentile_interval([math.fsum(row) / len(row) for row in zip(*draws, strict=True)])
-    return Cell(100 * mean, 100 * low, 100 * high, found[0]["n"])
+    draws = [_replicates(r, metric) for r in found]
+    means = [math.fsum(row) / len(row) for row in zip(*draws, strict=True)] if all(draws) else []
+    return score_cell(run, mean, means, found[0]["n"])
 
 
 def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell:
     """Share of the clean score that is left under a shift, percent; the interval from paired replicates."""
     clean, own = run.record(detector, "", "0"), summary_cell(run, detector, shift, metric)
-    if clean is None or math.isnan(own.mean) or not clean["metrics"][metric]:
+    if clean is None or math.isnan(own.mean) or not clean["metrics"].get(metric):
         return Cell(math.nan)
     drawn = run.record(detector, shift, "random")
     found = [drawn] if drawn else [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
-    rows = zip(clean["replicates"].get(metric, []), *(r["replicates"].get(metric, []) for r in found), strict=True)
-    shares = [100 * math.fsum(row[1:]) / len(found) / row[0] for row in rows if row[0] > 0]
-    low, high = percentile_interval(shares) if len(shares) > 1 else (math.nan, math.nan)
-    return Cell(own.mean / clean["metrics"][metric], low, high, own.n)
+    rows = zip(*(_replicates(r, metric) for r in (clean, *found)), strict=True)
+    shares = [math.fsum(row[1:]) / len(found) / row[0] for row in rows if row[0] > 0]
+    return score_cell(run, own.mean / 100.0 / clean["metrics"][metric], shares, own.n, bounded=False)
+
+
+def interval_note(run: DetectionRun) -> str:
+    """How the intervals of the page are made, in a sentence."""
+    if run.scenes < MIN_CLUSTERS:
+        return f"no intervals, since {run.scenes} scenes are too few (five are the least)."
+    return f"95 % intervals by the bootstrap over {run.scenes} scenes (beta limits; Student's t for ratios)."
 
 
 def title_of(shift: str) -> str:
@@ -148,7 +163,7 @@ def main_table(run: DetectionRun) -> Table:
         strength = "each scene at one severity from 1 to 5, all five as often, give or take one"
     return Table(
         "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
-        f"Percent; {strength}; 95 % intervals by the bootstrap over scenes. Shaded rows: {SOURCE}; ours "
+        f"Percent; {strength}; {interval_note(run)} Shaded rows: {SOURCE}; ours "
         "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.", SOURCE,
     )  # fmt: skip
 
@@ -181,7 +196,7 @@ def severity_table(run: DetectionRun) -> Table:
     for metric in ("mAP", "NDS", "AP_car"):
         for detector in run.detectors:
             for shift in run.shifts:
-                cells = [cell_of(run.record(detector, shift, s), metric) for s in names]
+                cells = [cell_of(run, run.record(detector, shift, s), metric) for s in names]
                 rows.append(Row((metric.replace("_", " "), detector, title_of(shift)), tuple(cells)))
     return Table(
         "severities", "By severity", ("Metric", "Detector", "Shift"), tuple(f"severity {s}" for s in names), tuple(rows)
@@ -203,8 +218,9 @@ def class_table(run: DetectionRun) -> Table:
     rows = []
     for detector in run.detectors:
         record = run.record(detector, "", "0")
-        cells = [cell_of(record, f"AP_{c}") for c in CLASSES]
-        cells += [cell_of(record, error, scale=1.0) for error in ERRORS]
+        cells = [cell_of(run, record, f"AP_{c}") for c in CLASSES]
+        errors = [record["metrics"].get(error) if record else None for error in ERRORS]
+        cells += [Cell(math.nan if error is None else error) for error in errors]
         rows.append(Row((detector,), tuple(cells)))
     note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
     return Table("classes", "On the clean data", ("Detector",), tuple(columns), tuple(rows), note)
@@ -222,7 +238,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
                 return None
             whole = {s: [r for r in row if r is not None] for s, row in records.items()}
             found[detector, metric] = {s: [r["metrics"][metric] for r in row] for s, row in whole.items()}
-            draws[detector, metric] = {s: [r["replicates"].get(metric, []) for r in row] for s, row in whole.items()}
+            draws[detector, metric] = {s: [_replicates(r, metric) for r in row] for s, row in whole.items()}
     rows = []
     for detector in run.detectors:
         cells = []
@@ -234,9 +250,10 @@ def robustness_table(run: DetectionRun) -> Table | None:
                 for k in range(len(draws[detector, metric][""][0]))
             ]
             for value, several in ((error, [s[1] for s in sets]), (rate, [s[0] for s in sets])):
-                known = [v for v in several if not math.isnan(v)]
-                low, high = percentile_interval(known) if len(known) > 1 else (math.nan, math.nan)
-                cells.append(Cell(100 * value, 100 * low, 100 * high))
+                # the baseline's mCE is 1 by definition, so its replicates do not vary
+                known = [] if value is error and own is base else several
+                n = next(iter(run.records.values())).get("n", 0)
+                cells.append(score_cell(run, value, known, n, bounded=False))
         rows.append(Row((detector,), tuple(cells)))
     return Table(
         "robustness", "Robustness in one number", ("Detector",), ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)"),
@@ -274,7 +291,7 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
             for d in run.detectors
             for s in ["", *run.shifts]
             for n in steps
-            if not math.isnan((cell := cell_of(run.record(d, s, n), metric)).mean)
+            if not math.isnan((cell := cell_of(run, run.record(d, s, n), metric)).mean)
         ),
         default=1.0,
     )
@@ -297,7 +314,7 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
             label = "clean" if n == "0" else n
             parts.append(f'<text x="{x:.1f}" y="{under + high + 15}" text-anchor="middle">{label}</text>')
         for index, detector in enumerate(run.detectors):
-            found = [(n, cell_of(run.record(detector, shift if n != "0" else "", n), metric)) for n in steps]
+            found = [(n, cell_of(run, run.record(detector, shift if n != "0" else "", n), metric)) for n in steps]
             found = [(n, c) for n, c in found if not math.isnan(c.mean)]
             colour = f"var(--s{index % 5})"
             known = [(n, c) for n, c in found if not math.isnan(c.low)]
@@ -324,38 +341,37 @@ def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
         clean = run.record(detector, "", "0")
         scores = {s: [summary_cell(run, detector, s, "NDS").mean / 100] for s in run.shifts}
         parts = {s: v for s, v in scores.items() if not math.isnan(v[0])}
-        base = cell_of(clean, "NDS").mean / 100
+        base = cell_of(run, clean, "NDS").mean / 100
         rates = resilience_rate(parts, base) if parts and base > 0 else {}
         worst = min(rates, key=lambda s: rates[s], default="")
         found.append(
-            {"name": detector, "mAP": cell_of(clean, "mAP"), "NDS": cell_of(clean, "NDS"),
+            {"name": detector, "mAP": cell_of(run, clean, "mAP"), "NDS": cell_of(run, clean, "NDS"),
              "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
-             "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
-             "weights": run.header.get("weights", {}).get(detector, "")}
+             "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else ""}
         )  # fmt: skip
     return found
 
 
-def write_detection_report(folder: Path, header: Mapping[str, Any]) -> Path:
-    """DIR/report.html and DIR/tables of a detection run. StoreError."""
-    run = load_detection_run(folder, header)
+def summary(found: Run) -> Table:
+    """The table that is shown on the terminal: percent."""
+    drawn = "random" in found.suite["severities"]
+    note = f"percent; {'severities from 1 to 5' if drawn else 'means over the severities that ran'}"
+    return replace(main_table(load_detection_run(found)), note=note)
+
+
+def section(found: Run) -> tuple[str, Sequence[Table]]:
+    """The page of a detection run and its tables."""
+    run = load_detection_run(found)
     robust = robustness_table(run)
     main, left, severities = main_table(run), left_table(run), severity_table(run)
     cars, classes = car_table(run), class_table(run)
-    write_tables(folder, [t for t in (main, left, robust, severities, cars, classes) if t is not None])
-    some = next(iter(run.records.values()))
-    page = template("detection.html").render(
-        run=run, suite=run.suite, title=run.suite.get("title") or run.suite["name"], main=main, left=left,
-        severities=severities, cars=cars, classes=classes, robust=robust, tiles=tiles(run, robust), plot=curves(run),
-        plot_map=curves(run, "mAP"),
-        command=header.get("command", f"ssad run {run.suite['name']}"),
-        versions=header.get("versions", {}), pictures=_pictures(folder),
-        samples=some.get("n", 0), scenes=some.get("scenes", 0),
-        failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
+    page = render(
+        "detection.html", found, main=main, left=left, severities=severities, cars=cars, classes=classes,
+        robust=robust, tiles=tiles(run, robust), plot=curves(run), plot_map=curves(run, "mAP"),
+        pictures=pictures(found.folder), samples=max(int(r.get("n", 0)) for r in run.records.values()),
+        scenes=run.scenes, failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
     )  # fmt: skip
-    path = folder / "report.html"
-    safeio.write_atomic(path, page)
-    return path
+    return page, [t for t in (main, left, robust, severities, cars, classes) if t is not None]
 
 
 def _skipped(run: DetectionRun) -> list[str]:
@@ -367,18 +383,4 @@ def _skipped(run: DetectionRun) -> list[str]:
         parts = [f"{k} {v}" for k, v in record.get("applied", {}).items() if k != "applied"]
         if parts:
             found.append(f"{title_of(shift)}, severity {severity}: {'; '.join(parts)}")
-    return found
-
-
-def _pictures(folder: Path) -> list[dict[str, str]]:
-    """Pictures with captions as data: URIs."""
-    place = folder / "pictures"
-    if not (place / "pictures.json").is_file():
-        return []
-    found = []
-    for file, caption in safeio.read_json(place / "pictures.json").items():
-        path = place / Path(str(file)).name
-        if path.is_file():
-            data = base64.b64encode(safeio.read_bytes(path)).decode()
-            found.append({"data": f"data:image/jpeg;base64,{data}", "caption": str(caption)})
     return found

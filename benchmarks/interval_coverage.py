@@ -1,0 +1,261 @@
+"""How often the 95 % intervals hold, by simulation: python benchmarks/interval_coverage.py [--quick]
+
+Draws data sets whose true mean is known, of the shapes that occur in a run, and counts how often the interval that
+`ssad.metrics` gives holds it. Writes the tables between the markers in docs/metrics.md; with --quick it prints them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, mean_limits, replicate_limits
+
+F64 = npt.NDArray[np.float64]
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "metrics.md"
+MARKERS = ("<!-- coverage: begin -->", "<!-- coverage: end -->")
+SHARES = (0.01, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95)
+# clusters, cases in each
+DESIGNS = ((8, 1), (32, 1), (150, 1), (5, 10), (8, 4), (32, 10), (150, 3))
+CORRELATIONS = (0.0, 0.3, 0.8, 1.0)
+STRATA = {
+    "all 0.01": [0.01] * 8, "all 0.05": [0.05] * 8, "all 0.1": [0.1] * 8, "all 0.3": [0.3] * 8, "all 0.5": [0.5] * 8,
+    "all 0.8": [0.8] * 8, "half 0, half 1": [0.0, 1.0] * 4, "half 0.05, half 0.95": [0.05, 0.95] * 4,
+    "half 0.2, half 0.8": [0.2, 0.8] * 4, "half 0.1, half 1": [0.1, 1.0] * 4, "one 0.5, others 0": [0.5] + [0.0] * 7,
+    "0.05 to 0.95": np.linspace(0.05, 0.95, 8).tolist(), "the paper's TD3": [1, 0.25, 0.75, 0, 1, 1, 1, 1],
+}  # fmt: skip
+
+
+def design(clusters: int, cases: int, strata: int = 1) -> Clusters:
+    """`clusters` clusters of `cases` cases in each of `strata` strata."""
+    total = clusters * strata
+    return Clusters(np.full(total, float(cases)), np.repeat(np.arange(strata), clusters))
+
+
+def occurrences(
+    random: np.random.Generator, draws: int, share: npt.ArrayLike, cases: int, correlation: float
+) -> npt.NDArray[np.bool_]:
+    """[draws, K, cases] whether an event occurs, its share [K] varying between clusters (beta-binomial)."""
+    mean = np.broadcast_to(np.asarray(share, np.float64), (draws, np.size(share)))
+    if correlation == 0.0:
+        chance = mean
+    elif correlation == 1.0:
+        chance = (random.random(mean.shape) < mean).astype(np.float64)
+    else:
+        spread = (1.0 - correlation) / correlation
+        inside = np.clip(mean, 1e-9, 1.0 - 1e-9)
+        drawn = random.beta(inside * spread, (1.0 - inside) * spread)
+        chance = np.where((mean <= 0.0) | (mean >= 1.0), mean, drawn)
+    return random.random((*mean.shape, cases)) < chance[..., None]
+
+
+def coverage(truth: float, low: F64, high: F64) -> tuple[float, float]:
+    """Share of the intervals given that hold the truth (to rounding), and the share of data sets that have one."""
+    given = ~np.isnan(low)
+    held = (low <= truth + 1e-12) & (high >= truth - 1e-12)
+    return (float(held[given].mean()) if given.any() else np.nan), float(given.mean())
+
+
+def share_coverage(share: npt.ArrayLike, layout: Clusters, correlation: float, draws: int) -> float:
+    """Coverage for the mean of events whose share is [K] in the clusters."""
+    each = np.broadcast_to(np.asarray(share, np.float64), layout.size.shape)
+    cases = int(layout.size[0])
+    random = stream("share", each.tolist(), cases, correlation)
+    sums = occurrences(random, draws, each, cases, correlation).sum(axis=2).astype(np.float64)
+    found = bounded_limits(sums, layout, cap=2.0 * layout.size.sum())
+    return coverage(float(layout.weight @ each), found.low, found.high)[0]
+
+
+def completion(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Route completion: 1, or with probability 0.1 uniform in [0.2, 1]; mean 0.96."""
+    cut = occurrences(random, draws, [0.1] * clusters, cases, correlation)
+    return np.where(cut, 0.2 + 0.8 * random.random(cut.shape), 1.0)
+
+
+def poor_completion(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Route completion: 1, or with probability 0.4 a value of the cluster, uniform in [0.2, 1]; mean 0.84."""
+    cut = occurrences(random, draws, [0.4] * clusters, cases, correlation)
+    return np.where(cut, 0.2 + 0.8 * random.random((draws, clusters, 1)), 1.0)
+
+
+def off_road(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Metres off the road: 0, or with probability 0.4 exponential with mean 2; mean 0.8."""
+    gone = occurrences(random, draws, [0.4] * clusters, cases, correlation)
+    return np.where(gone, random.exponential(2.0, gone.shape), 0.0)
+
+
+def rarely_off_road(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Metres off the road: 0, or with probability 0.1 exponential with mean 2; mean 0.2."""
+    gone = occurrences(random, draws, [0.1] * clusters, cases, correlation)
+    return np.where(gone, random.exponential(2.0, gone.shape), 0.0)
+
+
+def rarely_far_off_road(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """The same with one distance a cluster."""
+    gone = occurrences(random, draws, [0.1] * clusters, cases, correlation)
+    return np.where(gone, random.exponential(2.0, (draws, clusters, 1)), 0.0)
+
+
+def duration(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Seconds driven: normal, mean 15, standard deviation 3."""
+    shared = random.normal(size=(draws, clusters, 1)) * np.sqrt(correlation)
+    return 15.0 + 3.0 * (shared + random.normal(size=(draws, clusters, cases)) * np.sqrt(1.0 - correlation))
+
+
+def gap(random: np.random.Generator, draws: int, clusters: int, cases: int, correlation: float) -> F64:
+    """Metres to the nearest agent: log-normal with sigma 0.5; mean 1.133."""
+    shared = random.normal(size=(draws, clusters, 1)) * np.sqrt(correlation)
+    return np.exp(0.5 * (shared + random.normal(size=(draws, clusters, cases)) * np.sqrt(1.0 - correlation)))
+
+
+Draw = Callable[[np.random.Generator, int, int, int, float], F64]
+MEANS: dict[str, tuple[Draw, float, bool]] = {
+    "RC, 10 % below 1": (completion, 0.96, True),
+    "RC, 40 % below 1": (poor_completion, 0.84, True),
+    "OR, 60 % zeros": (off_road, 0.8, False),
+    "OR, 90 % zeros": (rarely_off_road, 0.2, False),
+    "OR, 90 % zeros, one distance a cluster": (rarely_far_off_road, 0.2, False),
+    "TS, normal": (duration, 15.0, False),
+    "MD, log-normal": (gap, float(np.exp(0.125)), False),
+}
+"""Name -> how it is drawn, its mean, whether it lies in [0, 1]."""
+
+
+def mean_coverage(name: str, layout: Clusters, correlation: float, draws: int) -> tuple[float, float]:
+    """Coverage for a mean, and the share of data sets that have an interval."""
+    draw, truth, bounded = MEANS[name]
+    random = stream(name, len(layout.size), layout.stratum.max(), float(layout.size[0]), correlation)
+    sums = draw(random, draws, len(layout.size), int(layout.size[0]), correlation).sum(axis=2)
+    found = bounded_limits(sums, layout) if bounded else mean_limits(sums, layout)
+    return coverage(truth, found.low, found.high)
+
+
+def precision(weight: F64, scene: npt.NDArray[np.intp], true: F64, objects: F64) -> F64:
+    """[B] average precision of detections in order of score, scenes [C] weighed by weight [B, C]."""
+    each = weight[:, scene]
+    right, wrong = np.cumsum(each * true, axis=1), np.cumsum(each * (1.0 - true), axis=1)
+    share = np.maximum.accumulate((right / np.maximum(right + wrong, 1e-9))[:, ::-1], axis=1)[:, ::-1]
+    found = np.diff(right, axis=1, prepend=0.0) / np.maximum(weight @ objects, 1e-9)[:, None]
+    return np.asarray((share * found).sum(axis=1))
+
+
+def detections(
+    random: np.random.Generator, scenes: int, recall: float, correlation: float
+) -> tuple[npt.NDArray[np.intp], F64, F64]:
+    """Detections of scenes in order of score: scene, whether it is true; objects in each scene."""
+    spread = (1.0 - correlation) / correlation
+    objects = random.poisson(8.0, scenes) + (random.random(scenes) < 0.3) * random.poisson(15.0, scenes)
+    right = random.binomial(objects, random.beta(recall * spread, (1.0 - recall) * spread, scenes))
+    wrong = random.poisson(random.gamma(1.0, 2.0, scenes))
+    scene = np.concatenate([np.repeat(np.arange(scenes), right), np.repeat(np.arange(scenes), wrong)])
+    true = np.repeat([1.0, 0.0], [right.sum(), wrong.sum()])
+    score = np.where(true > 0.0, random.beta(4.0, 2.0, len(true)), random.beta(2.0, 4.0, len(true)))
+    order = np.argsort(-score)
+    return scene[order], true[order], objects.astype(np.float64)
+
+
+def detection_coverage(scenes: int, recall: float, correlation: float, draws: int, replicates: int = 100) -> float:
+    """Coverage for the average precision of a detector, by the bootstrap over scenes."""
+    random = stream("detection", scenes, recall, correlation)
+    many = 20_000
+    truth = float(precision(np.ones((1, many)), *detections(random, many, recall, correlation))[0])
+    values, variances = np.zeros(draws), np.zeros(draws)
+    for k in range(draws):
+        found = detections(random, scenes, recall, correlation)
+        values[k] = precision(np.ones((1, scenes)), *found)[0]
+        weight = random.multinomial(scenes, np.full(scenes, 1.0 / scenes), size=replicates).astype(np.float64)
+        variances[k] = precision(weight, *found).var(ddof=1)
+    low, high = replicate_limits(values, variances, scenes, bounded=True)
+    return coverage(truth, low, high)[0]
+
+
+def stream(*key: object) -> np.random.Generator:
+    """A generator of its own for each simulation."""
+    return np.random.Generator(np.random.Philox(zlib.crc32(repr(key).encode())))
+
+
+def row(head: str, cells: list[str]) -> str:
+    """A line of a Markdown table."""
+    return f"| {head} | " + " | ".join(cells) + " |"
+
+
+def head(first: str, columns: list[str]) -> list[str]:
+    """Head of a Markdown table."""
+    return [row(first, columns), "|---|" + "---:|" * len(columns)]
+
+
+def percent(value: float) -> str:
+    """A coverage as it stands in the tables."""
+    return "" if np.isnan(value) else f"{100 * value:.1f}"
+
+
+def mean_cell(found: tuple[float, float]) -> str:
+    """Coverage, with the share of data sets that have an interval if not all have; too few to tell: a dash."""
+    held, given = found
+    return percent(held) if given == 1.0 else f"{percent(held)} ({100 * given:.0f})" if given >= 0.1 else "–"
+
+
+def tables(draws: int, detector_draws: int) -> list[str]:
+    """All tables as Markdown."""
+    lines = [
+        f"{draws:,} data sets a cell (average precision: {detector_draws:,}); percent that hold the true mean.",
+        "",
+    ]
+    lines += ["Shares (CR and the like). Clusters x cases in each, and how alike the cases of a cluster are:", ""]
+    lines += head("Data", [f"p = {p:g}" for p in SHARES])
+    for clusters, cases in DESIGNS:
+        for correlation in CORRELATIONS if cases > 1 else (0.0,):
+            name = f"{clusters} x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")
+            found = [share_coverage(p, design(clusters, cases), correlation, draws) for p in SHARES]
+            lines.append(row(name, [percent(value) for value in found]))
+    kinds = [(1, 0.0), *((10, c) for c in CORRELATIONS)]
+    titles = ["1 case", *(f"10 cases, correlation {c:g}" for c in CORRELATIONS)]
+    lines += ["", "The average of eight groups with four clusters each; p in the groups:", "", *head("p", titles)]
+    for name, shares in STRATA.items():
+        each = np.repeat(shares, 4)
+        found = [share_coverage(each, design(4, cases, 8), c, draws) for cases, c in kinds]
+        lines.append(row(name, [percent(value) for value in found]))
+    lines += [
+        "", "Means. In brackets: percent of the data sets that have an interval, where not all have one; a dash: fewer",
+        "than 10. In the last rows the average of eight groups with four clusters each.", "",
+        *head("Data", list(MEANS)),
+    ]  # fmt: skip
+    for clusters, cases in DESIGNS:
+        for correlation in (0.0, 0.3, 0.8) if cases > 1 else (0.0,):
+            name = f"{clusters} x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")
+            found = [mean_cell(mean_coverage(n, design(clusters, cases), correlation, draws)) for n in MEANS]
+            lines.append(row(name, found))
+    for cases, correlation in ((1, 0.0), (10, 0.3), (10, 0.8)):
+        name = f"8 groups, 4 x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")
+        lines.append(row(name, [mean_cell(mean_coverage(n, design(4, cases, 8), correlation, draws)) for n in MEANS]))
+    truths = ((0.3, 0.3), (0.5, 0.1), (0.8, 0.3), (0.1, 0.05))
+    lines += ["", "Average precision, 100 replicates of the bootstrap over scenes:", ""]
+    lines += head("Scenes", [f"recall {recall:g}, correlation {c:g}" for recall, c in truths])
+    for scenes in (8, 24, 150):
+        found = [detection_coverage(scenes, recall, c, detector_draws) for recall, c in truths]
+        lines.append(row(str(scenes), [percent(value) for value in found]))
+    return lines
+
+
+def main() -> None:
+    """Make the tables and write them into the document."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few data sets; print, write nothing")
+    quick = parser.parse_args().quick
+    lines = tables(200, 20) if quick else tables(4000, 1000)
+    if quick:
+        print("\n".join(lines))
+        return
+    before, _, rest = DOCUMENT.read_text().partition(MARKERS[0])
+    after = rest.partition(MARKERS[1])[2]
+    DOCUMENT.write_text("\n".join([before + MARKERS[0], "", *lines, "", MARKERS[1] + after]))
+
+
+if __name__ == "__main__":
+    assert MIN_CLUSTERS == 5, "the designs begin at five clusters"
+    main()

@@ -1,0 +1,118 @@
+"""Rotations: unit quaternions (w, x, y, z), 3 x 3 matrices, yaw, poses. Radians, right-handed; any leading axes.
+
+A matrix takes vectors of the turned frame to the frame it is turned in; its columns are the turned axes. Yaw turns
+about z, counter-clockwise from x.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.types import F64
+
+Floats = npt.NDArray[np.floating[Any]]
+
+
+def quaternion_to_matrix(quaternion: npt.ArrayLike) -> F64:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4] of any length; length 0 is no rotation."""
+    given = np.asarray(quaternion, np.float64)
+    length = np.linalg.norm(given, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(given / np.where(length > 0.0, length, 1.0), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def matrix_to_quaternion(matrix: npt.ArrayLike) -> F64:
+    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3], to about 1e-8; of the two that of w >= 0."""
+    m = np.asarray(matrix, np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    squares = np.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)
+    parts = np.sqrt(np.maximum(squares, 0.0)) / 2
+    # the signs are those of the largest part's products with the others, which are far from 0
+    wx, wy, wz = (m[..., k, j] - m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
+    yz, zx, xy = (m[..., k, j] + m[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1)))
+    one = np.ones_like(wx)
+    products = np.stack([one, wx, wy, wz, wx, one, xy, zx, wy, xy, one, yz, wz, zx, yz, one], -1)
+    largest = parts.argmax(-1)[..., None, None]
+    sign = np.take_along_axis(products.reshape(*one.shape, 4, 4), largest, -2)[..., 0, :]
+    signed = np.copysign(parts, sign)
+    return np.asarray(np.where(np.signbit(signed[..., :1]), -signed, signed) + 0.0, np.float64)  # + 0.0: no -0.0
+
+
+def yaw_to_quaternion(yaw: npt.ArrayLike) -> F64:
+    """Quaternions [..., 4] of turns about z by yaw [...]."""
+    half = np.asarray(yaw, np.float64) / 2
+    none = np.zeros_like(half)
+    return np.stack([np.cos(half), none, none, np.sin(half)], -1)
+
+
+def quaternion_to_yaw(quaternion: npt.ArrayLike) -> F64:
+    """Headings [...] of quaternions [..., 4] of any length: direction of the turned x axis in the plane."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, np.float64), -1, 0)
+    return np.asarray(np.arctan2(2.0 * (x * y + w * z), w * w + x * x - y * y - z * z))
+
+
+def quaternion_product(first: npt.ArrayLike, second: npt.ArrayLike) -> F64:
+    """Products [..., 4] of quaternions [..., 4]: the rotation `second`, then `first`."""
+    w, x, y, z = np.moveaxis(np.asarray(first, np.float64), -1, 0)
+    s, i, j, k = np.moveaxis(np.asarray(second, np.float64), -1, 0)
+    return np.stack(
+        [
+            w * s - x * i - y * j - z * k,
+            w * i + x * s + y * k - z * j,
+            w * j - x * k + y * s + z * i,
+            w * k + x * j - y * i + z * s,
+        ],
+        -1,
+    )
+
+
+def slerp(start: F64, end: F64, share: float) -> F64:
+    """Rotations [N, 4] between two quaternions [N, 4] along the shorter arc; share 0 is start, 1 is end.
+
+    Nearly equal ones (cosine of half the angle over 0.9995) are interpolated linearly, as in pyquaternion.
+    """
+    first = start / np.linalg.norm(start, axis=1, keepdims=True)
+    last = end / np.linalg.norm(end, axis=1, keepdims=True)
+    cosine = np.sum(first * last, axis=1, keepdims=True)
+    first = np.where(cosine < 0.0, -first, first)
+    cosine = np.abs(cosine)
+    angle = np.arccos(np.minimum(cosine, 0.9995))
+    sine = np.sin(angle)
+    arc = np.sin((1.0 - share) * angle) / sine * first + np.sin(share * angle) / sine * last
+    between = np.where(cosine > 0.9995, first + share * (last - first), arc)
+    return np.asarray(between / np.linalg.norm(between, axis=1, keepdims=True))
+
+
+def pose_matrix(translation: npt.ArrayLike, quaternion: npt.ArrayLike) -> F64:
+    """Poses [..., 4, 4] of translations [..., 3] and quaternions [..., 4]."""
+    turn = quaternion_to_matrix(quaternion)
+    pose = np.zeros((*turn.shape[:-2], 4, 4))
+    pose[..., :3, :3] = turn
+    pose[..., :3, 3] = translation
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def upright_pose(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
+    """Pose [4, 4] of something upright."""
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def wrap_angle(angle: npt.ArrayLike) -> Floats:
+    """Angles brought into [-pi, pi)."""
+    given = np.asarray(angle)
+    value: Floats = given if np.issubdtype(given.dtype, np.floating) else given.astype(np.float64)
+    wrapped = (value + np.pi) % (2.0 * np.pi) - np.pi
+    # rounding of the remainder may give exactly +pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped).astype(value.dtype)

@@ -1,0 +1,86 @@
+"""The page of any kind without a section of its own: a table of its columns by its factors, failures, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from ssad.metrics import CaseValue, estimate
+from ssad.report.artefacts import pictures
+from ssad.report.load import Run
+from ssad.report.pages import render
+from ssad.report.tables import METHODS, Cell, Row, Table
+
+Line = Mapping[str, Any]
+
+
+def section(run: Run) -> tuple[str, Sequence[Table]]:
+    """The page of a run and its one table."""
+    factors = _factors(run)
+    table = result_table(run)
+    failed = [
+        ([_factor(line, name) for name in factors], line["status"], line.get("reason", "")) for line in run.failures
+    ]
+    page = render("default.html", run, results=table, factors=factors, failures=failed, pictures=pictures(run.folder))
+    return page, [table]
+
+
+def summary(run: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return replace(result_table(run), note="")
+
+
+def result_table(run: Run) -> Table:
+    """A row for each combination of the factors' values, a column for each metric of the kind."""
+    factors = _factors(run)
+    columns: list[Mapping[str, Any]] = list(run.header.get("columns") or [])
+    if not columns:
+        columns = [{"name": name} for name in dict.fromkeys(m for line in run.lines for m in line.get("metrics") or {})]
+    cells: dict[tuple[str, ...], list[Line]] = {}
+    for line in run.lines:
+        cells.setdefault(tuple(_factor(line, name) for name in factors), []).append(line)
+    rows = [Row(head, tuple(_cell(lines, column) for column in columns)) for head, lines in cells.items()]
+    titles = [_title(column) for column in columns]
+    notes = [f"{title}: {c['better']} is better." for title, c in zip(titles, columns, strict=True) if c.get("better")]
+    note = " ".join([*notes, METHODS])
+    return Table(
+        "results", "Results", tuple(name.replace("_", " ") for name in factors), tuple(titles), tuple(rows), note
+    )
+
+
+def _factors(run: Run) -> list[str]:
+    """Names of the fields that tell a row: the kind's, or those of the usual ones that the lines have, or the key."""
+    named = [str(name) for name in run.header.get("factors") or []]
+    usual = [name for name in ("system", "detector", "group", "shift", "severity") if name in run.lines[0]]
+    return named or usual or ["key"]
+
+
+def _factor(line: Line, name: str) -> str:
+    value = line.get(name, (line.get("spec") or {}).get(name))
+    return "" if value is None else str(value)
+
+
+def _title(column: Mapping[str, Any]) -> str:
+    unit = column.get("unit")
+    return str(column.get("title") or column["name"]) + (f", {unit}" if unit else "")
+
+
+def _cell(lines: Sequence[Line], column: Mapping[str, Any]) -> Cell:
+    """A metric over the lines of a row: one line's own interval if it gives one, else that of the clusters."""
+    name = str(column["name"])
+    values = [(line.get("metrics") or {}).get(name) if line["status"] == "ok" else None for line in lines]
+    given = (lines[0].get("intervals") or {}).get(name) if len(lines) == 1 else None
+    if given and values[0] is not None:
+        low, high = (math.nan if v is None else float(v) for v in given)
+        return Cell(float(values[0]), low, high, int(lines[0].get("n", 1)), method="given")
+    truths = [isinstance(value, bool) for value in values if value is not None]
+    cases = [
+        CaseValue(
+            math.nan if value is None else float(value), str(line.get("cluster") or line["key"]),
+            str(line.get("case") or line["key"]), failed=line["status"] != "ok",
+        )
+        for line, value in zip(lines, values, strict=True)
+    ]  # fmt: skip
+    return Cell.of(estimate(cases, "share" if truths and all(truths) else "mean"))

@@ -1,0 +1,89 @@
+"""The replays of a driving page: every episode's data, and what became of it in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ssad.core.errors import SSADError, StoreError
+from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.traces import load_trace
+from ssad.core.types import EpisodeTrace
+from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
+from ssad.report.episodes import DrivingRun, EpisodeRecord
+from ssad.report.paper import SCENARIOS
+
+VERDICTS = {
+    "harmless": "a blind driver at the system's speed stays clear",
+    "avoidable": "avoidable by reacting once the danger has begun",
+    "anticipation": "avoidable only by acting earlier",
+    "autopilot": "avoided only by the privileged Autopilot",
+    "unavoidable": "nobody tried stayed clear",
+}
+
+
+def outcome_class(record: EpisodeRecord) -> str:
+    """Class of an episode in the matrix."""
+    if record.status != "ok":
+        return "failed"
+    return record.end if record.end in ("collision", "complete") else "cut"
+
+
+def _graph(run: DrivingRun, town: str) -> LaneGraph:
+    """The town as the run saw it. StoreError: the folder has lost it."""
+    own = run.folder / "towns" / f"{town}.npz"
+    if own.is_file():
+        return load_graph(own)
+    raise StoreError(f"towns/{town}.npz is missing: this run folder is not complete")
+
+
+def replay_data(run: DrivingRun) -> dict[str, Any]:
+    """All that the page's replay needs, keyed by cell and town, and which replays are missing and why."""
+    traces: dict[str, EpisodeTrace] = {}
+    missing: dict[str, str] = {}
+    for r in run.records:
+        if r.trace:
+            try:
+                traces[r.key] = load_trace(run.folder / r.trace)
+            except SSADError as error:
+                missing[r.key] = str(error)
+    graphs: dict[str, LaneGraph] = {}
+    for town in sorted({t.town for t in traces.values()}):
+        try:
+            graphs[town] = _graph(run, town)
+        except SSADError as error:
+            missing |= {key: str(error) for key, t in traces.items() if t.town == town}
+    episodes = {}
+    for r in run.records:
+        trace = traces.get(r.key)
+        if trace is None or trace.town not in graphs:
+            continue
+        episodes[r.key] = episode_data(trace, graphs[trace.town]) | {
+            "town": trace.town,
+            "system": r.system,
+            "group": SCENARIOS.get(r.group, r.group),
+            "scenario": r.scenario,
+            "outcome": outcome_class(r),
+            "witness": _witness_words(r.witness),
+        }
+    towns = {name: town_data(graph, [t for t in traces.values() if t.town == name]) for name, graph in graphs.items()}
+    return {
+        "scale": SCALE,
+        "speed": SPEED,
+        "share": SHARE,
+        "towns": towns,
+        "episodes": episodes,
+        "missing": missing,
+    }
+
+
+def _witness_words(witness: Mapping[str, Any] | None) -> str:
+    """What the witness says, in a sentence."""
+    if not witness:
+        return ""
+    words = VERDICTS.get(str(witness["verdict"]), str(witness["verdict"]))
+    m = witness.get("manoeuvre")
+    if m:
+        side = "" if not m["offset"] else f", {abs(m['offset']):.1f} m to the {'left' if m['offset'] > 0 else 'right'}"
+        words += f": from {m['start']:.1f} s on {m['speed']:.1f} m/s for {m['hold']:.0f} s{side}"
+    return f"{words} ({witness['clear']} of {witness['tried']} drivers tried stay clear)"
