@@ -154,7 +154,7 @@ def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     path = os.pathsep.join(filter(None, [str(install(site)), os.environ.get("PYTHONPATH")]))
     first = ssad_process("run", "quick", *settings, "--workers", "2", cwd=tmp_path, PYTHONPATH=path)
     assert first.returncode == 0, first.stderr
-    assert "StraightObstacle" in first.stdout
+    assert "Straight Obstacle" in first.stdout
     assert "report: runs/little/report.html" in first.stdout
     folder = tmp_path / "runs" / "little"
     results = (folder / "results.jsonl").read_bytes()

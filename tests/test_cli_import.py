@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
+import json
 from pathlib import Path
 
 import pytest
 from helpers.command import ssad
-from rich.console import Console
 
 from ssad.scenarios.dynamic import load_scenarios
 
@@ -34,12 +33,18 @@ def test_imports_are_listed() -> None:
 def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     """Each of SafeBench's eight hits the blind follower and is avoidable; the Autopilot copes with the traffic, in
     every 15th of FREA's scenarios or in all."""
-    from ssad.bench.run import plan, run
-    from ssad.bench.suite import load_suite
-
     some = [scenario.name for scenario in load_scenarios("frea")[::every]]
-    suite = load_suite("precrash", [f"scenarios=[safebench,{','.join(some)}]", "systems=[autopilot,blind]"])
-    records = run(plan(suite), tmp_path, workers=1 if every > 1 else 2, console=Console(file=io.StringIO()))
+    words = [
+        "--set",
+        f"scenarios=[safebench,{','.join(some)}]",
+        "--set",
+        "systems=[autopilot,blind]",
+        "--out",
+        tmp_path,
+    ]
+    done = ssad("run", "precrash", *words, "--workers", "1" if every > 1 else "2")
+    assert done.returncode == 0, done.stderr
+    records = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
     assert len(records) == 2 * (32 + len(some))
     assert {r["status"] for r in records} == {"ok"}
 

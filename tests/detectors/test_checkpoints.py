@@ -3,6 +3,7 @@
 import json
 import pickle
 import struct
+import tracemalloc
 import zipfile
 from collections import OrderedDict, defaultdict
 from pathlib import Path
@@ -17,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.safeio import MIB
 from ssad.detectors.checkpoints import (
     Card,
     fit_state,
@@ -248,6 +250,58 @@ def test_any_bytes_are_one_line(tmp_path_factory: pytest.TempPathFactory, data: 
     (folder / "a.pth").write_bytes(b"\x80\x02" + data)
     with pytest.raises(FormatError):
         load_weights(folder / "a.pth")
+
+
+GREEDY = {  # small pickles that ask for much: of memory, of time, of the interpreter's stack
+    "a value kept under a huge number": (b"}r" + struct.pack("<I", 1 << 24), "byte 3 of .* as number 16,777,216"),
+    "the same as text": (b"}p16777216\n", "byte 3 of .* as number 16,777,216"),
+    "the same, read again": (b"}q\x00h\x00r" + struct.pack("<I", 10**6), "byte 7 of .* as number 1,000,000"),
+    "many bytes announced": (b"\x96" + struct.pack("<Q", 1 << 28), "268435456 bytes"),
+    "a tuple far larger unfolded": (
+        b"})" + b"".join(b"q%ch%c\x86" % (k, k) for k in range(28)) + b"I1\ns", "more than 5,000,000 steps"
+    ),
+    "tuples deep inside each other": (b"})" + b"\x85" * 10_000 + b"I1\ns", "more than 5,000,000 steps"),
+    "a list copied again and again": (
+        b"](" + b"I1\n" * 1000 + b"eq\x00"
+        + b"ctorch\nSize\nq\x01" + b"h\x01h\x00\x85R" * 6000, "more than 5,000,000 steps",
+    ),
+    "a class of every name": (
+        b"".join(b"ca\n%d\n" % k for k in range(12_000)), "more than 5,000,000 steps",
+    ),
+    "nothing to take": (b"\x85", "byte 2 of .* a value that is not there"),
+}  # fmt: skip
+
+
+@STREAMS
+@pytest.mark.parametrize("case", GREEDY.values(), ids=GREEDY.keys())
+def test_memory_and_time_stay_in_proportion_to_the_file(case: tuple[bytes, str], zipped: bool, tmp_path: Path) -> None:
+    steps, words = case
+    path, data = tmp_path / "a.pth", b"\x80\x02" + steps + b"."
+    if zipped:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("a/data.pkl", data)
+    else:
+        path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with pytest.raises(FormatError, match=words) as caught:
+            load_weights(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert one_line(caught.value).startswith(f"{path}: ")
+    assert peak < 64 * MIB
+
+
+@STREAMS
+def test_numbers_may_be_shared_but_not_without_end(zipped: bool, tmp_path: Path) -> None:
+    base = torch.arange(10_000.0)
+    few, many = ({str(k): base[k:] for k in range(count)} for count in (8, 100))
+    torch.save(few, tmp_path / "few.pth", _use_new_zipfile_serialization=zipped)
+    assert same(load_weights(tmp_path / "few.pth"), few)
+    torch.save(many, tmp_path / "many.pth", _use_new_zipfile_serialization=zipped)
+    with pytest.raises(FormatError, match="refused: its tensors take more than 16 times its size"):
+        load_weights(tmp_path / "many.pth")
 
 
 def test_other_files_are_one_line(tmp_path: Path) -> None:

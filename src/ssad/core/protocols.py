@@ -263,7 +263,7 @@ class Detector(Protocol):
         """
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Target assignment as in training: decide which object each location should predict. Not differentiable.
+        """Decide which object each location should predict, as in training (target assignment); not differentiable.
 
         Args:
             dense: Outputs for B images.

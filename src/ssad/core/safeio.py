@@ -43,7 +43,8 @@ def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
     """The whole file, refused beyond `limit` bytes. FormatError."""
     try:
         with open(path, "rb") as file:
-            data = file.read(limit + 1)
+            size = os.fstat(file.fileno()).st_size or limit  # a pipe has none; room is made for as much as is asked for
+            data = file.read(min(size, limit) + 1)
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:

@@ -3,7 +3,9 @@
 `torch.save` writes a pickle, and a pickle can call any function. Here the pickle is walked with a table of the few
 names that describe tensors and plain containers; every other class becomes an inert record of its arguments and state.
 So weights can be taken out of a checkpoint that holds a training's configuration, or a whole model of a class that is
-not installed, and a hostile file does nothing. Formats: the zip archive of PyTorch 1.6 and later, and the older stream.
+not installed, and a hostile file does nothing. Before it is built, a pickle is read step by step: one that would take
+memory or time out of proportion to its size is refused. Formats: the zip archive of PyTorch 1.6 and later, and the
+older stream.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import io
 import pickle
 import struct
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +25,7 @@ from torch import Tensor
 
 from ssad.core.errors import FormatError
 from ssad.core.safeio import MIB, read_bytes
+from ssad.detectors.pickle_walk import RefusedError, Steps, walk
 
 MAX_BYTES = 4096 * MIB
 MAX_PICKLE = 256 * MIB
@@ -30,6 +33,7 @@ MAGIC = 0x1950A86A20F9469CFC6C  # the first number of the older stream
 STREAM = 1001
 DEEPEST = 60
 MOST = 200_000
+MOST_TIMES = 16  # tensors may share their numbers, but all together are at most so many times as large as the file
 CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state_dict(), 'weights.safetensors')"
 NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
 
@@ -43,7 +47,7 @@ _ATTACKS = frozenset({"os", "posix", "nt", "subprocess", "sys", "shutil", "socke
 _ATTACK_CALLS = frozenset({"eval", "exec", "compile", "__import__", "open", "input", "breakpoint"})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Storage:
     """A block of numbers in the file."""
 
@@ -52,7 +56,7 @@ class _Storage:
     count: Any
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Strided:
     """A tensor to be: a window of a storage. Nothing in it is trusted before `_Numbers.tensor`."""
 
@@ -102,23 +106,35 @@ class _Table(dict[Any, Any]):
 
 
 class _Maker:
-    """A function that the file may call; it cannot be changed by the file."""
+    """A function that the file may call; it cannot be changed by the file. What it copies counts as steps."""
 
-    __slots__ = ("_make",)
+    __slots__ = ("_make", "_steps")
 
-    def __init__(self, make: Callable[..., Any]) -> None:
-        self._make = make
+    def __init__(self, make: Callable[..., Any], steps: Steps) -> None:
+        self._make, self._steps = make, steps
 
     def __call__(self, *args: Any) -> Any:
+        self._steps.take(sum(len(value) for value in args if isinstance(value, Sized)))
         return self._make(*args)
 
     def __setstate__(self, state: Any) -> None:
         raise pickle.UnpicklingError("it changes a function")
 
 
+def _table(items: Any = ()) -> _Table:
+    """An OrderedDict; Python 2 wrote it with a list of its items. Of those, what has no text for a name is left out."""
+    return _Table((name, value) for name, value in items if isinstance(name, str))
+
+
+def _size(lengths: Any = ()) -> tuple[int, ...]:
+    if not isinstance(lengths, (list, tuple)) or not all(type(length) is int for length in lengths):
+        raise pickle.UnpicklingError("a size that is not whole numbers")
+    return tuple(lengths)
+
+
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "collections.OrderedDict": _Table,
-    "torch.Size": tuple,
+    "collections.OrderedDict": _table,
+    "torch.Size": _size,
     "torch._utils._rebuild_tensor": _Strided,
     "torch._utils._rebuild_tensor_v2": lambda storage, offset, size, stride, *_: _Strided(
         storage, offset, size, stride
@@ -135,9 +151,12 @@ _MAKERS: dict[str, Callable[..., Any]] = {
 class _Reader(pickle.Unpickler):
     """An unpickler that can build tensors to be, plain containers and inert records, and nothing else."""
 
-    def __init__(self, file: io.BufferedIOBase) -> None:
+    def __init__(self, file: io.BytesIO, part: str = "the file") -> None:
+        self.steps = Steps()
+        walk(file, part, self.steps)
         super().__init__(file, encoding="utf-8")
         self.names: set[str] = set()
+        self.classes: dict[str, type] = {}
 
     def find_class(self, module: str, name: str) -> Any:
         """Never an object of the running program."""
@@ -146,14 +165,17 @@ class _Reader(pickle.Unpickler):
         if module.split(".", maxsplit=1)[0] in _ATTACKS or (
             module in {"builtins", "__builtin__"} and name in _ATTACK_CALLS
         ):
-            raise _HostileError(full)
+            raise RefusedError(f"it would call {full}, which no weights need")
         if module in {"torch", "torch.storage"} and name in _KINDS:
             return _KINDS[name]
         if module == "torch" and isinstance(getattr(torch, name, None), torch.dtype):
             return getattr(torch, name)
         if full in _MAKERS:
-            return _Maker(_MAKERS[full])
-        return type(name, (_Inert,), {"__module__": module})
+            return _Maker(_MAKERS[full], self.steps)
+        if full not in self.classes:
+            self.steps.take(500)  # a class is far larger than its name
+            self.classes[full] = type(name, (_Inert,), {"__module__": module})
+        return self.classes[full]
 
     def persistent_load(self, pid: Any) -> Any:
         """The description of a storage; for a class that comes with its source, the class."""
@@ -163,20 +185,18 @@ class _Reader(pickle.Unpickler):
             raise pickle.UnpicklingError("a reference that is no storage")
         if len(pid) == 6 and pid[5] is not None:
             raise pickle.UnpicklingError("a view of a storage, as PyTorch before 0.4 wrote")
+        if not isinstance(pid[2], (str, int)):
+            raise pickle.UnpicklingError("a storage without a name")
         return _Storage(pid[1], str(pid[2]), pid[4])
-
-
-class _HostileError(Exception):
-    """The file names a function that starts programs or changes the machine."""
 
 
 class _Numbers:
     """Reads tensors once the pickle is known."""
 
-    def __init__(self, read: Callable[[str], bytes]) -> None:
+    def __init__(self, read: Callable[[str], bytes], size: int) -> None:
         self.read = read
         self.held: dict[str, Tensor] = {}
-        self.bytes = 0
+        self.left = min(MOST_TIMES * size, MAX_BYTES)
 
     def tensor(self, at: _Strided) -> Tensor:
         """The tensor, with storage of its own. ValueError: it does not lie within its storage."""
@@ -200,9 +220,9 @@ class _Numbers:
         have = len(data) // kind.itemsize
         if last >= have or count > have:
             raise ValueError("a tensor larger than its storage")
-        self.bytes += count * kind.itemsize
-        if self.bytes > MAX_BYTES:
-            raise ValueError(f"its tensors take more than {MAX_BYTES // MIB} MiB")
+        self.left -= count * kind.itemsize
+        if self.left < 0:
+            raise RefusedError(f"its tensors take more than {MOST_TIMES} times its size or {MAX_BYTES // MIB} MiB")
         return data[: have * kind.itemsize].view(kind).as_strided(size, stride, offset).clone()
 
 
@@ -228,8 +248,8 @@ def read_pickled(path: str | Path) -> dict[str, Tensor]:
             return {name: numbers.tensor(value) for name, value in state}
     except FormatError:
         raise
-    except _HostileError as error:
-        raise FormatError(f"{path}: refused: it would call {error}, which no weights need; nothing was run") from None
+    except RefusedError as error:
+        raise FormatError(f"{path}: refused: {error}; nothing was run") from None
     except Exception as error:  # what broken bytes raise is without number
         text = " ".join(str(error).split())[:120] or type(error).__name__
         raise FormatError(f"{path}: not a readable PyTorch checkpoint: {text}; {CONVERT}") from None
@@ -246,14 +266,15 @@ def _read_zip(path: str | Path, files: ExitStack) -> tuple[Any, _Numbers, set[st
     root = main[0].removesuffix("data.pkl")
     if any(member.compress_type != zipfile.ZIP_STORED for member in members.values()):
         raise FormatError(f"{path}: its parts are compressed, which PyTorch never does")
-    if sum(member.file_size for member in members.values()) > Path(path).stat().st_size:
+    size = Path(path).stat().st_size
+    if sum(member.file_size for member in members.values()) > size:
         raise FormatError(f"{path}: its parts overlap, which PyTorch never does")
     if members[main[0]].file_size > MAX_PICKLE:
         raise FormatError(f"{path}: its description alone is larger than {MAX_PICKLE // MIB} MiB")
     if f"{root}byteorder" in members and archive.read(f"{root}byteorder") != b"little":
         raise FormatError(f"{path}: written by a big-endian machine; {CONVERT}")
-    reader = _Reader(io.BytesIO(archive.read(main[0])))
-    return reader.load(), _Numbers(lambda key: archive.read(f"{root}data/{key}")), reader.names
+    reader = _Reader(io.BytesIO(archive.read(main[0])), main[0])
+    return reader.load(), _Numbers(lambda key: archive.read(f"{root}data/{key}"), size), reader.names
 
 
 def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
@@ -277,7 +298,7 @@ def _read_stream(path: str | Path) -> tuple[Any, _Numbers, set[str]]:
             raise ValueError(f"storage {key} is cut short or unknown")
         places[str(key)] = (file.tell(), file.tell() + count * kind.itemsize)
         file.seek(places[str(key)][1])
-    return tree, _Numbers(lambda key: data[slice(*places[key])]), reader.names
+    return tree, _Numbers(lambda key: data[slice(*places[key])], len(data)), reader.names
 
 
 def _storages(tree: Any) -> Iterator[_Storage]:
