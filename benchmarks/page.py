@@ -16,9 +16,9 @@ CEILING = {"cpu": (35e6, "ideal SIMD on one core"), "cuda": (8e9, "L2 bandwidth"
 
 
 def section(name: str, data: dict[str, Any]) -> list[str]:
-    """One machine: speed by batch size, and where the time goes."""
-    lines = [f"## {RUNS[name]}", ""]
-    lines += ["| scenes | agents a scene | µs a step | agent-steps/s | spread |", "|---:|---:|---:|---:|---:|"]
+    """One machine: speed by batch size, and the share of each kernel."""
+    lines = [f"### {RUNS[name]}", ""]
+    lines += ["| scenes | agents per scene | µs per step | agent-steps/s | spread |", "|---:|---:|---:|---:|---:|"]
     for row in data["rows"]:
         lines.append(
             f"| {row['batch']:,} | {row['agents']:.1f} | {row['us_per_step']:,.1f} | {row['agent_steps_per_s']:,.0f} | "
@@ -28,16 +28,16 @@ def section(name: str, data: dict[str, Any]) -> list[str]:
     limit, what = CEILING["cpu" if data["device"] == "cpu" else "cuda"]
     lines += [
         "",
-        f"The best row is {best / limit:.0%} of {limit:.0e} agent-steps/s, the estimated bound by {what}",
-        "of a bare step (bicycle, contacts and nearest lane alone).",
+        f"The best row reaches {best / limit:.0%} of {limit:.0e} agent-steps/s. This is the estimated bound by {what}",
+        "for a minimal step (bicycle model, contacts and nearest lane only).",
     ]
     if "highway" in data:
         other = data["highway"]
         lines += [
             "",
-            f"highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle sub-steps/s",
-            f"with {other['agents']:.1f} vehicles. One scene of ours gives {data['ratio_at_B1']:.0f} times as many",
-            "agent-steps/s.",
+            f"For comparison, highway-env's intersection-v1 in the same run: {other['agent_steps_per_s']:,.0f} vehicle",
+            f"sub-steps/s with {other['agents']:.1f} vehicles. One scene of SSAD gives {data['ratio_at_B1']:.0f} times",
+            "as many agent-steps/s.",
         ]
     parts = {key: value for key, value in data.items() if key.startswith("parts_us_B")}
     names = list(next(iter(parts.values())))
@@ -59,11 +59,12 @@ def shifts() -> list[str]:
     """Images a second of the distribution shifts."""
     cpu, gpu = read("shift_speed"), read("shift_speed-h200")
     lines = [
-        "# Speed of the distribution shifts",
+        "## Speed of the distribution shifts",
         "",
-        "`benchmarks/shift_speed.py`: 1600 x 900, 8 objects, mean over severities 1, 3 and 5, medians; the codec not",
-        f"counted. One core of a 2-core machine; {gpu['device']} in batches of {gpu['batch']}. Beside it",
-        "3D_Corruptions_AD, measured elsewhere on a like machine (one process).",
+        "Measured by `benchmarks/shift_speed.py` on images of 1600 x 900 with 8 objects, without the codec. Mean over",
+        "severities 1, 3 and 5 of medians, on one core of a 2-core machine and on",
+        f"{gpu['device']} in batches of {gpu['batch']}. The last column is 3D_Corruptions_AD",
+        "(one process), measured separately on a similar machine.",
         "",
         "| shift | physical, 1 core | paper, 1 core | physical, H200 | paper, H200 | 3D_Corruptions_AD |",
         "|---|---:|---:|---:|---:|---:|",
@@ -79,10 +80,14 @@ def shifts() -> list[str]:
         total = cpu["rows"][f"{kind} sum"]
         lines += [
             "",
-            f"Sum over the 11 shifts, {kind}: {1e3 * total['seconds']:.0f} ms a picture on one core, against",
-            f"{1e3 * total['others_seconds']:.0f} ms: {total['ratio']:.0f} times faster.",
+            f"All 11 shifts, {kind}: {1e3 * total['seconds']:.0f} ms per image on one core; 3D_Corruptions_AD takes",
+            f"{1e3 * total['others_seconds']:.0f} ms ({total['ratio']:.0f} times as long).",
         ]
-    lines += ["", "From JPEG to JPEG on one core (decode, shift, encode at quality 95; sensor noise as 4:4:4):", ""]
+    lines += [
+        "",
+        "From JPEG file to JPEG file on one core (decode, shift, encode at quality 95; sensor noise as 4:4:4):",
+        "",
+    ]
     lines += ["| shift | images/s | share of the codec |", "|---|---:|---:|"]
     for name in names:
         row = cpu["rows"][f"end to end {name}"]
@@ -94,18 +99,18 @@ def camera() -> list[str]:
     """Frames a second of the camera."""
     cpu, gpu = read("camera-cpu"), read("camera-h200")
     return [
-        "# Speed of the camera",
+        "## Speed of the camera",
         "",
-        f"`benchmarks/camera_speed.py`: a street with {cpu['things']} vehicles, 640 x 640, 2 x 2 samples a pixel,",
-        "shadows.",
+        f"Measured by `benchmarks/camera_speed.py`: a street with {cpu['things']} vehicles, 640 x 640 pixels, 2 x 2",
+        "samples per pixel, with shadows.",
         "",
-        "| | ms a frame | frames/s |",
+        "| | ms per frame | frames/s |",
         "|---|---:|---:|",
         f"| one core | {cpu['ms_per_frame']:.0f} | {cpu['frames_per_s']:.0f} |",
-        f"| {gpu['device']}, {gpu['batch']} views a call | {gpu['ms_per_frame']:.2f} | {gpu['frames_per_s']:,.0f} |",
+        f"| {gpu['device']}, {gpu['batch']} views per call | {gpu['ms_per_frame']:.2f} | {gpu['frames_per_s']:,.0f} |",
         "",
-        f"Re-texturing a car 20 m ahead with gradient, one core: {cpu['retexture_ms']:.1f} ms",
-        f"({cpu['pieces']:,} pieces).",
+        f"Applying a new texture to a car 20 m ahead, with gradient, takes {cpu['retexture_ms']:.1f} ms on one core",
+        f"({cpu['pieces']:,} textured fragments).",
         "",
     ]
 
@@ -114,11 +119,11 @@ def recorder() -> list[str]:
     """Samples of the recorder."""
     cpu = read("record-cpu")
     return [
-        "# Speed of the recorder",
+        "## Speed of the recorder",
         "",
-        f"`benchmarks/record_speed.py`: six cameras of {cpu['width']} x {cpu['width'] * 9 // 16} and a LiDAR, dense",
-        f"traffic, files and tables included, {cpu['samples']} samples on {cpu['workers']} cores:",
-        f"{cpu['s_per_1000'] / 60:.0f} minutes for 1,000 samples.",
+        f"Measured by `benchmarks/record_speed.py`: six cameras of {cpu['width']} x {cpu['width'] * 9 // 16} and a",
+        f"LiDAR in dense traffic, including all files and tables; {cpu['samples']} samples on {cpu['workers']} cores.",
+        f"1,000 samples take {cpu['s_per_1000'] / 60:.0f} minutes.",
         "",
     ]
 
@@ -126,21 +131,21 @@ def recorder() -> list[str]:
 def detectors() -> list[str]:
     """Images a second of the detectors, on each device that was measured."""
     lines = [
-        "# Speed of the detectors",
+        "## Speed of the detectors",
         "",
-        "`benchmarks/detector_speed.py`: medians, in turns with torchvision's FCOS (ResNet-50) on pictures of the same",
-        "size, and with ultralytics' models of like size where the package is there. Attack: losses and their gradient",
-        "to the picture, float32; the training step is in bfloat16 on a GPU. Images/s, and in brackets the ratio to",
-        "torchvision's FCOS in the same run.",
+        "Measured by `benchmarks/detector_speed.py`: images/s (medians), and in brackets the ratio to torchvision's",
+        "FCOS (ResNet-50), which ran alternately on images of the same size. Where ultralytics is installed, its",
+        "models of similar size were measured too. Attack: losses and their gradient with respect to the image,",
+        "float32. Training steps use bfloat16 on a GPU.",
         "",
     ]
     for path in sorted((ROOT / "benchmarks" / "results").glob("detectors-*.json")):
         data = read(path.stem)
         machine = f"{data['device']} of a 2-core machine" if "threads" in data["device"] else data["device"]
         lines += [
-            f"{machine}, {data['batch']} {'picture' if data['batch'] == 1 else 'pictures'} a call:",
+            f"{machine}, {data['batch']} {'image' if data['batch'] == 1 else 'images'} per call:",
             "",
-            "| detector | parameters | picture | forward | attack | training step |",
+            "| detector | parameters | image | forward | attack | training step |",
             "|---|---:|---|---:|---:|---:|",
         ]
         for row in data["rows"]:
@@ -160,18 +165,18 @@ def scores() -> list[str]:
     data = read("score_speed")
     ours, other = data["ours"], data["devkit"]
     return [
-        "# Speed of scoring",
+        "## Speed of scoring",
         "",
-        f"`benchmarks/score_speed.py`: {data['samples']:,} samples, {data['truth']:,} boxes of ground truth and",
-        f"{data['predictions']:,} detections ({data['results_mb']:.0f} MB of results), whole processes in one run.",
+        f"Measured by `benchmarks/score_speed.py`: {data['samples']:,} samples, {data['truth']:,} ground-truth boxes",
+        f"and {data['predictions']:,} detections (a results file of {data['results_mb']:.0f} MB); whole processes.",
         "",
         "| | CPU s | peak memory |",
         "|---|---:|---:|",
         f"| ssad score | {ours['cpu_s']:.2f} | {ours['peak_mib']} MiB |",
         f"| nuscenes-devkit 1.2.0 | {other['cpu_s']:.1f} | {other['peak_mib']} MiB |",
         "",
-        f"{data['cpu_ratio']:.1f} times faster; the largest difference between the two results is "
-        f"{data['largest_difference']:.1g}.",
+        f"`ssad score` uses {data['cpu_ratio']:.1f} times less CPU time. The largest difference between the two "
+        f"results is {data['largest_difference']:.1g}.",
         "",
     ]
 
@@ -179,11 +184,15 @@ def scores() -> list[str]:
 def page() -> str:
     """The page."""
     lines = [
-        "# Speed of the world",
+        "# Benchmarks",
         "",
-        "Made by `benchmarks/page.py` from `benchmarks/results`, which `benchmarks/world_speed.py --json` writes.",
-        "The full step: Autopilot traffic, signals, motion, contacts, the ego's record, restart of ended scenes,",
-        "and the observation of 28 numbers a scene, on natural junction episodes. Medians of five repeats.",
+        "`benchmarks/page.py` makes this page from the measurements in `benchmarks/results`.",
+        "",
+        "## Speed of the world",
+        "",
+        "Measured by `benchmarks/world_speed.py --json` on natural junction episodes; medians of five repetitions. A",
+        "step is complete: Autopilot traffic, signals, motion, contacts, the ego's record, restart of finished scenes,",
+        "and an observation of 28 numbers per scene.",
         "",
     ]
     for name in RUNS:

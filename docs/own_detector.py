@@ -1,4 +1,4 @@
-"""A detector of one's own: a small anchor-free network on cells of 8 pixels, held to `ssad.core.protocols.Detector`."""
+"""A detector of your own: a small anchor-free network on cells of 8 pixels, with the protocol `Detector`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ STRIDE = 8
 
 
 class OwnDetector(nn.Module):
-    """Every cell says which class it sees, and how far away the four sides of the box are."""
+    """Each cell predicts class scores and the distances to the four sides of a box."""
 
     task: Literal["2d", "3d"] = "2d"
 
     def __init__(self, classes: Sequence[str] = ("car", "person"), *, seed: int = 0) -> None:
         super().__init__()
         self.name, self.classes = "own", tuple(classes)
-        with torch.random.fork_rng(devices=[]):  # the global random numbers stay as they are
+        with torch.random.fork_rng(devices=[]):  # leaves the global random state unchanged
             torch.manual_seed(seed)
             parts: list[nn.Module] = []
             for before, after in ((3, 16), (16, 32), (32, 64)):
@@ -35,7 +35,7 @@ class OwnDetector(nn.Module):
         self.requires_grad_(False).eval()
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """What every place says, before any threshold, differentiable to the images."""
+        """Outputs at every location, before any threshold, differentiable with respect to the images."""
         height, width = check_images(self.name, images)
         inside = pad(images.to(self.head.weight.dtype) - 0.5, (0, -width % STRIDE, 0, -height % STRIDE))
         feature = self.trunk(inside)
@@ -46,16 +46,16 @@ class OwnDetector(nn.Module):
         place = (torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * STRIDE
         box = torch.cat([place - sides[..., :2], place + sides[..., 2:]], -1)
         stride, level = torch.full_like(place[:, 0], STRIDE), torch.zeros_like(place[:, 0], dtype=torch.int64)
-        # None: there is no quality, nothing multiplies the score of a class
+        # None: no quality score that multiplies the class scores
         return Dense(logit, None, box, place, stride, level, {"raw": [raw]}, (feature,), size=(height, width))
 
     @torch.no_grad()
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
-        """Boxes above the threshold, best first, suppressed class by class."""
+        """Boxes above the threshold, sorted by score, after non-maximum suppression per class."""
         least = check_threshold(self.name, 0.3 if threshold is None else threshold)
-        dense = self.dense(images)  # with BatchNorm or dropout: inside `modes.evaluating(self)`
+        dense = self.dense(images)  # with BatchNorm or dropout: inside `eval_mode.evaluating(self)`
         found = []
         for score, box in zip(dense.logit.sigmoid(), dense.box, strict=True):
             place, label = (score > least).nonzero(as_tuple=True)
@@ -64,7 +64,7 @@ class OwnDetector(nn.Module):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """A cell whose middle lies in a box answers for it, of several for the smallest."""
+        """A cell is assigned to the smallest box that contains its centre."""
         check_truth(self.name, truth, len(dense.box), scale=dense.box.new_ones(4), classes=len(self.classes))
         label = torch.full(dense.box.shape[:2], -1, device=dense.box.device)  # -1: background
         owner, target = label.clone(), torch.zeros_like(dense.box)
@@ -83,10 +83,10 @@ class OwnDetector(nn.Module):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """Focal loss of the classes and GIoU loss of the boxes, over the number of places that answer."""
+        """Focal loss of the classes and GIoU loss of the boxes, per assigned location."""
         label, count = assignment.label, len(dense.box)
         if label.shape != dense.box.shape[:2]:
-            raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
+            raise ConfigError(f"{self.name}: the assignment was made for images of another number or size")
         wanted = one_hot(label.clamp(min=0), len(self.classes)).to(dense.logit) * (label >= 0)[..., None]
         each = sigmoid_focal_loss(dense.logit, wanted).sum(-1) * (label != -2)
         image, place = (label >= 0).nonzero(as_tuple=True)

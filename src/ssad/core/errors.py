@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class SSADError(Exception):
-    """Something the user can mend; the base of all errors below.
+    """An error that the user can fix; the base of all errors below.
 
     The command line prints the message alone and ends with exit code 2.
 
@@ -48,15 +48,15 @@ LISTED = ("suite", "kind", "scenario", "system", "detector", "recipe", "shift", 
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """Make the error for a name that is not known.
+    """Make the error for a name that does not exist: the three closest names, and all names or where to find them.
 
     Args:
-        kind: Singular noun, such as "town"; `ssad list` must know its plural.
-        name: What was asked for.
-        known: What there is.
+        kind: What the name stands for, in the singular, such as "system".
+        name: What the user typed.
+        known: All names that exist.
 
     Returns:
-        An error that shows the three known names closest to it, to be raised by the caller.
+        The error, to be raised.
     """
     names = sorted(known)
     close = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
@@ -66,5 +66,12 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
 
 
 def install_extra(extra: str) -> str:
-    """How to install an optional dependency ("extra") of pyproject.toml, for the end of a message."""
+    """Say how to install an optional dependency, for the end of a message.
+
+    Args:
+        extra: Name in `[project.optional-dependencies]` of pyproject.toml.
+
+    Returns:
+        The hint, without a final stop.
+    """
     return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"

@@ -263,14 +263,14 @@ class Detector(Protocol):
         """
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Decide which object each location should predict, as in training (target assignment).
+        """Decide which object each location should predict, as in training (target assignment); not differentiable.
 
         Args:
             dense: Outputs for B images.
             truth: What is in each of these images.
 
         Returns:
-            Class and object of each place.
+            Class and object of each location.
         """
 
     def losses(
@@ -280,7 +280,7 @@ class Detector(Protocol):
 
         Args:
             dense: Outputs for B images.
-            assignment: Which place answers for which object in them.
+            assignment: The target assignment for these outputs.
             reduction: "batch": normalised over the batch, as in training. "image": each image as if it were alone.
 
         Returns:
