@@ -69,8 +69,12 @@ class WorldBoxes:
 
 @dataclass(frozen=True, slots=True)
 class TrackedBoxes(WorldBoxes):
-    """Boxes of known objects. instance: who each is, over time and sensors; visible [N]: least fraction that is seen
-    over all cameras, 1 where unknown."""
+    """Boxes of known objects.
+
+    Attributes:
+        instance: who each is, over time and sensors.
+        visible: [N] least fraction that is seen over all cameras, 1 where unknown.
+    """
 
     instance: tuple[str, ...]
     visible: F64
@@ -87,8 +91,7 @@ def size_columns(given: str, wanted: str) -> list[int]:
 
 
 def bottom_centre(centre: Any, size_lhw: Any) -> Any:
-    """Middle of the bottom [N, 3] of boxes in a camera's frame (arrays or tensors): where mmdetection3d and KITTI place
-    them."""
+    """Middle of the bottom [N, 3] of boxes in a camera's frame: where mmdetection3d and KITTI place them."""
     bottom = centre + 0.0
     bottom[..., 1] += 0.5 * size_lhw[..., 1]
     return bottom
