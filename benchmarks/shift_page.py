@@ -39,7 +39,7 @@ def read(run: str, table: str) -> dict[Key, tuple[float, ...]]:
         for row in csv.DictReader(file):
             if row.pop("source") == "ours":
                 numbers = [row.pop(name) for name in ("mean", "low", "high")]
-                key = tuple(value for name, value in row.items() if name not in ("n", "failed"))
+                key = tuple(value for name, value in row.items() if name not in ("n", "failed", "clusters", "method"))
                 found[key] = tuple(float(number) for number in numbers if number)
     return found
 
@@ -140,7 +140,7 @@ def page() -> str:
         f"cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
         "",
-        "* Brackets: 95 % intervals, bootstrap over drives.",
+        "* Brackets: 95 % intervals, from how the drives vary (how: [metrics.md](metrics.md)).",
         "* *Published*: results of the paper on nuScenes val with full-size detectors. Images and detectors differ, so",
         "  do not compare absolute values. The share of its own clean score that a detector keeps can be compared.",
         "* Physical: SSAD's default calibration, with severities in units such as metres of visibility. Each drive has",
