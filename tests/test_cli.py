@@ -148,7 +148,7 @@ def test_list(kind: str, name: str) -> None:
 def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A first run as a process of its own, with a driving system of an installed package; the rest in this one."""
     settings = ("--set", "scenarios=[StraightObstacle/00,RightTurn/01]", "--set", "name=little")
-    settings += ("--set", "systems=[acme-coast,blind]")
+    settings += ("--set", "systems=[acme-coast,blind]", "--set", "pictures=[]")
     site = tmp_path / "site-packages"
     site.mkdir()
     path = os.pathsep.join(filter(None, [str(install(site)), os.environ.get("PYTHONPATH")]))
