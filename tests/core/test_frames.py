@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.core.frames import Boxes3D, Camera, Frame, camera_to_world
+from ssad.core.boxes import TrackedBoxes
+from ssad.core.frames import Camera, Frame, camera_to_world
 from ssad.core.rotations import pose_matrix, quaternion_to_matrix
 
 HALF = np.sqrt(0.5)
@@ -74,7 +75,7 @@ def test_camera_to_world_goes_through_the_ego() -> None:
 
 
 def test_no_boxes_have_the_shapes_of_boxes() -> None:
-    none = Boxes3D.empty()
+    none = TrackedBoxes.empty()
     assert len(none) == 0
-    shapes = [getattr(none, name).shape for name in ("centre", "size", "rotation", "velocity", "visible")]
+    shapes = [getattr(none, name).shape for name in ("centre", "size_lwh", "rotation", "velocity", "visible")]
     assert shapes == [(0, 3), (0, 3), (0, 4), (0, 3), (0,)]

@@ -71,7 +71,7 @@ def write_moving(root: Path, places: list[tuple[float, float, float] | None], *,
 
 def same(one: Annotations, two: Annotations) -> bool:
     names = ("token", "instance", "category", "attributes", "visibility")
-    arrays = ("centre", "size", "rotation", "velocity", "lidar_points", "radar_points")
+    arrays = ("centre", "size_lwh", "rotation", "velocity", "lidar_points", "radar_points")
     return all(getattr(one, name) == getattr(two, name) for name in names) and all(
         np.array_equal(getattr(one, name), getattr(two, name), equal_nan=True) for name in arrays
     )

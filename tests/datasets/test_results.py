@@ -46,8 +46,12 @@ def test_columns_are_those_of_the_file(tmp_path: Path) -> None:
     rows = [(token, b) for token, boxes in data["results"].items() for b in boxes]
     table = found.boxes
     assert [found.samples[i] for i in table.sample] == [token for token, _ in rows]
-    for name in ("translation", "size", "rotation", "velocity"):
-        assert np.array_equal(getattr(table, name), np.array([b[name] for _, b in rows]), equal_nan=True), name
+    columns = {
+        "translation": table.centre, "size": table.size_lwh[:, [1, 0, 2]], "rotation": table.rotation,
+        "velocity": table.velocity,
+    }  # fmt: skip
+    for name, values in columns.items():
+        assert np.array_equal(values, np.array([b[name] for _, b in rows]), equal_nan=True), name
     assert [CLASSES[i] for i in table.label] == [b["detection_name"] for _, b in rows]
     names = ["" if i < 0 else ATTRIBUTES[i] for i in table.attribute]
     assert names == [b["attribute_name"] for _, b in rows]

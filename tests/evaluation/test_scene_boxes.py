@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from ssad.metrics.detection_boxes import BoxTable
 def twice(truth: GroundTruth) -> GroundTruth:
     """The same drives once more, under other names."""
     count, scenes = len(truth.samples), len(truth.scenes)
-    columns = {name: np.concatenate([getattr(truth.boxes, name)] * 2) for name in vars(BoxTable.empty())}
+    columns = {name: np.concatenate([getattr(truth.boxes, name)] * 2) for name in (f.name for f in fields(BoxTable))}
     columns["sample"][len(truth.boxes) :] += count
     return replace(
         truth, samples=(*truth.samples, *(f"{token} again" for token in truth.samples)),
@@ -36,7 +36,7 @@ def test_copies_of_a_drive_are_found(recorded: Path) -> None:
     assert distinct_scenes(truth).tolist() == [0, 1]
     assert distinct_scenes(twice(truth)).tolist() == [0, 1, 0, 1]
     moved = twice(truth)
-    moved.boxes.translation[-1, 0] += 1e-3
+    moved.boxes.centre[-1, 0] += 1e-3
     assert distinct_scenes(moved).tolist() == [0, 1, 0, 2]
 
 

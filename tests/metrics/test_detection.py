@@ -72,7 +72,7 @@ def random_tables(key: int, *, samples: int = 6, grid: float = 0.0, levels: int 
     return real, replace(
         predicted,
         rotation=np.stack([np.cos(yaw), zero, zero, np.sin(yaw)], axis=-1),
-        size=predicted.size * random.uniform(0.5, 2.0, (n, 3)),
+        size_lwh=predicted.size_lwh * random.uniform(0.5, 2.0, (n, 3)),
         velocity=random.normal(0.0, 1.0, (n, 2)),
         attribute=random.integers(-1, 2, n).astype(np.int8),
     )

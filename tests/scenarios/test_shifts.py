@@ -491,13 +491,13 @@ def test_labels_follow_the_objects(severity: int, seed: int, yaw: float, name: s
     assert abs(bottom) < 1e-9, "objects stay on the ground"
     d = deformations(spec, boxes, scene="s", sample="t")[0]
     if name == "scale":
-        assert new.size[0] == pytest.approx(boxes.size[0] * d[0, 0])
+        assert new.size_lwh[0] == pytest.approx(boxes.size_lwh[0] * d[0, 0])
         assert abs(d[0, 0] - 1) == pytest.approx(table.SCALE[severity - 1])
     if name == "rotation":
         turned = quaternion_to_matrix(new.rotation[0]) @ quaternion_to_matrix(boxes.rotation[0]).T
         angle = np.degrees(np.arccos((np.trace(turned) - 1) / 2))
         assert abs(angle - table.ROTATION[severity - 1]) <= table.ROTATION_SPREAD + 1e-6
-        assert new.size[0] == pytest.approx(boxes.size[0])
+        assert new.size_lwh[0] == pytest.approx(boxes.size_lwh[0])
     if name == "shear":
         cube = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0, 1)]) * [4.0, 1.8, 1.6]
         world = cube @ d.T @ quaternion_to_matrix(boxes.rotation[0]).T + [9.0, 2.0, 0.0]
@@ -543,7 +543,7 @@ def test_boxes_behind_and_across_the_camera_do_no_harm() -> None:
 @pytest.mark.parametrize("velocity", [(0.0, 6.0, 0.0), (0.0, -9.0, 0.0)])
 def test_blur_is_a_box_filter_along_the_motion(velocity: tuple[float, float, float]) -> None:
     boxes = cars((12.0, 0.0, 0.8), velocity=velocity)
-    image = drawn(replace(boxes, size=boxes.size * 0.95), [(250, 250, 250)])  # well inside its box
+    image = drawn(replace(boxes, size_lwh=boxes.size_lwh * 0.95), [(250, 250, 250)])  # well inside its box
     spec = ShiftSpec("motion_blur", 5)
     out = one(image, Frame(CAMERA, "s", boxes=boxes), spec).astype(float)
     k = CAMERA.intrinsic

@@ -716,7 +716,7 @@ def test_a_worker_that_dies_is_one_line(
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(run, "make_shard", _die)
-        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=2), "a worker died")
+        fails(StoreError, lambda: materialise(options(clean, tmp_path / "o"), workers=2), "the process ended")
     materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(tmp_path / "o" / "fog-3") == tree(fog)
 
