@@ -2,14 +2,12 @@
 
 import importlib.util
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from helpers.mono3d import one_thread
 from torch import Tensor, nn
 
 from ssad.core.detections import Detections, Truth
@@ -37,12 +35,6 @@ TWO_STAGE = [
     pytest.param("fasterrcnn_resnet50_fpn", marks=pytest.mark.slow),
     pytest.param("fasterrcnn_resnet50_fpn_v2", marks=pytest.mark.slow),
 ]
-
-
-@pytest.fixture(autouse=True)
-def _on_one_thread() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 def lively(model: str, **options: Any) -> Any:

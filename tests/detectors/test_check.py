@@ -1,13 +1,13 @@
 """The conformance test of detectors: it passes those of SSAD, and names the one promise that another breaks."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lively, one_thread
+from helpers.mono3d import TINY, TINY_PGD, lively
 from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
@@ -22,12 +22,6 @@ CLASSES = ("car", "person")
 SIZE = (48, 64)
 SMALL = replace(YOLOV3_TINY, width=0.125)
 Reduction = Literal["batch", "image"]
-
-
-@pytest.fixture(autouse=True)
-def _on_one_thread() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 # ---------------------------------------------------------------- those that keep their promises

@@ -1,12 +1,11 @@
 """Losses of the 3D detectors: their zeros, their sums, and their gradients to the image."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lens, lively, one_thread, perfect, some_truth
+from helpers.mono3d import TINY, TINY_PGD, lens, lively, perfect, some_truth
 from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Solids, Truth
@@ -17,12 +16,6 @@ from ssad.detectors.mono3d.detector import Mono3D
 FCOS = {"cls", "offset", "depth", "size", "rotsin", "velo", "dir", "attr", "centerness"}
 PGD = FCOS | {"bbox2d", "consistency"}
 BOTH = pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quiet() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 VIRTUAL = 400 / 1.2  # the lens of `some_truth` has 1.2 times this focal length

@@ -1,12 +1,11 @@
 """Target assignment, and that the assigned targets decode to the ground truth."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lens, one_thread, perfect, some_truth, truth_of
+from helpers.mono3d import TINY, TINY_PGD, lens, perfect, some_truth, truth_of
 from torch import Tensor
 
 from ssad.core.detections import Solids, Truth
@@ -19,12 +18,6 @@ from ssad.detectors.mono3d.targets import assign
 SIZE = (256, 416)
 K = lens(300.0, SIZE)
 ONE = torch.ones(2, dtype=torch.float64)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _quiet() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 def grid(strides: tuple[int, ...] = (8, 16, 32, 64, 128), size: tuple[int, int] = SIZE) -> Places:

