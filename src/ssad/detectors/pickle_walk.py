@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import io
-import pickle
-import pickletools
+from pickletools import genops, markobject, opcodes
 
 MOST_STEPS = 5_000_000  # a tensor of a checkpoint takes about 40
 
-_MARK = pickletools.markobject
 _TAKES = {  # of each step: how many values it takes, whether all down to a mark as well, how many it puts back
     op.name: (
-        op.stack_before.index(_MARK) if _MARK in op.stack_before else len(op.stack_before),
-        _MARK in op.stack_before,
+        op.stack_before.index(markobject) if markobject in op.stack_before else len(op.stack_before),
+        markobject in op.stack_before,
         len(op.stack_after),
     )
-    for op in pickletools.opcodes
+    for op in opcodes
 }
 _FILLS = frozenset({"APPEND", "APPENDS", "SETITEM", "SETITEMS", "ADDITEMS", "BUILD"})  # and put back what they fill
 _KEEPS = frozenset({"PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"})
@@ -56,12 +54,12 @@ def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
 
     Raises:
         RefusedError: It would take too many steps, or too much memory.
-        ValueError, UnpicklingError: It is none.
+        ValueError: It is none.
     """
     start = file.tell()
     stack: list[int] = []  # steps of each value; 0 is a mark
     kept: dict[int, int] = {}
-    for op, argument, at in pickletools.genops(file):
+    for op, argument, at in genops(file):
         try:
             if op.name in _KEEPS:
                 number = len(kept) if argument is None else int(argument)
@@ -78,7 +76,7 @@ def walk(file: io.BytesIO, part: str, steps: Steps) -> None:
             for _ in range(count):
                 taken += stack.pop()
         except IndexError:
-            raise pickle.UnpicklingError(f"byte {at} of {part} takes a value that is not there") from None
+            raise ValueError(f"byte {at} of {part} takes a value that is not there") from None
         steps.take(taken)
         if op.name == "MARK":
             stack.append(0)
