@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from helpers.sharing import Shared
 
 # One thread a process: as many as there are cores in each of several test workers only wait for each other. The
 # libraries read this when they are first imported, and child processes inherit it.
@@ -19,7 +20,6 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPE
 ROOT = Path(__file__).resolve().parent.parent
 
 # A folder that a fixture shares between test workers: its name, and what fills it
-Shared = Callable[[str, Callable[[Path], object]], Path]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

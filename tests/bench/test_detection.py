@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.sharing import Shared
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -44,12 +45,13 @@ ORACLE = "helpers.oracle3d:build"
 TOWNS = ["Larkhill", "Oldmarket"]
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("component") / "data"
-    return record_nuscenes(
-        Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3), workers=0
-    )
+@pytest.fixture(scope="session")
+def root(shared: Shared) -> Path:
+    def make(out: Path) -> None:
+        recording = Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3)
+        record_nuscenes(recording, workers=0)
+
+    return shared("two-towns", make)
 
 
 @pytest.fixture(autouse=True)
@@ -73,14 +75,15 @@ def suite_of(root: Path, **changes: Any) -> DetectionSuite:
     return DetectionSuite.model_validate(base | changes)
 
 
-@pytest.fixture(scope="module")
-def folder(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("component") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ORACLE_DATA", str(root))
-        run_detection(plan_detection(suite_of(root)), out, workers=0)
-        write_report(out)
-    return out
+@pytest.fixture(scope="session")
+def folder(root: Path, shared: Shared) -> Path:
+    def make(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("ORACLE_DATA", str(root))
+            run_detection(plan_detection(suite_of(root)), out, workers=0)
+            write_report(out)
+
+    return shared("detection-run", make)
 
 
 def lines(folder: Path) -> list[dict[str, Any]]:

@@ -68,14 +68,14 @@ BAD = {
     "raise": ("failed", "ValueError: this one raises"), "exit": ("failed", "SystemExit: this one leaves"),
     "die": ("crashed", "exit code 3): last words"), "segfault": ("crashed", "SIGSEGV"),
     "liar": ("failed", "other cells"), "object": ("failed", "not plain data"), "nan": ("failed", "not plain data"),
-    "hang": ("timeout", "took longer than 4 s"), "spin": ("timeout", "took longer than 4 s"),
+    "hang": ("timeout", "took longer than 2.5 s"), "spin": ("timeout", "took longer than 2.5 s"),
     "memory": ("crashed", "out of memory: it held"),
 }  # fmt: skip
 
 
 def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -> None:
     good = ["a", "b", "c", "d"]
-    records = go(dice([*good[:2], *BAD, *good[2:]], batch=7, timeout_s=4), folder, workers, ray=ray)
+    records = go(dice([*good[:2], *BAD, *good[2:]], batch=7, timeout_s=2.5), folder, workers, ray=ray)
     found = {r["number"]: r for r in records}
     assert [found[name]["status"] for name in good] == ["ok"] * 4
     for deed, (status, reason) in BAD.items():
@@ -86,7 +86,7 @@ def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -
     assert len(read_lines(folder / "episodes.jsonl")) == 4
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_bad_cell_costs_only_itself(tmp_path: Path, workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(WORKER_MEMORY, str(512 << 20))
     check_bad_cells(tmp_path, workers)
@@ -102,7 +102,7 @@ def test_on_ray_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert table(tmp_path / "ray") == table(tmp_path / "here")
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, workers: int) -> None:
     """Nine numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
     numbers = [f"n-{i}" for i in range(9)]
@@ -279,7 +279,7 @@ def test_workers_end_with_the_run_and_ctrl_c_leaves_a_folder_to_go_on_with(tmp_p
 def test_a_changed_run_is_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go(dice(["a"]), tmp_path / "run")
     assert [c.name for c in read_plan(tmp_path / "run").cells] == ["fair/a#0"]
-    monkeypatch.setattr(own_kind.Dice, "code", lambda self: "other")
+    monkeypatch.setattr(own_kind.Dice, "code", "other")
     with pytest.raises(ConfigError, match="code changed"):
         read_plan(tmp_path / "run")
     with pytest.raises(SSADError, match="holds another run"):

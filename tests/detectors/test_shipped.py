@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.sharing import Shared
 
 from ssad.core.errors import FormatError
 from ssad.core.images import read_image
@@ -25,11 +26,14 @@ THREE = [name for name in NAMES if not name.startswith("yolo")]
 SCENES = ["scene-larkhill-000"]
 
 
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> tuple[CocoSet, PictureSet]:
+@pytest.fixture(scope="session")
+def clips(shared: Shared) -> tuple[CocoSet, PictureSet]:
     """Eight pictures from 20 m behind, in a held-out town and with a seed that no training had."""
-    out = tmp_path_factory.mktemp("shipped") / "clips"
-    record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=1)
+
+    def make(out: Path) -> None:
+        record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=0)
+
+    out = shared("shipped-clips", make)
     data = read_coco(out / "annotations" / "test.json")
     bank = fill(coco_items(out, "test")[1], threads=1)
     return data, PictureSet(bank.pictures, tuple(coco_truth(data, target=True)))
@@ -66,13 +70,15 @@ def test_fresh_weights_do_not_find_it(name: str, clips: tuple[CocoSet, PictureSe
     assert score_2d(fresh, bank)["AP50_car"] < 0.1
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def drive(shared: Shared) -> Path:
     """Two moments of six cameras in a held-out town, with a seed that no training had."""
-    out = tmp_path_factory.mktemp("shipped") / "drive"
-    return record_nuscenes(
-        Recording(out, ("Larkhill",), ("Larkhill",), scenes=1, seconds=0.5, width=800, seed=77), workers=1
-    )
+
+    def make(out: Path) -> None:
+        towns = ("Larkhill",)
+        record_nuscenes(Recording(out, towns, towns, scenes=1, seconds=0.5, width=800, seed=77), workers=0)
+
+    return shared("shipped-drive", make)
 
 
 @pytest.mark.parametrize("name", THREE)

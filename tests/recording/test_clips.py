@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.sharing import Shared
 
 from ssad.assets.bodies import BODIES
 from ssad.camera.labels import label_picture
@@ -73,11 +74,13 @@ class Stopped(Exception):
     """Somebody ended the recording."""
 
 
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def drives(shared: Shared) -> Path:
     """A recording that was stopped after its first part and then gone on with."""
-    out = tmp_path_factory.mktemp("drive") / "a"
+    return shared("clips-drive", _stopped_recording)
 
+
+def _stopped_recording(out: Path) -> None:
     def stop(done: int, of: int) -> None:
         assert (done, of) == (1, 2)
         raise Stopped
@@ -94,7 +97,6 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record_clips(todo(out, "drive"), workers=0, progress=lambda done, of: steps.append((done, of)))
     assert steps == [(1, 2), (2, 2)]
     assert page.stat().st_mtime_ns == before, "what was there is left alone"
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +105,9 @@ def market(drives: Path) -> _Set:
     return _prepare(todo(drives, "drive"), "Oldmarket", (0, "drive", "Oldmarket", 0, 0))
 
 
-@pytest.fixture(scope="module")
-def orbits(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_clips(todo(tmp_path_factory.mktemp("orbit") / "a", "orbit"), workers=0)
+@pytest.fixture(scope="session")
+def orbits(shared: Shared) -> Path:
+    return shared("clips-orbit", lambda out: record_clips(todo(out, "orbit"), workers=0))
 
 
 def target_of(data: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:

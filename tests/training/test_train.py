@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers.sharing import Shared
 from torch.multiprocessing.spawn import spawn
 
 from ssad.cli import main
@@ -16,7 +17,6 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import make_detector
 from ssad.detectors.checkpoints import read_card
 from ssad.recording.clip_recorder import Clips, record_clips
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.training import detector as training
 from ssad.training.detector import Plan, command_of, run_training
 from ssad.training.recipe import find_recipe
@@ -24,27 +24,29 @@ from ssad.training.recipe import find_recipe
 SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
 
 
-@pytest.fixture(scope="module")
-def clips(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("train") / "clips"
+@pytest.fixture(scope="session")
+def clips(shared: Shared) -> Path:
     pairs = (("Twinford", 6), ("Oldmarket", 2))
-    record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=1)
-    return out
+
+    def make(out: Path) -> None:
+        record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
+
+    return shared("clips", make)
 
 
-@pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("train") / "drives"
-    towns, held = ("Twinford", "Oldmarket"), ("Oldmarket",)
-    return record_nuscenes(Recording(out, towns, held, scenes=1, seconds=0.5, width=160), workers=1)
+@pytest.fixture(scope="session")
+def drives(recorded: Path) -> Path:
+    return recorded
 
 
-@pytest.fixture(scope="module")
-def done(clips: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def done(clips: Path, shared: Shared) -> Path:
     """A finished training."""
-    out = tmp_path_factory.mktemp("train") / "out"
-    list(run_training(Plan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), say=lambda line: None))
-    return out
+
+    def make(out: Path) -> None:
+        list(run_training(Plan("yolov5n", (clips,), out, changes=SHORT, device="cpu"), say=lambda line: None))
+
+    return shared("trained", make)
 
 
 def test_weights_come_with_a_card_that_says_all(done: Path, clips: Path) -> None:

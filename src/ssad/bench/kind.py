@@ -10,6 +10,7 @@ import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -213,8 +214,9 @@ class Kind(ABC):
         """
         raise ConfigError(f"{folder}: cells of kind '{self.name}' cannot be replayed")
 
+    @cached_property
     def code(self) -> str:
-        """12 hex digits over the source that results depend on."""
+        """12 hex digits over the source that results depend on, as it was when first asked for."""
         return source_version(type(self).__module__)
 
     def make_cell(
@@ -222,7 +224,7 @@ class Kind(ABC):
     ) -> Cell:
         """A cell with its key. inputs: versions of what it depends on besides the source and its own description."""
         described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
-        key = digest("cell", self.name, self.code(), safeio.dump_json(described), system, seed, *inputs)
+        key = digest("cell", self.name, self.code, safeio.dump_json(described), system, seed, *inputs)
         return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
 
 

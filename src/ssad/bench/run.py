@@ -53,7 +53,7 @@ def run_json(plan: Plan) -> dict[str, Any]:
         "suite": plan.suite.model_dump(mode="json"),
         "command": command_of(plan.suite),
         "versions": {**versions(plan.device), **plan.versions},
-        "code": kind.code(),
+        "code": kind.code,
         "columns": [vars(column) for column in kind.columns],
         "factors": list(kind.factors),
         "cells": [{"key": c.key, "name": c.name, "seed": c.seed, **c.fields} for c in plan.cells],
