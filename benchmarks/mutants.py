@@ -44,9 +44,11 @@ MEMORY = 8 << 30  # bytes that a test run may allocate: a mutant may fill a list
 # package under src/ssad -> its tests, the quickest first; for all other packages they are tests/<package>
 TESTS: dict[str, tuple[str, ...]] = {
     "scenarios/dynamic": tuple(
-        f"tests/scenarios/test_{name}.py" for name in ("yaml", "knowledge", "sets", "natural", "import")
+        f"tests/scenarios/test_{name}.py"
+        for name in ("yaml", "knowledge", "sets", "natural", "import", "sampling", "episode")
     ),
     "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published")),
+    "jobs": ("tests/jobs", "tests/bench/test_engine.py"),
     "drivers": ("tests/world",),
     "envs": ("tests/test_envs.py", "tests/world/test_env.py"),
 }

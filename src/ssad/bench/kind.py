@@ -201,7 +201,7 @@ class Kind(ABC):
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """In a worker: do a piece for some systems, leaving its result in the folder. If this fails, nothing is lost
         but time: `execute` must do without, and its failure counts."""
-        raise NotImplementedError
+        raise CellError(f"the kind {self.name} names pieces of work, but not how they are made")
 
     def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default
         """In the main process, when all cells have run: pictures for the report."""
