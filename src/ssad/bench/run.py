@@ -101,7 +101,8 @@ class _Schedule:
         ready = [cell for cell in missing if not self.left[cell.key]]
         count = len(self.data) + len(missing)
         place = self.resources
-        start = (_start, (self.kind, self.job))
+        begins = type(self.kind).start is not Kind.start
+        start = (_start, (self.kind, self.job)) if begins else None
         total = len(self.plan.cells) + len(self.data)
         done = len(self.plan.cells) - len(missing)
         with (

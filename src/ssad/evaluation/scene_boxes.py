@@ -30,6 +30,7 @@ from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
+from ssad.jobs.machine import quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
@@ -129,6 +130,7 @@ class Watched:
 
 @lru_cache(maxsize=8)
 def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
+    quiet_warp()  # it runs the shifts
     torch.set_num_threads(threads)
     return detector_of(name, weights, device)
 

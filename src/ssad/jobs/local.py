@@ -149,7 +149,7 @@ class LocalProcesses:
     Args:
         workers: how many.
         start: a function and its argument, called once in each worker before its first task; its time does not count
-            as a task's. The first worker starts alone, since it may compile kernels for all.
+            as a task's. With one the first worker starts alone, since it may compile kernels for all.
         gpus: the workers see one of these each, in turn, as `CUDA_VISIBLE_DEVICES` names them; none: left as it is.
         threads: of linear algebra in each worker, unless the user's environment says otherwise.
     """
@@ -204,7 +204,7 @@ class LocalProcesses:
                     self._unsent.append(unsent)
         idle = sum(worker.task is None for worker in self._workers)
         while len(self._workers) < self.capacity and idle < len(self._waiting):
-            if self._workers and not any(worker.ready for worker in self._workers):
+            if self._start is not None and self._workers and not any(worker.ready for worker in self._workers):
                 return  # the first one starts alone
             names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
             environment = {name: os.environ.get(name, str(self._threads)) for name in names}

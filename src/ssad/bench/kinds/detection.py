@@ -28,7 +28,7 @@ from ssad.evaluation.scene_boxes import (
     forget_failures,
     score_scenes,
 )
-from ssad.jobs.machine import default_workers, quiet_warp
+from ssad.jobs.machine import default_workers
 from ssad.jobs.progress import Live
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
@@ -153,10 +153,6 @@ class Detection(Kind):
         if cell.fields["shift"] is None:
             return 0
         return 1 if isinstance(severity, str) else 2 + abs(severity - 3)
-
-    def start(self, job: Job) -> None:
-        """Warp runs the shifts."""
-        quiet_warp()
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Scenes whose boxes are still to be found."""
