@@ -82,6 +82,7 @@ class _Schedule:
         self.timeout: float = plan.suite.timeout_s
         self.left: dict[str, set[str]] = {}  # cell key -> pieces that it waits for
         self.users: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
+        self.sharing: dict[str, dict[str, None]] = {}  # piece -> systems that wait for it, in order
         self.data: dict[str, Any] = {}
         self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
         self.alone: set[str] = set()  # systems that share no pieces any more
@@ -98,6 +99,7 @@ class _Schedule:
             self.left[cell.key] = set(pieces)
             for name in pieces:
                 self.users.setdefault((name, cell.system), []).append(cell)
+                self.sharing.setdefault(name, {})[cell.system] = None
         ready = [cell for cell in missing if not self.left[cell.key]]
         count = len(self.data) + len(missing)
         place = self.resources
@@ -112,7 +114,7 @@ class _Schedule:
             for batch in self.kind.batches(self.plan, ready, min(count, place.workers or default_workers())):
                 self._add(batch)
             for name in self.data:
-                self._add_piece(name, [system for piece, system in self.users if piece == name])
+                self._add_piece(name, list(self.sharing[name]))
             for outcome in self.pool.outcomes(self.live.tick):
                 if isinstance(outcome.task.label, list):
                     self._batch_ended(outcome.task.label, outcome)
@@ -146,7 +148,8 @@ class _Schedule:
 
     def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
         waiting = self.users.pop((name, system), [])
-        if not any(piece == name for piece, _ in self.users):
+        self.sharing[name].pop(system, None)
+        if not self.sharing[name]:
             self.live.advance(True)
         for cell in waiting:
             self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting)
