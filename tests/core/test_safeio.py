@@ -7,6 +7,7 @@ import io
 import os
 import pickle
 import tempfile
+import threading
 import zipfile
 from pathlib import Path
 
@@ -226,6 +227,14 @@ def test_limits(tmp_path: Path) -> None:
     assert safeio.read_bytes(tmp_path / "a", limit=100) == b"x" * 100
     with pytest.raises(FormatError, match=r"a: larger than the limit of 9\.44138e-05 MiB"):
         safeio.read_bytes(tmp_path / "a", limit=99)
+    (tmp_path / "empty").touch()
+    assert safeio.read_bytes(tmp_path / "empty", limit=1 << 60) == b"", "no room is made for what is not there"
+    for limit in (4 << 20, (2 << 20) + 7):
+        os.mkfifo(tmp_path / f"pipe{limit}")
+        writer = threading.Thread(target=(tmp_path / f"pipe{limit}").write_bytes, args=(b"x" * ((2 << 20) + 7),))
+        writer.start()
+        assert len(safeio.read_bytes(tmp_path / f"pipe{limit}", limit=limit)) == (2 << 20) + 7, "a pipe, in parts"
+        writer.join()
     mebibytes = {
         function: inspect.signature(function).parameters["limit"].default / 2**20
         for function in (

@@ -43,8 +43,10 @@ def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
     """The whole file, refused beyond `limit` bytes. FormatError."""
     try:
         with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size or limit  # a pipe has none; room is made for as much as is asked for
-            data = file.read(min(size, limit) + 1)
+            # room is made for as much as is asked for: no more than the file says it has, and what a pipe holds in parts
+            data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
+            while len(data) <= limit and (part := file.read(MIB)):
+                data += part
     except FileNotFoundError:
         raise FormatError(f"{path}: no such file") from None
     except OSError as error:
