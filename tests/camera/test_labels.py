@@ -44,12 +44,12 @@ def at(x: float, y: float = 0.0, *, mesh: int = 0, tag: int = 1, yaw: float = 0.
 
 def seen(*things: Thing, scale: int = 2) -> tuple[Labels, Picture]:
     view = View(CAMERA, EYE, things)
-    picture = render(stage(), [view], scale=scale, shadows=False)
+    picture = render(stage(), [view], scale=scale, quality=PLAIN)
     return label_picture(stage(), view, picture, scale=scale), picture
 
 
 def empty_picture() -> Picture:
-    picture = render(stage(), [View(CAMERA, EYE, (at(10.0),))], shadows=False)
+    picture = render(stage(), [View(CAMERA, EYE, (at(10.0),))], quality=PLAIN)
     return replace(picture, tag=np.full_like(picture.tag, -1))
 
 
@@ -136,7 +136,7 @@ def test_a_thing_beside_the_camera_is_cut_at_the_near_plane() -> None:
 def test_what_is_behind_or_beside_has_no_label() -> None:
     things = (at(-8.0, tag=3), at(10.0, 30.0, tag=4), at(10.0, tag=5), at(14.0, tag=6), at(10.0, 3.0, tag=0))
     view = View(CAMERA, EYE, things)
-    picture = render(stage(), [view], shadows=False)
+    picture = render(stage(), [view], quality=PLAIN)
     assert label_picture(stage(), view, picture).tag.tolist() == [5]
     shares = visible_share(stage(), view, picture)
     assert list(shares) == [3, 4, 5, 6]
@@ -154,7 +154,7 @@ def test_things_of_one_tag_are_one() -> None:
 
 def test_labels_of_the_second_picture() -> None:
     views = [View(CAMERA, EYE, (at(10.0, tag=8),)), View(CAMERA, EYE, (at(20.0, tag=9),))]
-    picture = render(stage(), views, shadows=False)
+    picture = render(stage(), views, quality=PLAIN)
     assert label_picture(stage(), views[1], picture, 1).tag.tolist() == [9]
 
 
@@ -179,7 +179,7 @@ def test_labels_are_the_same_each_time_and_in_any_order() -> None:
 
 def test_a_picture_of_another_view_is_refused() -> None:
     view = View(CAMERA, EYE, (at(10.0, tag=8),))
-    picture = render(stage(), [view], shadows=False)
+    picture = render(stage(), [view], quality=PLAIN)
     with pytest.raises(ConfigError, match="shows tag 8"):
         label_picture(stage(), View(CAMERA, EYE, (at(10.0, tag=2),)), picture)
     with pytest.raises(ConfigError, match="no picture 1"):

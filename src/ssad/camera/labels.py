@@ -187,7 +187,8 @@ def _alone(
         wp.array(matrices.astype(np.float32), dtype=wp.mat44, device=device),
         wp.array(lens, dtype=wp.vec4, device=device), NEAR, float(scale), 0, float(side), float(side),
     ]  # fmt: skip
-    wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles], device=device)
+    owners = wp.empty(total, dtype=wp.vec2i, device=device)
+    wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles, owners], device=device)
     none = wp.zeros(1, dtype=int, device=device)
     wp.launch(raster.fill, dim=2 * total, inputs=[triangles, 1 << 20], outputs=[samples, none, none], device=device)
     shape = np.ceil(np.minimum(size, CROP)).astype(np.int32)[:, ::-1]

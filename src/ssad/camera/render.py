@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from ssad.camera.kernels import raster, shade
+from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of
 from ssad.camera.scene import Draws, Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
@@ -21,6 +22,7 @@ FAR = 500.0
 LARGE, LANES = 4096, 32  # large triangles that a view may list, threads for each
 DAY = 0.5  # exposure on a clear day
 SHADOW_SIZE, SHADOW_REACH = 1024, 60.0  # texels, m from the middle to the border
+FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,8 @@ class View:
     """A camera at a place: `pose` (camera to world) [4, 4], what stands there, the weather.
 
     noise: of the sensor by day, as the deviation at full light (0.01 is a good camera's); it grows where the exposure
-    must, by night. seed: of the noise; equal seeds give equal noise.
+    must, by night. seed: of the noise; equal seeds give equal noise. lamps: beside those of street and things; focus:
+    x, y of the place (m) around which shadows are finest, None for just before the camera.
     """
 
     camera: Camera
@@ -51,6 +54,37 @@ class View:
     weather: Weather = Weather()
     noise: float = 0.0
     seed: int = 0
+    lamps: tuple[Lamp, ...] = ()
+    focus: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """What light is followed. shadows: of the sun; fine: a fine map of them around the focus; contact: bodies keep the
+    light of the sky from the ground; lamps: those of street and things, and their shadows."""
+
+    shadows: bool = True
+    fine: bool = True
+    contact: bool = True
+    lamps: bool = True
+
+
+PLAIN = Quality(shadows=False, fine=False, contact=False, lamps=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """What covers most of each pixel, [B, H, W, 3] each; zero for sky.
+
+    albedo: linear; normal: unit, world; position: world, m; irradiance: of all light, over pi; gain: what the pixel's
+    radiance gains for a unit of albedo (light, share of the pixel, mirror, wet, fog).
+    """
+
+    albedo: F32
+    normal: F32
+    position: F32
+    irradiance: F32
+    gain: F32
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +92,7 @@ class Picture:
     """B pictures: image uint8 sRGB [B, H, W, 3]; radiance linear [B, H, W, 3]; tag [B, H, W] (-1 sky, 0 street, else
     that of the thing); depth [B, H, W] m along the optical axis, inf for sky; exposure [B]: image is the camera's
     curve of radiance times it; fragments: pieces of textured surfaces, black in the picture, by pixel and triangle
-    (see `ssad.camera.texture`)."""
+    (see `ssad.camera.texture`); surface: what the pixels show, where it was asked for."""
 
     image: U8
     radiance: F32
@@ -66,6 +100,7 @@ class Picture:
     depth: F32
     exposure: F64
     fragments: Any
+    surface: Surface | None = None
 
 
 def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
@@ -84,12 +119,12 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
     sun_colour = np.array([1.0, 0.72 + 0.25 * warm, 0.42 + 0.48 * warm]) * 2.6 * direct
     grey = np.array([0.88, 0.92, 0.98])
     veil = weather.clouds**2
-    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - veil) + grey * veil) * (0.004 + 0.9 * day)
+    zenith = (np.array([0.24, 0.46, 0.98]) * (1 - veil) + grey * veil) * (0.010 + 0.9 * day)
     glow = np.array([1.0, 0.55, 0.30]) * (1 - warm) * 0.5 * day
-    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - veil) + 1.15 * grey * veil) * (0.006 + 0.9 * day)
+    horizon = (np.array([0.95, 1.12, 1.30]) * (1 - veil) + 1.15 * grey * veil) * (0.016 + 0.9 * day)
     horizon = horizon + glow * (1 - weather.clouds)
     ground = 0.16 * (horizon + 0.5 * sun_colour * max(sun[2], 0))
-    lamps = float(np.clip((0.08 - height) / 0.15, 0, 1))
+    lamps = lamp_strength(height)
     bright = float(
         0.30 * (0.9 * sun_colour.mean() * max(sun[2], 0.1) + zenith.mean() + 0.6 * horizon.mean()) + 0.05 * lamps
     )
@@ -113,31 +148,34 @@ class _Pass:
     """One visibility pass over all views: draws, slots, samples."""
 
     def __init__(
-        self, stage: Scene, draws: Draws, lens: F32, *, ortho: bool, size: tuple[int, int], scale: int
-    ) -> None:
+        self, stage: Scene, draws: Draws, lens: F32, *, ortho: bool, size: tuple[int, int], scale: int,
+        near: float = NEAR,
+    ) -> None:  # fmt: skip
         device = stage.device
         total = int(draws.counts.sum())
-        self.starts = wp.array(
-            np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device
-        )
-        self.firsts = wp.array(draws.firsts, dtype=int, device=device)
-        self.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
-        self.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
-        self.tags = wp.array(draws.tags, dtype=int, device=device)
-        self.textures = wp.array(draws.textures, dtype=int, device=device)
-        self.rectangles = wp.array(draws.rectangles, dtype=wp.vec4, device=device)
+        drawn = shade.Drawn()
+        starts = wp.array(np.concatenate([[0], np.cumsum(draws.counts)]).astype(np.int32), dtype=int, device=device)
+        firsts = wp.array(draws.firsts, dtype=int, device=device)
+        drawn.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
+        drawn.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
+        drawn.tags = wp.array(draws.tags, dtype=int, device=device)
+        drawn.textures = wp.array(draws.textures, dtype=int, device=device)
+        drawn.rectangles = wp.array(draws.rectangles, dtype=wp.vec4, device=device)
+        drawn.lit = wp.array(draws.lit, dtype=int, device=device)
         self.lens = wp.array(lens, dtype=wp.vec4, device=device)
         views = wp.array(draws.views, dtype=int, device=device)
         height, width = size[0] * scale, size[1] * scale
-        self.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
+        self.samples = drawn.samples = wp.zeros((len(lens), height, width), dtype=wp.uint64, device=device)
+        self.drawn = drawn
+        drawn.owners = wp.empty(max(total, 1), dtype=wp.vec2i, device=device)
         if not total:
             return
         triangles = wp.empty(2 * total, dtype=raster.Triangle, device=device)
         inputs = [
-            stage.vertices, stage.faces, stage.listed, self.starts, self.firsts, views, self.matrices, self.lens,
-            NEAR, float(scale), int(ortho), float(width), float(height),
+            stage.vertices, stage.faces, stage.listed, starts, firsts, views, drawn.matrices, self.lens,
+            near, float(scale), int(ortho), float(width), float(height),
         ]  # fmt: skip
-        wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles], device=device)
+        wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles, drawn.owners], device=device)
         gpu = device != "cpu"
         # on a GPU large triangles are shared out over threads
         room = LARGE * len(lens) if gpu else 1
@@ -155,14 +193,16 @@ def render(
     views: Sequence[View],
     *,
     scale: int = 2,
-    shadows: bool = True,
+    quality: Quality = Quality(),
     download: bool = True,
     linear: bool = True,
+    surface: bool = False,
 ) -> Picture:
     """Pictures of views of one size. ConfigError for views that do not fit.
 
-    scale: samples a pixel along each side; download: numpy arrays; else the picture's image, radiance, tag and depth
-    stay on the stage's device as Warp arrays; linear: download the radiance too.
+    scale: samples a pixel along each side; quality: what light is followed; download: numpy arrays; else the picture's
+    image, radiance, tag and depth stay on the stage's device as Warp arrays; linear: download the radiance too;
+    surface: say what each pixel shows.
     """
     if not views:
         raise ConfigError("no view to render")
@@ -179,63 +219,134 @@ def render(
         lights.append(light)
         exposures.append(exposure)
     poses = np.array([v.pose for v in views], np.float64)
-    inverses = np.asarray(np.linalg.inv(poses), np.float64)
     things = [v.things for v in views]
-    eyes, axes = poses[:, :3, 3], poses[:, :3, 2]
     far = np.array([min(FAR, 6.0 / v.weather.fog) if v.weather.fog > 0 else FAR for v in views])
-    draws = stage.gather(inverses, things, eyes=eyes, axes=axes, reach=(70.0, 180.0), far=far)
+    draws = stage.gather(
+        np.asarray(np.linalg.inv(poses), np.float64), things, eyes=poses[:, :3, 3], axes=poses[:, :3, 2],
+        reach=(70.0, 180.0), far=far,
+    )  # fmt: skip
     seen = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
-    middles = eyes + axes * [0.7 * SHADOW_REACH, 0.7 * SHADOW_REACH, 0.0]
-    middles[:, 2] = 0.0
-    to_shadow = np.array([_light_camera(np.array(light[0]), m) for light, m in zip(lights, middles, strict=True)])
-    texel = 2 * SHADOW_REACH / SHADOW_SIZE
-    if shadows and any(light[0][2] > 0.02 for light in lights):
-        half = SHADOW_SIZE / 2 - 0.5
-        around = np.tile(np.array([1 / texel, 1 / texel, half, half], np.float32), (len(views), 1))
-        reach = np.full(len(views), 95.0)
-        casting = stage.gather(to_shadow, things, eyes=middles, axes=None, reach=(45.0, 95.0), far=reach, horizon=False)
-        dark = _Pass(stage, casting, around, ortho=True, size=(SHADOW_SIZE, SHADOW_SIZE), scale=1).samples
-    else:
-        dark = wp.zeros((len(views), 1, 1), dtype=wp.uint64, device=stage.device)
-    texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
-    texels[:2, 3] = SHADOW_SIZE / 2
+    shadows = _sun_shadows(stage, views, [light[0] for light in lights], quality)
+    near = _near(stage, views, quality)
     device, shape = stage.device, (len(views), *size)
-    radiance = wp.empty(shape, dtype=wp.vec3, device=device)
-    tag, depth = wp.empty(shape, dtype=int, device=device), wp.empty(shape, dtype=float, device=device)
+    textured = any(t.texture >= 0 for v in views for t in v.things)
+    projecting = any(lamp.texture >= 0 for v in views for lamp in v.lamps)
+    out = shade.Output()
+    out.radiance = wp.empty(shape, dtype=wp.vec3, device=device)
+    out.tag = wp.empty(shape, dtype=int, device=device)
+    out.depth = wp.empty(shape, dtype=float, device=device)
+    room = out.radiance.size * 2 if textured or projecting else 1
+    out.fragments = wp.empty(room, dtype=shade.Fragment, device=device)
+    out.found = wp.zeros(1, dtype=int, device=device)
+    out.surface = int(surface)
+    for name in SURFACE:
+        setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
     rows: Any = np.array(lights, dtype=shade.Light.numpy_dtype())  # type: ignore[attr-defined]
     inputs = [
-        seen.samples, stage.vertices, stage.faces, stage.normals, stage.uvs, stage.material, stage.surfaces,
-        stage.listed, seen.starts, seen.firsts, seen.matrices, seen.paints, seen.tags, seen.textures, seen.rectangles,
-        stage.wearable, seen.lens,
-        wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(rows, dtype=shade.Light, device=device),
-        dark,
-        wp.array((texels @ to_shadow).astype(np.float32), dtype=wp.mat44, device=device),
-        texel, scale,
+        stage.geometry, seen.drawn, seen.lens, wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
+        wp.array(rows, dtype=shade.Light, device=device), shadows, near, int(projecting), scale, out,
     ]  # fmt: skip
-    textured = any(t.texture >= 0 for v in views for t in v.things)
-    room = radiance.size * 2 if textured else 1
-    pieces = wp.empty(room, dtype=shade.Fragment, device=device)
-    found = wp.zeros(1, dtype=int, device=device)
-    wp.launch(shade.shade, dim=shape, inputs=inputs, outputs=[radiance, tag, depth, pieces, found], device=device)
+    wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
     fragments: Any = np.zeros(0, shade.Fragment.numpy_dtype())  # type: ignore[attr-defined]
-    if textured:
-        count = int(found.numpy()[0])
+    if textured or projecting:
+        count = int(out.found.numpy()[0])
         if count > room:
             raise ConfigError(f"{count} pieces of textured surfaces, more than {room}; render fewer views at once")
-        fragments = pieces[:count].numpy() if count else fragments
-        fragments = fragments[np.lexsort((fragments["slot"], fragments["place"]))]
+        fragments = out.fragments[:count].numpy() if count else fragments
+        fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
     image = wp.empty((*shape, 3), dtype=wp.uint8, device=device)
     bright = wp.array(np.array(exposures, np.float32), dtype=float, device=device)
     curve = wp.array(response(), dtype=wp.uint8, device=device)
     amount = wp.array(_noise(views, exposures), dtype=wp.vec2, device=device)
     seeds = wp.array(np.array([v.seed for v in views], np.int32), dtype=int, device=device)
-    inputs = [radiance, bright, amount, seeds, curve]
+    inputs = [out.radiance, bright, amount, seeds, curve]
     wp.launch(shade.develop, dim=shape, inputs=inputs, outputs=[image], device=device)
-    arrays = (image, radiance, tag, depth)
+    arrays = (image, out.radiance, out.tag, out.depth)
     if download:
-        arrays = tuple(a.numpy() if linear or a is not radiance else a for a in arrays)
-    return Picture(*arrays, np.array(exposures), fragments)
+        arrays = tuple(a.numpy() if linear or a is not out.radiance else a for a in arrays)
+    exported = _surface(out, np.array(lens), poses) if surface else None
+    return Picture(*arrays, np.array(exposures), fragments, exported)
+
+
+SURFACE = ("albedo", "normal", "irradiance", "gain")
+
+
+def _surface(out: Any, lens: F64, poses: F64) -> Surface:
+    """The exported surfaces, with positions from depth."""
+    found = {name: getattr(out, name).numpy() for name in SURFACE}
+    depth = out.depth.numpy()
+    y, x = np.mgrid[0 : depth.shape[1], 0 : depth.shape[2]]
+    ray = np.stack(
+        [(x - lens[:, 2, None, None]) / lens[:, 0, None, None], (y - lens[:, 3, None, None]) / lens[:, 1, None, None],
+         np.ones(depth.shape)], -1,
+    )  # fmt: skip
+    solid = np.isfinite(depth)
+    local = ray * np.where(solid, depth, 0.0)[..., None]
+    position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], local) + poses[:, None, None, :3, 3]
+    return Surface(position=(position * solid[..., None]).astype(np.float32), **found)
+
+
+def _sun_shadows(stage: Scene, views: Sequence[View], suns: Sequence[tuple[float, ...]], quality: Quality) -> Any:
+    """The shadow maps of the sun: a wide one, and a fine one around each view's focus."""
+    poses = np.array([v.pose for v in views], np.float64)
+    flat = poses[:, :3, 2] * [1.0, 1.0, 0.0]
+    wide = poses[:, :3, 3] + flat * 0.7 * SHADOW_REACH
+    fine = poses[:, :3, 3] + flat * FINE_AHEAD
+    for number, view in enumerate(views):
+        if view.focus is not None:
+            fine[number, :2] = view.focus
+    high = any(sun[2] > 0.02 for sun in suns)
+    shadows = shade.SunShadows()
+    shadows.wide, shadows.to_wide, shadows.wide_texel = _sun_map(
+        stage, views, suns, wide, SHADOW_REACH, SHADOW_SIZE if quality.shadows and high else 0
+    )
+    shadows.fine, shadows.to_fine, shadows.fine_texel = _sun_map(
+        stage, views, suns, fine, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and high else 0
+    )
+    return shadows
+
+
+def _sun_map(
+    stage: Scene, views: Sequence[View], suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
+) -> tuple[Any, Any, float]:
+    """A shadow map [B, size, size] around each middle, the matrices from the world to its texels, m a texel."""
+    middles = middles * [1.0, 1.0, 0.0]
+    texel = 2 * reach / max(size, 1)
+    to_light = np.array([_light_camera(np.array(sun), m) for sun, m in zip(suns, middles, strict=True)])
+    texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
+    texels[:2, 3] = size / 2
+    matrices = wp.array((texels @ to_light).astype(np.float32), dtype=wp.mat44, device=stage.device)
+    if not size:
+        return wp.zeros((len(views), 1, 1), dtype=wp.uint64, device=stage.device), matrices, texel
+    half = size / 2 - 0.5
+    around = np.tile(np.array([1 / texel, 1 / texel, half, half], np.float32), (len(views), 1))
+    # as far as what casts a shadow into the map can be away; small things of the street near its middle alone
+    far = 1.4 * reach + 11.0
+    casting = stage.gather(
+        to_light, [v.things for v in views], eyes=middles, axes=None, reach=(0.75 * reach, far),
+        far=np.full(len(views), far), horizon=False, casting=True,
+    )  # fmt: skip
+    return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+
+
+def _near(stage: Scene, views: Sequence[View], quality: Quality) -> Any:
+    """Lamps with their shadow maps, and bodies that keep light from the ground."""
+    lamps = [lamps_of(stage, view) if quality.lamps else list(view.lamps) for view in views]
+    near = near_of(stage, views, lamps, contact=quality.contact)
+    casting = [(view, lamp) for view, row in zip(views, lamps, strict=True) for lamp in row if lamp.shadows]
+    if not casting:
+        near.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
+        return near
+    poses = np.array([lamp.pose for _, lamp in casting], np.float64)
+    draws = stage.gather(
+        np.asarray(np.linalg.inv(poses), np.float64), [view.things for view, _ in casting], eyes=poses[:, :3, 3],
+        axes=poses[:, :3, 2], reach=(70.0, 180.0), far=np.array([lamp.reach for _, lamp in casting]), horizon=False,
+        casting=True,
+    )  # fmt: skip
+    lens = np.array([lamp_lens(lamp) for _, lamp in casting], np.float32)
+    size = (LAMP_SHADOWS, LAMP_SHADOWS)
+    near.shadows = _Pass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples
+    return near
 
 
 def _noise(views: Sequence[View], exposures: Sequence[float]) -> F32:

@@ -31,7 +31,8 @@ PATTERNS = {
 class Thing:
     """A body in a view: index of its mesh in the stage, pose (object to world) [4, 4], paint (linear RGB), tag that
     masks and boxes name it by. texture: which texture it wears (-1: none) on what lies in `rectangle` (u0, v0, u1, v1)
-    of its atlas; faces outside of all panels (windows, lamps, tyres) never wear one."""
+    of its atlas; faces outside of all panels (windows, lamps, tyres) never wear one. lit: whether its lamps are on (by
+    night they light what is before them); hidden: it casts its shadow and is not seen."""
 
     mesh: int
     pose: F64
@@ -39,6 +40,8 @@ class Thing:
     tag: int = 0
     texture: int = -1
     rectangle: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    lit: bool = True
+    hidden: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,13 @@ class Draws:
     tags: I32
     textures: I32
     rectangles: F32
+    lit: I32
+
+
+LAMPS = ("head_lamp", "tail_lamp")
+NIGHT = {  # what the night adds to the emission of a material while lamps are on
+    "head_lamp": 2.0, "tail_lamp": 0.8, "lamp_light": 4.0, "street_light": 4.0, "window_blind": 0.30, "shop_window": 0.5,
+}  # fmt: skip
 
 
 class Scene:
@@ -101,9 +111,49 @@ class Scene:
         self.material = on(np.concatenate(material).astype(np.int32), wp.int32)
         worn = [p.panel >= 0 if isinstance(p, Mesh) else np.zeros(len(p.faces), bool) for p in parts]
         self.wearable = on(np.concatenate(worn).astype(np.int32), wp.int32)
+        self.meshes = tuple(meshes)
+        self._lights: dict[int, dict[str, tuple[F64, float]]] = {}
+        self._standing: dict[int, tuple[F64, F64, float, float]] = {}
         rows: Any = np.array(surfaces, dtype=kernels.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = on(rows, kernels.Surface)
         self.listed = on(np.concatenate(listed), wp.int32)
+        self.geometry = kernels.Geometry()
+        for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
+            setattr(self.geometry, name, getattr(self, name))
+
+    def lights(self, mesh: int) -> dict[str, tuple[F64, float]]:
+        """Middle [3] (object frame, m) and area (m^2) of the head lamps and of the tail lamps of a mesh."""
+        if mesh not in self._lights:
+            body = self.meshes[mesh]
+            names, areas, middles = [m.name for m in body.materials], body.areas(), body.corners().mean(1)
+            found = {}
+            for name in LAMPS:
+                index = [k for k, other in enumerate(names) if other == name]
+                weight = areas * np.isin(body.material, index)
+                total = float(weight.sum())
+                found[name] = (weight @ middles / max(total, 1e-12), total)
+            self._lights[mesh] = found
+        return self._lights[mesh]
+
+    def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
+        """What a mesh covers of the ground: middle [2], half length and width [2], height of its underside and of its
+        top (object frame, m).
+
+        What looks down from at most half its height says how much of the rectangle about it is covered, and from where.
+        """
+        if mesh not in self._standing:
+            body = self.meshes[mesh]
+            low, high = body.bounds()
+            corners = body.corners()
+            cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            flat, heights = np.maximum(-0.5 * cross[:, 2], 0.0), corners[..., 2].mean(1)
+            flat = flat * (heights <= 0.5 * high[2])
+            sides = np.maximum(high[:2] - low[:2], 1e-3)
+            fill = float(np.clip(flat.sum() / sides.prod(), 0.1, 1.0))
+            under = float((flat * heights).sum() / max(float(flat.sum()), 1e-9)) if flat.any() else 0.0
+            half = 0.5 * sides * np.sqrt(fill)
+            self._standing[mesh] = (low[:2] + 0.5 * sides, half, max(under, 0.03), float(high[2]))
+        return self._standing[mesh]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
@@ -146,18 +196,20 @@ class Scene:
         reach: tuple[float, float],
         far: F64,
         horizon: bool = True,
+        casting: bool = False,
     ) -> Draws:
         """What B views need: tiles of the street, and things that are neither wholly behind them nor beyond `far` [B].
 
-        inverses [B, 4, 4]: world to camera. Other arguments as for `tiles`.
+        inverses [B, 4, 4]: world to camera; casting: hidden things too. Other arguments as for `tiles`.
         """
         first, count, view = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
         tiles = len(first)
         matrices = inverses[view]
-        flat = [t for row in things for t in row]
+        shown = [[t for t in row if casting or not t.hidden] for row in things]
+        flat = [t for row in shown for t in row]
         if flat:
             mesh = np.array([t.mesh for t in flat])
-            owner = np.repeat(np.arange(len(things)), [len(row) for row in things])
+            owner = np.repeat(np.arange(len(shown)), [len(row) for row in shown])
             moved = inverses[owner] @ np.stack([t.pose for t in flat])
             middle, radius = np.array(self.centre)[mesh], np.array(self.radius)[mesh]
             local = np.einsum("nij,nj->ni", moved[:, :3, :3], middle) + moved[:, :3, 3]
@@ -177,17 +229,22 @@ class Scene:
             tiles = 1
         n = len(first)
         paints, rectangles = np.zeros((n, 3), np.float32), np.tile(np.array([0, 0, 1, 1], np.float32), (n, 1))
-        tags, textures = np.zeros(n, np.int32), np.full(n, -1, np.int32)
+        tags, textures, lit = np.zeros(n, np.int32), np.full(n, -1, np.int32), np.ones(n, np.int32)
         if flat:
             paints[tiles:] = [t.paint for t in flat]
             tags[tiles:] = [t.tag for t in flat]
             textures[tiles:] = [t.texture for t in flat]
+            lit[tiles:] = [t.lit for t in flat]
             if (textures >= 0).any():
                 rectangles[tiles:] = [t.rectangle for t in flat]
-        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, textures, rectangles)
+        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, textures, rectangles, lit)
 
 
 def surface(material: Material) -> tuple[Any, ...]:
     """A material as the kernels want it."""
     pattern = PATTERNS.get(material.name, kernels.PLAIN)
-    return (material.colour, material.specular, material.gloss, material.emission, int(material.paint), int(pattern))
+    night, lamp = NIGHT.get(material.name, 0.0), int(material.name in LAMPS)
+    return (
+        material.colour, material.specular, material.gloss, material.emission, night, int(material.paint), lamp,
+        int(pattern),
+    )  # fmt: skip

@@ -92,7 +92,7 @@ class SceneObjects:
             walked = float(body.driven[low] + part * (body.driven[high] - body.driven[low]))
             mesh = body.meshes[int(walked / STRIDE * len(body.meshes)) % len(body.meshes)]
             pose = upright_pose(float(x), float(y), float(yaw), float(z))
-            found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag)))
+            found.append(PlacedObject(body, pose, speed, Thing(mesh, pose, body.paint, body.tag, lit=not body.parked)))
         return found
 
     def add(

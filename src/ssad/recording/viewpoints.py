@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssad.camera.render import View, Weather, render
+from ssad.camera.render import PLAIN, View, Weather, render
 from ssad.camera.scene import Scene
 from ssad.core.frames import Camera
 from ssad.core.geometry import obb_distance
@@ -152,7 +152,7 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int) -> Boo
             away.append(float(np.linalg.norm(eye - start)))
             # thick air: what lies far beyond the camera need not be drawn
             views.append(View(camera, look_at(start, eye), (), Weather(fog=6.0 / (away[-1] + 20.0))))
-        depth = render(stage, views, scale=1, shadows=False, linear=False).depth
+        depth = render(stage, views, scale=1, quality=PLAIN, linear=False).depth
         free += [bool((d >= a + 0.3).all()) for d, a in zip(depth, away, strict=True)]
     return np.array(free, bool)
 

@@ -12,6 +12,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 NONE = wp.constant(wp.uint64(0))
+LOW = wp.constant(0.21)  # m above the ground (or a body's base): what is lower casts no shadow
 LAST = wp.constant(wp.uint64(4294967295))
 
 
@@ -90,11 +91,21 @@ def setup(
     width: float,
     height: float,
     triangles: wp.array(dtype=Triangle),
+    owners: wp.array(dtype=wp.vec2i),
 ):
-    """Moves each listed face into its camera, drops what is turned away or out of the picture, clips, projects."""
+    """Moves each listed face into its camera, drops what is turned away or out of the picture, clips, projects.
+
+    owners: the draw and the face of each index. A parallel projection is light: the ground casts no shadow.
+    """
     index = wp.tid()
     draw = draw_of(starts, index)
     face = listed[firsts[draw] + index - starts[draw]]
+    owners[index] = wp.vec2i(draw, face)
+    if ortho == 1 and vertices[faces[face, 0]][2] < LOW:
+        if vertices[faces[face, 1]][2] < LOW and vertices[faces[face, 2]][2] < LOW:
+            triangles[2 * index].view = -1
+            triangles[2 * index + 1].view = -1
+            return
     m = matrices[draw]
     view = views[draw]
     p = wp.transform_point(m, vertices[faces[face, 0]])

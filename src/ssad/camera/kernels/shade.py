@@ -1,12 +1,14 @@
 """Shading: what light comes from each sample, averaged to pixels. Linear in the colour of every surface.
 
-One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with shadow map, sky and
-ground as ambient light, a mirror term for glass and paint, lamps by night, fog by distance.
+One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with two shadow maps (one
+fine, where it matters), sky and ground as ambient light that bodies keep from the ground below them, lamps, a mirror
+term for glass, paint and wet roads, fog by distance.
 """
 
 import warp as wp
 
-from ssad.camera.kernels.raster import LAST, draw_of
+from ssad.camera.kernels.light import CELLS, Lamp, Near, cell_of, lamp_at, openness
+from ssad.camera.kernels.raster import LAST
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -21,19 +23,63 @@ GLASS = wp.constant(6)
 
 @wp.struct
 class Surface:
-    """A material: linear albedo, mirror share, gloss, emission, 1 where it takes the paint, pattern."""
+    """A material: linear albedo, mirror share, gloss, emission by day and what the night adds to it, 1 where it takes
+    the paint, 1 where it shines only while the lamps of its body are on, pattern."""
 
     colour: wp.vec3
     specular: float
     gloss: float
     emission: float
+    night: float
     paint: int
+    lamp: int
     pattern: int
 
 
 @wp.struct
+class Geometry:
+    """What a scene is made of, see `ssad.camera.scene.Scene`."""
+
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array2d(dtype=int)
+    normals: wp.array2d(dtype=wp.vec3)
+    uvs: wp.array2d(dtype=wp.vec2)
+    material: wp.array(dtype=int)
+    surfaces: wp.array(dtype=Surface)
+    wearable: wp.array(dtype=int)
+
+
+@wp.struct
+class Drawn:
+    """Ranges of listed faces under one matrix each, see `ssad.camera.scene.Draws`; samples: keys of what is seen; owners: draw and face
+    of each key."""
+
+    samples: wp.array3d(dtype=wp.uint64)
+    owners: wp.array(dtype=wp.vec2i)
+    matrices: wp.array(dtype=wp.mat44)
+    paints: wp.array(dtype=wp.vec3)
+    tags: wp.array(dtype=int)
+    textures: wp.array(dtype=int)
+    rectangles: wp.array(dtype=wp.vec4)
+    lit: wp.array(dtype=int)
+
+
+@wp.struct
+class SunShadows:
+    """Shadow maps of the sun: one wide, one fine; matrices from the world to texels; m a texel."""
+
+    wide: wp.array3d(dtype=wp.uint64)
+    fine: wp.array3d(dtype=wp.uint64)
+    to_wide: wp.array(dtype=wp.mat44)
+    to_fine: wp.array(dtype=wp.mat44)
+    wide_texel: float
+    fine_texel: float
+
+
+@wp.struct
 class Fragment:
-    """A piece of a textured surface in a pixel: its light is what the pixel gains per unit of the texture's colour.
+    """A piece of a textured or lit surface in a pixel: its light is what the pixel gains per unit of the texture's
+    colour, which the surface wears or a lamp projects.
 
     place: view, row and column in one number; slot: the triangle's; u, v in the texture's rectangle, 0 to 1; area:
     share of the texture that the pixel spans; light: RGB.
@@ -49,10 +95,59 @@ class Fragment:
 
 
 @wp.struct
+class Output:
+    """What `shade` writes. radiance, tag, depth [B, H, W]; fragments and how many were found; and, where `surface` is
+    1, of what covers most of a pixel: albedo, normal, irradiance / pi and gain [B, H, W]."""
+
+    radiance: wp.array3d(dtype=wp.vec3)
+    tag: wp.array3d(dtype=int)
+    depth: wp.array3d(dtype=float)
+    fragments: wp.array(dtype=Fragment)
+    found: wp.array(dtype=int)
+    surface: int
+    albedo: wp.array3d(dtype=wp.vec3)
+    normal: wp.array3d(dtype=wp.vec3)
+    irradiance: wp.array3d(dtype=wp.vec3)
+    gain: wp.array3d(dtype=wp.vec3)
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets a face: draw and face, point and unit normal in the world, texture coordinates, depth along
+    the axis, distance, all m; slant: cosine between ray and face; stretch: texture area for 1 m^2 of the face."""
+
+    draw: int
+    face: int
+    place: wp.vec3
+    normal: wp.vec3
+    uv: wp.vec2
+    z: float
+    distance: float
+    slant: float
+    stretch: float
+
+
+@wp.struct
+class Lit:
+    """Light on a point: irradiance / pi of all, and what of it comes straight from the sun (0..1 of the sun's)."""
+
+    light: wp.vec3
+    sun: float
+
+
+@wp.struct
+class Seen:
+    """What a surface sends to the camera: its colour, and what it gains per unit of albedo."""
+
+    colour: wp.vec3
+    gain: wp.vec3
+
+
+@wp.struct
 class Light:
     """Light of a view: unit vector to the sun, its colour (irradiance / pi), sky overhead and at the horizon, light
-    from the ground; extinction of fog, 1/m; clouds in 0..1; wet in 0..1; lamps: strength of head lamps and street
-    lamps; turn: offset of the clouds."""
+    from the ground; extinction of fog, 1/m; clouds in 0..1; wet in 0..1; lamps: how far lamps are on, 0..1;
+    turn: offset of the clouds."""
 
     sun: wp.vec3
     sun_colour: wp.vec3
@@ -107,37 +202,84 @@ def sky(light: Light, ray: wp.vec3, fine: int) -> wp.vec3:
         white = light.horizon * 0.9 + light.sun_colour * 0.25
         colour = colour * (1.0 - amount) + white * amount
         toward = wp.dot(ray, light.sun)
-        if toward > 0.0:
+        if toward > 0.9:
             glow = wp.pow(toward, 64.0) * 0.35 + wp.pow(toward, 2000.0) * 40.0
             colour = colour + light.sun_colour * glow * (1.0 - 0.9 * light.clouds)
     return colour
 
 
 @wp.func
+def surroundings(light: Light, ray: wp.vec3, p: wp.vec3, sharp: float) -> wp.vec3:
+    """What a mirror at a point sees in a direction (unit vector, world): sky, houses up to a roof line, the road;
+    sharp: 1 for glass, less for what blurs its image."""
+    level = wp.max(wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]), 1.0e-4)
+    rise = ray[2] / level
+    if sharp * (rise - 0.5) > 0.25:
+        return sky(light, ray, 0)
+    x = ray[0] / level
+    y = ray[1] / level
+    form = cloudy(x * 4.0 + p[0] * 0.04, y * 4.0 + p[1] * 0.04)
+    roofs = 0.10 + 0.38 * form
+    houses = (light.horizon * 0.5 + light.zenith * 0.3 + light.sun_colour * 0.25) * (0.10 + 0.16 * form)
+    road = light.ground * 0.6
+    above = wp.clamp((rise - roofs) * 16.0 * sharp + 0.5, 0.0, 1.0)
+    below = wp.clamp(0.5 - rise * 7.0, 0.0, 1.0)
+    image = houses * (1.0 - below) + road * below
+    if above > 0.0:
+        image = image * (1.0 - above) + sky(light, ray, 0) * above
+    return image
+
+
+@wp.func
+def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
+    """1 where the texel holds nothing nearer to the light."""
+    if wp.cast(wp.uint32(shadows[view, row, column] >> wp.uint64(32)), float) <= depth:
+        return 1.0
+    return 0.0
+
+
+@wp.func
 def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
-    """Share of the sun that reaches a point given in texels and metres along the light: four texels, weighted."""
+    """Share of the sun that reaches a point given in texels and metres along the light: four texels, weighted; -1
+    outside the map."""
     size = shadows.shape[1]
     if size < 4:
-        return 1.0
+        return -1.0
     x = p[0] - 0.5
     y = p[1] - 0.5
     i = int(wp.floor(x))
     j = int(wp.floor(y))
     if i < 0 or j < 0 or i >= size - 1 or j >= size - 1:
-        return 1.0
+        return -1.0
     u = x - float(i)
     v = y - float(j)
     depth = (1.0e3 - p[2] + bias) * 1.0e-3
-    total = float(0.0)
-    if wp.cast(wp.uint32(shadows[view, j, i] >> wp.uint64(32)), float) <= depth:
-        total += (1.0 - u) * (1.0 - v)
-    if wp.cast(wp.uint32(shadows[view, j, i + 1] >> wp.uint64(32)), float) <= depth:
-        total += u * (1.0 - v)
-    if wp.cast(wp.uint32(shadows[view, j + 1, i] >> wp.uint64(32)), float) <= depth:
-        total += (1.0 - u) * v
-    if wp.cast(wp.uint32(shadows[view, j + 1, i + 1] >> wp.uint64(32)), float) <= depth:
-        total += u * v
-    return total
+    low = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
+    high = open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
+    return low * (1.0 - v) + high * v
+
+
+@wp.func
+def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
+    """Share of the sun that reaches a point with a normal: by the fine map where it has the point."""
+    texel = shadows.fine_texel
+    share = sunlit(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
+    if share < 0.0:
+        texel = shadows.wide_texel
+        share = sunlit(shadows.wide, view, wp.transform_point(shadows.to_wide[view], p + n * (texel * 1.5)), texel)
+    if share < 0.0:
+        share = 1.0
+    return share
+
+
+@wp.func
+def octave(uv: wp.vec2, rate: float, depth: float, fine: float) -> float:
+    """1 with smooth noise of `depth` about it, `rate` cells a metre; it fades out where a pixel (`fine` m) has a third
+    of a cell and more."""
+    keep = wp.clamp(2.0 - 3.0 * fine * rate, 0.0, 1.0)
+    if keep <= 0.0:
+        return 1.0
+    return 1.0 + keep * depth * (cloudy(uv[0] * rate, uv[1] * rate) - 0.5)
 
 
 @wp.func
@@ -147,13 +289,11 @@ def textured(surface: Surface, albedo: wp.vec3, uv: wp.vec2, fine: float) -> wp.
         return albedo
     factor = float(1.0)
     if surface.pattern == GRAIN:
-        factor = 0.86 + 0.28 * cloudy(uv[0] * 0.23, uv[1] * 0.23)
-        if fine < 0.06:
-            factor = factor * (0.85 + 0.3 * cloudy(uv[0] * 21.0, uv[1] * 21.0))
+        factor = octave(uv, 0.21, 0.28, fine) * octave(uv, 1.7, 0.10, fine)
+        factor = factor * octave(uv, 9.0, 0.22, fine) * octave(uv, 37.0, 0.36, fine)
     elif surface.pattern == LEAF:
-        factor = 0.75 + 0.5 * cloudy(uv[0] * 1.3, uv[1] * 1.3)
-        if fine < 0.2:
-            factor = factor * (0.7 + 0.6 * cloudy(uv[0] * 9.0, uv[1] * 9.0))
+        factor = octave(uv, 0.31, 0.3, fine) * octave(uv, 1.3, 0.5, fine)
+        factor = factor * octave(uv, 9.0, 0.6, fine) * octave(uv, 31.0, 0.4, fine)
     else:
         wide = float(0.25)
         tall = float(0.08)
@@ -176,43 +316,176 @@ def textured(surface: Surface, albedo: wp.vec3, uv: wp.vec2, fine: float) -> wp.
         edge = wp.min((x - column) * wide, (uv[1] / tall - row) * tall)
         if edge < joint:
             factor = factor * (1.0 - 0.35 * keep)
+        factor = factor * octave(uv, 0.27, 0.22, fine) * octave(uv, 11.0, 0.14, fine)
     return albedo * factor
+
+
+@wp.func
+def hit_of(geometry: Geometry, drawn: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
+    """Where a ray (camera frame, z = 1) meets the plane of a slot's face, no further out than its edges."""
+    hit = Hit()
+    owner = drawn.owners[slot / 2]
+    hit.draw = owner[0]
+    hit.face = owner[1]
+    face = hit.face
+    m = drawn.matrices[hit.draw]
+    a = wp.transform_point(m, geometry.vertices[geometry.faces[face, 0]])
+    b = wp.transform_point(m, geometry.vertices[geometry.faces[face, 1]])
+    c = wp.transform_point(m, geometry.vertices[geometry.faces[face, 2]])
+    ab = b - a
+    ac = c - a
+    plane = wp.cross(ab, ac)
+    along = wp.dot(plane, ray)
+    if wp.abs(along) < 1.0e-12:
+        along = -1.0e-12
+    hit.z = wp.clamp(wp.dot(plane, a) / along, 0.05, 2.0e3)
+    # in shares of the corners
+    inside = ray * hit.z - a
+    square = wp.dot(plane, plane)
+    sb = wp.clamp(wp.dot(wp.cross(inside, ac), plane) / square, 0.0, 1.0)
+    sc = wp.clamp(wp.dot(wp.cross(ab, inside), plane) / square, 0.0, 1.0 - sb)
+    sa = 1.0 - sb - sc
+    hit.uv = geometry.uvs[face, 0] * sa + geometry.uvs[face, 1] * sb + geometry.uvs[face, 2] * sc
+    bent = geometry.normals[face, 0] * sa + geometry.normals[face, 1] * sb + geometry.normals[face, 2] * sc
+    hit.normal = wp.normalize(wp.transform_vector(pose, wp.transform_vector(m, bent)))
+    length = wp.length(ray)
+    hit.distance = hit.z * length
+    hit.place = wp.transform_point(pose, ray * hit.z)
+    hit.slant = wp.max(wp.abs(along) / (wp.sqrt(square) * length), 0.05)
+    ua = geometry.uvs[face, 1] - geometry.uvs[face, 0]
+    ub = geometry.uvs[face, 2] - geometry.uvs[face, 0]
+    hit.stretch = wp.abs(ua[0] * ub[1] - ua[1] * ub[0]) / wp.sqrt(square)
+    return hit
+
+
+@wp.func
+def lit_at(
+    light: Light, shadows: SunShadows, near: Near, view: int, row: int, p: wp.vec3, n: wp.vec3, open_: float
+) -> Lit:
+    """All light on a point with a normal, but for lamps that project a texture."""
+    lit = Lit()
+    facing = wp.dot(n, light.sun)
+    if facing > 0.0:
+        lit.sun = facing * sun_at(shadows, view, p, n)
+    up = 0.5 + 0.5 * n[2]
+    lit.light = light.sun_colour * lit.sun
+    lit.light += (light.zenith * (0.65 * up) + light.horizon * (0.35 * up)) * open_ + light.ground * (1.0 - up)
+    if row >= 0:
+        for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+            lamp = near.lamps[near.lamp_list[at]]
+            if lamp.texture < 0:
+                lit.light += lamp.light * (lamp_at(lamp, near.shadows, p, n, light.fog)[0] * open_)
+    return lit
+
+
+@wp.func
+def seen_from(
+    light: Light, near: Near, row: int, surface: Surface, albedo: wp.vec3, glow: float, hit: Hit, lit: Lit, away: wp.vec3
+) -> Seen:
+    """What a lit surface sends back along a unit ray: its own colour, what it mirrors, fog."""
+    seen = Seen()
+    n = hit.normal
+    p = hit.place
+    colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
+    gain = lit.light
+    mirror = surface.specular
+    gloss = surface.gloss
+    if surface.paint == 1:
+        mirror = 0.05
+    wet = int(0)
+    if light.wet > 0.0 and n[2] > 0.9:
+        wet = 1
+        # a film of water: darker, and a mirror the better the deeper it stands
+        film = light.wet * wp.clamp(0.25 + 1.5 * (cloudy(p[0] * 0.35, p[1] * 0.35) - 0.3), 0.0, 1.0)
+        dark = 1.0 - 0.45 * light.wet
+        colour = colour * dark
+        gain = gain * dark
+        mirror = wp.max(mirror, 0.02)
+        gloss = wp.max(gloss, 0.35 * light.wet + 0.6 * film)
+    sharp = float(1.0)
+    if wet == 1:
+        sharp = 0.1
+    back = away - n * (2.0 * wp.dot(n, away))
+    glance = 1.0 - wp.max(-wp.dot(n, away), 0.0)
+    fresnel = glance * glance * glance * glance * glance
+    # no step where the mirror begins to count: the first hundredths are given away
+    share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
+    if share > 0.0:
+        colour = colour * (1.0 - share) + surroundings(light, back, p, sharp) * share
+        gain = gain * (1.0 - share)
+    if gloss > 0.2:
+        power = 8.0 + 400.0 * gloss * gloss
+        bright = (mirror + fresnel) * gloss * 6.0
+        if lit.sun > 0.0:
+            colour += light.sun_colour * (wp.pow(wp.max(wp.dot(back, light.sun), 0.0), power) * bright)
+        if light.lamps > 0.0 and row >= 0:
+            # a lamp seen in the mirror, drawn long on a wet road as by its small waves
+            rough = power
+            if wet == 1:
+                rough = 60.0
+            for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+                lamp = near.lamps[near.lamp_list[at]]
+                if lamp.texture < 0:
+                    toward = wp.normalize(lamp.place - p)
+                    shine = wp.pow(wp.max(wp.dot(back, toward), 0.0), rough)
+                    if shine > 0.001:
+                        given = lamp_at(lamp, near.shadows, p, toward, light.fog)[0]
+                        colour += lamp.light * (given * shine * bright * 0.5)
+    if light.fog > 0.0:
+        clear = wp.exp(-light.fog * hit.distance)
+        colour = colour * clear + light.horizon * (1.0 - clear)
+        gain = gain * clear
+    seen.colour = colour
+    seen.gain = gain
+    return seen
+
+
+@wp.func
+def keep(out: Output, fragment: Fragment):
+    """Lists a fragment as long as there is room."""
+    at = wp.atomic_add(out.found, 0, 1)
+    if at < out.fragments.shape[0]:
+        out.fragments[at] = fragment
+
+
+@wp.func
+def project(
+    out: Output, near: Near, row: int, fragment: Fragment, hit: Hit, albedo: wp.vec3, through: wp.vec3, span: float,
+    open_: float, fog: float,
+):
+    """Lists what lamps that project a texture add to a pixel; through: share of light that the surface sends on;
+    span: area of the surface in the pixel, m^2."""
+    for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+        lamp = near.lamps[near.lamp_list[at]]
+        if lamp.texture >= 0:
+            given = lamp_at(lamp, near.shadows, hit.place, hit.normal, fog)
+            if given[0] > 0.0:
+                piece = fragment
+                piece.texture = lamp.texture
+                piece.u = 0.5 + 0.5 * given[1]
+                piece.v = 0.5 + 0.5 * given[2]
+                piece.area = given[3] * span
+                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given[0] * open_)
+                keep(out, piece)
 
 
 @wp.kernel
 def shade(
-    samples: wp.array3d(dtype=wp.uint64),
-    vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=int),
-    normals: wp.array2d(dtype=wp.vec3),
-    uvs: wp.array2d(dtype=wp.vec2),
-    material: wp.array(dtype=int),
-    surfaces: wp.array(dtype=Surface),
-    listed: wp.array(dtype=int),
-    starts: wp.array(dtype=int),
-    firsts: wp.array(dtype=int),
-    matrices: wp.array(dtype=wp.mat44),
-    paints: wp.array(dtype=wp.vec3),
-    tags: wp.array(dtype=int),
-    textures: wp.array(dtype=int),
-    rectangles: wp.array(dtype=wp.vec4),
-    wearable: wp.array(dtype=int),
+    geometry: Geometry,
+    drawn: Drawn,
     lens: wp.array(dtype=wp.vec4),
     to_world: wp.array(dtype=wp.mat44),
     lights: wp.array(dtype=Light),
-    shadows: wp.array3d(dtype=wp.uint64),
-    to_shadow: wp.array(dtype=wp.mat44),
-    texel: float,
+    shadows: SunShadows,
+    near: Near,
+    projecting: int,
     scale: int,
-    radiance: wp.array3d(dtype=wp.vec3),
-    tag: wp.array3d(dtype=int),
-    depth: wp.array3d(dtype=float),
-    fragments: wp.array(dtype=Fragment),
-    found: wp.array(dtype=int),
+    out: Output,
 ):
-    """Linear light [B, H, W], tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky).
+    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
 
-    Textured surfaces are black in `radiance`; their pieces are listed in `fragments`, in any order, `found` of them.
+    Textured surfaces are black in the radiance; their pieces are listed as fragments, in any order, and so is what
+    lamps that project a texture add (`projecting`: 1 if there are any).
     """
     view, y, x = wp.tid()
     focal = lens[view]
@@ -220,47 +493,50 @@ def shade(
     pose = to_world[view]
     total = wp.vec3(0.0, 0.0, 0.0)
     best = int(0)
-    seen = int(-1)
+    most = int(-1)
     far = float(wp.inf)
     count = scale * scale
     step = 1.0 / float(scale)
     eye = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
     # the lower half of a key names the triangle, 0 the sky
-    whole = int(1)
-    name = samples[view, y * scale, x * scale] & LAST
-    for s in range(1, count):
-        if (samples[view, y * scale + s / scale, x * scale + s % scale] & LAST) != name:
-            whole = 0
+    top = y * scale
+    left = x * scale
+    name = drawn.samples[view, top, left] & LAST
+    different = int(0)
+    for dy in range(scale):
+        for dx in range(scale):
+            if (drawn.samples[view, top + dy, left + dx] & LAST) != name:
+                different += 1
     rounds = count
-    if whole == 1:
+    if different == 0:
         rounds = 1
     for s in range(rounds):
-        key = samples[view, y * scale + s / scale, x * scale + s % scale] & LAST
-        # a triangle is shaded where it comes first
+        key = name
+        covered = count
+        px = 0.5 * float(count * (scale - 1))
+        py = px
         fresh = int(1)
-        for e in range(s):
-            if (samples[view, y * scale + e / scale, x * scale + e % scale] & LAST) == key:
-                fresh = 0
-        if fresh == 1:
+        if different > 0:
+            # a triangle is shaded where it comes first
+            key = drawn.samples[view, top + s / scale, left + s % scale] & LAST
             covered = int(0)
             px = float(0.0)
             py = float(0.0)
-            if whole == 1:
-                covered = count
-                px = 0.5 * float(count * (scale - 1))
-                py = px
-            else:
-                for e in range(s, count):
-                    if (samples[view, y * scale + e / scale, x * scale + e % scale] & LAST) == key:
+            e = int(0)
+            for dy in range(scale):
+                for dx in range(scale):
+                    if (drawn.samples[view, top + dy, left + dx] & LAST) == key:
+                        if e < s:
+                            fresh = 0
                         covered += 1
-                        px += float(e % scale)
-                        py += float(e / scale)
+                        px += float(dx)
+                        py += float(dy)
+                    e += 1
+        if fresh == 1:
             u = float(x) + (px / float(covered) + 0.5) * step - 0.5
             v = float(y) + (py / float(covered) + 0.5) * step - 0.5
             ray = wp.vec3((u - focal[2]) / focal[0], (v - focal[3]) / focal[1], 1.0)
-            away = wp.transform_vector(pose, ray)
-            length = wp.length(away)
-            away = away / length
+            away = wp.normalize(wp.transform_vector(pose, ray))
             colour = wp.vec3(0.0, 0.0, 0.0)
             mine = int(-1)
             z = float(wp.inf)
@@ -271,114 +547,68 @@ def shade(
                     colour = colour * veil + light.horizon * (1.0 - veil)
             else:
                 slot = int(LAST - key)
-                draw = draw_of(starts, slot / 2)
-                face = listed[firsts[draw] + slot / 2 - starts[draw]]
-                m = matrices[draw]
-                mine = tags[draw]
-                a = wp.transform_point(m, vertices[faces[face, 0]])
-                b = wp.transform_point(m, vertices[faces[face, 1]])
-                c = wp.transform_point(m, vertices[faces[face, 2]])
-                # where the ray meets the plane, in shares of the corners
-                ab = b - a
-                ac = c - a
-                plane = wp.cross(ab, ac)
-                along = wp.dot(plane, ray)
-                if wp.abs(along) < 1.0e-12:
-                    along = -1.0e-12
-                z = wp.clamp(wp.dot(plane, a) / along, 0.05, 2.0e3)
-                hit = ray * z - a
-                square = wp.dot(plane, plane)
-                sb = wp.clamp(wp.dot(wp.cross(hit, ac), plane) / square, 0.0, 1.0)
-                sc = wp.clamp(wp.dot(wp.cross(ab, hit), plane) / square, 0.0, 1.0 - sb)
-                sa = 1.0 - sb - sc
-                uv = uvs[face, 0] * sa + uvs[face, 1] * sb + uvs[face, 2] * sc
-                bent = normals[face, 0] * sa + normals[face, 1] * sb + normals[face, 2] * sc
-                n = wp.normalize(wp.transform_vector(pose, wp.transform_vector(m, bent)))
-                surface = surfaces[material[face]]
+                hit = hit_of(geometry, drawn, slot, ray, pose)
+                z = hit.z
+                mine = drawn.tags[hit.draw]
+                surface = geometry.surfaces[geometry.material[hit.face]]
                 albedo = surface.colour
                 if surface.paint == 1:
-                    albedo = paints[draw]
-                distance = z * length
-                worn = textures[draw]
+                    albedo = drawn.paints[hit.draw]
+                worn = drawn.textures[hit.draw]
+                box = drawn.rectangles[hit.draw]
                 tx = float(0.0)
                 ty = float(0.0)
                 if worn >= 0:
-                    box = rectangles[draw]
-                    tx = (uv[0] - box[0]) / (box[2] - box[0])
-                    ty = (uv[1] - box[1]) / (box[3] - box[1])
-                    if wearable[face] == 0 or tx < 0.0 or tx > 1.0 or ty < 0.0 or ty > 1.0:
+                    tx = (hit.uv[0] - box[0]) / (box[2] - box[0])
+                    ty = (hit.uv[1] - box[1]) / (box[3] - box[1])
+                    if geometry.wearable[hit.face] == 0 or tx < 0.0 or tx > 1.0 or ty < 0.0 or ty > 1.0:
                         worn = -1
-                albedo = textured(surface, albedo, uv, distance / focal[0])
+                albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
                 if worn >= 0:
                     albedo = wp.vec3(0.0, 0.0, 0.0)
-                p = eye + away * distance
-                facing = wp.dot(n, light.sun)
-                direct = float(0.0)
-                if facing > 0.0:
-                    q = wp.transform_point(to_shadow[view], p + n * (texel * 1.5))
-                    direct = facing * sunlit(shadows, view, q, texel)
-                open = 0.5 + 0.5 * n[2]
-                around = light.zenith * (0.65 * open) + light.horizon * (0.35 * open) + light.ground * (1.0 - open)
-                # near the ground beneath things less of the sky is seen: folded into the shadow of the sun
-                lamp = light.lamps * wp.max(-wp.dot(n, away), 0.0) * 14.0 / (distance * distance + 8.0)
-                lit = light.sun_colour * direct + around + wp.vec3(1.0, 0.95, 0.85) * lamp
-                colour = wp.cw_mul(albedo, lit) + albedo * surface.emission
-                gain = lit * (float(covered) / float(count))
-                # mirror: the sky above, the street below
-                mirror = surface.specular
-                if surface.paint == 1:
-                    mirror = 0.05
-                if light.wet > 0.0 and n[2] > 0.9:
-                    mirror = mirror + 0.05 * light.wet
-                    colour = colour * (1.0 - 0.4 * light.wet)
-                    gain = gain * (1.0 - 0.4 * light.wet)
-                back = away - n * (2.0 * wp.dot(n, away))
-                glance = 1.0 - wp.max(-wp.dot(n, away), 0.0)
-                fresnel = glance * glance * glance * glance * glance
-                mirror = (mirror + (1.0 - mirror) * fresnel) * surface.gloss
-                if mirror > 0.02:
-                    image = light.ground
-                    if back[2] > 0.0:
-                        image = sky(light, back, 0)
-                    colour = colour * (1.0 - mirror) + image * mirror
-                    gain = gain * (1.0 - mirror)
-                if direct > 0.0 and surface.gloss > 0.2:
-                    shine = wp.max(wp.dot(back, light.sun), 0.0)
-                    power = 8.0 + 400.0 * surface.gloss * surface.gloss
-                    colour = colour + light.sun_colour * (
-                        wp.pow(shine, power) * (surface.specular + fresnel) * surface.gloss * 6.0
-                    )
-                if light.fog > 0.0:
-                    clear = wp.exp(-light.fog * distance)
-                    colour = colour * clear + light.horizon * (1.0 - clear)
-                    gain = gain * clear
-                if worn >= 0:
-                    at = wp.atomic_add(found, 0, 1)
-                    if at < fragments.shape[0]:
-                        piece = Fragment()
-                        piece.place = (view * radiance.shape[1] + y) * radiance.shape[2] + x
-                        piece.slot = slot
+                row = cell_of(hit.place, eye)
+                open_ = float(1.0)
+                if row >= 0:
+                    row = view * CELLS * CELLS + row
+                    if hit.normal[2] > 0.7:
+                        open_ = openness(near, row, hit.place)
+                lit = lit_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
+                glow = surface.emission + surface.night * light.lamps
+                if surface.lamp == 1 and drawn.lit[hit.draw] == 0:
+                    glow = 0.0
+                shown = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
+                colour = shown.colour
+                share = float(covered) / float(count)
+                if worn >= 0 or (projecting == 1 and row >= 0):
+                    piece = Fragment()
+                    piece.place = (view * out.radiance.shape[1] + y) * out.radiance.shape[2] + x
+                    piece.slot = slot
+                    # area of the surface that the pixel spans
+                    span = hit.distance * hit.distance / (focal[0] * focal[1] * hit.slant)
+                    span = span / (wp.length(ray) * wp.dot(ray, ray))
+                    if worn >= 0:
                         piece.texture = worn
                         piece.u = tx
                         piece.v = ty
-                        box = rectangles[draw]
-                        ua = uvs[face, 1] - uvs[face, 0]
-                        ub = uvs[face, 2] - uvs[face, 0]
-                        flat = wp.abs(ua[0] * ub[1] - ua[1] * ub[0]) / ((box[2] - box[0]) * (box[3] - box[1]))
-                        # area of the surface that the pixel spans, over the area of the triangle, times its texture
-                        slant = wp.abs(along) / (wp.sqrt(square) * length)
-                        span = distance * distance / (focal[0] * focal[1]) / wp.max(slant, 0.05) / (length * length)
-                        piece.area = flat / wp.sqrt(square) * span * length
-                        piece.light = gain
-                        fragments[at] = piece
+                        piece.area = hit.stretch / ((box[2] - box[0]) * (box[3] - box[1])) * span
+                        piece.light = shown.gain * share
+                        keep(out, piece)
+                    elif projecting == 1:
+                        through = wp.cw_div(shown.gain, wp.max(lit.light, wp.vec3(1.0e-6, 1.0e-6, 1.0e-6))) * share
+                        project(out, near, row, piece, hit, albedo, through, span, open_, light.fog)
+                if out.surface == 1 and (covered > best or (covered == best and z < far)):
+                    out.albedo[view, y, x] = albedo
+                    out.normal[view, y, x] = hit.normal
+                    out.irradiance[view, y, x] = lit.light
+                    out.gain[view, y, x] = shown.gain * share
             total = total + colour * float(covered)
             if covered > best or (covered == best and z < far):
                 best = covered
-                seen = mine
+                most = mine
                 far = z
-    radiance[view, y, x] = total / float(count)
-    tag[view, y, x] = seen
-    depth[view, y, x] = far
+    out.radiance[view, y, x] = total / float(count)
+    out.tag[view, y, x] = most
+    out.depth[view, y, x] = far
 
 
 @wp.kernel

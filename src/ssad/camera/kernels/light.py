@@ -1,0 +1,172 @@
+"""Light that is near: lamps, and what keeps the light of the sky from the ground below and beside it.
+
+Both are found through a grid of squares around the camera, so that a pixel asks only those that can reach it.
+"""
+
+import warp as wp
+
+from ssad.camera.kernels.raster import NONE
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CELLS = wp.constant(32)  # squares along each side of the grid
+CELL = wp.constant(8.0)  # m
+
+
+@wp.struct
+class Lamp:
+    """A lamp in the world: place, axes (across and down, each divided by the tangent of the spread; ahead), light.
+
+    light: irradiance / pi on a plane 1 m ahead, RGB; inner: square of the share of the spread that is fully lit;
+    square: 1 where it lights a rectangle, else an ellipse; reach: m, beyond it is dark; layer: of the lamp shadow
+    maps, -1 for none; near: m, the near plane of that map; texture: what it projects, -1 for plain light; spread:
+    area that it lights on a plane 1 m ahead, m^2.
+    """
+
+    place: wp.vec3
+    across: wp.vec3
+    down: wp.vec3
+    ahead: wp.vec3
+    light: wp.vec3
+    inner: float
+    square: int
+    reach: float
+    layer: int
+    texture: int
+    spread: float
+
+
+@wp.struct
+class Occluder:
+    """A body that stands on the ground: its place, heading (cosine, sine), half length and half width of what it
+    covers, heights of its underside and of its middle, all m; reach: m from its place."""
+
+    place: wp.vec3
+    heading: wp.vec2
+    half: wp.vec2
+    under: float
+    middle: float
+    reach: float
+
+
+@wp.struct
+class Near:
+    """Lamps and occluders of all views with their grids. Row `view * CELLS * CELLS + cell` of `lamp_start` is where
+    the lamps of a square begin in `lamp_list`, the next where they end; the same for occluders."""
+
+    lamps: wp.array(dtype=Lamp)
+    lamp_start: wp.array(dtype=int)
+    lamp_list: wp.array(dtype=int)
+    occluders: wp.array(dtype=Occluder)
+    occluder_start: wp.array(dtype=int)
+    occluder_list: wp.array(dtype=int)
+    shadows: wp.array3d(dtype=wp.uint64)
+
+
+@wp.func
+def cell_of(p: wp.vec3, eye: wp.vec3) -> int:
+    """The square of the grid around the camera in which a point lies, -1 outside."""
+    column = int(wp.floor((p[0] - eye[0]) / CELL)) + CELLS / 2
+    row = int(wp.floor((p[1] - eye[1]) / CELL)) + CELLS / 2
+    if column < 0 or row < 0 or column >= CELLS or row >= CELLS:
+        return -1
+    return row * CELLS + column
+
+
+@wp.func
+def corner(x: float, y: float, height: float) -> float:
+    """Share of the sky that a horizontal rectangle from straight above to (x, y) at a height hides, signed."""
+    a = wp.sqrt(height * height + x * x)
+    b = wp.sqrt(height * height + y * y)
+    return (x / a * wp.atan(y / a) + y / b * wp.atan(x / b)) * 0.15915494
+
+
+@wp.func
+def hidden(half: wp.vec2, x: float, y: float, height: float) -> float:
+    """Share of the light of an even sky that a rectangle at a height above a point keeps from flat ground there.
+
+    The configuration factor between an element and a parallel rectangle (Howell, catalog of factors, B-4).
+    """
+    if height < 0.02:
+        height = 0.02
+    return (
+        corner(half[0] - x, half[1] - y, height)
+        + corner(half[0] + x, half[1] - y, height)
+        + corner(half[0] - x, half[1] + y, height)
+        + corner(half[0] + x, half[1] + y, height)
+    )
+
+
+@wp.func
+def openness(near: Near, row: int, p: wp.vec3) -> float:
+    """Share of the sky's light that bodies leave to flat ground at a point."""
+    free = float(1.0)
+    for at in range(near.occluder_start[row], near.occluder_start[row + 1]):
+        body = near.occluders[near.occluder_list[at]]
+        if p[2] < body.place[2] + body.under:
+            dx = p[0] - body.place[0]
+            dy = p[1] - body.place[1]
+            if dx * dx + dy * dy < body.reach * body.reach:
+                x = dx * body.heading[0] + dy * body.heading[1]
+                y = dy * body.heading[0] - dx * body.heading[1]
+                low = hidden(body.half, x, y, body.place[2] + body.under - p[2])
+                high = hidden(body.half, x, y, body.place[2] + body.middle - p[2])
+                fade = wp.clamp((1.0 - wp.sqrt(dx * dx + dy * dy) / body.reach) * 3.0, 0.0, 1.0)
+                free = free * (1.0 - fade * wp.max(low, high))
+    return wp.max(free, 0.0)
+
+
+@wp.func
+def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: float, z: float) -> float:
+    """Share of a lamp that reaches a point: x and y in -1..1 of its spread, z m ahead; four texels, weighted."""
+    size = shadows.shape[1]
+    u = (0.5 * x + 0.5) * float(size) - 0.5
+    v = (0.5 * y + 0.5) * float(size) - 0.5
+    i = wp.clamp(int(wp.floor(u)), 0, size - 2)
+    j = wp.clamp(int(wp.floor(v)), 0, size - 2)
+    u = wp.clamp(u - float(i), 0.0, 1.0)
+    v = wp.clamp(v - float(j), 0.0, 1.0)
+    depth = 1.0 / z
+    total = float(0.0)
+    if shadows[layer, j, i] == NONE or wp.cast(wp.uint32(shadows[layer, j, i] >> wp.uint64(32)), float) <= depth:
+        total += (1.0 - u) * (1.0 - v)
+    if shadows[layer, j, i + 1] == NONE or wp.cast(wp.uint32(shadows[layer, j, i + 1] >> wp.uint64(32)), float) <= depth:
+        total += u * (1.0 - v)
+    if shadows[layer, j + 1, i] == NONE or wp.cast(wp.uint32(shadows[layer, j + 1, i] >> wp.uint64(32)), float) <= depth:
+        total += (1.0 - u) * v
+    if shadows[layer, j + 1, i + 1] == NONE or wp.cast(wp.uint32(shadows[layer, j + 1, i + 1] >> wp.uint64(32)), float) <= depth:
+        total += u * v
+    return total
+
+
+@wp.func
+def lamp_at(lamp: Lamp, shadows: wp.array3d(dtype=wp.uint64), p: wp.vec3, n: wp.vec3, fog: float) -> wp.vec4:
+    """Irradiance / pi that a lamp of unit light gives a point with a normal, with where in its spread (x, y in -1..1)
+    the point lies and how much of the spread an area of 1 m^2 there takes: (irradiance, x, y, share)."""
+    to = p - lamp.place
+    square = wp.max(wp.dot(to, to), 1.0e-4)
+    distance = wp.sqrt(square)
+    facing = -wp.dot(n, to) / distance
+    ahead = wp.dot(to, lamp.ahead)
+    if facing <= 0.0 or ahead <= 0.02 or distance >= lamp.reach:
+        return wp.vec4(0.0, 0.0, 0.0, 0.0)
+    x = wp.dot(to, lamp.across) / ahead
+    y = wp.dot(to, lamp.down) / ahead
+    weight = float(1.0)
+    if lamp.square == 1:
+        if wp.abs(x) > 1.0 or wp.abs(y) > 1.0:
+            weight = 0.0
+    else:
+        radius = x * x + y * y
+        if radius > lamp.inner:
+            weight = wp.max((1.0 - radius) / (1.0 - lamp.inner), 0.0)
+    if weight <= 0.0:
+        return wp.vec4(0.0, x, y, 0.0)
+    # a plane across the axis is lit evenly: the intensity grows with the cube of the secant
+    secant = distance / ahead
+    bundle = secant * secant * secant * facing / square
+    if lamp.layer >= 0:
+        weight = weight * lamp_shadow(shadows, lamp.layer, x, y, ahead - 0.02 - 0.004 * ahead)
+    # the last third of the reach fades, so that no edge shows
+    weight = weight * wp.clamp(3.0 * (1.0 - distance / lamp.reach), 0.0, 1.0) * wp.exp(-fog * distance)
+    return wp.vec4(weight * bundle, x, y, bundle / lamp.spread)
