@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, box
 from ssad.camera.labels import Labels, extents, label_picture, visible_share
-from ssad.camera.render import Picture, View, render
+from ssad.camera.render import PLAIN, Picture, View, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera

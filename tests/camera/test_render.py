@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ssad.assets import mesh as meshes
 from ssad.assets.mesh import Material, build
 from ssad.camera.kernels import raster
-from ssad.camera.render import View, Weather, light_of, render, response
+from ssad.camera.render import PLAIN, View, Weather, light_of, render, response
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import apply_taps, levels_of, pyramid, pyramid_transpose, taps_of, texture_gradient
 from ssad.core.errors import ConfigError
@@ -40,7 +40,8 @@ def visible(vertices: Any, faces: Any, *, width: int = 128, height: int = 96, sc
         on([0], wp.int32), on([0], wp.int32), on(np.eye(4)[None], wp.mat44), on([[60, 60, 31.5, 23.5]], wp.vec4),
         0.2, float(scale), 0, float(width), float(height),
     ]  # fmt: skip
-    wp.launch(raster.setup, dim=count, inputs=inputs, outputs=[triangles], device="cpu")
+    owners = wp.empty(count, dtype=wp.vec2i, device="cpu")
+    wp.launch(raster.setup, dim=count, inputs=inputs, outputs=[triangles, owners], device="cpu")
     spare = [wp.zeros(1, dtype=int, device="cpu") for _ in range(2)]
     wp.launch(raster.fill, dim=2 * count, inputs=[triangles, 1e30], outputs=[samples, *spare], device="cpu")
     keys = samples.numpy()[0]
@@ -123,7 +124,7 @@ def scene(*things: Thing, weather: Weather = NOON) -> View:
 
 
 def test_depth_tags_and_the_nuscenes_camera_model(stage: Scene) -> None:
-    picture = render(stage, [scene(Thing(1, place(12.0, 0.5), tag=7))], shadows=False)
+    picture = render(stage, [scene(Thing(1, place(12.0, 0.5), tag=7))], quality=PLAIN)
     tag, depth = picture.tag[0], picture.depth[0]
     assert (tag[:10] == -1).all()
     assert np.isinf(depth[:10]).all()
@@ -173,7 +174,7 @@ def test_things_throw_shadows_and_the_sun_lights_what_faces_it(stage: Scene) -> 
 def test_coverage_is_averaged_over_samples(stage: Scene) -> None:
     """The mean radiance hardly changes with the number of samples; edges get between values."""
     view = scene(Thing(1, place(9.0, 0.3), (0.9, 0.1, 0.1), tag=1))
-    one, two, four = (render(stage, [view], scale=s, shadows=False).radiance[0] for s in (1, 2, 4))
+    one, two, four = (render(stage, [view], scale=s, quality=PLAIN).radiance[0] for s in (1, 2, 4))
     assert two.mean() == pytest.approx(four.mean(), rel=0.01)
     assert np.abs(two - four).mean() < np.abs(one - four).mean()
 
@@ -187,8 +188,6 @@ def test_weather_and_hour_change_the_picture_as_they_should(stage: Scene) -> Non
     contrast = lambda p: float(np.ptp(p.image[0][red].astype(float).mean(0)))  # noqa: E731
     assert contrast(foggy) < 0.7 * contrast(clear)
     assert night.radiance.mean() < 0.2 * clear.radiance.mean()
-    far, near = night.radiance[0][26, 2].mean(), night.radiance[0][46, 2].mean()
-    assert near > 2 * far, "head lamps light what is near"
     assert (np.diff(response().astype(int)) >= 0).all()
 
 

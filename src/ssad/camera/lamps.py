@@ -19,17 +19,19 @@ from ssad.core.errors import ConfigError
 from ssad.core.types import F64, I32
 
 if TYPE_CHECKING:
-    from ssad.camera.render import View
+    from ssad.camera.render import View, Weather
     from ssad.camera.scene import Scene
 
 LUX = 1 / 60  # irradiance / pi of one lux, on the scale on which the sun at noon is about 2.6
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
 LAMP_NEAR = 0.05  # m: what is nearer to a lamp casts no shadow (its own housing)
-HEAD_LAMPS = (16.0, (0.62, 0.085), (1.0, 0.97, 0.90), 60.0, 0.07)  # power, spread, colour, reach (m), tilt (rad)
+HEAD_LAMPS = (7.0, (0.60, 0.06), (1.0, 0.97, 0.90), 60.0, 0.055)  # power, spread, colour, reach (m), tilt (rad)
 TAIL_LAMPS = (0.25, (1.6, 1.0), (1.0, 0.05, 0.03), 8.0, 0.0)
 STREET_LAMP = (26.0, (2.4, 1.7), (1.0, 0.86, 0.66), 28.0)
 LIT_UP_TO = 130.0  # m from the eye up to which lamps of bodies and of the street are on
 SHADED_UP_TO = 60.0  # m: likewise bodies that keep light from the ground
+NOSE = 3.7  # m from the rear axle of a car to its front
+FLAT = 0.25  # m: what is lower keeps no light from the ground
 AHEAD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # a lamp that looks along x
 
 
@@ -76,19 +78,15 @@ class Lamp:
         return float(np.pi * across * down * (1.0 + (1.0 - self.soft) ** 2) / 2.0)
 
 
-def head_lamp(vehicle: F64, *, front: float = 3.7, height: float = 0.65, strength: float = 1.0) -> Lamp:
-    """The low beam of a vehicle, for one that carries the camera and is not seen.
+def own_lamps(vehicle: F64, weather: Weather) -> tuple[Lamp, ...]:
+    """The low beam of a vehicle that carries the camera and is not seen: none by day.
 
     Args:
-        vehicle: Vehicle to world [4, 4]: x forward, z up.
-        front: Where its lamps are before the origin of that frame, m.
-        height: How high they are, m.
-        strength: From 0 (off) to 1.
+        vehicle: Vehicle to world [4, 4]: x forward, z up, on the ground, `NOSE` m behind its front.
+        weather: Says how far lamps are on.
     """
-    power, spread, colour, reach, tilt = HEAD_LAMPS
-    pose = vehicle @ _moved(np.array([front, 0.0, height])) @ AHEAD
-    pose[:3, :3] = pose[:3, :3] @ _tilted(tilt)
-    return Lamp(pose, power * strength, spread, colour, 0.6, False, reach, False)
+    strength = lamp_strength(weather.sun_height)
+    return (_beam(vehicle @ _moved(np.array([NOSE, 0.0, 0.65])), HEAD_LAMPS, strength),) if strength > 0.0 else ()
 
 
 def lamps_of(scene: Scene, view: View) -> list[Lamp]:
@@ -109,10 +107,9 @@ def lamps_of(scene: Scene, view: View) -> list[Lamp]:
                 found.append(Lamp(pose, power * strength, spread, colour, 0.5, False, reach, False))
     for thing in view.things:
         if thing.lit and np.hypot(*(thing.pose[:2, 3] - eye[:2])) < LIT_UP_TO:
-            for place, (power, spread, colour, reach, tilt), back in _own(scene, thing.mesh):
-                pose = thing.pose @ _moved(place) @ (np.diag([-1.0, -1.0, 1.0, 1.0]) if back else np.eye(4)) @ AHEAD
-                pose[:3, :3] = pose[:3, :3] @ _tilted(tilt)
-                found.append(Lamp(pose, power * strength, spread, colour, 0.6, False, reach, False))
+            for place, kind, back in _own(scene, thing.mesh):
+                turned = np.diag([-1.0, -1.0, 1.0, 1.0]) if back else np.eye(4)
+                found.append(_beam(thing.pose @ _moved(place) @ turned, kind, strength))
     return found
 
 
@@ -139,7 +136,7 @@ def near_of(scene: Scene, views: Sequence[View], lamps: Sequence[Sequence[Lamp]]
         if contact:
             for thing in view.things:
                 away = float(np.hypot(*(thing.pose[:2, 3] - eye[:2])))
-                if away < SHADED_UP_TO and thing.pose[2, 2] > 0.9:
+                if away < SHADED_UP_TO and thing.pose[2, 2] > 0.9 and scene.standing(thing.mesh)[3] > FLAT:
                     row, middle, around = _occluder_row(scene, thing.mesh, thing.pose)
                     occluder_rows.append(row)
                     occluder_places.append((number, *(middle - eye[:2]), around))
@@ -213,6 +210,14 @@ def _own(scene: Scene, mesh: int) -> list[tuple[F64, tuple[Any, ...], bool]]:
         if area > 0.0:
             found.append((place, kind, back))
     return found
+
+
+def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> Lamp:
+    """A lamp of a vehicle, at the origin of a frame that looks along x."""
+    power, spread, colour, reach, tilt = kind
+    ahead = pose @ AHEAD
+    ahead[:3, :3] = ahead[:3, :3] @ _tilted(tilt)
+    return Lamp(ahead, power * strength, spread, colour, 0.6, False, reach, False)
 
 
 def lamp_lens(lamp: Lamp) -> tuple[float, float, float, float]:

@@ -21,6 +21,7 @@ import numpy as np
 from ssad.assets.actor_bodies import class_of
 from ssad.assets.bodies import BODIES, draw_paint, draw_size, draw_style, make_body
 from ssad.camera.labels import label_picture
+from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.render import Picture, View, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core import safeio
@@ -28,8 +29,9 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest, generator
-from ssad.core.types import U8, EpisodeTrace
+from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool
@@ -240,7 +242,9 @@ def _take(
         noise = int(digest("clips noise", *made.key, n)[:7], 16)
         things = (own, *(s.thing for s in around))
         around.append(PlacedObject(target, shot.target, 0.0, own))
-        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise), around))
+        lamps = own_lamps(_follower(shot), shot.weather) if clips.mode == "drive" else ()
+        focus = float(shot.target[0, 3]), float(shot.target[1, 3])
+        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise, lamps, focus), around))
     size = batch_size(clips.device)
     for k in range(0, len(ready), size):
         picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)
@@ -258,6 +262,13 @@ def _take(
                 "target_size": [round(v, 3) for v in target.size], "objects": objects,
             }  # fmt: skip
             yield n, row | shot.about, picture.image[index]
+
+
+def _follower(shot: Viewpoint) -> F64:
+    """The vehicle [4, 4] that carries the following camera, which is 2 m behind its nose."""
+    eye, ahead = shot.camera[:3, 3], shot.camera[:3, 2]
+    pose = upright_pose(float(eye[0]), float(eye[1]), float(np.arctan2(ahead[1], ahead[0])))
+    return pose @ upright_pose(2.0 - NOSE, 0.0, 0.0)
 
 
 def _annotate(

@@ -20,6 +20,7 @@ import numpy as np
 from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.camera.labels import visible_share
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
+from ssad.camera.lamps import own_lamps
 from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene
@@ -222,7 +223,8 @@ class _Moment:
             ego = ego_at(trace, fired)
             things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], 140.0))
             noise = int(digest("noise", *key, step, c)[:7], 16)
-            views.append(View(camera, ego @ camera.to_ego, things, weather, NOISE, noise))
+            lamps = own_lamps(ego, weather)
+            views.append(View(camera, ego @ camera.to_ego, things, weather, NOISE, noise, lamps))
             times.append(fired)
             egos.append(ego)
         return _Moment(step, now, views, times, egos)

@@ -1,0 +1,204 @@
+"""Lamps, shadows near things, and what a picture says of its surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssad.assets import mesh as meshes
+from ssad.assets.bodies import make_body
+from ssad.assets.mesh import Material, build
+from ssad.camera.lamps import Lamp, lamp_strength, lamps_of, own_lamps
+from ssad.camera.render import PLAIN, Quality, View, Weather, light_of, render
+from ssad.camera.scene import Scene, Thing
+from ssad.camera.texture import apply_taps, taps_of, texture_gradient
+from ssad.core.errors import ConfigError
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.seeding import generator
+
+GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
+CAMERA = Camera(96, 96, np.array([[96.0, 0, 47.5], [0, 96.0, 47.5], [0, 0, 1]]))
+NIGHT = Weather(sun_height=-0.5, clouds=0.0)
+DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def at(x: float, y: float, z: float, turn: Any = None) -> Any:
+    pose = np.eye(4) if turn is None else np.array(turn, float)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def ground() -> Any:
+    vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * 60
+    return build(vertices, np.array([[0, 1, 2], [0, 2, 3]]), materials=(GREY,))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    block = meshes.box((4.0, 2.0, 1.5), material=GREY, centre=(0.0, 0.0, 0.95))  # 0.2 m above the ground
+    return Scene(None, [ground(), block, make_body("car", style="suv", generator=generator("lamps"))])
+
+
+def above(height: float, *things: Thing, **other: Any) -> View:
+    """A look straight down on the ground."""
+    return View(CAMERA, at(0, 0, height, DOWN), (Thing(0, np.eye(4)), *things), NIGHT, **other)
+
+
+def lamp_light(scene: Scene, view: View, **options: Any) -> Any:
+    """Irradiance / pi [H, W, 3] of the lamps of a view alone."""
+    lit, dark = (render(scene, [v], surface=True, **options).surface for v in (view, replace(view, lamps=())))
+    assert lit is not None
+    assert dark is not None
+    return lit.irradiance[0].astype(float) - dark.irradiance[0]
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    height=st.floats(6.0, 14.0), across=st.floats(0.2, 0.7), down=st.floats(0.2, 0.7), soft=st.floats(0.0, 1.0),
+    square=st.booleans(), tilt=st.floats(-0.2, 0.2),
+)  # fmt: skip
+def test_the_power_of_a_lamp_is_what_arrives(
+    scene: Scene, height: float, across: float, down: float, soft: float, square: bool, tilt: float
+) -> None:
+    """Over the ground that catches all of it, whatever its height, spread, edge and tilt."""
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    turned = DOWN @ np.array([[1, 0, 0, 0], [0, cos, -sin, 0], [0, sin, cos, 0], [0, 0, 0, 1.0]])
+    lamp = Lamp(at(1.0, 0.5, height, turned), 7.0, (across, down), (1.0, 0.5, 0.25), soft, square, 1e3, shadows=False)
+    camera = Camera(240, 240, np.array([[240.0, 0, 119.5], [0, 240.0, 119.5], [0, 0, 1]]))
+    light = lamp_light(scene, replace(above(40.0, lamps=(lamp,)), camera=camera), quality=PLAIN)
+    pixel = (40.0 / 240.0) ** 2
+    assert light.sum((0, 1)) * pixel == pytest.approx(7.0 * np.array([1.0, 0.5, 0.25]), rel=0.03)
+
+
+def test_a_lamp_fades_with_its_reach_and_needs_sense() -> None:
+    pose = at(0, 0, 5, DOWN)
+    for wrong in (
+        {"power": -1.0}, {"power": np.nan}, {"spread": (0.0, 1.0)}, {"reach": 0.0}, {"soft": 2.0}, {"pose": np.eye(3)},
+    ):  # fmt: skip
+        with pytest.raises(ConfigError, match="a lamp"):
+            Lamp(**({"pose": pose, "power": 1.0} | wrong))  # type: ignore[arg-type]
+
+
+def test_what_stands_in_its_way_keeps_light_off(scene: Scene) -> None:
+    lamp = Lamp(at(0, 0, 8.0, DOWN), 40.0, (1.0, 1.0), reach=100.0)
+    view = above(30.0, lamps=(lamp,))
+    free = lamp_light(scene, view, quality=PLAIN)
+    block = Thing(1, np.eye(4), tag=1)
+    seen = replace(view, things=(*view.things, block))
+    hidden = replace(view, things=(*view.things, replace(block, hidden=True)))
+    ghost = lamp_light(scene, hidden, quality=PLAIN)
+    assert ghost[47, 47].max() == 0.0, "a hidden thing casts, and the ground below it is seen"
+    # the edge of the shadow: the lamp is 8 m up, the top of the block 1.7 m, its half length 2 m
+    row = ghost[47, :, 0] / np.maximum(free[47, :, 0], 1e-9)
+    edge = 47.5 + 2.0 * 8.0 / (8.0 - 1.7) * 96.0 / 30.0
+    assert row[int(edge) - 2] < 0.1
+    assert row[int(edge) + 3] > 0.9
+    assert lamp_light(scene, seen, quality=PLAIN)[47, 47].min() > 0.5 * free[47, 47].min(), "its top is lit"
+    through = replace(hidden, lamps=(replace(lamp, shadows=False),))
+    assert lamp_light(scene, through, quality=PLAIN) == pytest.approx(free, abs=1e-6)
+
+
+def test_a_projected_texture_is_linear_and_its_gradient_exact(scene: Scene) -> None:
+    """The picture of a projector is that of a lamp where the texture is white; and the transpose is the gradient."""
+    lamp = Lamp(at(0, 0, 8.0, DOWN), 40.0, (0.6, 0.6), square=True, reach=100.0)
+    things = (Thing(0, np.eye(4)), Thing(1, at(1.0, 0.3, 0.0), tag=1))
+    view = View(CAMERA, at(0, 0, 20.0, DOWN), things, NIGHT)
+    white = render(scene, [replace(view, lamps=(lamp,))]).radiance.astype(float)
+    picture = render(scene, [replace(view, lamps=(replace(lamp, texture=3),))])
+    taps = taps_of(picture, 32, texture=3)
+    assert len(taps.pixel) > 1000
+    assert apply_taps(taps, np.ones((32, 32, 3)), picture.radiance) == pytest.approx(white, abs=2e-5)
+    draws = np.random.default_rng(0)
+    texture, pull = draws.random((32, 32, 3)), draws.normal(size=picture.radiance.shape)
+    change = draws.normal(size=texture.shape)
+    step = 1e-3
+    plus, minus = (apply_taps(taps, texture + s * step * change, picture.radiance) for s in (1, -1))
+    slope = ((plus - minus) * pull).sum() / (2 * step)
+    assert (texture_gradient(taps, pull) * change).sum() == pytest.approx(slope, rel=1e-6)
+    half = np.zeros((32, 32, 3))
+    half[:, :16] = 1.0  # u grows to the lamp's right, the picture's right
+    lit = apply_taps(taps, half, picture.radiance) - picture.radiance
+    assert lit[0, :, :40].sum() > 20 * lit[0, :, 56:].sum()
+
+
+def test_bodies_keep_the_sky_from_the_ground(scene: Scene) -> None:
+    """The share that a rectangle hides from a point below its middle, after the configuration factor."""
+    weather = Weather(sun_height=0.0, clouds=1.0)  # no sun
+    base = replace(above(20.0), weather=weather)
+    hidden = replace(base, things=(*base.things, Thing(1, np.eye(4), tag=1, hidden=True)))
+    free, under = (render(scene, [v], surface=True).surface for v in (base, hidden))
+    off = render(scene, [hidden], quality=Quality(contact=False), surface=True).surface
+    assert free is not None
+    assert under is not None
+    assert off is not None
+    assert off.irradiance == pytest.approx(free.irradiance)
+    ratio = under.irradiance[0].mean(-1) / free.irradiance[0].mean(-1)
+    grid = np.stack(np.meshgrid(np.linspace(-2, 2, 801), np.linspace(-1, 1, 401)), -1)
+    share = (0.2**2 / (np.pi * ((grid**2).sum(-1) + 0.2**2) ** 2)).sum() * (4 / 800) * (2 / 400)
+    assert 1.0 - ratio[47, 47] == pytest.approx(share, abs=0.02)
+    beside = ratio[47, 47 + int(2.3 * 96 / 20)]
+    assert 0.3 < beside < 0.95
+    assert ratio[4, 4] == pytest.approx(1.0, abs=1e-3), "far away nothing changes"
+
+
+def test_the_surface_explains_the_picture(scene: Scene) -> None:
+    """Radiance is gain times albedo where nothing mirrors; positions lie on the ground; normals point up."""
+    view = View(CAMERA, FORWARD, (Thing(0, np.eye(4)),), Weather())
+    picture = render(scene, [view], surface=True)
+    surface = picture.surface
+    assert surface is not None
+    solid = picture.tag[0] == 0
+    assert solid.sum() > 1000
+    rows = np.flatnonzero(solid.all(1))[2:]  # below the horizon
+    assert (surface.gain * surface.albedo)[0, rows] == pytest.approx(picture.radiance[0, rows], rel=1e-4)
+    assert surface.position[0, rows, :, 2] == pytest.approx(0.0, abs=1e-3)
+    assert surface.normal[0, rows][..., 2] == pytest.approx(1.0)
+    assert surface.albedo[0, rows] == pytest.approx(0.4)
+    assert not surface.albedo[0, ~solid & (picture.tag[0] < 0)].any()
+    assert render(scene, [view]).surface is None
+
+
+def test_by_night_lamps_are_on(scene: Scene) -> None:
+    car = Thing(2, at(10.0, 0.0, 0.0), tag=1)
+    view = View(CAMERA, FORWARD, (Thing(0, np.eye(4)), car), NIGHT)
+    assert lamp_strength(1.0) == 0.0
+    assert lamp_strength(-1.0) == 1.0
+    assert not lamps_of(scene, replace(view, weather=Weather()))
+    head, tail = lamps_of(scene, view)
+    assert head.pose[0, 2] > 0.9, "forward"
+    assert tail.pose[0, 2] < -0.9
+    assert head.pose[0, 3] > 11.5
+    assert tail.pose[0, 3] < 8.5
+    assert not lamps_of(scene, replace(view, things=(replace(car, lit=False),)))
+    lit, off = (render(scene, [replace(view, things=(view.things[0], c))]) for c in (car, replace(car, lit=False)))
+    assert lit.radiance[0, 50:].sum() > 1.05 * off.radiance[0, 50:].sum()
+    assert not own_lamps(np.eye(4), Weather())
+    beam = own_lamps(np.eye(4), NIGHT)
+    with_beam = render(scene, [replace(view, lamps=beam)]).radiance[0].sum(-1)
+    without = render(scene, [view]).radiance[0].sum(-1)
+    gained = with_beam - without
+    assert gained[60:].sum() > 5.0 * gained[:36].sum(), "the road, not the sky"
+
+
+def test_fine_shadows_are_finer(scene: Scene) -> None:
+    """The edge of the shadow of a block, against the geometry: within a few centimetres."""
+    weather = Weather(sun_height=0.8, sun_heading=0.0, clouds=0.0)
+    camera = Camera(256, 256, np.array([[512.0, 0, 127.5], [0, 512.0, 127.5], [0, 0, 1]]))
+    things = (Thing(0, np.eye(4)), Thing(1, np.eye(4), tag=1, hidden=True))
+    view = View(camera, at(-3.0, 0.0, 10.0, DOWN), things, weather, focus=(-2.0, 0.0))
+    sun = np.array(light_of(weather)[0][0])
+    edge = -2.0 - 1.7 * sun[0] / sun[2]  # of the shadow of the upper edge, on the far side of the sun
+    errors = []
+    for fine in (True, False):
+        picture = render(scene, [view], quality=Quality(fine=fine, contact=False))
+        row = picture.radiance[0][127].sum(-1)
+        where = -3.0 + (np.arange(256) - 127.5) * 10.0 / 512.0
+        half = 0.5 * (row.max() + row.min())
+        errors.append(abs(float(where[np.flatnonzero(row < half)[0]]) - edge))
+    assert errors[0] < 0.06
+    assert errors[0] < errors[1] + 0.02
