@@ -241,4 +241,3 @@ def _tilted(angle: float) -> F64:
     """A turn of the axis downwards (camera frame)."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, cos, sin], [0.0, -sin, cos]])
-

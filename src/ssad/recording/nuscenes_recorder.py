@@ -19,8 +19,8 @@ import numpy as np
 
 from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.camera.labels import visible_share
-from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.lamps import own_lamps
+from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene

@@ -87,8 +87,7 @@ def hidden(half: wp.vec2, x: float, y: float, height: float) -> float:
 
     The configuration factor between an element and a parallel rectangle (Howell, catalog of factors, B-4).
     """
-    if height < 0.02:
-        height = 0.02
+    height = max(height, 0.02)
     return (
         corner(half[0] - x, half[1] - y, height)
         + corner(half[0] + x, half[1] - y, height)
@@ -130,11 +129,20 @@ def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: f
     total = float(0.0)
     if shadows[layer, j, i] == NONE or wp.cast(wp.uint32(shadows[layer, j, i] >> wp.uint64(32)), float) <= depth:
         total += (1.0 - u) * (1.0 - v)
-    if shadows[layer, j, i + 1] == NONE or wp.cast(wp.uint32(shadows[layer, j, i + 1] >> wp.uint64(32)), float) <= depth:
+    if (
+        shadows[layer, j, i + 1] == NONE
+        or wp.cast(wp.uint32(shadows[layer, j, i + 1] >> wp.uint64(32)), float) <= depth
+    ):
         total += u * (1.0 - v)
-    if shadows[layer, j + 1, i] == NONE or wp.cast(wp.uint32(shadows[layer, j + 1, i] >> wp.uint64(32)), float) <= depth:
+    if (
+        shadows[layer, j + 1, i] == NONE
+        or wp.cast(wp.uint32(shadows[layer, j + 1, i] >> wp.uint64(32)), float) <= depth
+    ):
         total += (1.0 - u) * v
-    if shadows[layer, j + 1, i + 1] == NONE or wp.cast(wp.uint32(shadows[layer, j + 1, i + 1] >> wp.uint64(32)), float) <= depth:
+    if (
+        shadows[layer, j + 1, i + 1] == NONE
+        or wp.cast(wp.uint32(shadows[layer, j + 1, i + 1] >> wp.uint64(32)), float) <= depth
+    ):
         total += u * v
     return total
 

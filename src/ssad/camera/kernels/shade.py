@@ -7,7 +7,7 @@ term for glass, paint and wet roads, fog by distance.
 
 import warp as wp
 
-from ssad.camera.kernels.light import CELLS, Lamp, Near, cell_of, lamp_at, openness
+from ssad.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness
 from ssad.camera.kernels.raster import LAST
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -380,7 +380,15 @@ def lit_at(
 
 @wp.func
 def seen_from(
-    light: Light, near: Near, row: int, surface: Surface, albedo: wp.vec3, glow: float, hit: Hit, lit: Lit, away: wp.vec3
+    light: Light,
+    near: Near,
+    row: int,
+    surface: Surface,
+    albedo: wp.vec3,
+    glow: float,
+    hit: Hit,
+    lit: Lit,
+    away: wp.vec3,
 ) -> Seen:
     """What a lit surface sends back along a unit ray: its own colour, what it mirrors, fog."""
     seen = Seen()
@@ -450,8 +458,16 @@ def keep(out: Output, fragment: Fragment):
 
 @wp.func
 def project(
-    out: Output, near: Near, row: int, fragment: Fragment, hit: Hit, albedo: wp.vec3, through: wp.vec3, span: float,
-    open_: float, fog: float,
+    out: Output,
+    near: Near,
+    row: int,
+    fragment: Fragment,
+    hit: Hit,
+    albedo: wp.vec3,
+    through: wp.vec3,
+    span: float,
+    open_: float,
+    fog: float,
 ):
     """Lists what lamps that project a texture add to a pixel; through: share of light that the surface sends on;
     span: area of the surface in the pixel, m^2."""
