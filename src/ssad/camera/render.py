@@ -306,7 +306,7 @@ def _sun_shadows(stage: Scene, views: Sequence[View], suns: Sequence[tuple[float
     return shadows
 
 
-def _sun_map(
+def _sun_map(  # noqa: PLR0917
     stage: Scene, views: Sequence[View], suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
 ) -> tuple[Any, Any, float]:
     """A shadow map [B, size, size] around each middle, the matrices from the world to its texels, m a texel."""

@@ -61,7 +61,8 @@ class Draws:
 
 LAMPS = ("head_lamp", "tail_lamp")
 NIGHT = {  # what the night adds to the emission of a material while lamps are on
-    "head_lamp": 2.0, "tail_lamp": 0.8, "lamp_light": 4.0, "street_light": 4.0, "window_blind": 0.30, "shop_window": 0.5,
+    "head_lamp": 2.0, "tail_lamp": 0.8, "lamp_light": 4.0, "street_light": 4.0, "window_blind": 0.3,
+    "shop_window": 0.5,
 }  # fmt: skip
 
 

@@ -116,6 +116,15 @@ def openness(near: Near, row: int, p: wp.vec3) -> float:
 
 
 @wp.func
+def passes(shadows: wp.array3d(dtype=wp.uint64), layer: int, row: int, column: int, depth: float) -> float:
+    """1 where a texel of a lamp's shadow map holds nothing nearer to the lamp (depth: inverse, 1/m)."""
+    key = shadows[layer, row, column]
+    if key == NONE or wp.cast(wp.uint32(key >> wp.uint64(32)), float) <= depth:
+        return 1.0
+    return 0.0
+
+
+@wp.func
 def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: float, z: float) -> float:
     """Share of a lamp that reaches a point: x and y in -1..1 of its spread, z m ahead; four texels, weighted."""
     size = shadows.shape[1]
@@ -126,25 +135,9 @@ def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: f
     u = wp.clamp(u - float(i), 0.0, 1.0)
     v = wp.clamp(v - float(j), 0.0, 1.0)
     depth = 1.0 / z
-    total = float(0.0)
-    if shadows[layer, j, i] == NONE or wp.cast(wp.uint32(shadows[layer, j, i] >> wp.uint64(32)), float) <= depth:
-        total += (1.0 - u) * (1.0 - v)
-    if (
-        shadows[layer, j, i + 1] == NONE
-        or wp.cast(wp.uint32(shadows[layer, j, i + 1] >> wp.uint64(32)), float) <= depth
-    ):
-        total += u * (1.0 - v)
-    if (
-        shadows[layer, j + 1, i] == NONE
-        or wp.cast(wp.uint32(shadows[layer, j + 1, i] >> wp.uint64(32)), float) <= depth
-    ):
-        total += (1.0 - u) * v
-    if (
-        shadows[layer, j + 1, i + 1] == NONE
-        or wp.cast(wp.uint32(shadows[layer, j + 1, i + 1] >> wp.uint64(32)), float) <= depth
-    ):
-        total += u * v
-    return total
+    low = passes(shadows, layer, j, i, depth) * (1.0 - u) + passes(shadows, layer, j, i + 1, depth) * u
+    high = passes(shadows, layer, j + 1, i, depth) * (1.0 - u) + passes(shadows, layer, j + 1, i + 1, depth) * u
+    return low * (1.0 - v) + high * v
 
 
 @wp.func

@@ -51,8 +51,8 @@ class Geometry:
 
 @wp.struct
 class Drawn:
-    """Ranges of listed faces under one matrix each, see `ssad.camera.scene.Draws`; samples: keys of what is seen; owners: draw and face
-    of each key."""
+    """Ranges of listed faces under one matrix each, see `ssad.camera.scene.Draws`; samples: keys of
+    what is seen; owners: draw and face of each key."""
 
     samples: wp.array3d(dtype=wp.uint64)
     owners: wp.array(dtype=wp.vec2i)
