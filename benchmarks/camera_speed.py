@@ -19,13 +19,14 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+import torch
 import warp as wp
 
 from ssad.assets.bodies import draw_paint, make_body
 from ssad.assets.street import build_street
 from ssad.camera.render import View, Weather, render
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.texture import apply_taps, taps_of, texture_gradient
+from ssad.camera.scene import Layer, Scene, Thing
+from ssad.camera.texture import retexture, taps_of
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.roads import load_town
@@ -59,7 +60,7 @@ def scene(size: int, device: str) -> tuple[Scene, View]:
     things = [
         Thing(k % len(meshes), place(*graph.xy[i], graph.yaw[i]), draw_paint(draws), k + 1) for k, i in enumerate(spots)
     ]
-    things.append(Thing(0, ego @ place(21.7, 0, 0), tag=100, texture=0))
+    things.append(Thing(0, ego @ place(21.7, 0, 0), tag=100, layers=(Layer(0),)))
     focal = 0.79 * size
     camera = Camera(size, size, np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]))
     return stage, View(camera, ego @ FORWARD, tuple(things), Weather(0.8, 0.9))
@@ -100,8 +101,9 @@ def main() -> None:
     if device == "cpu":
         picture = render(stage, [view])
         taps = taps_of(picture, 256)
-        texture, pull = np.full((256, 256, 3), 0.4), np.ones_like(picture.radiance)
-        both = median(lambda: (apply_taps(taps, texture, picture.radiance), texture_gradient(taps, pull)), device, 15)
+        radiance = torch.tensor(picture.radiance)
+        texture = torch.full((3, 256, 256), 0.4, requires_grad=True)
+        both = median(lambda: retexture(taps, texture, radiance).sum().backward(), device, 15)
         result["retexture_ms"] = 1e3 * both
         result["pieces"] = len(taps.pixel)
         print(f"{1e3 * both:.2f} ms to re-texture {len(taps.pixel)} pieces, with gradient")

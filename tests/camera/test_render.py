@@ -16,7 +16,6 @@ from ssad.assets.mesh import Material, build
 from ssad.camera.kernels import raster
 from ssad.camera.render import PLAIN, View, Weather, light_of, render, response
 from ssad.camera.scene import Scene, Thing
-from ssad.camera.texture import apply_taps, levels_of, pyramid, pyramid_transpose, taps_of, texture_gradient
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 
@@ -191,69 +190,6 @@ def test_weather_and_hour_change_the_picture_as_they_should(stage: Scene) -> Non
     assert (np.diff(response().astype(int)) >= 0).all()
 
 
-# ---------------------------------------------------------------- textures
-
-
-def test_a_texture_of_one_colour_is_a_paint(stage: Scene) -> None:
-    colour = (0.7, 0.2, 0.4)
-    painted = render(stage, [scene(Thing(1, place(8.0, 0.4), colour, tag=1))])
-    textured = render(stage, [scene(Thing(1, place(8.0, 0.4), tag=1, texture=0))])
-    taps = taps_of(textured, 32)
-    assert len(taps.pixel) > 50
-    assert taps.weight.sum(1) == pytest.approx(1.0)
-    out = apply_taps(taps, np.broadcast_to(colour, (32, 32, 3)), textured.radiance)
-    assert out == pytest.approx(painted.radiance, rel=1e-4, abs=1e-5)
-
-
-def test_the_gradient_equals_finite_differences(stage: Scene) -> None:
-    rng = np.random.default_rng(0)
-    picture = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
-    for size in (16, 64, 256):
-        taps = taps_of(picture, size)
-        texture, step = rng.uniform(0, 1, (size, size, 3)), rng.normal(size=(size, size, 3))
-        pull = rng.normal(size=picture.radiance.shape)
-        gradient = texture_gradient(taps, pull)
-        ahead, behind = (apply_taps(taps, texture + h * step, picture.radiance) for h in (1e-3, -1e-3))
-        expected = ((ahead - behind) * pull).sum() / 2e-3
-        assert (gradient * step).sum() == pytest.approx(expected, rel=1e-5)
-
-
-def test_small_textures_and_far_things_still_get_gradient(stage: Scene) -> None:
-    """Far away a pixel spans many texels: through the pyramid each of those that are seen gets its share."""
-    shares = []
-    for distance in (8.0, 40.0):
-        picture = render(stage, [scene(Thing(1, place(distance, 0.0), tag=1, texture=0))])
-        gradient = texture_gradient(taps_of(picture, 128), np.ones_like(picture.radiance))
-        shares.append(float((np.abs(gradient).sum(-1) > 0).mean()))
-    assert shares[1] > 0.5 * shares[0]
-
-
-@given(st.integers(0, 7), st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
-def test_the_pyramid_keeps_the_mean_and_its_transpose_is_one(power: int, seed: int) -> None:
-    size = 2**power
-    rng = np.random.default_rng(seed)
-    texture = rng.uniform(0, 1, (size, size, 3))
-    rows = pyramid(texture)
-    start = 0
-    for edge in levels_of(size):
-        assert rows[start : start + edge * edge].mean(0) == pytest.approx(texture.mean((0, 1)))
-        start += edge * edge
-    assert start == len(rows)
-    other = rng.normal(size=rows.shape)
-    assert (rows * other).sum() == pytest.approx((texture * pyramid_transpose(other, size)).sum())
-
-
-def test_a_patch_stays_in_its_rectangle(stage: Scene) -> None:
-    whole = render(stage, [scene(Thing(1, place(7.0, 0.4), tag=1, texture=0))])
-    u0, v0, u1, v1 = cube().panel_rectangle("body")
-    part = (u0, v0, u0 + 0.4 * (u1 - u0), v0 + 0.4 * (v1 - v0))
-    patch = render(stage, [scene(Thing(1, place(7.0, 0.4), (0.3, 0.3, 0.3), tag=1, texture=0, rectangle=part))])
-    assert 0 < len(patch.fragments) < len(whole.fragments)
-    assert patch.fragments["u"].min() >= 0
-    assert patch.fragments["u"].max() <= 1
-
-
 # ---------------------------------------------------------------- bad input
 
 
@@ -273,11 +209,6 @@ def test_wrong_use_is_refused_in_one_line(stage: Scene) -> None:
         assert "\n" not in str(error.value)
     with pytest.raises(ConfigError):
         Scene(None, [])
-    picture = render(stage, [view])
-    with pytest.raises(ConfigError, match="power of two"):
-        taps_of(picture, 100)
-    with pytest.raises(ConfigError, match="square"):
-        pyramid(np.zeros((8, 4, 3)))
 
 
 def test_an_empty_scene_is_sky(stage: Scene) -> None:

@@ -12,7 +12,7 @@ import warp as wp
 
 from ssad.camera.kernels import raster, shade
 from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of
-from ssad.camera.scene import Draws, Scene, Thing
+from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
@@ -45,7 +45,8 @@ class View:
 
     noise: of the sensor by day, as the deviation at full light (0.01 is a good camera's); it grows where the exposure
     must, by night. seed: of the noise; equal seeds give equal noise. lamps: beside those of street and things; focus:
-    x, y of the place (m) around which shadows are finest, None for just before the camera.
+    x, y of the place (m) around which shadows are finest, None for just before the camera; decals: above what things
+    wear, the lowest first.
     """
 
     camera: Camera
@@ -56,6 +57,7 @@ class View:
     seed: int = 0
     lamps: tuple[Lamp, ...] = ()
     focus: tuple[float, float] | None = None
+    decals: tuple[Decal, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,8 +161,6 @@ class _Pass:
         drawn.matrices = wp.array(draws.matrices, dtype=wp.mat44, device=device)
         drawn.paints = wp.array(draws.paints, dtype=wp.vec3, device=device)
         drawn.tags = wp.array(draws.tags, dtype=int, device=device)
-        drawn.textures = wp.array(draws.textures, dtype=int, device=device)
-        drawn.rectangles = wp.array(draws.rectangles, dtype=wp.vec4, device=device)
         drawn.lit = wp.array(draws.lit, dtype=int, device=device)
         self.lens = wp.array(lens, dtype=wp.vec4, device=device)
         views = wp.array(draws.views, dtype=int, device=device)
@@ -229,13 +229,13 @@ def render(
     shadows = _sun_shadows(stage, views, [light[0] for light in lights], quality)
     near = _near(stage, views, quality)
     device, shape = stage.device, (len(views), *size)
-    textured = any(t.texture >= 0 for v in views for t in v.things)
+    layers = _layers(draws, views, stage.device)
     projecting = any(lamp.texture >= 0 for v in views for lamp in v.lamps)
     out = shade.Output()
     out.radiance = wp.empty(shape, dtype=wp.vec3, device=device)
     out.tag = wp.empty(shape, dtype=int, device=device)
     out.depth = wp.empty(shape, dtype=float, device=device)
-    room = out.radiance.size * 2 if textured or projecting else 1
+    room = out.radiance.size * 2 if layers.any or projecting else 1
     out.fragments = wp.empty(room, dtype=shade.Fragment, device=device)
     out.found = wp.zeros(1, dtype=int, device=device)
     out.surface = int(surface)
@@ -243,12 +243,13 @@ def render(
         setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
     rows: Any = np.array(lights, dtype=shade.Light.numpy_dtype())  # type: ignore[attr-defined]
     inputs = [
-        stage.geometry, seen.drawn, seen.lens, wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
+        stage.geometry, seen.drawn, layers, seen.lens,
+        wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
         wp.array(rows, dtype=shade.Light, device=device), shadows, near, int(projecting), scale, out,
     ]  # fmt: skip
     wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
     fragments: Any = np.zeros(0, shade.Fragment.numpy_dtype())  # type: ignore[attr-defined]
-    if textured or projecting:
+    if layers.any or projecting:
         count = int(out.found.numpy()[0])
         if count > room:
             raise ConfigError(f"{count} pieces of textured surfaces, more than {room}; render fewer views at once")
@@ -327,6 +328,38 @@ def _sun_map(  # noqa: PLR0917
         far=np.full(len(views), far), horizon=False, casting=True,
     )  # fmt: skip
     return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
+
+
+def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
+    """Layers of draws and decals of views as the kernels read them."""
+    masks: list[F32] = []
+
+    def mask_of(wanted: Layer | Decal) -> tuple[int, int, int]:
+        if wanted.mask is None:
+            return -1, 0, 0
+        start = sum(m.size for m in masks)
+        masks.append(np.asarray(wanted.mask, np.float32))
+        return start, masks[-1].shape[1], masks[-1].shape[0]
+
+    layers = [(layer.texture, layer.rectangle, layer.opacity, *mask_of(layer)) for row in draws.layers for layer in row]
+    decals = []
+    for decal in (d for view in views for d in view.decals):
+        (width, height), turn = decal.size, decal.pose[:3, :3]
+        decals.append(
+            (decal.texture, tuple(decal.pose[:3, 3]), tuple(turn[:, 0] * 2 / width), tuple(turn[:, 1] * 2 / height),
+             tuple(turn[:, 2]), decal.depth, width * height, decal.tag, decal.opacity, *mask_of(decal))
+        )  # fmt: skip
+    table = shade.Layers()
+    for name, struct, rows in (("layers", shade.Layer, layers), ("decals", shade.Decal, decals)):
+        dtype = struct.numpy_dtype()
+        found: Any = np.array(rows, dtype) if rows else np.zeros(1, dtype)
+        setattr(table, name, wp.array(found, dtype=struct, device=device))
+    for name, counts in (("start", [len(r) for r in draws.layers]), ("decal_start", [len(v.decals) for v in views])):
+        setattr(table, name, wp.array(np.cumsum([0, *counts]).astype(np.int32), dtype=int, device=device))
+    flat = np.concatenate([m.ravel() for m in masks]) if masks else np.zeros(1, np.float32)
+    table.masks = wp.array(flat, dtype=float, device=device)
+    table.any = int(bool(layers or decals))
+    return table
 
 
 def _near(stage: Scene, views: Sequence[View], quality: Quality) -> Any:

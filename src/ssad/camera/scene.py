@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,18 +28,76 @@ PATTERNS = {
 
 
 @dataclass(frozen=True, slots=True)
+class Layer:
+    """A texture that a thing wears.
+
+    Attributes:
+        texture: Which texture; several layers may show the same.
+        rectangle: What it covers of the body's atlas: u0, v0, u1, v1.
+        opacity: From 0 to 1.
+        mask: Opacity of each texel [h, w] over the rectangle, 0 to 1, of any size; None where it is even.
+    """
+
+    texture: int
+    rectangle: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    opacity: float = 1.0
+    mask: F32 | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        u0, v0, u1, v1 = self.rectangle
+        if not (u0 < u1 and v0 < v1 and np.isfinite(self.rectangle).all()):
+            raise ConfigError(f"a layer's rectangle is u0, v0, u1, v1 with u0 < u1 and v0 < v1, not {self.rectangle}")
+        check_opacity(self.texture, self.opacity, self.mask)
+
+
+@dataclass(frozen=True, slots=True)
+class Decal:
+    """A texture on whatever lies in a box in the world and faces it: a road, a wall, a sign, a jacket.
+
+    Attributes:
+        texture: Which texture.
+        pose: Decal to world [4, 4]: x right and y down on the texture, z into the surface; the origin is its middle.
+        size: Width and height, m.
+        depth: How far before and behind its middle it reaches, m.
+        tag: Of the only thing that wears it; -1 for all, 0 for the street.
+        opacity: From 0 to 1.
+        mask: As of a layer.
+    """
+
+    texture: int
+    pose: F64
+    size: tuple[float, float]
+    depth: float = 0.3
+    tag: int = -1
+    opacity: float = 1.0
+    mask: F32 | None = field(default=None, compare=False)
+
+    def __post_init__(self) -> None:
+        if np.shape(self.pose) != (4, 4) or not np.isfinite(self.pose).all() or not min(*self.size, self.depth) > 0.0:
+            raise ConfigError("a decal needs a finite pose [4, 4], and size and depth above 0")
+        check_opacity(self.texture, self.opacity, self.mask)
+
+
+def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
+    """ConfigError unless a texture has a number from 0 and opacities lie in 0 to 1."""
+    if texture < 0 or not 0.0 <= opacity <= 1.0:
+        raise ConfigError(f"texture {texture} with opacity {opacity}: numbers start at 0, opacity is 0 to 1")
+    if mask is not None and not (np.ndim(mask) == 2 and np.size(mask) and np.min(mask) >= 0 and np.max(mask) <= 1):
+        raise ConfigError("a mask of opacities is [h, w] with values from 0 to 1")
+
+
+@dataclass(frozen=True, slots=True)
 class Thing:
     """A body in a view: index of its mesh in the stage, pose (object to world) [4, 4], paint (linear RGB), tag that
-    masks and boxes name it by. texture: which texture it wears (-1: none) on what lies in `rectangle` (u0, v0, u1, v1)
-    of its atlas; faces outside of all panels (windows, lamps, tyres) never wear one. lit: whether its lamps are on (by
-    night they light what is before them); hidden: it casts its shadow and is not seen."""
+    masks and boxes name it by. layers: what it wears, the lowest first; faces outside of all panels (windows, lamps,
+    tyres) never wear anything. lit: whether its lamps are on (by night they light what is before them); hidden: it
+    casts its shadow and is not seen."""
 
     mesh: int
     pose: F64
     paint: tuple[float, float, float] = (0.5, 0.5, 0.5)
     tag: int = 0
-    texture: int = -1
-    rectangle: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    layers: tuple[Layer, ...] = ()
     lit: bool = True
     hidden: bool = False
 
@@ -54,9 +112,8 @@ class Draws:
     matrices: F32
     paints: F32
     tags: I32
-    textures: I32
-    rectangles: F32
     lit: I32
+    layers: tuple[tuple[Layer, ...], ...]
 
 
 LAMPS = ("head_lamp", "tail_lamp")
@@ -229,16 +286,13 @@ class Scene:
             first, count, view, matrices = *(np.zeros(1, np.int32) for _ in range(3)), np.eye(4)[None]
             tiles = 1
         n = len(first)
-        paints, rectangles = np.zeros((n, 3), np.float32), np.tile(np.array([0, 0, 1, 1], np.float32), (n, 1))
-        tags, textures, lit = np.zeros(n, np.int32), np.full(n, -1, np.int32), np.ones(n, np.int32)
+        paints, tags, lit = np.zeros((n, 3), np.float32), np.zeros(n, np.int32), np.ones(n, np.int32)
         if flat:
             paints[tiles:] = [t.paint for t in flat]
             tags[tiles:] = [t.tag for t in flat]
-            textures[tiles:] = [t.texture for t in flat]
             lit[tiles:] = [t.lit for t in flat]
-            if (textures >= 0).any():
-                rectangles[tiles:] = [t.rectangle for t in flat]
-        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, textures, rectangles, lit)
+        layers = ((),) * tiles + tuple(t.layers for t in flat)
+        return Draws(first, count, view, matrices.astype(np.float32), paints, tags, lit, layers)
 
 
 def surface(material: Material) -> tuple[Any, ...]:

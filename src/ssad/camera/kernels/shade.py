@@ -50,6 +50,51 @@ class Geometry:
 
 
 @wp.struct
+class Layer:
+    """A texture on a body: which, the rectangle of the atlas that it covers (u0, v0, u1, v1), how opaque it is, and
+    where in `Layers.masks` its opacities begin (-1: even), so many columns and rows."""
+
+    texture: int
+    box: wp.vec4
+    opacity: float
+    mask: int
+    columns: int
+    rows: int
+
+
+@wp.struct
+class Decal:
+    """A texture on whatever lies in a box in the world: its middle, across and down (each divided by half the side),
+    ahead (unit) and half its depth, m; tag: of the only body that wears it, -1 for any; else as a layer."""
+
+    texture: int
+    place: wp.vec3
+    across: wp.vec3
+    down: wp.vec3
+    ahead: wp.vec3
+    depth: float
+    area: float
+    tag: int
+    opacity: float
+    mask: int
+    columns: int
+    rows: int
+
+
+@wp.struct
+class Layers:
+    """Layers of all draws, bottom first: those of draw d begin at start[d] and end at start[d + 1]; decals of all
+    views, above the layers, likewise; opacities; any: 0 where there are none of both."""
+
+    layers: wp.array(dtype=Layer)
+    start: wp.array(dtype=int)
+    decals: wp.array(dtype=Decal)
+    decal_start: wp.array(dtype=int)
+    masks: wp.array(dtype=float)
+    any: int
+
+
+@wp.struct
 class Drawn:
     """Ranges of listed faces under one matrix each, see `ssad.camera.scene.Draws`; samples: keys of
     what is seen; owners: draw and face of each key."""
@@ -59,8 +104,6 @@ class Drawn:
     matrices: wp.array(dtype=wp.mat44)
     paints: wp.array(dtype=wp.vec3)
     tags: wp.array(dtype=int)
-    textures: wp.array(dtype=int)
-    rectangles: wp.array(dtype=wp.vec4)
     lit: wp.array(dtype=int)
 
 
@@ -485,10 +528,113 @@ def project(
                 keep(out, piece)
 
 
+@wp.func
+def opacity(masks: wp.array(dtype=float), start: int, columns: int, rows: int, u: float, v: float) -> float:
+    """The opacity of a mask at (u, v) in 0..1, between its texels."""
+    x = wp.clamp(u * float(columns) - 0.5, 0.0, float(columns - 1))
+    y = wp.clamp(v * float(rows) - 0.5, 0.0, float(rows - 1))
+    i = wp.min(int(x), wp.max(columns - 2, 0))
+    j = wp.min(int(y), wp.max(rows - 2, 0))
+    right = wp.min(i + 1, columns - 1)
+    below = wp.min(j + 1, rows - 1)
+    x = x - float(i)
+    y = y - float(j)
+    upper = masks[start + j * columns + i] * (1.0 - x) + masks[start + j * columns + right] * x
+    lower = masks[start + below * columns + i] * (1.0 - x) + masks[start + below * columns + right] * x
+    return upper * (1.0 - y) + lower * y
+
+
+@wp.func
+def on_layer(all: Layers, layer: Layer, uv: wp.vec2) -> wp.vec3:
+    """u, v in a layer's texture and its opacity there, 0 beside it."""
+    box = layer.box
+    u = (uv[0] - box[0]) / (box[2] - box[0])
+    v = (uv[1] - box[1]) / (box[3] - box[1])
+    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0:
+        return wp.vec3(u, v, 0.0)
+    share = layer.opacity
+    if layer.mask >= 0:
+        share = share * opacity(all.masks, layer.mask, layer.columns, layer.rows, u, v)
+    return wp.vec3(u, v, share)
+
+
+@wp.func
+def on_decal(all: Layers, decal: Decal, p: wp.vec3, n: wp.vec3, tag: int) -> wp.vec3:
+    """u, v in a decal's texture and its opacity there, 0 beside it and on what is turned away."""
+    to = p - decal.place
+    u = 0.5 + 0.5 * wp.dot(to, decal.across)
+    v = 0.5 + 0.5 * wp.dot(to, decal.down)
+    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or wp.abs(wp.dot(to, decal.ahead)) > decal.depth:
+        return wp.vec3(u, v, 0.0)
+    if wp.dot(n, decal.ahead) >= 0.0 or (decal.tag >= 0 and decal.tag != tag):
+        return wp.vec3(u, v, 0.0)
+    share = decal.opacity
+    if decal.mask >= 0:
+        share = share * opacity(all.masks, decal.mask, decal.columns, decal.rows, u, v)
+    return wp.vec3(u, v, share)
+
+
+@wp.func
+def left_by(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int) -> float:
+    """Share of a surface's own colour that its layers and the decals leave."""
+    left = float(1.0)
+    if wearable == 1:
+        for k in range(all.start[draw], all.start[draw + 1]):
+            left = left * (1.0 - on_layer(all, all.layers[k], hit.uv)[2])
+    for k in range(all.decal_start[view], all.decal_start[view + 1]):
+        left = left * (1.0 - on_decal(all, all.decals[k], hit.place, hit.normal, tag)[2])
+    return left
+
+
+@wp.func
+def wear(
+    out: Output,
+    all: Layers,
+    view: int,
+    draw: int,
+    wearable: int,
+    fragment: Fragment,
+    hit: Hit,
+    tag: int,
+    gain: wp.vec3,
+    span: float,
+):
+    """Lists what decals and layers add to a pixel, from the uppermost down; span: area of the surface in it, m^2."""
+    left = float(1.0)
+    count = all.decal_start[view + 1] - all.decal_start[view]
+    for k in range(count):
+        decal = all.decals[all.decal_start[view + 1] - 1 - k]
+        at = on_decal(all, decal, hit.place, hit.normal, tag)
+        if at[2] > 0.0:
+            piece = fragment
+            piece.texture = decal.texture
+            piece.u = at[0]
+            piece.v = at[1]
+            piece.area = span * wp.abs(wp.dot(hit.normal, decal.ahead)) / decal.area
+            piece.light = gain * (left * at[2])
+            keep(out, piece)
+            left = left * (1.0 - at[2])
+    if wearable == 1:
+        count = all.start[draw + 1] - all.start[draw]
+        for k in range(count):
+            layer = all.layers[all.start[draw + 1] - 1 - k]
+            at = on_layer(all, layer, hit.uv)
+            if at[2] > 0.0:
+                piece = fragment
+                piece.texture = layer.texture
+                piece.u = at[0]
+                piece.v = at[1]
+                piece.area = hit.stretch / ((layer.box[2] - layer.box[0]) * (layer.box[3] - layer.box[1])) * span
+                piece.light = gain * (left * at[2])
+                keep(out, piece)
+                left = left * (1.0 - at[2])
+
+
 @wp.kernel
 def shade(
     geometry: Geometry,
     drawn: Drawn,
+    layers: Layers,
     lens: wp.array(dtype=wp.vec4),
     to_world: wp.array(dtype=wp.mat44),
     lights: wp.array(dtype=Light),
@@ -500,8 +646,8 @@ def shade(
 ):
     """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
 
-    Textured surfaces are black in the radiance; their pieces are listed as fragments, in any order, and so is what
-    lamps that project a texture add (`projecting`: 1 if there are any).
+    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
+    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
     """
     view, y, x = wp.tid()
     focal = lens[view]
@@ -570,18 +716,9 @@ def shade(
                 albedo = surface.colour
                 if surface.paint == 1:
                     albedo = drawn.paints[hit.draw]
-                worn = drawn.textures[hit.draw]
-                box = drawn.rectangles[hit.draw]
-                tx = float(0.0)
-                ty = float(0.0)
-                if worn >= 0:
-                    tx = (hit.uv[0] - box[0]) / (box[2] - box[0])
-                    ty = (hit.uv[1] - box[1]) / (box[3] - box[1])
-                    if geometry.wearable[hit.face] == 0 or tx < 0.0 or tx > 1.0 or ty < 0.0 or ty > 1.0:
-                        worn = -1
                 albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
-                if worn >= 0:
-                    albedo = wp.vec3(0.0, 0.0, 0.0)
+                if layers.any == 1:
+                    albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, mine)
                 row = cell_of(hit.place, eye)
                 open_ = float(1.0)
                 if row >= 0:
@@ -595,22 +732,18 @@ def shade(
                 shown = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
                 colour = shown.colour
                 share = float(covered) / float(count)
-                if worn >= 0 or (projecting == 1 and row >= 0):
+                if layers.any == 1 or (projecting == 1 and row >= 0):
                     piece = Fragment()
                     piece.place = (view * out.radiance.shape[1] + y) * out.radiance.shape[2] + x
                     piece.slot = slot
                     # area of the surface that the pixel spans
                     span = hit.distance * hit.distance / (focal[0] * focal[1] * hit.slant)
                     span = span / (wp.length(ray) * wp.dot(ray, ray))
-                    if worn >= 0:
-                        piece.texture = worn
-                        piece.u = tx
-                        piece.v = ty
-                        piece.area = hit.stretch / ((box[2] - box[0]) * (box[3] - box[1])) * span
-                        piece.light = shown.gain * share
-                        keep(out, piece)
-                    elif projecting == 1:
-                        through = wp.cw_div(shown.gain, wp.max(lit.light, wp.vec3(1.0e-6, 1.0e-6, 1.0e-6))) * share
+                    gain = shown.gain * share
+                    if layers.any == 1:
+                        wear(out, layers, view, hit.draw, geometry.wearable[hit.face], piece, hit, mine, gain, span)
+                    if projecting == 1 and row >= 0:
+                        through = wp.cw_div(gain, wp.max(lit.light, wp.vec3(1.0e-6, 1.0e-6, 1.0e-6)))
                         project(out, near, row, piece, hit, albedo, through, span, open_, light.fog)
                 if out.surface == 1 and (covered > best or (covered == best and z < far)):
                     out.albedo[view, y, x] = albedo

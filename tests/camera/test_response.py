@@ -1,4 +1,4 @@
-"""Textures and the camera's curve in torch; sensor noise."""
+"""The camera's curve in torch; sensor noise."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import torch
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, build
 from ssad.camera.render import Picture, View, Weather, render
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.texture import apply_taps, taps_of, texture_gradient
-from ssad.camera.torch_texture import TorchTaps, develop, pyramid, retexture, to_linear
-from ssad.core.errors import ConfigError
+from ssad.camera.scene import Layer, Scene, Thing
+from ssad.camera.texture import retexture, taps_of, to_linear
+from ssad.camera.torch_sensor import develop
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 
@@ -31,44 +30,31 @@ def stage() -> Scene:
 DAY = Weather(0.8, 2.0, 0.2)
 
 
-def view(*, texture: int, weather: Weather = DAY) -> View:
+def view(*, worn: bool = False, weather: Weather = DAY) -> View:
     pose = np.eye(4)
     pose[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
     pose[0, 3] = 9.0
-    things = (Thing(0, np.eye(4), tag=1), Thing(1, pose, (0.6, 0.1, 0.2), 2, texture))
+    things = (Thing(0, np.eye(4), tag=1), Thing(1, pose, (0.6, 0.1, 0.2), 2, (Layer(0),) if worn else ()))
     return View(Camera.typical(96, 64), FORWARD, things, weather)
 
 
 @pytest.fixture(scope="module")
 def picture(stage: Scene) -> Picture:
-    return render(stage, [view(texture=0)])
-
-
-def test_torch_gives_what_numpy_gives_and_its_gradient(picture: Picture) -> None:
-    taps = taps_of(picture, 64)
-    texture = np.random.default_rng(1).random((64, 64, 3))
-    pull = np.random.default_rng(2).normal(size=picture.radiance.shape)
-    held = TorchTaps.of(taps, dtype=torch.float64)
-    leaf = torch.tensor(texture).permute(2, 0, 1).clone().requires_grad_()
-    out = retexture(held, leaf, torch.tensor(picture.radiance, dtype=torch.float64))
-    assert np.abs(out.detach().numpy() - apply_taps(taps, texture, picture.radiance)).max() < 1e-12
-    (out * torch.tensor(pull)).sum().backward()
-    assert leaf.grad is not None
-    assert np.abs(leaf.grad.permute(1, 2, 0).numpy() - texture_gradient(taps, pull)).max() < 1e-10
+    return render(stage, [view(worn=True)])
 
 
 def test_the_developed_picture_is_that_of_the_renderer(stage: Scene, picture: Picture) -> None:
-    painted = render(stage, [view(texture=-1)])
+    painted = render(stage, [view()])
     shown = develop(torch.tensor(painted.radiance), torch.tensor(painted.exposure)) * 255
     assert (shown[0].permute(1, 2, 0).numpy() - painted.image[0]).__abs__().max() < 1.2
     colour = torch.tensor([0.6, 0.1, 0.2])[:, None, None].expand(3, 32, 32)
-    worn = retexture(TorchTaps.of(taps_of(picture, 32)), colour, torch.tensor(picture.radiance))
+    worn = retexture(taps_of(picture, 32), colour, torch.tensor(picture.radiance))
     again = develop(worn, torch.tensor(picture.exposure)) * 255
     assert (again[0].permute(1, 2, 0).numpy() - painted.image[0]).__abs__().max() < 1.5
 
 
 def test_gradient_through_the_camera_equals_finite_differences(picture: Picture) -> None:
-    held = TorchTaps.of(taps_of(picture, 16), dtype=torch.float64)
+    held = taps_of(picture, 16, dtype=torch.float64)
     radiance = torch.tensor(picture.radiance, dtype=torch.float64)
     weight = torch.randn(1, 3, 64, 96, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     start = torch.rand(3, 16, 16, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
@@ -85,19 +71,10 @@ def test_gradient_through_the_camera_equals_finite_differences(picture: Picture)
     assert float((leaf.grad * step).sum()) == pytest.approx(float(expected), rel=1e-5)
 
 
-def test_the_pyramid_keeps_the_mean_colour() -> None:
-    texture = torch.rand(3, 32, 32, dtype=torch.float64)
-    rows, start = pyramid(texture), 0
-    for edge in (32, 16, 8, 4, 2, 1):
-        assert torch.allclose(rows[start : start + edge * edge].mean(0), texture.mean((1, 2)))
-        start += edge * edge
-    assert start == len(rows)
-
-
 def test_noise_has_the_stated_deviation_and_no_bias(stage: Scene) -> None:
-    still = render(stage, [view(texture=-1)])
-    noisy = render(stage, [replace(view(texture=-1), noise=0.03, seed=s) for s in range(24)])
-    assert np.array_equal(render(stage, [replace(view(texture=-1), noise=0.03, seed=7)]).image[0], noisy.image[7])
+    still = render(stage, [view()])
+    noisy = render(stage, [replace(view(), noise=0.03, seed=s) for s in range(24)])
+    assert np.array_equal(render(stage, [replace(view(), noise=0.03, seed=7)]).image[0], noisy.image[7])
     flat = (still.image[0] > 60).all(-1) & (still.image[0] < 180).all(-1)
     found = noisy.image[:, flat].astype(float)
     assert abs(found.mean() - still.image[0][flat].mean()) < 0.5
@@ -106,15 +83,7 @@ def test_noise_has_the_stated_deviation_and_no_bias(stage: Scene) -> None:
     expected = slope * 0.03 * np.sqrt(light + 0.2**2)
     assert found.std(0).mean() == pytest.approx(expected.mean(), rel=0.15)
     night = Weather(-0.2, 0.0, 0.4)
-    pair = render(stage, [replace(view(texture=-1, weather=night), noise=0.03, seed=s) for s in range(24)])
-    dark = render(stage, [view(texture=-1, weather=night)]).image[0]
+    pair = render(stage, [replace(view(weather=night), noise=0.03, seed=s) for s in range(24)])
+    dark = render(stage, [view(weather=night)]).image[0]
     same = (dark > 60).all(-1) & (dark < 180).all(-1)
     assert pair.image[:, same].astype(float).std(0).mean() > 1.3 * found.std(0).mean(), "more noise by night"
-
-
-def test_wrong_textures_are_refused(picture: Picture) -> None:
-    taps = TorchTaps.of(taps_of(picture, 16))
-    radiance = torch.tensor(picture.radiance)
-    for wrong in (torch.zeros(3, 32, 32), torch.zeros(16, 16, 3), torch.zeros(3, 16, 8)):
-        with pytest.raises(ConfigError):
-            retexture(taps, wrong, radiance)
