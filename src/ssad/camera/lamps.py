@@ -142,16 +142,23 @@ def near_of(scene: Scene, views: Sequence[View], lamps: Sequence[Sequence[Lamp]]
                     occluder_places.append((number, *(middle - eye[:2]), around))
     near = kernels.Near()
     device = scene.device
-    for name, struct, rows, places in (
+    tables: Any = (
         ("lamp", kernels.Lamp, lamp_rows, lamp_places),
         ("occluder", kernels.Occluder, occluder_rows, occluder_places),
-    ):
-        table: Any = np.array(rows, dtype=struct.numpy_dtype()) if rows else np.zeros(1, struct.numpy_dtype())  # type: ignore[attr-defined]
+    )
+    for name, struct, rows, places in tables:
+        table: Any = struct_array(struct, rows)
         start, listed = _grid(np.array(places, np.float64).reshape(-1, 4), len(views))
         setattr(near, f"{name}s", wp.array(table, dtype=struct, device=device))
         setattr(near, f"{name}_start", wp.array(start, dtype=int, device=device))
         setattr(near, f"{name}_list", wp.array(listed, dtype=int, device=device))
     return near
+
+
+def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
+    """Rows as an array of a kernel's struct; one row of zeros where there is none."""
+    dtype = struct.numpy_dtype()
+    return np.array(rows, dtype) if rows else np.zeros(1, dtype)
 
 
 def _grid(places: F64, views: int) -> tuple[I32, I32]:

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ssad.camera.kernels import raster, shade
-from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of
+from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of, struct_array
 from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
@@ -241,11 +241,10 @@ def render(
     out.surface = int(surface)
     for name in SURFACE:
         setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
-    rows: Any = np.array(lights, dtype=shade.Light.numpy_dtype())  # type: ignore[attr-defined]
     inputs = [
         stage.geometry, seen.drawn, layers, seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(rows, dtype=shade.Light, device=device), shadows, near, int(projecting), scale, out,
+        wp.array(struct_array(shade.Light, lights), dtype=shade.Light, device=device), shadows, near, int(projecting), scale, out,
     ]  # fmt: skip
     wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
     fragments: Any = np.zeros(0, shade.Fragment.numpy_dtype())  # type: ignore[attr-defined]
@@ -350,10 +349,9 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
              tuple(turn[:, 2]), decal.depth, width * height, decal.tag, decal.opacity, *mask_of(decal))
         )  # fmt: skip
     table = shade.Layers()
-    for name, struct, rows in (("layers", shade.Layer, layers), ("decals", shade.Decal, decals)):
-        dtype = struct.numpy_dtype()
-        found: Any = np.array(rows, dtype) if rows else np.zeros(1, dtype)
-        setattr(table, name, wp.array(found, dtype=struct, device=device))
+    tables: Any = (("layers", shade.Layer, layers), ("decals", shade.Decal, decals))
+    for name, struct, rows in tables:
+        setattr(table, name, wp.array(struct_array(struct, rows), dtype=struct, device=device))
     for name, counts in (("start", [len(r) for r in draws.layers]), ("decal_start", [len(v.decals) for v in views])):
         setattr(table, name, wp.array(np.cumsum([0, *counts]).astype(np.int32), dtype=int, device=device))
     flat = np.concatenate([m.ravel() for m in masks]) if masks else np.zeros(1, np.float32)
