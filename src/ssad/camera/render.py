@@ -244,7 +244,8 @@ def render(
     inputs = [
         stage.geometry, seen.drawn, layers, seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(struct_array(shade.Light, lights), dtype=shade.Light, device=device), shadows, near, int(projecting), scale, out,
+        wp.array(struct_array(shade.Light, lights), dtype=shade.Light, device=device), shadows, near,
+        int(projecting), scale, out,
     ]  # fmt: skip
     wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
     fragments: Any = np.zeros(0, shade.Fragment.numpy_dtype())  # type: ignore[attr-defined]
