@@ -10,30 +10,12 @@ from hypothesis import strategies as st
 from benchmarks.interval_coverage import design, detection_coverage, mean_coverage, share_coverage
 from ssad.metrics.intervals import (
     Clusters,
-    beta_quantile,
     bounded_limits,
     mean_limits,
     replicate_limits,
     share_limits,
     t_quantile,
 )
-
-
-# scipy.special.betaincinv(a, b, p), version 1.17
-@pytest.mark.parametrize(
-    ("probability", "a", "b", "value"),
-    [
-        (0.025, 1.0, 8.0, 0.00315972353),
-        (0.975, 2.0, 7.0, 0.52650967088),
-        (0.025, 82.0, 183.0, 0.25530184788),
-        (0.975, 0.5, 0.5, 0.99845866687),
-        (0.025, 0.1, 30.0, 1.95987706e-18),
-    ],
-)
-def test_beta_quantiles(probability, a, b, value):
-    alone = beta_quantile(probability, np.array([a]), np.array([b]))[0]
-    assert alone == pytest.approx(value, rel=1e-8)
-    assert beta_quantile(probability, np.array([3.0, a]), np.array([5.0, b]))[1] == pytest.approx(alone, rel=1e-10)
 
 
 def test_student_quantiles():
