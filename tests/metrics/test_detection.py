@@ -17,12 +17,12 @@ from ssad.metrics.detection import (
     BikeRacks,
     BoxTable,
     DetectionConfig,
+    DetectionScores,
     check_counts,
     filter_boxes,
     keep_boxes,
     match,
     scene_intervals,
-    score_detections,
 )
 
 CAR, PEDESTRIAN, BICYCLE, CONE, BARRIER = (
@@ -46,6 +46,10 @@ def boxes(rows: list[tuple[Any, ...]], **columns: Any) -> BoxTable:
         ego_distance=np.hypot(x, y) if n else np.zeros(0),
     )
     return replace(table, **columns)
+
+
+def score_detections(truth: BoxTable, found: BoxTable, samples: int) -> DetectionScores:
+    return match(truth, found, samples=samples).scores()
 
 
 def random_tables(key: int, *, samples: int = 6, grid: float = 0.0, levels: int = 0) -> tuple[BoxTable, BoxTable]:

@@ -10,7 +10,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from ssad.core.seeding import generator
-from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d, precision_recall
+from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 
 
 def coco_ap(truth: Boxes2D, found: Boxes2D, labels: int, threshold: float, most: int) -> np.ndarray:
@@ -99,11 +99,6 @@ def test_by_hand() -> None:
     # a false one between two right ones: precision 1 up to recall 0.5, then 2/3
     found = one([0, 0, 0], [A, FAR, B], [0.9, 0.8, 0.7])
     assert average_precision(truth, found, labels=1)[0] == pytest.approx((51 + 50 * 2 / 3) / 101)
-    precision, recall = precision_recall(truth, found, labels=1, score=0.75)
-    assert (precision[0], recall[0]) == (0.5, 0.5)
-    precision, recall = precision_recall(truth, found, labels=1, score=0.95)
-    assert np.isnan(precision[0])
-    assert recall[0] == 0.0
 
 
 def test_the_second_detection_of_a_box_is_wrong_and_one_in_a_crowd_is_not() -> None:
@@ -113,7 +108,7 @@ def test_the_second_detection_of_a_box_is_wrong_and_one_in_a_crowd_is_not() -> N
     matched = match_2d(crowd, found, labels=1)
     assert matched.hit.tolist() == [True, False]
     assert matched.ignored.tolist() == [False, True]
-    assert matched.precision_recall(0.0)[0][0] == 1.0
+    assert matched.average_precision()[0] == pytest.approx(1.0)
 
 
 def test_other_images_and_labels_do_not_match() -> None:

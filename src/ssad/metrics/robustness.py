@@ -33,7 +33,7 @@ def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
     if (least == 0.0).any():
         name = names[int((least == 0.0).argmax())]
         raise ConfigError(f"shift '{name}': the baseline makes no error there, so none can be relative to it")
-    return dict(zip(names, (error / least).tolist(), strict=True))
+    return {name: float(error[k] / least[k]) for k, name in enumerate(names)}
 
 
 def resilience_rate(scores: Scores, clean: float) -> dict[str, float]:
@@ -41,7 +41,7 @@ def resilience_rate(scores: Scores, clean: float) -> dict[str, float]:
     names, values = _table(scores, "scores")
     if not clean > 0.0 or math.isinf(clean):
         raise ConfigError(f"the clean score is {clean}; a resilience rate needs one above 0")
-    return dict(zip(names, (values.mean(axis=1) / clean).tolist(), strict=True))
+    return {name: float(values[k].mean() / clean) for k, name in enumerate(names)}
 
 
 def mean_resilience_rate(scores: Scores, clean: float) -> float:
