@@ -399,7 +399,7 @@ def test_places_ahead(crossroads: LaneGraph) -> None:
 
 
 def test_a_lanes_path_goes_on_over_the_lanes_that_follow(crossroads: LaneGraph) -> None:
-    for start, distance in ((60.25, 20.0), (60.25, 60.0), (99.96, 150.0)):
+    for start, distance in ((60.25, 20.0), (60.25, 60.0), (99.96, 110.0)):
         path = lane_path(crossroads, Place(0, start), distance)
         assert np.allclose(path[:, 0], 1.75)
         assert path[0, 1] == pytest.approx(start - 115.0, abs=1e-4)
