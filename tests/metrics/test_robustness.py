@@ -56,3 +56,20 @@ def test_shifts_must_be_those_of_the_baseline() -> None:
 def test_a_rate_needs_a_clean_score(clean: float) -> None:
     with pytest.raises(ConfigError, match="clean"):
         resilience_rate(OURS, clean)
+
+
+def test_names_keep_their_scores_and_no_cell_may_miss() -> None:
+    three = {"fog": [0.9, 0.1], "snow": [0.5, 0.5], "rain": [0.2, 0.0]}
+    assert resilience_rate(three, 0.8) == pytest.approx({"fog": 0.625, "snow": 0.625, "rain": 0.125})
+    assert list(resilience_rate(three, 0.8)) == list(three)
+    assert mean_resilience_rate(three, 0.8) == pytest.approx((0.625 + 0.625 + 0.125) / 3)
+    base = {"rain": [0.0, 0.0], "fog": [0.5, 0.0], "snow": [0.0, 0.0]}
+    assert corruption_error(three, base) == pytest.approx({"fog": 1.0 / 1.5, "snow": 0.5, "rain": 0.9})
+    with pytest.raises(ConfigError, match=r"scores: shift 'rain' has no value at severity 2; run that cell first"):
+        resilience_rate(three | {"rain": [0.2, None]}, 0.8)
+    with pytest.raises(ConfigError, match=r"baseline: shift 'fog' has no value at severity 1"):
+        corruption_error(three, base | {"fog": [None, 0.0]})
+    with pytest.raises(ConfigError, match=r"shift 'snow': the baseline makes no error there"):
+        corruption_error(three, base | {"snow": [1.0, 1.0]})
+    with pytest.raises(ConfigError, match=r"differ in: rain, sleet; run both"):
+        corruption_error(three, {"fog": [0.0, 0.0], "snow": [0.0, 0.0], "sleet": [0.0, 0.0]})
