@@ -126,3 +126,28 @@ def test_nothing_at_all() -> None:
     assert np.isnan(average_precision(one([], []), one([0], [A], [0.5]), labels=1)[0])
     with pytest.raises(ValueError, match="scores"):
         match_2d(one([0], [A]), one([0], [A]), labels=1)
+
+
+@pytest.mark.parametrize(("side", "threshold", "hit"), [(5.0, 0.5, True), (4.99, 0.5, False), (5.0, 0.51, False)])
+def test_an_overlap_at_the_threshold_counts(side: float, threshold: float, hit: bool) -> None:
+    found = one([0], [[0, 0, 10, side]], [0.5])
+    assert match_2d(one([0], [A]), found, labels=1, threshold=threshold).hit.tolist() == [hit]
+
+
+@pytest.mark.parametrize(("off", "hit"), [(0.0, True), (5e-10, True), (5e-9, False)])
+def test_a_threshold_of_1_leaves_room_for_rounding(off: float, hit: bool) -> None:
+    found = one([0], [[0, 0, 10, 10 + off]], [0.5])
+    assert match_2d(one([0], [A]), found, labels=1, threshold=1.0).hit.tolist() == [hit]
+
+
+def test_boxes_that_touch_do_not_overlap() -> None:
+    for box in ([10, 0, 20, 10], [0, 10, 10, 20], [-5, -5, 0, 0], [20, 20, 30, 30]):
+        assert not match_2d(one([0], [A]), one([0], [box], [0.5]), labels=1, threshold=0.0 + 1e-12).hit.any()
+    assert match_2d(one([0], [A]), one([0], [[9, 9, 19, 19]], [0.5]), labels=1, threshold=1 / 199).hit.all()
+
+
+def test_the_best_so_many_of_an_image_count() -> None:
+    truth = one([0, 1], [A, A])
+    found = one([0, 0, 0, 1], [FAR, FAR, A, A], [0.9, 0.8, 0.7, 0.6])
+    for most, hits in ((1, [False, True]), (2, [False, False, True]), (3, [False, False, True, True])):
+        assert match_2d(truth, found, labels=1, max_detections=most).hit.tolist() == hits
