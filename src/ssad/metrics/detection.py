@@ -212,8 +212,7 @@ def scene_intervals(
 class _Ranking:
     """The predictions of a class from best to worst, each as often as its sample counts.
 
-    weight, end [n]: how often, and cumulated; runs: where the run of equal scores of one sample that each is in begins
-    [n], and its length [n], None if there are no ties.
+    weight, end [n]: how often, and cumulated; runs: as `ClassMatches` has them.
     """
 
     score: F64
@@ -225,13 +224,7 @@ class _Ranking:
     def of(matches: ClassMatches, weights: I64) -> _Ranking:
         """The ranking of a class."""
         weight = weights[matches.sample]
-        same = (matches.sample[1:] == matches.sample[:-1]) & (matches.score[1:] == matches.score[:-1])
-        runs = None
-        if same.any():
-            head = np.flatnonzero(np.r_[True, ~same])
-            size = np.diff(np.r_[head, len(weight)])
-            runs = np.repeat(head, size), np.repeat(size, size)
-        return _Ranking(matches.score, weight, np.cumsum(weight), runs)
+        return _Ranking(matches.score, weight, np.cumsum(weight), matches.runs)
 
     @property
     def total(self) -> int:

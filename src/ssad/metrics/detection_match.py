@@ -28,13 +28,15 @@ class ClassMatches:
     """The predictions of a class from best to worst, and which of them are matched.
 
     sample [n], score [n]; hits: for each threshold the places [T] in that order of the matched ones, ascending;
-    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known).
+    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of equal
+    scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
     """
 
     sample: I32
     score: F64
     hits: tuple[I64, ...]
     errors: F64
+    runs: tuple[I64, I64] | None
 
 
 def match_class(
@@ -71,7 +73,18 @@ def match_class(
         score=score,
         hits=tuple(hit for hit, _ in pairs),
         errors=_errors(truth.take(real[taken]), predictions.take(rank[hit]), np.pi if name == "barrier" else 2 * np.pi),
+        runs=_runs(sample, score),
     )
+
+
+def _runs(sample: I32, score: F64) -> tuple[I64, I64] | None:
+    """Begin and length [n] of the runs of equal sample and score."""
+    same = (sample[1:] == sample[:-1]) & (score[1:] == score[:-1])
+    if not same.any():
+        return None
+    head = np.flatnonzero(np.r_[True, ~same])
+    length = np.diff(np.r_[head, len(score)])
+    return np.repeat(head, length), np.repeat(length, length)
 
 
 def _near_pairs(

@@ -78,10 +78,8 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
     """
     means, mean, part = _contributions(sums, clusters)
     count = clusters.member.sum(axis=0)
-    edge = (means <= 0.0) | (means >= 1.0)
-    if count.min() < 2:  # the strata are merged below, so none is at an edge unless all are
-        edge = np.broadcast_to(((mean <= 0.0) | (mean >= 1.0))[..., None], edge.shape)
-        count = np.full(len(count), len(clusters.size))
+    # with a stratum of one cluster all are merged below, and none is at an edge of its own
+    edge = ((means <= 0.0) | (means >= 1.0)) & (count.min() >= 2)
     share = 0.5 / (count + 1.0)
     assumed = np.sqrt(share * (1.0 - share) * (count - 1.0) / count)[clusters.stratum] * clusters.weight
     spread = _spread(np.where(edge[..., clusters.stratum], assumed, part), clusters)

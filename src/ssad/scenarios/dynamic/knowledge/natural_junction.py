@@ -63,7 +63,7 @@ def spawn_places(graph: LaneGraph) -> list[Place]:
         free = float(graph.length[lane]) - 2.0 * _FROM_END
         if free < 0.0:
             continue
-        count = int(free // _SPACING) + 1
+        count = int(free / _SPACING) + 1
         first = _FROM_END + (free - (count - 1) * _SPACING) / 2.0
         places += [Place(int(lane), first + k * _SPACING) for k in range(count)]
     return places
