@@ -377,8 +377,9 @@ def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["safebench", "frea"])
-def test_every_imported_scenario_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
-    found = import_routes(data_dir / "routes" / name)
+def test_every_imported_route_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
+    # the ten repetitions of FREA's routes differ in the draw of traffic alone
+    found = [s for s in import_routes(data_dir / "routes" / name) if s.seed < 3]
     graphs = {town: load_graph(carla_home / "towns" / f"{town}.npz") for town in sorted({s.town for s in found})}
     for scenario in found:
         graph = graphs[scenario.town]

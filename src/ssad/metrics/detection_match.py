@@ -28,8 +28,8 @@ class ClassMatches:
     """The predictions of a class from best to worst, and which of them are matched.
 
     sample [n], score [n]; hits: for each threshold the places [T] in that order of the matched ones, ascending;
-    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of equal
-    scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
+    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of
+    equal scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
     """
 
     sample: I32
