@@ -45,7 +45,7 @@ MEMORY = 8 << 30  # bytes that a test run may allocate: a mutant may fill a list
 TESTS: dict[str, tuple[str, ...]] = {
     "scenarios/dynamic": tuple(
         f"tests/scenarios/test_{name}.py"
-        for name in ("yaml", "knowledge", "sets", "natural", "import", "sampling", "episode")
+        for name in ("yaml", "knowledge", "docs", "sets", "natural", "import", "sampling", "episode")
     ),
     "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published")),
     "jobs": ("tests/jobs", "tests/bench/test_engine.py"),

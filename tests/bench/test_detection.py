@@ -32,7 +32,7 @@ from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
 from ssad.jobs.local import WORKER_MEMORY
-from ssad.metrics.detection import score_detections
+from ssad.metrics.detection import match
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.report import write_report
 from ssad.report.kinds.detection import left_table, load_detection_run, main_table, robustness_table
@@ -222,10 +222,10 @@ def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None
 
     truth = read_truth(root, "v1.0-ssad")
     found = [b for path in sorted(folder.glob("detections/*/gaussian-3/*.npz")) for b in read_boxes(path)[0]]
-    scores = score_detections(
+    scores = match(
         filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
         filter_boxes(box_table(found, truth), racks=truth.racks), samples=len(truth.samples),
-    )  # fmt: skip
+    ).scores()  # fmt: skip
     record = next(r for r in lines(folder) if (r["shift"], r["severity"]) == ("gaussian", 3))
     assert record["metrics"]["NDS"] == pytest.approx(scores.nd_score, abs=1e-6)
 
