@@ -26,8 +26,6 @@ from ssad.assets.bodies.parts import (
 from ssad.assets.bodies.people import draw_look, figure, seated, torso_charts
 from ssad.assets.mesh import Material, Mesh, Point, loft, merge, ring, sphere, tube
 
-STYLES = ("ridden", "parked")
-
 
 def bicycle(
     style: str, size: Point, *, generator: np.random.Generator, detail: int, phase: float | None = None

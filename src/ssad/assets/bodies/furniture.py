@@ -9,13 +9,6 @@ import numpy as np
 from ssad.assets.bodies.parts import STEEL, TRIM, Chart, crate, finish, side_charts, sided
 from ssad.assets.mesh import F64, Material, Mesh, Point, lathe, merge, prism, tube
 
-STYLES = {
-    "traffic_cone": ("cone", "tall", "drum"),
-    "barrier": ("jersey", "fence", "board", "water"),
-    "traffic_signal": ("post", "mast", "walker"),
-    "street_lamp": ("curved", "straight"),
-    "sign": ("stop", "yield", "limit", "warning", "direction"),
-}
 ORANGE = Material("orange", (0.75, 0.12, 0.01), specular=0.04, gloss=0.3)
 WHITE = Material("reflective", (0.78, 0.78, 0.78), specular=0.1, gloss=0.6)
 RED = Material("red", (0.52, 0.015, 0.02), specular=0.06, gloss=0.5)
@@ -27,7 +20,6 @@ LAMPS = (
     Material("lamp_green", (0.015, 0.22, 0.11), gloss=0.7),
 )
 STREET_LIGHT = Material("street_light", (0.80, 0.78, 0.70), emission=0.0)
-SIGN_FACE = Material("sign_face", (0.75, 0.75, 0.75), specular=0.08, gloss=0.5)
 SIGN_INK = Material("sign_ink", (0.02, 0.02, 0.022), specular=0.08, gloss=0.5)
 SIGN_BLUE = Material("sign_blue", (0.02, 0.09, 0.38), specular=0.08, gloss=0.5)
 SIGN_BACK = Material("sign_back", (0.30, 0.31, 0.31), specular=0.1, gloss=0.3)
@@ -126,7 +118,7 @@ def _across(outline: list[tuple[float, float]], y0: float, y1: float, material: 
 def signal_head(*, lamps: tuple[Material, ...] = LAMPS, detail: int = 2) -> Mesh:
     """A signal head that looks along +x, its base at the origin: 0.30 m wide, 0.32 m for each lamp.
 
-    Its materials lamp_red, lamp_yellow and lamp_green have no emission: `Mesh.relit` turns one on.
+    Its materials lamp_red, lamp_yellow and lamp_green have no emission.
     """
     n = (6, 8, 14)[detail]
     high = 0.32 * len(lamps)

@@ -52,11 +52,6 @@ BUS = Shell(
     tail_from=0.82,
     grille=(S4, S4), glass_gap=0.03, wheel_width=0.3,
 )  # fmt: skip
-STYLES = {
-    "truck": ("box", "flatbed", "tractor", "tipper"),
-    "bus": ("city", "coach", "bendy"),
-    "trailer": ("box", "flatbed", "tank", "utility"),
-}
 
 
 def truck(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:

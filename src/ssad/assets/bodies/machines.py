@@ -25,7 +25,6 @@ from ssad.assets.bodies.parts import (
 )
 from ssad.assets.mesh import Material, Mesh, Point, lathe, merge, prism, tube
 
-STYLES = ("excavator", "wheel_loader")
 COLOURS = ((0.72, 0.40, 0.02), (0.75, 0.33, 0.03), (0.70, 0.48, 0.05), (0.60, 0.14, 0.03))
 
 
@@ -165,7 +164,6 @@ def _loader(machine: Material, reach: float, detail: int) -> list[Mesh]:
         )
     )
     parts.append(crate((-0.6, -0.3, 0.6), (0.4, 0.3, 1.0), DARK))
-    cab = [(-0.85, 1.3), (-0.95, 2.95), (0.25, 2.95), (0.45, 1.3)]
     parts.append(_slab([(-0.82, 1.7), (-0.9, 2.85), (0.22, 2.85), (0.38, 1.7)], 0.66, GLASS))
     parts.append(_slab([(-0.84, 1.3), (-0.87, 1.7), (0.4, 1.7), (0.45, 1.3)], 0.67, FRAME))
     painted.append(crate((-1.0, -0.72, 2.85), (0.32, 0.72, 3.05), machine))
@@ -174,7 +172,6 @@ def _loader(machine: Material, reach: float, detail: int) -> list[Mesh]:
         for x, d in ((-0.86, -0.07), (0.32, -0.14), (-0.25, -0.02))
     ]
     parts.append(both_sides(merge(posts)))
-    del cab
     lift = 0.25 * reach
     painted.append(
         both_sides(

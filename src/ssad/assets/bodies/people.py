@@ -10,7 +10,6 @@ import numpy.typing as npt
 from ssad.assets.bodies.parts import Chart, crate, unwrap
 from ssad.assets.mesh import F64, Material, Mesh, Point, loft, merge, sphere, tube
 
-STYLES = ("adult", "child", "standing")
 SKINS = ((0.62, 0.40, 0.29), (0.50, 0.31, 0.21), (0.35, 0.20, 0.13), (0.20, 0.11, 0.07), (0.10, 0.055, 0.035))
 HAIRS = ((0.015, 0.012, 0.010), (0.05, 0.03, 0.02), (0.13, 0.075, 0.04), (0.38, 0.27, 0.14), (0.40, 0.40, 0.40))
 CLOTHS = ((0.02, 0.02, 0.025), (0.03, 0.045, 0.11), (0.14, 0.14, 0.15), (0.55, 0.55, 0.54), (0.30, 0.03, 0.04),

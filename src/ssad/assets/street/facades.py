@@ -14,6 +14,7 @@ from ssad.assets.street.palette import Look
 from ssad.assets.street.triangles import ALL, Piece, box, flat
 
 VISIBLE = NEAR | MID
+PARAPET = 0.7  # m, of flat roofs
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -122,15 +123,13 @@ def grid(
     return panes(wall, xx, zz, size, look, frame=frame, sill=sill)
 
 
-def door(
-    wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1), kind: str = "door"
-) -> list[Piece]:
+def door(wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1)) -> list[Piece]:
     """A door in a frame, its middle at x, with a step."""
     wide, high = size
     left = x - wide / 2
     return [
         flat(wall.quads(left - 0.12, 0.0, wide + 0.24, high + 0.14, 0.03), look.stone[0], levels=NEAR),
-        flat(wall.quads(left, 0.04, wide, high, 0.05), look.pick(kind), levels=VISIBLE),
+        flat(wall.quads(left, 0.04, wide, high, 0.05), look.pick("door"), levels=VISIBLE),
     ]
 
 
@@ -192,7 +191,6 @@ def flat_roof(
     look: Look,
     *,
     coping: int,
-    parapet: float = 0.7,
     plant: int = 2,
 ) -> list[Piece]:
     """A flat roof with a parapet above z and boxes of building services."""
@@ -200,7 +198,7 @@ def flat_roof(
     t = 0.3
     low = np.array([[x[0], y[0], z], [x[0], y[1] - t, z], [x[0], y[0] + t, z], [x[1] - t, y[0] + t, z]])
     high = np.array([[x[1], y[0] + t, 0], [x[1], y[1], 0], [x[0] + t, y[1] - t, 0], [x[1], y[1] - t, 0]])
-    high[:, 2] = z + parapet
+    high[:, 2] = z + PARAPET
     parts = [box(low, high, coping, levels=VISIBLE)]
     deck = [[x[0], y[0], z + 0.1], [x[1], y[0], z + 0.1], [x[1], y[1], z + 0.1], [x[0], y[1], z + 0.1]]
     parts.append(flat(np.array([deck]), look.flat_roof, levels=ALL))

@@ -119,7 +119,7 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) ->
         if not len(neighbours):
             p, q = (left.xy[at], right.xy[at])[order[0]], (left.xy[at], right.xy[at])[order[1]]
             corners = [[*p, -0.02], [*q, -0.02], [*q, KERB], [*p, KERB]]
-            soup.polygons(np.array([corners]), look.kerb)
+            soup.add(flat(np.array([corners]), look.kerb))
 
 
 def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:

@@ -167,11 +167,11 @@ def _pull_push(value: F32, weight: F32) -> F32:
     return np.asarray(near + (value - near) * np.minimum(weight, 1), np.float32)
 
 
-def _guided(guide: F32, value: F32, *, radius: int = 6, softness: float = 0.003) -> F32:
-    """Guided filter: a locally linear function of the guide."""
-    size = (2 * radius + 1, 2 * radius + 1)
+def _guided(guide: F32, value: F32) -> F32:
+    """Guided filter over 13 x 13 cells: a locally linear function of the guide."""
+    size = (13, 13)
     mean_g, mean_v = cv2.blur(guide, size), cv2.blur(value, size)
-    slope = (cv2.blur(guide * value, size) - mean_g * mean_v) / (cv2.blur(guide * guide, size) - mean_g**2 + softness)
+    slope = (cv2.blur(guide * value, size) - mean_g * mean_v) / (cv2.blur(guide * guide, size) - mean_g**2 + 0.003)
     return np.asarray(cv2.blur(slope, size) * guide + cv2.blur(mean_v - slope * mean_g, size), np.float32)
 
 
