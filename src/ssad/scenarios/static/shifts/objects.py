@@ -272,13 +272,10 @@ def _add_item(
 
 def _stamp(batch: Batch, plan: _Plan) -> tuple[Any, Any, Any, Any]:
     """Items, outlines and where each image's items start, on the device; and whose pixel each pixel is."""
-    device = batch.device
     items = structs(batch, plan.items, kernels.Item)
-    points = on(batch, np.concatenate(plan.points).astype(np.float32), wp.vec2)
-    first = on(batch, plan.first, wp.int32)
-    owner = wp.zeros((batch.count, batch.height, batch.width), dtype=wp.int16, device=device)
-    dim = (batch.count, batch.height)
-    wp.launch(kernels.stamp, dim=dim, inputs=[items, first, points], outputs=[owner], device=device)
+    points, first = on(batch, np.concatenate(plan.points), wp.vec2), on(batch, plan.first, wp.int32)
+    owner = wp.zeros((batch.count, batch.height, batch.width), dtype=wp.int16, device=batch.device)
+    batch.launch(kernels.stamp, (batch.count, batch.height), [items, first, points], owner)
     return items, points, first, owner
 
 
@@ -299,34 +296,18 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
     out = batch.copy()
     if not any(d.applied for d in done):
         return out, done
-    device = batch.device
     items, points, first, owner = _stamp(batch, plan)
     respect = int(specs[0].calibration == "physical")
     if plan.lines:
         for rank in sorted({r for r, _, _ in plan.lines}):
             chosen = [(item, lines) for r, item, lines in plan.lines if r == rank]
-            wp.launch(
-                kernels.smear,
-                dim=(len(chosen), max(lines for _, lines in chosen) * 2),
-                inputs=[batch.data, items, on(batch, [c[0] for c in chosen], wp.int32), owner, batch.stride],
-                outputs=[out.data],
-                device=device,
-            )
+            ranked = on(batch, [item for item, _ in chosen], wp.int32)
+            dim = (len(chosen), max(lines for _, lines in chosen) * 2)
+            batch.launch(kernels.smear, dim, [batch.data, items, ranked, owner, batch.stride], out.data)
         return out, done
-    nodes = wp.zeros(plan.node_count, dtype=wp.vec4, device=device)
+    nodes = wp.zeros(plan.node_count, dtype=wp.vec4, device=batch.device)
     tallest = max(row[16] for row in plan.items)
-    wp.launch(
-        kernels.displace,
-        dim=(len(plan.items), tallest),
-        inputs=[items, points, lens(batch, frames)],
-        outputs=[nodes],
-        device=device,
-    )
-    wp.launch(
-        kernels.paint,
-        dim=(batch.count, batch.height),
-        inputs=[batch.words(), items, first, owner, nodes, respect, batch.stride],
-        outputs=[out.data],
-        device=device,
-    )
+    batch.launch(kernels.displace, (len(plan.items), tallest), [items, points, lens(batch, frames)], nodes)
+    inputs = [batch.words(), items, first, owner, nodes, respect, batch.stride]
+    batch.launch(kernels.paint, (batch.count, batch.height), inputs, out.data)
     return out, done
