@@ -166,7 +166,7 @@ def gable(
         parts.append(flat(points((a1, b0, z), (a1, b1, z), (a1, middle, top)), wall))
         parts.append(flat(points((a0, b1, z), (a0, b0, z), (a0, middle, top)), wall))
     # undersides and edges of the overhang
-    down = np.array([0.0, 0.0, thick])
+    down = thick * UP
     parts += [flat((p - down)[:, ::-1], roof, levels=NEAR) for p in sides]
     rim = [
         points((o0, c0, low - thick), (o1, c0, low - thick), (o1, c0, low), (o0, c0, low)),
@@ -219,21 +219,13 @@ def balcony(wall: Wall, x: F64, z: F64, wide: float, look: Look, *, deep: float 
     base = wall.foot + x[:, None] * wall.along + z[:, None] * UP
     right, out = wide * wall.along, deep * wall.out
     ring = [base, base + out, base + out + right, base + right]
-    slab = np.array([0.0, 0.0, 0.16])
-    rail = np.array([0.0, 0.0, 1.05])
+    slab, rail = 0.16 * UP, 1.05 * UP
     quads = [np.stack([p - slab, q - slab, q, p], axis=1) for p, q in pairwise(ring)]
-    quads += [np.stack([base, base + out, base + out + right, base + right], axis=1)]
-    quads += [np.stack([base + right - slab, base + out + right - slab, base + out - slab, base - slab], axis=1)]
+    quads += [np.stack(ring, axis=1), np.stack([p - slab for p in ring[::-1]], axis=1)]
     parts = [flat(np.concatenate(quads), look.stone[1], levels=VISIBLE)]
     sides = [np.stack([p + 0.12 * UP, q + 0.12 * UP, q + rail, p + rail], axis=1) for p, q in pairwise(ring)]
-    inner = [
-        (q - 0.04 * outward)[:, ::-1] for q, outward in zip(sides, (-wall.along, wall.out, wall.along), strict=True)
-    ]
-    parts.append(
-        flat(
-            np.concatenate(sides + inner),
-            look.frame[1] if look.generator.random() < 0.5 else look.glass[3],
-            levels=VISIBLE,
-        )
-    )
+    outwards = (-wall.along, wall.out, wall.along)
+    inner = [(side - 0.04 * away)[:, ::-1] for side, away in zip(sides, outwards, strict=True)]
+    railing = look.frame[1] if look.generator.random() < 0.5 else look.glass[3]
+    parts.append(flat(np.concatenate(sides + inner), railing, levels=VISIBLE))
     return parts

@@ -181,18 +181,12 @@ def _worn(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> Non
         x, y, yaw, width = graph.at(lane, float(rng.uniform(2.0, max(2.1, length - 6.0))))
         long, wide = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
         aside = rng.uniform(-0.5, 0.5) * (width - wide)
-        box = np.array(
-            [[[0.0, aside - wide / 2], [long, aside - wide / 2], [long, aside + wide / 2], [0.0, aside + wide / 2]]]
-        )
+        low, high = aside - wide / 2, aside + wide / 2
+        box = np.array([[[0.0, low], [long, low], [long, high], [0.0, high]]])
         _paint(soup, place((x, y, yaw), box), look.patch, z=WEAR, levels=NEAR)
     angle = np.arange(8) * np.pi / 4
     disc = 0.32 * np.stack([np.cos(angle), np.sin(angle)], axis=1)[None]
     for _ in range(rng.poisson(length / 40.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(1.0, max(1.1, length - 1.0))))
-        _paint(
-            soup,
-            place((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width])),
-            look.iron,
-            z=1.4 * WEAR,
-            levels=NEAR,
-        )
+        cover = place((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width]))
+        _paint(soup, cover, look.iron, z=1.4 * WEAR, levels=NEAR)

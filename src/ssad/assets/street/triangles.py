@@ -34,24 +34,16 @@ class Palette:
     def __init__(self) -> None:
         self.table: dict[Material, int] = {}
 
-    def add(
-        self,
-        name: str,
-        colour: ArrayLike,
-        *,
-        specular: float = 0.04,
-        gloss: float = 0.1,
-        emission: float = 0.0,
-    ) -> int:
+    def add(self, name: str, colour: ArrayLike, *, specular: float = 0.04, gloss: float = 0.1) -> int:
         """Index of a material (colour: linear RGB)."""
         r, g, b = np.round(np.clip(np.asarray(colour, np.float64), 0.0, 1.0), 4).tolist()
-        return self.table.setdefault(Material(name, (r, g, b), specular, gloss, emission), len(self.table))
+        return self.table.setdefault(Material(name, (r, g, b), specular, gloss), len(self.table))
 
     def shade(self, index: int, factor: float, name: str | None = None) -> int:
         """A darker or lighter material like another one."""
         like = list(self.table)[index]
         colour = factor * np.array(like.colour)
-        return self.add(name or like.name, colour, specular=like.specular, gloss=like.gloss, emission=like.emission)
+        return self.add(name or like.name, colour, specular=like.specular, gloss=like.gloss)
 
 
 class TriangleBuilder:
@@ -207,10 +199,5 @@ def tiles(owner: F64, levels: I32) -> tuple[tuple[float, float], int, int, I32, 
         count = np.bincount(index[mine], minlength=nx * ny + 1)
         offset.append(start + np.concatenate([[0], np.cumsum(count)]))
         start += len(mine)
-    return (
-        (float(low[0]), float(low[1])),
-        nx,
-        ny,
-        np.concatenate(order).astype(np.int32),
-        np.stack(offset).astype(np.int32),
-    )
+    listed, starts = np.concatenate(order).astype(np.int32), np.stack(offset).astype(np.int32)
+    return (float(low[0]), float(low[1])), nx, ny, listed, starts
