@@ -61,9 +61,8 @@ class FreeGround:
         for k in range(len(self.crosswalks)):
             near = np.hypot(*(p - self.crosswalks[k]).T) < 20.0
             if near.any():
-                least[near] = np.minimum(
-                    least[near], polygon_distance(p[near], self.graph.crosswalk(k).astype(np.float64))
-                )
+                gap = polygon_distance(p[near], self.graph.crosswalk(k).astype(np.float64))
+                least[near] = np.minimum(least[near], gap)
         return least
 
 
@@ -98,12 +97,8 @@ class Side:
         at = float(np.clip(s, 0.0, self.length))
         yaw = float(np.interp(at, edge.s, np.unwrap(edge.yaw)))
         x, y = (float(np.interp(at, edge.s, edge.xy[:, k])) for k in range(2))
-        over = s - at
-        return (
-            x + over * np.cos(yaw) + away * np.sin(yaw),
-            y + over * np.sin(yaw) - away * np.cos(yaw),
-            yaw,
-        )
+        over, cos, sin = s - at, np.cos(yaw), np.sin(yaw)
+        return x + over * cos + away * sin, y + over * sin - away * cos, yaw
 
 
 def sides(graph: LaneGraph) -> list[Side]:

@@ -52,11 +52,9 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
     elif spec.name == "scale":
         matrix = np.eye(3) * (1 + sign[0] * table.SCALE[step])
     elif spec.name == "rotation":
-        degrees = (
-            table.PAPER_LIDAR_ROTATION[step] + spread[0]
-            if other
-            else table.ROTATION[step] + spread[0] * table.ROTATION_SPREAD
-        )
+        degrees = table.ROTATION[step] + spread[0] * table.ROTATION_SPREAD
+        if other:
+            degrees = table.PAPER_LIDAR_ROTATION[step] + spread[0]
         a = np.radians(sign[0] * degrees)
         matrix = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
     else:
@@ -69,9 +67,8 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
 def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> F64:
     """[N, 3, 3]: what happens to each object, in its own axes. The paper draws anew for the LiDAR."""
     if spec.calibration == "paper":
-        return np.broadcast_to(
-            np.array(_draw(spec, ("lidar" if lidar else "sample", sample), lidar)), (len(boxes), 3, 3)
-        )
+        drawn = _draw(spec, ("lidar" if lidar else "sample", sample), lidar)
+        return np.broadcast_to(np.array(drawn), (len(boxes), 3, 3))
     found = [_draw(spec, ("instance", scene, name), lidar) for name in boxes.instance]
     return np.array(found).reshape(-1, 3, 3)
 
@@ -104,9 +101,8 @@ def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sampl
     matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
     length = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
     rotation = boxes.axes()
-    turn = np.arctan2(
-        np.einsum("ni,ni->n", length, rotation[:, :, 1]), np.einsum("ni,ni->n", length, rotation[:, :, 0])
-    )
+    forward, aside = (np.einsum("ni,ni->n", length, rotation[:, :, k]) for k in (0, 1))
+    turn = np.arctan2(aside, forward)
     quaternion = quaternion_product(boxes.rotation, yaw_to_quaternion(turn))
     axes = quaternion_to_matrix(quaternion)
     corners = np.einsum("nji,nkj->nki", axes, np.einsum("nij,kj->nki", matrix, UNIT_CORNERS))
