@@ -233,11 +233,6 @@ def read_yaml_document(path: str | Path, *, limit: int = 16 * MIB) -> Document:
     return parse_yaml_document(read_text(path, limit=limit), str(path))
 
 
-def read_yaml(path: str | Path, *, limit: int = 16 * MIB) -> Any:
-    """Plain data of a YAML file. FormatError."""
-    return read_yaml_document(path, limit=limit).data
-
-
 def dump_yaml(data: Any) -> str:
     """YAML text that `parse_yaml` reads back to equal data; keys keep their order."""
     import yaml
