@@ -19,10 +19,8 @@ from ssad.core.registry import describe
 from ssad.jobs.task import Outcome, Status, Task
 
 START_S = 600.0  # a worker may compile kernels when it starts
-SCARCE, SCARCE_S = (
-    0.04,
-    2.0,
-)  # share of the memory that must not be lacking for so many seconds: the largest worker ends
+SCARCE = 0.04  # share of the memory: with less left
+SCARCE_S = 2.0  # for so many seconds, the largest worker ends
 WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: bytes that a worker may hold
 LOOK_S = 0.2  # from one look at the memory to the next
 
