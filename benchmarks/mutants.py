@@ -55,7 +55,13 @@ TESTS: dict[str, tuple[str, ...]] = {
         ),
         "tests/bench/test_engine.py",
     ),
-    "bench": tuple(f"tests/bench/test_{name}.py" for name in ("suite", "run", "pictures", "engine", "detection")),
+    "bench": tuple(
+        f"tests/bench/test_{name}.py"
+        for name in (
+            *("kind", "source", "run", "suite", "driving_kind", "detection_kind"),
+            *("pictures", "driving", "engine", "detection"),
+        )
+    ),
     "drivers": ("tests/world",),
     "envs": ("tests/test_envs.py", "tests/world/test_env.py"),
 }

@@ -257,3 +257,5 @@ def test_a_ray_worker_keeps_its_child_process_for_tasks_of_one_start(monkeypatch
     assert [(task.function, task.argument, task.timeout_s) for task in made[0].tasks] == [(abs, 1, 7.0), (abs, 2, 7.0)]
     cluster._on_node((abs, 3, 7.0), None)
     assert [(one.start, one.closed) for one in made] == [(start, True), (None, False)]
+    cluster._on_node((abs, 4, 7.0), start)
+    assert [(one.start, one.closed) for one in made] == [(start, True), (None, True), (start, False)]

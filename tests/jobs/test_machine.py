@@ -117,7 +117,7 @@ def test_a_device_that_cannot_be_had_is_one_line(warp: FakeWarp, monkeypatch: py
 
 
 def test_one_worker_a_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 2, 5}, raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0: {0, 2, 5}}[process], raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 8)
     assert default_workers() == 3
     monkeypatch.delattr(os, "sched_getaffinity")

@@ -34,6 +34,7 @@ def test_append_and_reopen(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="already"):
             store.append(result("a"), None)
     assert read_run(tmp_path)["identity"] == "a"
+    assert '\n "identity": "a"' in (tmp_path / "run.json").read_text(), "people read it"
     assert [r["key"] for r in read_lines(tmp_path / "episodes.jsonl")] == ["a", "b"]
 
 
@@ -103,8 +104,11 @@ def test_a_doubled_key_is_reported(tmp_path: Path) -> None:
 
 
 def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
-    with Store.open(tmp_path, RUN), pytest.raises(StoreError, match="another ssad run"):
-        Store.open(tmp_path, RUN)
+    with Store.open(tmp_path, RUN):
+        before = open_files()
+        with pytest.raises(StoreError, match="another ssad run"):
+            Store.open(tmp_path, RUN)
+        assert open_files() == before
     Store.open(tmp_path, RUN).close()
 
 

@@ -38,6 +38,10 @@ def do(what: str) -> Any:
     if what == "print":
         os.write(1, b"to standard output\n")
         print("and so")
+    if what == "death":
+        number = ctypes.c_int()
+        ctypes.CDLL(None).prctl(2, ctypes.byref(number))  # PR_GET_PDEATHSIG
+        return number.value
     return sys.path if what == "path" else what
 
 
@@ -154,6 +158,11 @@ def test_the_kernel_is_asked_to_end_it_with_its_parent(monkeypatch: pytest.Monke
     worker._die_with_parent()
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="of Linux")
+def test_the_kernel_ends_it_with_its_parent(process: Worker) -> None:
+    assert work(process, "death").value == signal.SIGKILL
+
+
 def test_it_takes_its_descriptors_from_the_command_line() -> None:
     theirs, orders = os.pipe()
     answers, theirs_too = os.pipe()
@@ -161,7 +170,7 @@ def test_it_takes_its_descriptors_from_the_command_line() -> None:
     with subprocess.Popen(command, pass_fds=(theirs, theirs_too)) as one:
         os.close(theirs)
         os.close(theirs_too)
-        with Connection(orders, readable=False) as give, Connection(answers, writable=False) as hear:
+        with Connection(orders) as give, Connection(answers) as hear:
             give.send(([], False))
             assert hear.recv() == ("ready", None)
             give.send((abs, -3))

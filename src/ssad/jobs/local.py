@@ -45,8 +45,8 @@ class Worker:
         )
         os.close(theirs)
         os.close(theirs_too)
-        self.answers = Connection(answers, writable=False)
-        self._orders = Connection(orders, readable=False)
+        self.answers = Connection(answers)
+        self._orders = Connection(orders)
         self.ready = False
         self.task: Task | None = None
         self.began = time.monotonic()
@@ -159,7 +159,7 @@ class LocalProcesses:
         self._waiting: list[Task] = []
         self._unsent: list[Outcome] = []
         self._started = 0
-        self._looked = 0.0
+        self._looked = time.monotonic()
         self._plenty = (0, time.monotonic())  # memory of the machine, and when there was enough of it
 
     @property

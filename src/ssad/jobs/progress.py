@@ -59,7 +59,7 @@ class Live:
 
     def line(self) -> None:
         """One plain line."""
-        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}", highlight=False)
+        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}")
 
     def __enter__(self) -> Self:
         if self.bar:
