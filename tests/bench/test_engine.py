@@ -68,22 +68,24 @@ BAD = {
     "raise": ("failed", "ValueError: this one raises"), "exit": ("failed", "SystemExit: this one leaves"),
     "die": ("crashed", "exit code 3): last words"), "segfault": ("crashed", "SIGSEGV"),
     "liar": ("failed", "other cells"), "object": ("failed", "not plain data"), "nan": ("failed", "not plain data"),
-    "hang": ("timeout", "took longer than 1.5 s"), "spin": ("timeout", "took longer than 1.5 s"),
     "memory": ("crashed", "out of memory: it held"),
 }  # fmt: skip
+HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 1.5 s"))
 
 
 def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -> None:
+    """Only what hangs has little time: all else must have enough on a machine that is busy."""
     good = ["a", "b", "c", "d"]
-    records = go(dice([*good[:2], *BAD, *good[2:]], batch=7, timeout_s=1.5), folder, workers, ray=ray)
-    found = {r["number"]: r for r in records}
-    assert [found[name]["status"] for name in good] == ["ok"] * 4
-    for deed, (status, reason) in BAD.items():
-        assert found[deed]["status"] == status, found[deed]
-        assert reason in found[deed]["reason"]
-        assert "\n" not in found[deed]["reason"]
-        assert found[deed]["metrics"] == {}
-    assert len(read_lines(folder / "episodes.jsonl")) == 4
+    for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 1.5)):
+        suite = dice([*good[:2], *deeds, *good[2:]], batch=batch, timeout_s=timeout_s)
+        found = {r["number"]: r for r in go(suite, folder / name, workers, ray=ray)}
+        assert [found[number]["status"] for number in good] == ["ok"] * 4
+        for deed, (status, reason) in deeds.items():
+            assert found[deed]["status"] == status, found[deed]
+            assert reason in found[deed]["reason"]
+            assert "\n" not in found[deed]["reason"]
+            assert found[deed]["metrics"] == {}
+        assert len(read_lines(folder / name / "episodes.jsonl")) == 4
 
 
 @pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
@@ -106,7 +108,7 @@ def test_on_ray_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, workers: int) -> None:
     """Seven numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
     numbers = [f"n-{i}" for i in range(7)]
-    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=1.0)
+    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=1.5)
     plan = own_kind.SharedDice().plan(suite)
     records = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())))
     status = {name: {r["status"] for r in records if r["system"] == name} for name in suite.systems}
