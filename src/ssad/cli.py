@@ -266,8 +266,9 @@ def record(
     images: Annotated[
         str, typer.Option(help="With --clips: images per town, one number for each town or one for all.")
     ] = "600,400,400,400",
-    style: Annotated[
-        str | None, typer.Option(help="With --clips: body style of the target car.  [default: random]")
+    target: Annotated[
+        str | None,
+        typer.Option(help="With --clips: the target car, STYLE[:PAINT[:SEED]].  [default: another one in each part]"),
     ] = None,
     device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
     workers: Workers = None,
@@ -283,7 +284,7 @@ def record(
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
 
-    idle = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "style")
+    idle = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "target")
     for name in idle:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
@@ -297,10 +298,12 @@ def record(
 
         if clips is not None:
             from ssad.recording.clip_recorder import Clips, pair_images, record_clips
+            from ssad.recording.target import parse_target
 
             pairs = pair_images(names(towns), names(images))
             todo = Clips(
-                out, pairs, names(held_out), clips, style=style, seed=seed, device=pick_device(device), streets=streets,  # type: ignore[arg-type]
+                out, pairs, names(held_out), clips, target=parse_target(target) if target else None, seed=seed,  # type: ignore[arg-type]
+                device=pick_device(device), streets=streets,
             )  # fmt: skip
             record_clips(todo, workers=workers, ray=ray, progress=progress)
             text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"

@@ -21,12 +21,11 @@ import numpy as np
 import pytest
 from helpers.sharing import Shared
 
-from ssad.assets.bodies import BODIES
 from ssad.camera.labels import label_picture
-from ssad.camera.render import View, Weather, render
-from ssad.camera.scene import Thing
-from ssad.core.errors import ConfigError, StoreError
-from ssad.core.frames import Camera
+from ssad.camera.render import Weather, render
+from ssad.camera.scene import Layer
+from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
 from ssad.core.types import F64
 from ssad.recording.clip_recorder import (
@@ -38,10 +37,11 @@ from ssad.recording.clip_recorder import (
     Clips,
     _prepare,
     _Set,
+    clip_views,
     pair_images,
     record_clips,
 )
-from ssad.recording.nuscenes_recorder import NOISE
+from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.viewpoints import AIM, EYE, follow, look_at, polar, turn_of, weather_name
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
@@ -239,24 +239,48 @@ def projected(row: dict[str, Any]) -> F64:
     return np.concatenate([xy.min(0), xy.max(0)])
 
 
-def test_a_row_tells_all_to_draw_the_picture_again(drives: Path, market: _Set) -> None:
-    data, made, target = read(drives, "test"), market, market.targets[0]
-    for row in data["images"]:
-        assert row["drive"] == made.trace.key
-        assert (row["target_style"], row["target_size"]) == (target.style, [round(v, 3) for v in target.size])
-        camera = Camera(row["width"], row["height"], np.array(row["intrinsic"]))
-        pose = np.array(row["pose"])
-        own = Thing(target.meshes[0], np.array(row["target_pose"]), target.paint, TARGET)
-        around = made.cast.at(row["time"], pose[:2, 3], 150.0)
-        view = View(camera, pose, (own, *(s.thing for s in around)), Weather(**row["light"]), NOISE, 1)
-        picture = render(made.stage, [view], linear=False)
-        labels = label_picture(made.stage, view, picture)
-        box = labels.box[labels.tag == TARGET][0]
-        x, y, w, h = target_of(data, row)["bbox"]
-        assert np.abs(box - [x, y, x + w, y + h]).max() <= 1.0
-        stored = cv2.imread(str(drives / "images" / row["file_name"]))
-        assert stored is not None
-        assert np.abs(stored[..., ::-1].astype(float) - picture.image[0]).mean() < 8.0
+def test_a_recording_is_drawn_again(drives: Path, orbits: Path) -> None:
+    """Each row gives scene, view, target and labels; what is rendered is what was stored."""
+    for folder in (drives, orbits):
+        rows = read(folder, "all")["images"]
+        again = list(clip_views(folder))
+        assert [v.file for v in again] == [row["file_name"] for row in rows]
+        assert len({id(v.scene) for v in again}) < len(again), "pictures of a part share a scene"
+        for seen in again:
+            picture = render(seen.scene, [seen.view])
+            assert encode_jpeg(picture.image[0], 92, "420") == (folder / "images" / seen.file).read_bytes()
+            labels = label_picture(seen.scene, seen.view, picture)
+            target = next(o for o in seen.objects if o["target"])
+            x, y, w, h = target["bbox"]
+            assert labels.box[labels.tag == TARGET][0].tolist() == [x, y, x + w, y + h]
+            assert seen.view.things[0].tag == TARGET
+            worn = seen.wearing(Layer(4)).things
+            assert worn[0].layers == (Layer(4),)
+            assert worn[1:] == seen.view.things[1:]
+
+
+def test_the_named_target_is_the_same_metal_everywhere(tmp_path: Path) -> None:
+    target = TargetCar("suv", "red", seed=2)
+    found = []
+    for town in ("Twinford", "Oldmarket"):
+        clips = todo(tmp_path, "drive", target=target)
+        made = _prepare(clips, town, (0, "drive", town, 0, 0))
+        (body,) = made.targets
+        found.append(made.stage.meshes[body.meshes[0]])
+        assert body.paint == target.colour
+        assert body.size == target.full_size
+    assert np.array_equal(found[0].vertices, found[1].vertices)
+    assert np.array_equal(found[0].uv, found[1].uv)
+    assert found[0].rectangles == found[1].rectangles
+
+
+def test_clip_views_refuses_what_it_does_not_know(drives: Path, tmp_path: Path) -> None:
+    data = read(drives, "all")
+    del data["images"][0]["attempt"]
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "annotations" / "all.json").write_text(json.dumps(data))
+    with pytest.raises(FormatError, match="record them again"):
+        next(clip_views(tmp_path))
 
 
 def test_pycocotools_reads_it_and_the_truth_scores_1(drives: Path, orbits: Path) -> None:
@@ -300,7 +324,7 @@ def test_same_bytes_of_an_orbit_for_two_workers_and_after_kill_9(orbits: Path, t
     record_clips(todo(tmp_path / "d", "orbit"), workers=2)
     assert contents(tmp_path / "d") == contents(orbits)
     command = [sys.executable, "-m", "ssad.cli", "record", str(tmp_path / "e"), "--clips", "orbit", "--images", "2,1"]
-    command += ["--towns", "Twinford,Oldmarket", "--held-out", "Oldmarket", "--style", "van", "--workers", "2"]
+    command += ["--towns", "Twinford,Oldmarket", "--held-out", "Oldmarket", "--target", "van:white:3", "--workers", "2"]
     for pause in (5.0, 7.0):
         with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:
             time.sleep(pause)
@@ -323,7 +347,7 @@ def test_a_town_of_many_parts_shows_each_cell_once_before_any_comes_again(tmp_pa
 
 
 def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path) -> None:
-    for changes in ({"seed": 1}, {"size": 168}, {"style": "van"}, {"images": PAIRS[:1]}):
+    for changes in ({"seed": 1}, {"size": 168}, {"target": TargetCar("van")}, {"images": PAIRS[:1]}):
         with pytest.raises(StoreError, match="another recording") as error:
             record_clips(todo(drives, "drive", **changes), workers=0)
         assert "\n" not in str(error.value)
@@ -349,7 +373,6 @@ def test_another_recording_in_the_folder_is_refused(drives: Path, tmp_path: Path
         ({"images": ()}, "name a town"),
         ({"images": (("Twinford", 0),)}, "0 pictures"),
         ({"images": (("Twinford", 1), ("Twinford", 2))}, "named twice"),
-        ({"style": "spaceship"}, "spaceship.*choose from.*sedan"),
         ({"mode": "walk"}, "drive or orbit"),
         ({"size": 60}, "a car 20 m away needs"),
         ({"size": 8192}, "4096"),
@@ -384,7 +407,7 @@ def test_numbers_of_pictures_are_paired_with_towns() -> None:
         (["walk"], "drive or orbit"),
         (["drive", "--images", "1,2"], "2 numbers for 4 towns"),
         (["drive", "--towns", "Nowhere", "--images", "2"], "unknown town 'Nowhere'"),
-        (["orbit", "--style", "spaceship"], "no car of style 'spaceship'"),
+        (["orbit", "--target", "spaceship"], "spaceship"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(
@@ -442,6 +465,20 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: _Set) -> None
     assert shots(float(trace.driven[-1])) == []
 
 
-def test_styles_are_those_of_cars(tmp_path: Path) -> None:
-    for style in BODIES["car"].styles:
-        assert Clips(tmp_path, style=style).style == style
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("van", TargetCar("van")),
+        ("suv:red", TargetCar("suv", "red")),
+        ("sedan:white:7", TargetCar("sedan", "white", seed=7)),
+    ],
+)
+def test_targets_are_named_by_style_paint_and_seed(text: str, expected: TargetCar) -> None:
+    assert parse_target(text) == expected
+    assert expected.mesh().bounds()[1][2] == pytest.approx(expected.full_size[2], abs=1e-3)
+
+
+@pytest.mark.parametrize("text", ["spaceship", "sedan:mauve", "sedan:red:x", "sedan:red:1:2"])
+def test_unknown_targets_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError):
+        parse_target(text)

@@ -9,7 +9,7 @@ gives the same bytes, and a run that was stopped goes on.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -19,13 +19,14 @@ import cv2
 import numpy as np
 
 from ssad.assets.actor_bodies import class_of
-from ssad.assets.bodies import BODIES, draw_paint, draw_size, draw_style, make_body
+from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
+from ssad.assets.mesh import Point
 from ssad.camera.labels import label_picture
 from ssad.camera.lamps import NOSE, own_lamps
-from ssad.camera.render import Picture, View, render
-from ssad.camera.scene import Scene, Thing
+from ssad.camera.render import Picture, View, Weather, render
+from ssad.camera.scene import Layer, Scene, Thing
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, StoreError
+from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -39,6 +40,7 @@ from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
 from ssad.recording.nuscenes_recorder import HELD_OUT, NOISE, draw_weather, drive, run_parts
 from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
+from ssad.recording.target import TargetCar
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
 from ssad.roads import load_town, town_names
 
@@ -58,8 +60,8 @@ NEAR: Final = 0.2  # largest share of the picture that something right before th
 
 @dataclass(frozen=True, slots=True)
 class Clips:
-    """What to record. images: town -> how many pictures; mode; size: pixels a side; style: of the target car (None:
-    any); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of the orbit;
+    """What to record. images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one
+    in each part); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of an orbit;
     quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`. ConfigError for what
     cannot be."""
 
@@ -68,7 +70,7 @@ class Clips:
     held_out: tuple[str, ...] = HELD_OUT
     mode: Literal["drive", "orbit"] = "drive"
     size: int = 640
-    style: str | None = None
+    target: TargetCar | None = None
     behind: float = 20.0
     height: float = 2.0
     distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
@@ -91,8 +93,6 @@ class Clips:
                 raise ConfigError(f"{town}: {count} pictures; ask for one or more")
             if sum(t == town for t, _ in self.images) > 1:
                 raise ConfigError(f"{town} is named twice; name each town once")
-        if self.style is not None and self.style not in BODIES["car"].styles:
-            raise ConfigError(f"no car of style '{self.style}'; choose from: {', '.join(BODIES['car'].styles)}")
         if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
             raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
         if not (self.distances and self.azimuths and self.elevations):
@@ -143,19 +143,30 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
     cast = place_objects(trace, graph, street, key=key)
-    count = TARGETS if clips.mode == "orbit" else 1
-    targets = tuple(_target(cast, clips.style, generator("clips target", *key, n)) for n in range(count))
+    if clips.target is not None:
+        targets: tuple[ObjectBody, ...] = (_named(cast, clips.target),)
+    else:
+        count = TARGETS if clips.mode == "orbit" else 1
+        targets = tuple(_drawn(cast, generator("clips target", *key, n)) for n in range(count))
     return _Set(clips, key, trace, cast, Scene(street, cast.meshes, device=clips.device), targets)
 
 
-def _target(cast: SceneObjects, style: str | None, draws: np.random.Generator) -> ObjectBody:
-    """A car in the place of the ego, with its mesh in the cast."""
-    style = style or draw_style("car", generator=draws)
+def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
+    """Some car in the place of the ego, with its mesh in the cast."""
+    style = draw_style("car", generator=draws)
     drawn = draw_size("car", style, generator=draws)
     size = min(drawn[0], 4.9), min(drawn[1], 2.06), drawn[2]
     mesh = cast.mesh(make_body("car", style=style, size=size, generator=draws))
-    paint, nowhere = draw_paint(draws), np.zeros((1, 4))
-    return ObjectBody(TARGET, "car", style, size, paint, (mesh,), nowhere, np.ones(1, bool), np.zeros(1))
+    return _body(mesh, style, size, draw_paint(draws))
+
+
+def _named(cast: SceneObjects, target: TargetCar) -> ObjectBody:
+    """The target car in the place of the ego, with its mesh in the cast."""
+    return _body(cast.mesh(target.mesh()), target.style, target.full_size, target.colour)
+
+
+def _body(mesh: int, style: str, size: Point, paint: tuple[float, float, float]) -> ObjectBody:
+    return ObjectBody(TARGET, "car", style, size, paint, (mesh,), np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
 
 
 def batch_size(device: str) -> int:
@@ -212,7 +223,8 @@ def _part(task: tuple[Clips, str, int, int, str]) -> str:
             for n, row, image in _take(made, shots, skipped):
                 file = f"{name}-{n:03d}.jpg"
                 safeio.write_atomic(clips.out / "images" / file, encode_jpeg(image, clips.quality, "420"))
-                rows[n] = {"file_name": file, "town": town, "drive": made.trace.key} | row
+                about = {"file_name": file, "town": town, "drive": made.trace.key, "part": number, "attempt": attempt}
+                rows[n] = about | {"slot": n} | row
         if not missing():
             break
     else:
@@ -229,8 +241,7 @@ def _take(
 ) -> Iterator[tuple[int, dict[str, Any], U8]]:
     """Renders and labels shots; those that show their target, with what is annotated. Counts why others do not."""
     clips = made.clips
-    middle, focal = (clips.size - 1) / 2, FOCAL * clips.size
-    camera = Camera(clips.size, clips.size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
+    camera = _camera(clips.size)
     ready: list[tuple[int, Viewpoint, View, list[PlacedObject]]] = []
     for n, shot in shots:
         target = made.targets[n % len(made.targets)]
@@ -238,13 +249,9 @@ def _take(
         if not has_room(target, shot, around):
             skipped["crowded"] += 1
             continue
-        own = Thing(target.meshes[0], shot.target, target.paint, TARGET)
-        noise = int(digest("clips noise", *made.key, n)[:7], 16)
-        things = (own, *(s.thing for s in around))
-        around.append(PlacedObject(target, shot.target, 0.0, own))
-        lamps = own_lamps(_follower(shot), shot.weather) if clips.mode == "drive" else ()
-        focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise, lamps, focus), around))
+        view = _view(made, n, shot, around, camera)
+        around.append(PlacedObject(target, shot.target, 0.0, view.things[0]))
+        ready.append((n, shot, view, around))
     size = batch_size(clips.device)
     for k in range(0, len(ready), size):
         picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)
@@ -255,13 +262,29 @@ def _take(
                 continue
             target = around[-1].body
             row = {
-                "width": clips.size, "height": clips.size, "time": round(shot.time, 3),
+                "width": clips.size, "height": clips.size, "time": shot.time,
                 "weather": weather_name(shot.weather), "light": asdict(shot.weather),
-                "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.round(5).tolist(),
-                "target_pose": shot.target.round(5).tolist(), "target_style": target.style,
+                "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.tolist(),
+                "target_pose": shot.target.tolist(), "target_style": target.style,
                 "target_size": [round(v, 3) for v in target.size], "objects": objects,
             }  # fmt: skip
             yield n, row | shot.about, picture.image[index]
+
+
+def _camera(size: int) -> Camera:
+    middle, focal = (size - 1) / 2, FOCAL * size
+    return Camera(size, size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
+
+
+def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], camera: Camera) -> View:
+    """View `n` of a part: the target first, then who else is there."""
+    target = made.targets[n % len(made.targets)]
+    own = Thing(target.meshes[0], shot.target, target.paint, TARGET)
+    noise = int(digest("clips noise", *made.key, n)[:7], 16)
+    lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
+    focus = float(shot.target[0, 3]), float(shot.target[1, 3])
+    things = (own, *(s.thing for s in around))
+    return View(camera, shot.camera, things, shot.weather, NOISE, noise, lamps, focus)
 
 
 def _follower(shot: Viewpoint) -> F64:
@@ -343,3 +366,73 @@ def record_clips(
             page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
             safeio.write_atomic(out / "annotations" / f"{split}.json", page)
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class ClipView:
+    """A recorded picture and what it shows, ready to be rendered again.
+
+    Attributes:
+        file: Its name in the folder `images`.
+        row: What the annotation file says of it.
+        scene: Street and bodies.
+        view: Camera, things (the target first, tag `TARGET`) and light.
+        objects: What is annotated in it: label (index into `CLASSES`), bbox (x, y, width, height), area, target ...
+    """
+
+    file: str
+    row: Mapping[str, Any]
+    scene: Scene
+    view: View
+    objects: tuple[Mapping[str, Any], ...]
+
+    def wearing(self, *layers: Layer) -> View:
+        """The view with layers on the target."""
+        target, *others = self.view.things
+        return replace(self.view, things=(replace(target, layers=layers), *others))
+
+
+def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iterator[ClipView]:
+    """The pictures of a recording with their scenes, in order.
+
+    Rendering a view gives the recorded picture (before JPEG) again. Pictures of one part of a recording share a scene.
+
+    Args:
+        folder: What `record_clips` wrote.
+        split: train, test or all.
+        device: Where to render.
+
+    Raises:
+        FormatError: No recording of this version.
+    """
+    path = folder / "annotations" / f"{split}.json"
+    data = safeio.read_json(path, limit=1 << 30)
+    try:
+        about = data["info"]["recording"]
+        own: dict[int, list[Mapping[str, Any]]] = {row["id"]: [] for row in data["images"]}
+        for one in data["annotations"]:
+            own[one["image_id"]].append(one)
+        clips = _clips_of(about, folder, device)
+        made, last = None, None
+        for row in data["images"]:
+            key = (clips.seed, clips.mode, row["town"], row["part"], row["attempt"])
+            if made is None or key != last:
+                made, last = _prepare(clips, row["town"], key), key
+            weather = Weather(**row["light"])
+            shot = Viewpoint(row["time"], np.array(row["pose"]), np.array(row["target_pose"]), weather, {})
+            around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
+            view = _view(made, row["slot"], shot, around, _camera(clips.size))
+            yield ClipView(row["file_name"], row, made.stage, view, tuple(own[row["id"]]))
+    except (KeyError, TypeError) as error:
+        why = f"({type(error).__name__}: {error})"
+        raise FormatError(f"{path}: not the clips of this version {why}; record them again") from None
+
+
+def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
+    """The recording that `Clips.identity` describes."""
+    given: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in about.items() if k != "clips"}
+    given["images"] = tuple((town, count) for town, count in about["images"])
+    if about["target"] is not None:
+        size = about["target"]["size"]
+        given["target"] = TargetCar(**about["target"] | {"size": None if size is None else tuple(size)})
+    return Clips(folder, **given | {"mode": about["clips"], "device": device})

@@ -247,7 +247,8 @@ def describe_data(folder: Path) -> str:
             return folder.name
         towns, counts = zip(*about["images"], strict=True)
         words = ["--clips", about["clips"], "--towns", ",".join(towns), "--images", ",".join(map(str, counts))]
-        words += ["--style", about["style"]] if about.get("style") else []
+        target = about.get("target")
+        words += ["--target", f"{target['style']}:{target['paint']}:{target['seed']}"] if target else []
     elif (folder / ".parts" / "recording.json").is_file():
         about = safeio.read_json(folder / ".parts" / "recording.json")
         words = ["--towns", ",".join(about["towns"]), "--scenes", str(about["scenes"])]

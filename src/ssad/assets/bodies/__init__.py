@@ -7,14 +7,16 @@ means over styles are near those of the boxes in nuScenes (Caesar et al. 2020) w
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ssad.assets.bodies import car as _car
 from ssad.assets.bodies import cycles, furniture, heavy, machines, people
-from ssad.assets.mesh import Mesh, Point
+from ssad.assets.mesh import Mesh, Point, Rectangle
 from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.seeding import generator as seeded
 
 DETAILS = (0, 1, 2)
 
@@ -143,9 +145,10 @@ def make_body(
     """The mesh of a kind of road user or furniture, see `BODIES`; base centred on the origin, x forward.
 
     `style` and `size` (length, width, height, m) are drawn where None. The mesh fills its size exactly; a walker
-    fills it over the whole walking cycle. `detail` 2 is full, 0 is for far away: the draws, the size and the places
-    of panels in the atlas do not depend on it. `phase` (rad) is the place in the cycle of a walker or the angle of a
-    bicycle's crank. The generator always gives the same number of draws for a style. UnknownNameError, ConfigError.
+    fills it over the whole walking cycle. `detail` 2 is full, 0 is for far away: draws and size do not depend on it. A
+    panel has the same place in the texture atlas in every body of a style, whatever its size and detail. `phase` (rad)
+    is the place in the cycle of a walker or the angle of a bicycle's crank. The generator always gives the same number
+    of draws for a style. UnknownNameError, ConfigError.
     """
     body = _body(kind)
     drawn_style = draw_style(kind, generator=generator)
@@ -160,7 +163,30 @@ def make_body(
         raise ConfigError(f"{kind}: detail {detail} is not one of 0, 1, 2")
     extra = {"phase": phase} if body.phased else {}
     length, width, height = (float(v) for v in lengths)
-    return body.make(chosen, (length, width, height), generator=generator, detail=detail, **extra)
+    mesh = body.make(chosen, (length, width, height), generator=generator, detail=detail, **extra)
+    return _in_atlas(mesh, _atlas(kind, chosen))
+
+
+@lru_cache
+def _atlas(kind: str, style: str) -> Mapping[str, Rectangle]:
+    """The rectangle of each panel of a style: that of its mean size, so that one texture fits every size."""
+    body = BODIES[kind]
+    mean = body.make(style, body.styles[style].size, generator=seeded("atlas", kind, style), detail=0)
+    return dict(zip(mean.panels, mean.rectangles, strict=True))
+
+
+def _in_atlas(mesh: Mesh, atlas: Mapping[str, Rectangle]) -> Mesh:
+    """The mesh with each panel moved and stretched into its rectangle of the atlas, parts of one panel together."""
+    uv = mesh.uv.astype(np.float64)
+    whole = [name.split("/")[0] for name in mesh.panels]
+    places = tuple(atlas[name] for name in mesh.panels)
+    for panel in set(whole):
+        parts = [k for k, name in enumerate(whole) if name == panel]
+        own, wanted = (np.array([table[k] for k in parts]) for table in (mesh.rectangles, places))
+        (low, high), (left, right) = ((r[:, :2].min(0), r[:, 2:].max(0)) for r in (own, wanted))
+        faces = np.isin(mesh.panel, parts)
+        uv[faces] = left + (uv[faces] - low) / np.maximum(high - low, 1e-9) * (right - left)
+    return replace(mesh, uv=np.clip(uv, 0.0, 1.0).astype(np.float32), rectangles=places)
 
 
 def _body(kind: str) -> Body:
