@@ -1,8 +1,6 @@
-"""Textures and the camera's curve in torch; sensor noise."""
+"""Textures in torch, and the camera after them."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +11,8 @@ from ssad.assets.mesh import Material, build
 from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import apply_taps, taps_of, texture_gradient
-from ssad.camera.torch_texture import TorchTaps, develop, pyramid, retexture, to_linear
+from ssad.camera.torch_sensor import develop
+from ssad.camera.torch_texture import TorchTaps, pyramid, retexture, to_linear
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
@@ -92,24 +91,6 @@ def test_the_pyramid_keeps_the_mean_colour() -> None:
         assert torch.allclose(rows[start : start + edge * edge].mean(0), texture.mean((1, 2)))
         start += edge * edge
     assert start == len(rows)
-
-
-def test_noise_has_the_stated_deviation_and_no_bias(stage: Scene) -> None:
-    still = render(stage, [view(texture=-1)])
-    noisy = render(stage, [replace(view(texture=-1), noise=0.03, seed=s) for s in range(24)])
-    assert np.array_equal(render(stage, [replace(view(texture=-1), noise=0.03, seed=7)]).image[0], noisy.image[7])
-    flat = (still.image[0] > 60).all(-1) & (still.image[0] < 180).all(-1)
-    found = noisy.image[:, flat].astype(float)
-    assert abs(found.mean() - still.image[0][flat].mean()) < 0.5
-    light = still.radiance[0][flat] * still.exposure[0]
-    slope = 255 * 1.055 / 2.4 * light ** (1 / 2.4 - 1)  # of the sRGB curve
-    expected = slope * 0.03 * np.sqrt(light + 0.2**2)
-    assert found.std(0).mean() == pytest.approx(expected.mean(), rel=0.15)
-    night = Weather(-0.2, 0.0, 0.4)
-    pair = render(stage, [replace(view(texture=-1, weather=night), noise=0.03, seed=s) for s in range(24)])
-    dark = render(stage, [view(texture=-1, weather=night)]).image[0]
-    same = (dark > 60).all(-1) & (dark < 180).all(-1)
-    assert pair.image[:, same].astype(float).std(0).mean() > 1.3 * found.std(0).mean(), "more noise by night"
 
 
 def test_wrong_textures_are_refused(picture: Picture) -> None:

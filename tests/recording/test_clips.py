@@ -41,7 +41,7 @@ from ssad.recording.clip_recorder import (
     pair_images,
     record_clips,
 )
-from ssad.recording.nuscenes_recorder import NOISE
+from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.recording.viewpoints import AIM, EYE, follow, look_at, polar, turn_of, weather_name
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
@@ -248,7 +248,7 @@ def test_a_row_tells_all_to_draw_the_picture_again(drives: Path, market: _Set) -
         pose = np.array(row["pose"])
         own = Thing(target.meshes[0], np.array(row["target_pose"]), target.paint, TARGET)
         around = made.cast.at(row["time"], pose[:2, 3], 150.0)
-        view = View(camera, pose, (own, *(s.thing for s in around)), Weather(**row["light"]), NOISE, 1)
+        view = View(camera, pose, (own, *(s.thing for s in around)), Weather(**row["light"]), SENSOR, 1)
         picture = render(made.stage, [view], linear=False)
         labels = label_picture(made.stage, view, picture)
         box = labels.box[labels.tag == TARGET][0]

@@ -37,7 +37,7 @@ from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
-from ssad.recording.nuscenes_recorder import HELD_OUT, NOISE, draw_weather, drive, run_parts
+from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, draw_weather, drive, run_parts
 from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
 from ssad.roads import load_town, town_names
@@ -244,7 +244,7 @@ def _take(
         around.append(PlacedObject(target, shot.target, 0.0, own))
         lamps = own_lamps(_follower(shot), shot.weather) if clips.mode == "drive" else ()
         focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, NOISE, noise, lamps, focus), around))
+        ready.append((n, shot, View(camera, shot.camera, things, shot.weather, SENSOR, noise, lamps, focus), around))
     size = batch_size(clips.device)
     for k in range(0, len(ready), size):
         picture = render(made.stage, [view for _, _, view, _ in ready[k : k + size]], linear=False)

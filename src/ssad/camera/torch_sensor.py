@@ -1,0 +1,709 @@
+"""The camera's sensor in torch: what `ssad.camera.render` does from light to JPEG, with gradients.
+
+`develop` is the chain of `ssad.camera.sensor` and equals the renderer's pictures to the rounding to 8 bits; `jpeg` is
+libjpeg's encoder and decoder. An attack changes few pixels: `Window` develops those and what depends on them alone.
+
+Slopes: light above a full photosite and colours outside 0..1 have slope zero, as in the camera. Rounding (to 8 bits,
+and in JPEG) is done for real and has slope one (straight-through): the mean slope of a staircase, so that what an
+optimiser sees is the picture that is recorded and how it changes over steps larger than a stair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad, pixel_shuffle
+
+from ssad.camera.sensor import (
+    ACROSS,
+    ALONG,
+    BRIGHTEST,
+    DAY_EXPOSURE,
+    DEFAULT_SENSOR,
+    GREEN,
+    KNEE,
+    OPPOSITE,
+    SHOULDER,
+    SMALLEST,
+    Sensor,
+    noise_levels,
+    point_spread,
+)
+from ssad.camera.torch_texture import TorchTaps
+from ssad.core.errors import ConfigError
+
+# Annex K of the JPEG standard (ITU-T T.81), for quality 50
+LUMINANCE = (
+    (16, 11, 10, 16, 24, 40, 51, 61),
+    (12, 12, 14, 19, 26, 58, 60, 55),
+    (14, 13, 16, 24, 40, 57, 69, 56),
+    (14, 17, 22, 29, 51, 87, 80, 62),
+    (18, 22, 37, 56, 68, 109, 103, 77),
+    (24, 35, 55, 64, 81, 104, 113, 92),
+    (49, 64, 78, 87, 103, 121, 120, 101),
+    (72, 92, 95, 98, 112, 100, 103, 99),
+)
+CHROMINANCE = (
+    (17, 18, 24, 47, 99, 99, 99, 99),
+    (18, 21, 26, 66, 99, 99, 99, 99),
+    (24, 26, 56, 99, 99, 99, 99, 99),
+    (47, 66, 99, 99, 99, 99, 99, 99),
+    *(((99,) * 8,) * 4),
+)
+# libjpeg's 16-bit fixed-point weights of R, G, B in Y, Cb, Cr, and back
+TO_YCBCR = ((19595, 38470, 7471), (-11059, -21709, 32768), (32768, -27439, -5329))
+FROM_YCBCR = ((1.0, 0.0, 1.402), (1.0, -0.344136286, -0.714136286), (1.0, 1.772, 0.0))
+ACCURATE = 96  # quality from which libjpeg-turbo takes the accurate DCT unless told
+TIE = 2.0**-12  # so that halves go up in whatever order sums were made
+
+
+# ---------------------------------------------------------------- from light to colour
+
+
+@lru_cache(maxsize=8)
+def _lens_weights(blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4]: from a square of four with a border of one px to the
+    photosites of the square."""
+    centre, side = point_spread(blur)
+    line = np.array([side, centre, side])
+    spread = line[:, None] * line
+    square = np.zeros((4, 3, 4, 4))
+    for site, colour in enumerate((0, 1, 1, 2)):
+        y, x = divmod(site, 2)
+        square[site, colour, y : y + 3, x : x + 3] = spread
+    return spread, square
+
+
+@lru_cache(maxsize=1)
+def _demosaic_weights() -> np.ndarray:
+    """[12, 1, 6, 6]: from a square of four with a border of two px to its colours, those of one colour together."""
+    itself = np.zeros((5, 5))
+    itself[2, 2] = 8.0
+    taps = (
+        (itself, ALONG, ACROSS, OPPOSITE),  # red at red's site, at the greens beside and below it, at blue's
+        (GREEN, itself, itself, GREEN),
+        (OPPOSITE, ACROSS, ALONG, itself),
+    )
+    square = np.zeros((12, 1, 6, 6))
+    for colour, sites in enumerate(taps):
+        for site, weights in enumerate(sites):
+            y, x = divmod(site, 2)
+            square[4 * colour + site, 0, y : y + 5, x : x + 5] = np.array(weights) / 8
+    return square
+
+
+def _squares(picture: Tensor, weights: np.ndarray, border: int) -> Tensor:
+    """A picture [B, C, H, W], mirrored at its borders, in squares of four: [B, C', H, W]."""
+    height, width = picture.shape[2:]
+    wide = pad(picture, (border, border + width % 2, border, border + height % 2), mode="reflect")
+    kernel = torch.as_tensor(weights, dtype=picture.dtype, device=picture.device)
+    return pixel_shuffle(conv2d(wide, kernel, stride=2), 2)[:, :, :height, :width]
+
+
+def photosites(light: Tensor, sensor: Sensor) -> Tensor:
+    """What falls on the photosites: the lens's point spread, and one colour for each where there is a mosaic.
+
+    Args:
+        light: Linear, [B, H, W, 3].
+        sensor: Whose lens and mosaic.
+
+    Returns:
+        Light of each photosite, [B, H, W] with a mosaic, [B, H, W, 3] without.
+
+    Raises:
+        ConfigError: The picture is smaller than 3 x 3.
+    """
+    sensor.check_size(*light.shape[1:3])
+    colours = light.permute(0, 3, 1, 2)
+    spread, square = _lens_weights(sensor.blur)
+    if sensor.mosaic:
+        return _squares(colours, square, 1)[:, 0]
+    if sensor.blur == 0:
+        return light
+    kernel = torch.as_tensor(spread, dtype=light.dtype, device=light.device).expand(3, 1, 3, 3)
+    return conv2d(pad(colours, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).permute(0, 2, 3, 1)
+
+
+def fill(light: Tensor, exposure: Tensor | float, sensor: Sensor, noise: Tensor | None = None) -> Tensor:
+    """What the photosites hold: light with noise, and no more than fits. Zero slope where they are full.
+
+    Args:
+        light: Exposed light on each photosite, [B, H, W] or [B, H, W, 3].
+        exposure: [B] or one for all, on which the level of the noise depends.
+        sensor: Whose noise and full photosites.
+        noise: Independent normal numbers of deviation one, shaped as light; None for none.
+
+    Returns:
+        The raw picture, shaped as light. The slope counts that noise grows with light.
+
+    Raises:
+        ConfigError: The noise has another shape.
+    """
+    if noise is not None and sensor.noise > 0:
+        if noise.shape != light.shape:
+            raise ConfigError(f"noise of shape {list(noise.shape)} for photosites {list(light.shape)}")
+        scale = torch.as_tensor(exposure, dtype=light.dtype, device=light.device).reshape(-1, *[1] * (light.ndim - 1))
+        gain = (scale / DAY_EXPOSURE).clamp_min(1.0).sqrt()
+        photons, dark = noise_levels(sensor.noise, DAY_EXPOSURE)
+        light = light + torch.sqrt(photons * gain * light.clamp_min(0.0) + (dark * gain) ** 2) * noise
+    return light.clamp_max(sensor.full)
+
+
+def demosaic(raw: Tensor) -> Tensor:
+    """The missing colours of an RGGB mosaic by Malvar, He and Cutler (ICASSP 2004).
+
+    Args:
+        raw: What the photosites hold, [B, H, W].
+
+    Returns:
+        Linear colours, [B, H, W, 3]; noise and edges can take them a little below zero.
+    """
+    return _squares(raw[:, None], _demosaic_weights(), 2).permute(0, 2, 3, 1)
+
+
+def curve(light: Tensor) -> Tensor:
+    """The camera's curve: linear to 0.8, a soft shoulder above, then sRGB.
+
+    Args:
+        light: Linear, of any shape; used in 0..4.
+
+    Returns:
+        sRGB in [0, 1]. The slope is finite everywhere.
+    """
+    light = light.clamp(0.0, 0.99975 * BRIGHTEST)
+    soft = torch.where(
+        light > KNEE, KNEE + (1 - KNEE) * (1 - torch.exp(-(light - KNEE).clamp_min(0.0) / SHOULDER)), light
+    )
+    return torch.where(soft <= 0.0031308, soft * 12.92, 1.055 * soft.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator) -> Tensor:
+    """A sample of noise for `develop`: normal numbers of deviation one.
+
+    Args:
+        shape: B, H, W.
+        sensor: With a mosaic a photosite has one number, else three.
+        generator: Where they come from; the sample is on its device.
+
+    Returns:
+        [B, H, W] or [B, H, W, 3], float32.
+    """
+    size = (*shape, 3)[: 3 if sensor.mosaic else 4]
+    return torch.randn(size, generator=generator, device=generator.device)
+
+
+def develop(
+    radiance: Tensor,
+    exposure: Tensor | float,
+    sensor: Sensor = DEFAULT_SENSOR,
+    noise: Tensor | torch.Generator | None = None,
+) -> Tensor:
+    """The camera's picture of a radiance, as `ssad.camera.render` makes it before it rounds to 8 bits.
+
+    Args:
+        radiance: Linear, [B, H, W, 3].
+        exposure: What radiance is multiplied by, [B] or one for all.
+        sensor: Lens, mosaic, noise and full photosites.
+        noise: A sample as `draw_noise` gives, which stays fixed over calls; or where to draw one; None for none.
+
+    Returns:
+        sRGB in [0, 1], [B, 3, H, W]; differentiable in the radiance.
+
+    Raises:
+        ConfigError: The picture is smaller than 3 x 3, or the noise has another shape.
+    """
+    scale = torch.as_tensor(exposure, dtype=radiance.dtype, device=radiance.device).reshape(-1, 1, 1, 1)
+    if isinstance(noise, torch.Generator):
+        noise = draw_noise(radiance.shape[:3], sensor, noise)
+    if noise is not None:
+        noise = noise.to(radiance)
+    raw = fill(photosites(radiance * scale, sensor), exposure, sensor, noise)
+    return curve(demosaic(raw) if sensor.mosaic else raw).permute(0, 3, 1, 2)
+
+
+# ---------------------------------------------------------------- JPEG
+
+
+def _straight(value: Tensor, rounded: Tensor) -> Tensor:
+    """Exactly what is rounded, with the slope of the value (straight-through)."""
+    return rounded.detach() + (value - value.detach())
+
+
+def _nearest(value: Tensor) -> Tensor:
+    """The nearest whole number, halves up, with slope one."""
+    return _straight(value, torch.floor(value + (0.5 + TIE)))
+
+
+def to_8_bits(image: Tensor) -> Tensor:
+    """Rounds to the 256 codes of a file, with slope one inside 0..1 and zero outside.
+
+    Args:
+        image: Any shape, used in 0..1.
+
+    Returns:
+        Multiples of 1/255.
+    """
+    return _nearest(image.clamp(0.0, 1.0) * 255) / 255
+
+
+def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of the coefficients of luminance and chrominance: Annex K's tables, scaled as libjpeg does.
+
+    Args:
+        quality: 1 to 100.
+
+    Returns:
+        Two tables [8, 8] of 1..255, rows by vertical frequency.
+
+    Raises:
+        ConfigError: The quality is outside 1..100.
+    """
+    if not 1 <= quality <= 100:
+        raise ConfigError(f"a JPEG quality of {quality}: it must be in 1..100")
+    scale = 5000 // quality if quality < 50 else 200 - 2 * quality
+    luminance, chrominance = (np.clip((np.array(t) * scale + 50) // 100, 1, 255) for t in (LUMINANCE, CHROMINANCE))
+    return luminance, chrominance
+
+
+@lru_cache(maxsize=1)
+def _cosines() -> np.ndarray:
+    """The orthonormal DCT-II [8, 8], a row for each frequency."""
+    k = np.arange(8)
+    rows = np.cos(np.pi * (2 * k + 1) * k[:, None] / 16) / 2
+    rows[0] /= np.sqrt(2)
+    return np.asarray(rows)
+
+
+def _fast_pass(lines: Tensor) -> Tensor:
+    """libjpeg's fast DCT along the first axis of whole numbers [8, ...], by Arai, Agui and Nakajima with constants of
+    8 bits. Each frequency comes out scaled by `_fast_divisors`."""
+    a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
+    s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
+    d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4
+    even, odd, low = s0 + s3, s1 + s2, s0 - s3
+    turned = (s1 - s2 + low) * 181 >> 8
+    e0, e1, e2 = d3 + d2, d2 + d1, d1 + d0
+    shared = (e0 - e2) * 98 >> 8
+    f0, f2 = (e0 * 139 >> 8) + shared, (e2 * 334 >> 8) + shared
+    f1 = e1 * 181 >> 8
+    g0, g1 = d0 + f1, d0 - f1
+    return torch.stack([even + odd, g0 + f2, low + turned, g1 - f0, even - odd, g1 + f0, low - turned, g0 - f2])
+
+
+def _fast_divisors(table: np.ndarray) -> np.ndarray:
+    """Steps [8, 8] in the scale of `_fast_pass`, rounded as libjpeg does."""
+    scales = np.array([np.sqrt(2) * np.cos(k * np.pi / 16) if k else 1.0 for k in range(8)])
+    return np.asarray(np.floor(table * np.rint(np.outer(scales, scales) * 2**14) / 2**11 + 0.5))
+
+
+def _accurate_pass(lines: Tensor, *, first: bool) -> Tensor:
+    """libjpeg's accurate DCT along the first axis of whole numbers [8, ...], by Loeffler, Ligtenberg and Moschytz with
+    constants of 13 bits. The first pass keeps two bits more, the second takes them off: eighths in the end."""
+    a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
+    s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
+    d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4
+    even, odd, low, high = s0 + s3, s1 + s2, s0 - s3, s1 - s2
+    turned = (high + low) * 4433
+    shared = (d3 + d1 + d2 + d0) * 9633
+    z1, z2 = (d3 + d0) * -7373, (d2 + d1) * -20995
+    z3, z4 = (d3 + d1) * -16069 + shared, (d2 + d0) * -3196 + shared
+    rows = [
+        even + odd, d0 * 12299 + z1 + z4, turned + low * 6270, d1 * 25172 + z2 + z3,
+        even - odd, d2 * 16819 + z2 + z4, turned - high * 15137, d3 * 2446 + z1 + z3,
+    ]  # fmt: skip
+    bits = 11 if first else 15
+    for k in (1, 2, 3, 5, 6, 7):
+        rows[k] = rows[k] + (1 << (bits - 1)) >> bits
+    for k in (0, 4):
+        rows[k] = rows[k] << 2 if first else rows[k] + 2 >> 2
+    return torch.stack(rows)
+
+
+def _steps(blocks: Tensor, table: np.ndarray, *, fast: bool) -> Tensor:
+    """How many steps each coefficient of blocks [..., 8, 8] of whole numbers has, to libjpeg's last bit."""
+    lines = blocks.movedim(-1, 0).to(torch.int32).contiguous()
+    if fast:
+        found, divisors = _fast_pass(_fast_pass(lines).movedim(-1, 0).contiguous()), _fast_divisors(table)
+    else:
+        once = _accurate_pass(lines, first=True).movedim(-1, 0).contiguous()
+        found, divisors = _accurate_pass(once, first=False), 8 * table
+    # vertical and horizontal frequency, blocks
+    step = torch.as_tensor(divisors.astype(np.int32), device=blocks.device).reshape(8, 8, *[1] * (found.ndim - 2))
+    whole = found.sign() * torch.div(found.abs() + step // 2, step, rounding_mode="floor")
+    return whole.movedim((0, 1), (-2, -1)).to(blocks.dtype)
+
+
+def _compress(plane: Tensor, table: np.ndarray, *, fast: bool) -> Tensor:
+    """Whole codes [..., H, W], in whole blocks of 8 x 8, through quantisation and back."""
+    cosines = torch.as_tensor(_cosines(), dtype=plane.dtype, device=plane.device)
+    step = torch.as_tensor(table, dtype=plane.dtype, device=plane.device)
+    height, width = plane.shape[-2:]
+    blocks = plane.reshape(*plane.shape[:-2], height // 8, 8, width // 8, 8).transpose(-3, -2) - 128
+    with torch.no_grad():
+        whole = _steps(blocks, table, fast=fast)
+    kept = _straight(cosines @ blocks @ cosines.T / step, whole) * step
+    pixels = _nearest(cosines.T @ kept @ cosines + 128)
+    return pixels.transpose(-3, -2).reshape(plane.shape).clamp(0, 255)
+
+
+def _to_ycbcr(codes: Tensor) -> Tensor:
+    """Whole Y, Cb and Cr of whole R, G and B [B, 3, H, W], to libjpeg's last bit."""
+    weights = torch.tensor(TO_YCBCR, dtype=codes.dtype, device=codes.device) / 65536
+    middle = torch.tensor([0.0, 128.0, 128.0], dtype=codes.dtype, device=codes.device).reshape(3, 1, 1)
+    smooth = torch.einsum("ij,bjhw->bihw", weights, codes) + middle
+    with torch.no_grad():
+        red, green, blue = codes.to(torch.int32).unbind(1)
+        halves = (32768, (128 << 16) + 32767, (128 << 16) + 32767)
+        rows = [a * red + b * green + c * blue + half >> 16 for (a, b, c), half in zip(TO_YCBCR, halves, strict=True)]
+        whole = torch.stack(rows, 1).to(codes.dtype)
+    return _straight(smooth, whole)
+
+
+def _halved(plane: Tensor) -> Tensor:
+    """The mean of each 2 x 2; halves go down and up by turns along a row, as in libjpeg."""
+    total = plane[..., ::2, ::2] + plane[..., ::2, 1::2] + plane[..., 1::2, ::2] + plane[..., 1::2, 1::2]
+    bias = 1.0 + torch.arange(total.shape[-1], device=plane.device) % 2
+    return _straight(total / 4, torch.floor((total + bias) / 4))
+
+
+def _doubled(plane: Tensor) -> Tensor:
+    """Twice the size by weights 3 : 1 along each side ("fancy upsampling"), with libjpeg's rounding."""
+    wide = pad(plane, (1, 1, 1, 1), mode="replicate")
+    middle = 3 * wide[..., 1:-1, :]
+    rows = torch.stack([middle + wide[..., :-2, :], middle + wide[..., 2:, :]], -2).flatten(-3, -2)
+    middle = 3 * rows[..., 1:-1]
+    total = torch.stack([middle + rows[..., :-2], middle + rows[..., 2:]], -1)
+    bias = torch.tensor([8.0, 7.0], dtype=plane.dtype, device=plane.device)
+    return _straight(total / 16, torch.floor((total + bias) / 16)).flatten(-2)
+
+
+def _block(subsampling: str) -> int:
+    """Pixels along a side that one coded unit spans."""
+    if subsampling not in ("420", "444"):
+        raise ConfigError(f'a chroma subsampling of {subsampling!r}: it must be "420" or "444"')
+    return 16 if subsampling == "420" else 8
+
+
+def _extended(picture: Tensor, height: int, width: int) -> Tensor:
+    """A picture [C, H, W] with its last row and column repeated up to a size."""
+    down, right = height - picture.shape[1], width - picture.shape[2]
+    return pad(picture[None], (0, right, 0, down), mode="replicate")[0] if down or right else picture
+
+
+def _repeated(planes: Tensor, sizes: Sequence[tuple[int, int]]) -> Tensor:
+    """Planes [B, C, H, W] with what lies beyond sizes [B] replaced by the last row and column before."""
+    whole = (int(planes.shape[2]), int(planes.shape[3]))
+    if all(size == whole for size in sizes):
+        return planes
+    return torch.stack([_extended(one[:, :h, :w], *whole) for one, (h, w) in zip(planes, sizes, strict=True)])
+
+
+def _coded(image: Tensor, sizes: Sequence[tuple[int, int]], quality: int, subsampling: str, *, fast: bool) -> Tensor:
+    """JPEG of images [B, 3, H, W] in [0, 1] that are whole blocks and repeat their last pixels beyond sizes [B]."""
+    luminance, chrominance = quantisation(quality)
+    planes = _to_ycbcr(_nearest(image.clamp(0.0, 1.0) * 255))
+    bright, colours = planes[:, :1], planes[:, 1:]
+    if subsampling == "420":
+        # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the last
+        halves = [((height + 1) // 2, (width + 1) // 2) for height, width in sizes]
+        colours = _halved(colours)
+        colours = _repeated(colours, [(height, colours.shape[3]) for height, _ in halves])
+        colours = _doubled(_repeated(_compress(colours, chrominance, fast=fast), halves))
+    else:
+        colours = _compress(colours, chrominance, fast=fast)
+    back = torch.tensor(FROM_YCBCR, dtype=image.dtype, device=image.device)
+    decoded = torch.cat([_compress(bright, luminance, fast=fast), colours - 128], 1)
+    return _nearest(torch.einsum("ij,bjhw->bihw", back, decoded)).clamp(0, 255) / 255
+
+
+def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bool | None = None) -> Tensor:
+    """A picture after it was written as JPEG and read again, as libjpeg does both.
+
+    Rounds to 8 bits, YCbCr, means of 2 x 2 of the colours where they are subsampled, DCT of 8 x 8, quantisation, and
+    all of it back. Borders are repeated to whole blocks.
+
+    Args:
+        image: sRGB in [0, 1], [B, 3, H, W].
+        quality: 1 to 100, as libjpeg scales it.
+        subsampling: "420" or "444".
+        fast: Whether the encoder takes libjpeg's fast DCT, which hits other steps where steps are small; None for what
+            `ssad.core.images.encode_jpeg` (libjpeg-turbo's own choice) does: below 96. OpenCV and Pillow do not.
+
+    Returns:
+        Multiples of 1/255, shaped as image. Slope one through every rounding, zero where a value is cut off at black or
+        white.
+
+    Raises:
+        ConfigError: A quality or subsampling that there is not.
+    """
+    block, (height, width) = _block(subsampling), image.shape[2:]
+    size = (-(-height // block) * block, -(-width // block) * block)
+    whole = torch.stack([_extended(one, *size) for one in image])
+    fast = quality < ACCURATE if fast is None else fast
+    return _coded(whole, [(height, width)] * len(image), quality, subsampling, fast=fast)[:, :, :height, :width]
+
+
+# ---------------------------------------------------------------- only what is touched
+
+
+Span = tuple[int, int]  # first, and one after the last
+Rectangle = tuple[Span, Span]  # of rows and columns
+
+
+def _rectangles(pixels: Tensor, shape: tuple[int, int, int]) -> list[Rectangle]:
+    """The rectangle around flat pixels of each picture; empty where it has none."""
+    count, height, width = shape
+    flat = pixels.detach().reshape(-1).cpu()
+    if len(flat) and not (int(flat.min()) >= 0 and int(flat.max()) < count * height * width):
+        raise ConfigError(f"a pixel outside of {count} pictures of {width} x {height}")
+    batch, y, x = flat // (height * width), flat // width % height, flat % width
+    spans = []
+    for values, most in ((y, height), (x, width)):
+        low = torch.full((count,), most).scatter_reduce(0, batch, values, "amin").tolist()
+        high = torch.full((count,), -1).scatter_reduce(0, batch, values, "amax").tolist()
+        spans.append([(a, b + 1) if a <= b else (0, 0) for a, b in zip(low, high, strict=True)])
+    return list(zip(*spans, strict=True))
+
+
+def _grown(span: Span, margin: int, most: int, step: int = 1) -> Span:
+    """A span with a margin, out to multiples of a step, in 0..most; an empty one stays empty."""
+    if span[0] == span[1]:
+        return span
+    return max((span[0] - margin) // step * step, 0), min(-(-(span[1] + margin) // step) * step, most)
+
+
+def _alike(spans: Sequence[Span], most: int, step: int) -> list[Span]:
+    """Spans of one length that hold given ones, in 0..most, at multiples of a step."""
+    length = max(SMALLEST, *(high - low // step * step for low, high in spans))
+    length = -(-length // step) * step
+    length = min(length + (most - length) % step, most)
+    starts = [min(low // step * step, most - length) for low, _ in spans]
+    return [(start, start + length) for start in starts]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The part of pictures that changes when a few pixels do, and what it is developed from.
+
+    All rectangles are spans of rows and of columns, one for each picture; read and coded rectangles have one size.
+
+    Attributes:
+        shape: B, H, W of the whole pictures.
+        sensor: Whose pictures.
+        changed: What changes.
+        read: Where the radiance is needed.
+        coded: Where the developed picture is needed: whole JPEG blocks, which can stand out of the picture.
+        quality: Of JPEG; None for none.
+        subsampling: Of JPEG, "420" or "444".
+    """
+
+    shape: tuple[int, int, int]
+    sensor: Sensor
+    changed: tuple[Rectangle, ...]
+    read: tuple[Rectangle, ...]
+    coded: tuple[Rectangle, ...]
+    quality: int | None
+    subsampling: str
+
+    @staticmethod
+    def around(
+        pixels: Tensor,
+        shape: Sequence[int],
+        sensor: Sensor,
+        *,
+        quality: int | None = None,
+        subsampling: str = "420",
+    ) -> Window:
+        """The window of what changes when the radiance of pixels does.
+
+        Args:
+            pixels: Flat indices into B * H * W, such as `TorchTaps.pixel`.
+            shape: B, H, W of the pictures.
+            sensor: Whose pictures.
+            quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+            subsampling: Of JPEG, "420" or "444".
+
+        Returns:
+            The window; it is empty in pictures without such a pixel.
+
+        Raises:
+            ConfigError: A pixel outside the pictures, or a quality or subsampling that there is not.
+        """
+        count, height, width = shape
+        block, bleed = 1, 0
+        if quality is not None:
+            # what is read of the colours next to a block is made of that block
+            block, bleed = _block(subsampling), 1 if subsampling == "420" else 0
+        changed = []
+        for sides in _rectangles(pixels, (count, height, width)):
+            rows, columns = (
+                _grown(_grown(span, sensor.reach, most, block), bleed, most)
+                for span, most in zip(sides, (height, width), strict=True)
+            )
+            changed.append((rows, columns))
+        return Window.of(changed, shape, sensor, quality=quality, subsampling=subsampling)
+
+    @staticmethod
+    def of(
+        changed: Sequence[Rectangle],
+        shape: Sequence[int],
+        sensor: Sensor,
+        *,
+        quality: int | None = None,
+        subsampling: str = "420",
+    ) -> Window:
+        """The window that gives the developed values of rectangles.
+
+        Args:
+            changed: Spans of rows and of columns, one pair for each picture.
+            shape: B, H, W of the pictures.
+            sensor: Whose pictures.
+            quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+            subsampling: Of JPEG, "420" or "444".
+
+        Returns:
+            The window.
+
+        Raises:
+            ConfigError: A quality or subsampling that there is not.
+        """
+        count, height, width = shape
+        block, bleed = 1, 0
+        if quality is not None:
+            quantisation(quality)
+            block, bleed = _block(subsampling), 1 if subsampling == "420" else 0
+        coded, read = [], []
+        for side, most in enumerate((height, width)):
+            room = -(-most // block) * block
+            blocks = [_grown(_grown(rectangle[side], bleed, most), 0, room, block) for rectangle in changed]
+            blocks = _alike(blocks, room, block)
+            coded.append(blocks)
+            need = [_grown((low, min(high, most)), sensor.reach, most) for low, high in blocks]
+            read.append(_alike(need, most, 2 if sensor.mosaic else 1))
+        return Window(
+            (count, height, width), sensor, tuple(changed), tuple(zip(*read, strict=True)),
+            tuple(zip(*coded, strict=True)), quality, subsampling,
+        )  # fmt: skip
+
+    def crop(self, picture: Tensor) -> Tensor:
+        """What the window reads of radiance or noise.
+
+        Args:
+            picture: [B, H, W, ...].
+
+        Returns:
+            [B, h, w, ...].
+
+        Raises:
+            ConfigError: The pictures have another shape.
+        """
+        if tuple(picture.shape[:3]) != self.shape:
+            raise ConfigError(f"a window of pictures {list(self.shape)}, not {list(picture.shape[:3])}")
+        return torch.stack([one[slice(*y), slice(*x)] for one, (y, x) in zip(picture, self.read, strict=True)])
+
+    def taps(self, taps: TorchTaps) -> TorchTaps:
+        """Taps into the radiance that `crop` gives.
+
+        Args:
+            taps: Into whole pictures, all of their pixels inside the window.
+
+        Returns:
+            The same with other pixels.
+
+        Raises:
+            ConfigError: A pixel outside the window.
+        """
+        _, height, width = self.shape
+        spans = torch.tensor(self.read, device=taps.pixel.device)  # [B, 2, 2]
+        size = spans[0, :, 1] - spans[0, :, 0]
+        batch = taps.pixel // (height * width)
+        y = taps.pixel // width % height - spans[batch, 0, 0]
+        x = taps.pixel % width - spans[batch, 1, 0]
+        if bool(((y < 0) | (y >= size[0]) | (x < 0) | (x >= size[1])).any()):
+            raise ConfigError("a tap outside of the window")
+        return replace(taps, pixel=(batch * size[0] + y) * size[1] + x)
+
+    def develop(self, radiance: Tensor, exposure: Tensor | float, noise: Tensor | None = None) -> Tensor:
+        """What `develop` and `jpeg` make of the whole pictures, in the coded rectangles; right where it changes.
+
+        Args:
+            radiance: Of the window, as `crop` gives it, [B, h, w, 3].
+            exposure: [B] or one for all.
+            noise: Of the window: `crop` of a sample for whole pictures; None for none.
+
+        Returns:
+            [B, 3, h', w'] of the coded rectangles.
+
+        Raises:
+            ConfigError: The noise has another shape.
+        """
+        picture = develop(radiance, exposure, self.sensor, noise)
+        _, height, width = self.shape
+        parts, sizes = [], []
+        for one, (rows, columns), (y, x) in zip(picture, self.coded, self.read, strict=True):
+            size = min(rows[1], height) - rows[0], min(columns[1], width) - columns[0]
+            top, left = rows[0] - y[0], columns[0] - x[0]
+            inside = one[:, top : top + size[0], left : left + size[1]]
+            parts.append(_extended(inside, rows[1] - rows[0], columns[1] - columns[0]))
+            sizes.append(size)
+        image = torch.stack(parts)
+        if self.quality is None:
+            return image
+        return _coded(image, sizes, self.quality, self.subsampling, fast=self.quality < ACCURATE)
+
+    def paste(self, developed: Tensor, picture: Tensor) -> Tensor:
+        """Whole pictures with the window's part renewed.
+
+        Args:
+            developed: What `develop` gives.
+            picture: The pictures before, [B, 3, H, W].
+
+        Returns:
+            [B, 3, H, W]; differentiable in both.
+        """
+        whole = picture.clone()
+        for n, ((y, x), (rows, columns)) in enumerate(zip(self.changed, self.coded, strict=True)):
+            top, left = y[0] - rows[0], x[0] - columns[0]
+            whole[n, :, slice(*y), slice(*x)] = developed[n, :, top : top + y[1] - y[0], left : left + x[1] - x[0]]
+        return whole
+
+
+def develop_at(
+    radiance: Tensor,
+    exposure: Tensor | float,
+    sensor: Sensor,
+    pixels: Tensor,
+    noise: Tensor | None = None,
+    *,
+    quality: int | None = None,
+    subsampling: str = "420",
+) -> Tensor:
+    """Developed pixels alone: `develop`, then `jpeg` where a quality is given, of the pictures' parts that they need.
+
+    Args:
+        radiance: Linear, [B, H, W, 3].
+        exposure: What radiance is multiplied by, [B] or one for all.
+        sensor: Lens, mosaic, noise and full photosites.
+        pixels: Flat indices into B * H * W, [F].
+        noise: A sample for the whole pictures, as `draw_noise` gives; None for none.
+        quality: Of JPEG, 1 to 100; None for pictures that are not compressed.
+        subsampling: Of JPEG, "420" or "444".
+
+    Returns:
+        sRGB in [0, 1], [F, 3]: the same as of the whole pictures.
+
+    Raises:
+        ConfigError: A pixel outside the pictures, or bad settings.
+    """
+    count, height, width = radiance.shape[:3]
+    wanted = _rectangles(pixels, (count, height, width))
+    window = Window.of(wanted, radiance.shape[:3], sensor, quality=quality, subsampling=subsampling)
+    developed = window.develop(window.crop(radiance), exposure, None if noise is None else window.crop(noise))
+    batch = pixels // (height * width)
+    corner = torch.tensor([[rows[0], columns[0]] for rows, columns in window.coded], device=pixels.device)[batch]
+    return developed[batch, :, pixels // width % height - corner[:, 0], pixels % width - corner[:, 1]]
