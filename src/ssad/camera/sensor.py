@@ -27,7 +27,7 @@ BRIGHTEST: Final = 4.0  # light at which the curve ends
 DAY_EXPOSURE: Final = 0.5  # exposure on a clear day
 READ_NOISE: Final = 0.2  # deviation without light, in parts of that at full light
 WIDEST_BLUR: Final = 0.7  # px; three taps hold no wider spread without a ringing response
-SMALLEST: Final = 3  # px along a side that a mosaic needs
+SMALLEST: Final = 4  # px along a side, so that what is beyond the border can be mirrored
 
 
 @dataclass(frozen=True, slots=True)
