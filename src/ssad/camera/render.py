@@ -11,8 +11,10 @@ import numpy as np
 import warp as wp
 
 from ssad.camera.kernels import raster, shade
+from ssad.camera.kernels import sensor as sensing
 from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of, struct_array
 from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
+from ssad.camera.sensor import BRIGHTEST, DEFAULT_SENSOR, KNEE, SHOULDER, Sensor, noise_levels, point_spread
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64, I32, U8
@@ -20,7 +22,6 @@ from ssad.core.types import F32, F64, I32, U8
 NEAR = 0.15  # m
 FAR = 500.0
 LARGE, LANES = 4096, 32  # large triangles that a view may list, threads for each
-DAY = 0.5  # exposure on a clear day
 SHADOW_SIZE, SHADOW_REACH = 1024, 60.0  # texels, m from the middle to the border
 FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
@@ -43,17 +44,16 @@ class Weather:
 class View:
     """A camera at a place: `pose` (camera to world) [4, 4], what stands there, the weather.
 
-    noise: of the sensor by day, as the deviation at full light (0.01 is a good camera's); it grows where the exposure
-    must, by night. seed: of the noise; equal seeds give equal noise. lamps: beside those of street and things; focus:
-    x, y of the place (m) around which shadows are finest, None for just before the camera; decals: above what things
-    wear, the lowest first.
+    sensor: lens, mosaic, noise and full photosites; seed: of the noise; equal seeds give equal noise. lamps: beside
+    those of street and things; focus: x, y of the place (m) around which shadows are finest, None for just before the
+    camera; decals: above what things wear, the lowest first.
     """
 
     camera: Camera
     pose: F64
     things: tuple[Thing, ...] = ()
     weather: Weather = Weather()
-    noise: float = 0.0
+    sensor: Sensor = DEFAULT_SENSOR
     seed: int = 0
     lamps: tuple[Lamp, ...] = ()
     focus: tuple[float, float] | None = None
@@ -140,8 +140,8 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
 @lru_cache(maxsize=1)
 def response() -> U8:
     """The camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
-    light = 4 * ((np.arange(4096) + 0.5) / 4096) ** 2
-    soft = np.where(light > 0.8, 0.8 + 0.2 * (1 - np.exp(-(light - 0.8) / 0.4)), light)
+    light = BRIGHTEST * ((np.arange(4096) + 0.5) / 4096) ** 2
+    soft = np.where(light > KNEE, KNEE + (1 - KNEE) * (1 - np.exp(-(light - KNEE) / SHOULDER)), light)
     srgb = np.where(soft <= 0.0031308, soft * 12.92, 1.055 * soft ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(srgb * 255), np.uint8)
 
@@ -255,13 +255,7 @@ def render(
             raise ConfigError(f"{count} pieces of textured surfaces, more than {room}; render fewer views at once")
         fragments = out.fragments[:count].numpy() if count else fragments
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
-    image = wp.empty((*shape, 3), dtype=wp.uint8, device=device)
-    bright = wp.array(np.array(exposures, np.float32), dtype=float, device=device)
-    curve = wp.array(response(), dtype=wp.uint8, device=device)
-    amount = wp.array(_noise(views, exposures), dtype=wp.vec2, device=device)
-    seeds = wp.array(np.array([v.seed for v in views], np.int32), dtype=int, device=device)
-    inputs = [out.radiance, bright, amount, seeds, curve]
-    wp.launch(shade.develop, dim=shape, inputs=inputs, outputs=[image], device=device)
+    image = _develop(out.radiance, views, exposures)
     arrays = (image, out.radiance, out.tag, out.depth)
     if download:
         arrays = tuple(a.numpy() if linear or a is not out.radiance else a for a in arrays)
@@ -381,14 +375,29 @@ def _near(stage: Scene, views: Sequence[View], quality: Quality) -> Any:
     return near
 
 
-def _noise(views: Sequence[View], exposures: Sequence[float]) -> F32:
-    """Variance for each unit of light and deviation in the dark, [B, 2]. Beyond the exposure of a clear day half of
-    the rest (in stops) is a longer shutter, which costs no noise, half is gain."""
-    rows = []
+def _develop(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:
+    """The pictures uint8 [B, H, W, 3] that the views' sensors make of radiance [B, H, W], on its device."""
+    device, (count, height, width) = radiance.device, radiance.shape
+    rows: Any = []
     for view, exposure in zip(views, exposures, strict=True):
-        gain = max(exposure / DAY, 1.0) ** 0.5
-        rows.append([view.noise**2 * gain, 0.2 * view.noise * gain])
-    return np.array(rows, np.float32)
+        sensor = view.sensor
+        sensor.check_size(height, width)
+        photons, dark = noise_levels(sensor.noise, exposure)
+        centre, side = point_spread(sensor.blur)
+        rows.append((exposure, centre, side, sensor.full, photons, dark, view.seed, int(sensor.mosaic)))
+    table: Any = np.array(rows, dtype=sensing.Response.numpy_dtype())  # type: ignore[attr-defined]
+    responses = wp.array(table, dtype=sensing.Response, device=device)
+    curve = wp.array(response(), dtype=wp.uint8, device=device)
+    image = wp.empty((count, height, width, 3), dtype=wp.uint8, device=device)
+    if any(view.sensor.mosaic for view in views):
+        raw = wp.empty(radiance.shape, dtype=float, device=device)
+        squares = (count, (height + 1) // 2, (width + 1) // 2)
+        wp.launch(sensing.expose, dim=squares, inputs=[radiance, responses], outputs=[raw], device=device)
+        wp.launch(sensing.develop, dim=squares, inputs=[raw, responses, curve], outputs=[image], device=device)
+    if not all(view.sensor.mosaic for view in views):
+        inputs = [radiance, responses, curve]
+        wp.launch(sensing.develop_plain, dim=radiance.shape, inputs=inputs, outputs=[image], device=device)
+    return image
 
 
 def _light_camera(sun: F64, middle: F64) -> F64:

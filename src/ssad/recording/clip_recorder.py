@@ -38,7 +38,7 @@ from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
-from ssad.recording.nuscenes_recorder import HELD_OUT, NOISE, draw_weather, drive, run_parts
+from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, draw_weather, drive, run_parts
 from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
 from ssad.recording.target import TargetCar
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
@@ -284,7 +284,7 @@ def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], c
     lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
     focus = float(shot.target[0, 3]), float(shot.target[1, 3])
     things = (own, *(s.thing for s in around))
-    return View(camera, shot.camera, things, shot.weather, NOISE, noise, lamps, focus)
+    return View(camera, shot.camera, things, shot.weather, SENSOR, noise, lamps, focus)
 
 
 def _follower(shot: Viewpoint) -> F64:

@@ -24,6 +24,7 @@ from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
 from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene
+from ssad.camera.sensor import Sensor
 from ssad.core import safeio
 from ssad.core.boxes import WorldBoxes
 from ssad.core.errors import ConfigError, StoreError
@@ -54,7 +55,7 @@ AHEAD: Final = {
     "CAM_FRONT_LEFT": 0.0431, "CAM_FRONT": 0.0355, "CAM_FRONT_RIGHT": 0.0276, "CAM_BACK_RIGHT": 0.0201,
     "CAM_BACK": 0.0104, "CAM_BACK_LEFT": 0.0005,
 }  # fmt: skip
-NOISE: Final = 0.012  # of the sensor
+SENSOR: Final = Sensor(noise=0.012)
 FIRST: Final = 0.1  # s, when the first sweep ends
 PART_S: Final = 7200.0  # s that a part may take
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
@@ -224,7 +225,7 @@ class _Moment:
             things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], 140.0))
             noise = int(digest("noise", *key, step, c)[:7], 16)
             lamps = own_lamps(ego, weather)
-            views.append(View(camera, ego @ camera.to_ego, things, weather, NOISE, noise, lamps))
+            views.append(View(camera, ego @ camera.to_ego, things, weather, SENSOR, noise, lamps))
             times.append(fired)
             egos.append(ego)
         return _Moment(step, now, views, times, egos)

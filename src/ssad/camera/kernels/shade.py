@@ -758,29 +758,3 @@ def shade(
     out.radiance[view, y, x] = total / float(count)
     out.tag[view, y, x] = most
     out.depth[view, y, x] = far
-
-
-@wp.kernel
-def develop(
-    radiance: wp.array3d(dtype=wp.vec3),
-    exposure: wp.array(dtype=float),
-    noise: wp.array(dtype=wp.vec2),
-    seed: wp.array(dtype=int),
-    curve: wp.array(dtype=wp.uint8),
-    out: wp.array4d(dtype=wp.uint8),
-):
-    """Linear light to 8 bits: exposure, noise, then the camera's curve, listed over the square root of light in 0..4.
-
-    noise: variance for each unit of light (of photons), and deviation without light (of reading).
-    """
-    b, y, x = wp.tid()
-    light = radiance[b, y, x] * exposure[b]
-    amount = noise[b]
-    if amount[0] + amount[1] > 0.0:
-        state = wp.rand_init(seed[b], y * out.shape[2] + x)
-        for c in range(3):
-            spread = wp.sqrt(amount[0] * wp.max(light[c], 0.0) + amount[1] * amount[1])
-            light[c] = light[c] + spread * wp.randn(state)
-    for c in range(3):
-        v = wp.sqrt(wp.clamp(light[c], 0.0, 3.999)) * 0.5 * float(curve.shape[0])
-        out[b, y, x, c] = curve[int(v)]

@@ -1,0 +1,110 @@
+"""What the camera's sensor costs: python benchmarks/sensor_speed.py [--out FILE]
+
+The renderer's last step on one core, 640 x 640, by sensor; and in torch, forward and backward from a texture of
+256 x 256 on a car 20 m ahead: whole pictures, and only what the texture touches. Medians of the process's own time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+import warp as wp
+from camera_speed import scene
+
+from ssad.camera.render import View, _develop, render
+from ssad.camera.sensor import PINHOLE, Sensor
+from ssad.camera.texture import retexture, taps_of
+from ssad.camera.torch_jpeg import jpeg
+from ssad.camera.torch_sensor import Window, develop, draw_noise
+
+NOISE = 0.012
+RENDERED = {
+    "pinhole": PINHOLE,
+    "lens and mosaic": Sensor(),
+    "lens": Sensor(mosaic=False),
+    "pinhole, noise": Sensor(blur=0.0, mosaic=False, noise=NOISE),
+    "lens, mosaic, noise": Sensor(noise=NOISE),
+}
+TORCH: dict[str, tuple[Sensor, int | None]] = {
+    "curve": (PINHOLE, None),
+    "lens, mosaic, noise": (Sensor(noise=NOISE), None),
+    "lens, mosaic, noise, JPEG": (Sensor(noise=NOISE), 92),
+}
+
+
+def median(run: Callable[[], object], repeats: int) -> float:
+    """Median ms of a call, after one to warm up."""
+    times = []
+    for _ in range(repeats + 1):
+        begin = time.process_time()
+        run()
+        times.append(1e3 * (time.process_time() - begin))
+    return statistics.median(times[1:])
+
+
+def rendered(view: View, radiance: Any, exposure: float, repeats: int) -> dict[str, float]:
+    """Ms of the renderer's last step by sensor."""
+    held = wp.array(radiance, dtype=wp.vec3, device="cpu")
+    found = {}
+    for name, sensor in RENDERED.items():
+        views = [View(view.camera, view.pose, sensor=sensor, seed=3)]
+        found[name] = median(lambda views=views: _develop(held, views, [exposure]), repeats)  # type: ignore[misc]
+    return found
+
+
+def in_torch(picture: Any, repeats: int) -> dict[str, dict[str, float]]:
+    """Ms from texture to picture and back, of all pixels and of the touched ones."""
+    taps, radiance = taps_of(picture, 256), torch.tensor(picture.radiance)
+    exposure, texture = float(picture.exposure[0]), torch.full((3, 256, 256), 0.4)
+    found = {}
+    for name, (sensor, quality) in TORCH.items():
+        noise = draw_noise(radiance.shape[:3], sensor, torch.Generator().manual_seed(0))
+        window = Window.around(taps.pixel, radiance.shape[:3], sensor, quality=quality)
+        part, part_noise, part_taps = window.crop(radiance), window.crop(noise), window.taps(taps)
+
+        def whole(sensor: Sensor = sensor, quality: int | None = quality, noise: torch.Tensor = noise) -> None:
+            leaf = texture.clone().requires_grad_()
+            image = develop(retexture(taps, leaf, radiance), exposure, sensor, noise)
+            (image if quality is None else jpeg(image, quality)).sum().backward()
+
+        def touched(part: Any = part, noise: Any = part_noise, taps: Any = part_taps, window: Window = window) -> None:
+            leaf = texture.clone().requires_grad_()
+            window.develop(retexture(taps, leaf, part), exposure, noise).sum().backward()
+
+        found[name] = {"whole": median(whole, repeats), "touched": median(touched, repeats)}
+    return found
+
+
+def main() -> None:
+    """Measures, prints, writes JSON."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    stage, view = scene(640, "cpu")
+    picture = render(stage, [view])
+    result: dict[str, Any] = {
+        "rendered_ms": rendered(view, picture.radiance, float(picture.exposure[0]), options.repeats),
+        "torch_ms": in_torch(picture, options.repeats),
+    }
+    for name, ms in result["rendered_ms"].items():
+        print(f"{ms:6.2f} ms  renderer: {name}")
+    for name, both in result["torch_ms"].items():
+        print(f"{both['whole']:6.1f} ms  torch, whole picture: {name}\n{both['touched']:6.1f} ms  only what is touched")
+    if options.out:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
