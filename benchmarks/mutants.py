@@ -45,10 +45,23 @@ MEMORY = 8 << 30  # bytes that a test run may allocate: a mutant may fill a list
 TESTS: dict[str, tuple[str, ...]] = {
     "scenarios/dynamic": tuple(
         f"tests/scenarios/test_{name}.py"
-        for name in ("yaml", "knowledge", "sets", "natural", "import", "sampling", "episode")
+        for name in ("yaml", "knowledge", "docs", "sets", "natural", "import", "sampling", "episode")
     ),
     "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published")),
-    "jobs": ("tests/jobs", "tests/bench/test_engine.py"),
+    "jobs": (
+        *(
+            f"tests/jobs/test_{name}.py"
+            for name in ("machine", "progress", "cluster", "local", "store", "worker", "pool")
+        ),
+        "tests/bench/test_engine.py",
+    ),
+    "bench": tuple(
+        f"tests/bench/test_{name}.py"
+        for name in (
+            *("kind", "source", "run", "suite", "driving_kind", "detection_kind"),
+            *("pictures", "driving", "engine", "detection"),
+        )
+    ),
     "drivers": ("tests/world",),
     "envs": ("tests/test_envs.py", "tests/world/test_env.py"),
 }
@@ -196,8 +209,12 @@ class Copy:
 
     def run(self, *, timeout: float, first: str = "", **environment: str) -> tuple[str, float, str]:
         """("passed", "failed" or "timed out", seconds, output); tests named after `first` go before the others."""
-        folders = [self.folder / test for test in self.tests if first and (self.folder / test).is_dir()]
-        near = sorted(str(path.relative_to(self.folder)) for f in folders for path in f.rglob(f"test_{first}*.py"))
+        near = [
+            str(path.relative_to(self.folder))
+            for test in map(self.folder.joinpath, self.tests)
+            for path in (sorted(test.rglob("test_*.py")) if test.is_dir() else [test])
+            if first and path.name.startswith(f"test_{first}")
+        ]
         data = self.root / os.environ.get("SSAD_DATA", "../shared/data")
         environment |= {
             "PYTHONPATH": str(self.folder / "src"),

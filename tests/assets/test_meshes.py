@@ -18,7 +18,6 @@ from ssad.assets.bodies import BODIES, PAINT_SHARES, PAINTS, draw_paint, draw_si
 from ssad.assets.bodies.parts import MARGIN, Chart, pack
 from ssad.assets.mesh import Material, Mesh, box, lathe, loft, merge, prism, ring, sphere, triangulate, tube
 from ssad.assets.mesh_files import load_mesh
-from ssad.assets.obj import save_obj
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.seeding import generator
 
@@ -43,6 +42,25 @@ def face_normals(mesh: Mesh) -> np.ndarray:
     return np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
 
 
+def volume_of(mesh: Mesh) -> float:
+    """Signed volume: positive where closed surfaces face outwards."""
+    p = mesh.corners()
+    return float(np.einsum("fi,fi->", p[:, 0], np.cross(p[:, 1], p[:, 2])) / 6.0)
+
+
+def panel_faces(mesh: Mesh, name: str) -> np.ndarray:
+    """Faces of a panel, or of all parts of it, [F] bool."""
+    return np.isin(mesh.panel, [i for i, p in enumerate(mesh.panels) if p == name or p.startswith(f"{name}/")])
+
+
+def panel_scale(mesh: Mesh, name: str) -> float:
+    """Metres on the surface for one unit of u or v, averaged over a panel."""
+    chosen = panel_faces(mesh, name)
+    a, b = (mesh.uv[chosen, k] - mesh.uv[chosen, 0] for k in (1, 2))
+    flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
+    return float(np.sqrt(mesh.areas()[chosen].sum() / flat))
+
+
 # ---------------------------------------------------------------- solids
 
 
@@ -62,7 +80,7 @@ def face_normals(mesh: Mesh) -> np.ndarray:
 )
 def test_solids_have_their_volume_and_face_outwards(mesh: Mesh, volume: float) -> None:
     mesh.check()
-    assert mesh.volume() == pytest.approx(volume, rel=4e-3)
+    assert volume_of(mesh) == pytest.approx(volume, rel=4e-3)
     # a closed surface: the area vectors cancel
     np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0.0, atol=1e-4)
     assert (np.einsum("fci,fi->fc", mesh.normals, face_normals(mesh)) > 0).all()
@@ -105,7 +123,7 @@ def test_a_crossing_polygon_is_refused() -> None:
 def test_transformed_keeps_outside_outside() -> None:
     mesh = prism([(0, 0), (2, 0), (0, 1)], (0.0, 1.0), material=GREY)
     mirror = mesh.transformed(np.diag([1.0, -1.0, 1.0, 1.0]))
-    assert mirror.volume() == pytest.approx(mesh.volume())
+    assert volume_of(mirror) == pytest.approx(volume_of(mesh))
     shear = np.eye(4)
     shear[0, 2], shear[:3, 3] = 0.7, (1.0, 2.0, 3.0)
     moved = mesh.transformed(shear)
@@ -121,10 +139,10 @@ def test_merge_joins_materials_and_panels() -> None:
     both = merge([a, b, a.moved(y=5.0)])
     assert both.materials == (GREY, RED)
     assert both.panels == ("side", "top")
-    assert both.volume() == pytest.approx(3.0)
+    assert volume_of(both) == pytest.approx(3.0)
     assert both.painted().sum() == 12
-    assert both.panel_faces("side").sum() == 24
-    assert both.panel_scale("top") == pytest.approx(1.0)
+    assert panel_faces(both, "side").sum() == 24
+    assert panel_scale(both, "top") == pytest.approx(1.0)
     with pytest.raises(ConfigError, match="no panel 'hood'; this mesh has: side, top"):
         both.panel_rectangle("hood")
 
@@ -158,7 +176,7 @@ def test_check_names_the_fault() -> None:
 def test_every_body_is_sound(kind: str, style: str, detail: int) -> None:
     mesh = body(kind, style, detail)
     mesh.check(f"{kind} {style}")
-    assert mesh.volume() > 0.0
+    assert volume_of(mesh) > 0.0
     turned = np.einsum("fci,fi->fc", mesh.normals, face_normals(mesh)) > 0
     assert turned.mean() > 0.995
     low, _ = mesh.bounds()
@@ -231,7 +249,7 @@ def test_panels_lie_apart_in_the_atlas_and_are_the_same_at_all_details(kind: str
         assert other.panels == mesh.panels
         assert other.rectangles == mesh.rectangles
     for name in {*(p.split("/")[0] for p in mesh.panels), *mesh.panels}:
-        chosen = mesh.panel_faces(name)
+        chosen = panel_faces(mesh, name)
         u0, v0, u1, v1 = mesh.panel_rectangle(name)
         uv = mesh.uv[chosen]
         assert uv.size == 0 or (uv.min(axis=(0, 1)) >= np.array([u0, v0]) - 5e-3).all()
@@ -243,15 +261,15 @@ def test_car_panels_have_area_in_proportion_and_upright_texture(style: str) -> N
     mesh = body("car", style)
     names = {"hood", "roof", "front", "rear", "left_side/front_door", "right_side/rear_door"}
     assert names <= set(mesh.panels)
-    scales = [mesh.panel_scale(p) for p in (*names, "left_side", "right_side")]
+    scales = [panel_scale(mesh, p) for p in (*names, "left_side", "right_side")]
     assert max(scales) / min(scales) < 1.35
     # left side: front of the car to the left of the texture, roof at its upper edge; the right side mirrors it
     for name, sign in (("left_side", -1.0), ("right_side", 1.0)):
-        chosen = mesh.panel_faces(name)
+        chosen = panel_faces(mesh, name)
         p, uv = mesh.corners()[chosen].reshape(-1, 3), mesh.uv[chosen].reshape(-1, 2)
         assert np.corrcoef(p[:, 0], uv[:, 0])[0, 1] * sign > 0.999
         assert np.corrcoef(p[:, 2], uv[:, 1])[0, 1] < -0.999
-    rear = mesh.panel_faces("rear")
+    rear = panel_faces(mesh, "rear")
     p, uv = mesh.corners()[rear].reshape(-1, 3), mesh.uv[rear].reshape(-1, 2)
     assert np.corrcoef(p[:, 1], uv[:, 0])[0, 1] < -0.999
 
@@ -315,9 +333,6 @@ def test_paints_and_lights() -> None:
     assert set(PAINTS) == set(PAINT_SHARES)
     colours = np.array([draw_paint(generator("paint", k)) for k in range(50)])
     assert ((colours >= 0.0) & (colours <= 0.9)).all()
-    mesh = body("car", "sedan").repainted({"paint": (0.1, 0.2, 0.3)}).relit({"tail_lamp": 0.9})
-    assert next(m for m in mesh.materials if m.paint).colour == (0.1, 0.2, 0.3)
-    assert next(m for m in mesh.materials if m.name == "tail_lamp").emission == 0.9
     assert {"lamp_red", "lamp_yellow", "lamp_green"} <= {m.name for m in body("traffic_signal", "post").materials}
     assert any(m.paint for kind in PAINTED for m in make_body(kind, generator=generator(0)).materials)
 
@@ -406,27 +421,6 @@ def test_a_concave_polygon_keeps_its_area(tmp_path: Path) -> None:
     text = "v 0 0 0\nv 2 0 0\nv 2 1 0\nv 1 1 0\nv 1 2 0\nv 0 2 0\nv 0 0 1\nvt 0 0\n"
     mesh = load_mesh(write(tmp_path, text + "f 1/1 2/1 3/1 4/1 5/1 6/1\nf 1/1 2/1 7/1\n"))
     assert mesh.areas().sum() == pytest.approx(3.0 + 1.0)
-
-
-@pytest.mark.parametrize("kind", ["car", "pedestrian", "trailer"])
-def test_obj_round_trip(kind: str, tmp_path: Path) -> None:
-    mesh = make_body(kind, generator=generator("obj"), detail=1)
-    save_obj(mesh, tmp_path / "body.obj")
-    read = load_mesh(tmp_path / "body.obj", paint=[m.name for m in mesh.materials if m.paint])
-    assert len(read.faces) == len(mesh.faces)
-    low, _ = mesh.bounds()
-    shift = (
-        [0.0, 0.0, low[2]]
-        if kind != "pedestrian"
-        else mesh.corners().reshape(-1, 3)[0] - read.corners().reshape(-1, 3)[0]
-    )
-    np.testing.assert_allclose(read.corners() + shift, mesh.corners(), atol=1e-4)
-    np.testing.assert_allclose(read.normals, mesh.normals, atol=1e-3)
-    painted = mesh.painted()
-    np.testing.assert_array_equal(read.painted(), painted)
-    np.testing.assert_allclose(read.uv[painted], mesh.uv[painted], atol=1e-5)
-    names = [mesh.materials[i].name for i in mesh.material]
-    assert [read.materials[i].name for i in read.material] == names
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from helpers.sharing import Shared
 from rich.console import Console
 from typer.testing import CliRunner
@@ -32,8 +34,7 @@ from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
 from ssad.jobs.local import WORKER_MEMORY
-from ssad.metrics.detection import score_detections
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.metrics.detection import match
 from ssad.report import write_report
 from ssad.report.kinds.detection import left_table, load_detection_run, main_table, robustness_table
 from ssad.report.load import load_run
@@ -42,16 +43,11 @@ from ssad.scenarios.static.shifts import SHIFTS as KNOWN
 from ssad.scenarios.static.shifts import ShiftSpec, dealt_severities
 
 ORACLE = "helpers.oracle3d:build"
-TOWNS = ["Larkhill", "Oldmarket"]
 
 
 @pytest.fixture(scope="session")
-def root(shared: Shared) -> Path:
-    def make(out: Path) -> None:
-        recording = Recording(out, tuple(TOWNS), tuple(TOWNS), scenes=1, seconds=1.0, width=160, seed=3)
-        record_nuscenes(recording, workers=0)
-
-    return shared("two-towns", make)
+def root(tiny_set: Path) -> Path:
+    return tiny_set
 
 
 @pytest.fixture(autouse=True)
@@ -69,8 +65,8 @@ def run_detection(plan: Plan, folder: Path, *, workers: int, retry: bool = False
 
 def suite_of(root: Path, **changes: Any) -> DetectionSuite:
     base: dict[str, Any] = {
-        "kind": "detection", "name": "t", "detectors": [ORACLE], "data": str(root), "reference": "shifts",
-        "shifts": ["gaussian", "fog"], "severities": [1, 3, 5, "random"], "replicates": 20,
+        "kind": "detection", "name": "t", "detectors": [ORACLE], "data": str(root), "split": "mini_val",
+        "reference": "shifts", "shifts": ["gaussian", "fog"], "severities": [1, 3, 5, "random"], "replicates": 20,
     }  # fmt: skip
     return DetectionSuite.model_validate(base | changes)
 
@@ -106,7 +102,7 @@ def test_random_is_put_together_from_the_severities(folder: Path, root: Path) ->
     assert not list((folder / "detections").glob("*/fog-random"))
     record = next(r for r in lines(folder) if r["shift"] == "fog" and r["severity"] == "random")
     drawn = {Path(p).name for p in record["artefacts"]["detections"]}
-    tokens = [s["token"] for s in json.loads((root / "v1.0-ssad" / "scene.json").read_text())]
+    tokens = [s["token"] for s in json.loads((root / "v1.0-mini" / "scene.json").read_text())]
     assert drawn == {f"fog-{severity}" for severity in dealt_severities(ShiftSpec("fog"), tokens).values()}
     assert len(drawn) == len(tokens)
     boxes = {Path(p).name: {f.stem for f in (folder / p).glob("*.npz")} for p in record["artefacts"]["detections"]}
@@ -220,12 +216,12 @@ def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None
     from ssad.evaluation.detection import box_table
     from ssad.metrics.detection_boxes import filter_boxes
 
-    truth = read_truth(root, "v1.0-ssad")
+    truth = read_truth(root, "v1.0-mini")
     found = [b for path in sorted(folder.glob("detections/*/gaussian-3/*.npz")) for b in read_boxes(path)[0]]
-    scores = score_detections(
+    scores = match(
         filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
         filter_boxes(box_table(found, truth), racks=truth.racks), samples=len(truth.samples),
-    )  # fmt: skip
+    ).scores()  # fmt: skip
     record = next(r for r in lines(folder) if (r["shift"], r["severity"]) == ("gaussian", 3))
     assert record["metrics"]["NDS"] == pytest.approx(scores.nd_score, abs=1e-6)
 
@@ -234,11 +230,10 @@ def test_a_picture_that_is_gone_fails_its_cells_alone(root: Path, tmp_path: Path
     """The clean data need it as well; a shift that needs nothing of that scene would go on."""
     broken = tmp_path / "data"
     shutil.copytree(root, broken)
-    shutil.rmtree(broken / ".parts", ignore_errors=True)
     victim = next((broken / "samples" / "CAM_FRONT").iterdir())
     victim.unlink()
     todo = suite_of(broken, shifts=["gaussian"], severities=[3])
-    records = run_detection(plan_detection(todo), tmp_path / "run", workers=2)
+    records = run_detection(plan_detection(todo), tmp_path / "run", workers=0)
     Detection().finish(plan_detection(todo), tmp_path / "run")  # goes without
     assert {r["status"] for r in records} == {"failed"}
     assert all(victim.name in r["reason"] for r in records)
@@ -340,11 +335,41 @@ def test_kill_9_at_20_moments(root: Path, folder: Path, tmp_path: Path) -> None:
     assert len(lines(out)) == len(tables[2])
 
 
-def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path) -> None:
-    todo = suite_of(root, detectors=["fcos3d-light", "fcos3d-light@fresh=random"], shifts=["fog"], severities=[3])
-    plan = plan_detection(todo)
-    assert list(plan.details) == ["fcos3d-light", "fcos3d-light@fresh"]
+@pytest.mark.slow
+def test_detectors_are_built_to_plan_a_run(root: Path) -> None:
+    """Slow, since they are not imported by anything else here."""
+    plan = plan_detection(suite_of(root, detectors=["fcos3d-light", "fcos3d-light@fresh=random"]))
     assert plan.inputs["weights"]["fcos3d-light"] != plan.inputs["weights"]["fcos3d-light@fresh"]
+    for detector, words in (("yolov5n=random", "2D"), ("fcos3d-light=/nowhere.pth", r"nowhere\.pth")):
+        with pytest.raises(SSADError, match=words):
+            plan_detection(suite_of(root, detectors=[detector]))
+
+
+def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+
+    def detector(name: str, weights: str, device: str) -> torch.nn.Module:
+        built.append((name, weights, device))
+        module = torch.nn.Linear(2, 2)
+        torch.nn.init.constant_(module.weight, len(weights))
+        torch.nn.init.zeros_(module.bias)
+        module.task = "3d"  # type: ignore[assignment]
+        return module
+
+    monkeypatch.setattr(detection, "detector_of", detector)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/nobody")
+    given = ["fcos3d-light", "fcos3d-light@fresh=random", "fcos3d-light@a=own.pth", "fcos3d-light@b=~/own.pth"]
+    plan = plan_detection(suite_of(root, detectors=given))
+    names = ["fcos3d-light", "fcos3d-light@fresh", "fcos3d-light@a", "fcos3d-light@b"]
+    files = ["", "random", str(tmp_path / "own.pth"), "/home/nobody/own.pth"]
+    assert plan.details == dict(zip(names, files, strict=True))
+    assert built == [(name, file, "cpu") for name, file in plan.details.items()]
+    weights = plan.inputs["weights"]
+    assert len(set(weights.values())) == 4
+    assert all(re.fullmatch("[0-9a-f]{12}", version) for version in weights.values())
+    (own,) = plan_detection(suite_of(root, detectors=[ORACLE])).inputs["weights"].values()
+    assert own.startswith(weights["fcos3d-light"] + " "), "and of its source"
 
 
 def test_a_changed_detector_of_ones_own_is_another_run(
@@ -367,12 +392,11 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "a shift twice": ({"shifts": ["fog", "fog"]}, "twice"),
     "no weights are shipped": ({"detectors": ["fcos3d"]}, "fcos3d=FILE"),
     "unknown detector": ({"detectors": ["fcos3d-lite"]}, "fcos3d-light"),
-    "a 2D detector": ({"detectors": ["yolov5n=random"]}, "2D"),
-    "weights that are not there": ({"detectors": ["fcos3d-light=/nowhere.pth"]}, "nowhere.pth"),
+    "a 2D detector": ({"detectors": ["helpers.oracle3d:build_flat"]}, "build_flat finds 2D boxes"),
     "the same detector twice": ({"detectors": [ORACLE, ORACLE]}, "twice; .*@mine=FILE"),
     "a split of recorded data": ({"data": "recorded", "split": "mini_val"}, "mini_val"),
-    "a split without scenes": ({"split": "mini_val"}, "none of its 2 scenes"),
-    "an unknown town": ({"data": "recorded", "recorded": {"towns": ["Atlantis"]}}, "Atlantis"),
+    "a split without scenes": ({"split": "mini_train"}, "none of its 2 scenes"),
+    "an unknown town": ({"data": "recorded", "split": "all", "recorded": {"towns": ["Atlantis"]}}, "Atlantis"),
 }
 
 
@@ -425,7 +449,8 @@ def test_a_suite_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
 def test_through_the_command(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     words = ["run", "shifts", "--out", str(out), "--device", "cpu", "--workers", "1"]
-    for setting in (f"data={root}", f"detectors={ORACLE}", "shifts=[impulse]", "severities=[2]", "replicates=5"):
+    settings = ["split=mini_val", "shifts=[impulse]", "severities=[2]", "replicates=5"]
+    for setting in (f"data={root}", f"detectors={ORACLE}", *settings):
         words += ["--set", setting]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output

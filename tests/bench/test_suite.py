@@ -11,7 +11,6 @@ import pytest
 from ssad.bench.kind import Plan, find_cell
 from ssad.bench.kinds import driving
 from ssad.bench.kinds.driving import Driving, DrivingSuite
-from ssad.bench.source import source_files, source_version
 from ssad.bench.suite import command_of, load_suite, suite_files
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import Pose, Scenario
@@ -153,37 +152,3 @@ def test_a_command_spells_out_what_differs(write: Callable[[str], str]) -> None:
     assert command_of(load_suite("quick", ["repetitions=3", "systems=blind"])) == (
         "ssad run quick --set 'systems=[blind]' --set repetitions=3"
     )
-
-
-def test_the_source_of_a_cell_is_found() -> None:
-    """What a drive depends on is in its key, and a report or a detector is not."""
-    found = set(source_files("ssad.bench.kinds.driving"))
-    for name in ("core.safeio", "core.registry", "core.traces", "core.geometry", "metrics.driving",
-                 "metrics.criticality", "world.kernels.traffic", "world.witness", "drivers.builtin", "roads.router",
-                 "scenarios.dynamic.knowledge.lane_changing", "scenarios.dynamic.knowledge._placing"):  # fmt: skip
-        assert f"ssad.{name}" in found, name
-    assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
-    seen = set(source_files("ssad.bench.kinds.detection"))
-    for name in ("detectors.mono3d.nms", "detectors.yolo.decode", "scenarios.static.shifts.kernels.falling",
-                 "metrics.detection_match", "evaluation.scene_boxes", "recording.drives", "camera.kernels.shade",
-                 "assets.street.palette", "datasets.nuscenes.truth"):  # fmt: skip
-        assert f"ssad.{name}" in seen, name
-
-
-def test_any_changed_file_that_is_led_to_changes_the_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    files = {
-        "one.py": "import two\nfrom pack import inner\nNAMES = {'x': 'pack.named:X'}\nimport numpy\n",
-        "two.py": "def f():\n    from three import (\n        g,\n    )\n", "three.py": "g = 1\n", "four.py": "h = 1\n",
-        "pack/__init__.py": "", "pack/inner.py": "from . import beside\n", "pack/beside.py": "", "pack/named.py": "",
-    }  # fmt: skip
-    (tmp_path / "pack").mkdir()
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
-    assert set(source_files("one")) == {"one", "two", "three", "pack", "pack.inner", "pack.beside", "pack.named"}
-    before = source_version("one")
-    for name, text in files.items():
-        (tmp_path / name).write_text(text + "# changed\n")
-        assert (source_version("one") != before) == (name != "four.py"), name
-        (tmp_path / name).write_text(text)
-        assert source_version("one") == before

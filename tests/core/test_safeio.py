@@ -177,15 +177,15 @@ def test_npz_truncated_is_one_line(cut: int) -> None:
 
 def test_missing_large_and_binary_files(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no such file"):
-        safeio.read_yaml(tmp_path / "none.yaml")
+        safeio.read_yaml_document(tmp_path / "none.yaml")
     (tmp_path / "big.yaml").write_text("a" * 100)
     with pytest.raises(FormatError, match="larger than the limit"):
-        safeio.read_yaml(tmp_path / "big.yaml", limit=10)
+        safeio.read_yaml_document(tmp_path / "big.yaml", limit=10)
     (tmp_path / "bin.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(FormatError, match="not UTF-8"):
-        safeio.read_yaml(tmp_path / "bin.yaml")
+        safeio.read_yaml_document(tmp_path / "bin.yaml")
     with pytest.raises(FormatError, match="cannot be read"):
-        safeio.read_yaml(tmp_path)
+        safeio.read_yaml_document(tmp_path)
 
 
 def test_atomic_write_leaves_the_old_file_when_it_fails(tmp_path: Path) -> None:
@@ -238,15 +238,15 @@ def test_limits(tmp_path: Path) -> None:
     mebibytes = {
         function: inspect.signature(function).parameters["limit"].default / 2**20
         for function in (
-            safeio.read_bytes, safeio.read_text, safeio.read_yaml, safeio.read_yaml_document, safeio.read_json,
+            safeio.read_bytes, safeio.read_text, safeio.read_yaml_document, safeio.read_json,
             safeio.read_xml, safeio.load_npz,
         )
     }  # fmt: skip
-    assert list(mebibytes.values()) == [64, 64, 16, 16, 256, 256, 2048]
+    assert list(mebibytes.values()) == [64, 64, 16, 256, 256, 2048]
     with (tmp_path / "large").open("wb") as file:
         file.truncate(16 * 2**20 + 1)
     with pytest.raises(FormatError, match="larger than the limit of 16 MiB"):
-        safeio.read_yaml(tmp_path / "large")
+        safeio.read_yaml_document(tmp_path / "large")
 
 
 def test_files_are_read_as_their_texts_are(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_files_are_read_as_their_texts_are(tmp_path: Path) -> None:
     assert safeio.read_xml(tmp_path / "a.xml").get("b") == "1"
     (tmp_path / "a.yaml").write_text("a: 1\nb:\n  - 2")
     document = safeio.read_yaml_document(tmp_path / "a.yaml")
-    assert document.data == safeio.read_yaml(tmp_path / "a.yaml") == {"a": 1, "b": [2]}
+    assert document.data == {"a": 1, "b": [2]}
     assert str(document.error(("b", 0), "bad")) == f"{tmp_path / 'a.yaml'}:3: b[0]: bad"
     (tmp_path / "bad.json").write_text('{"a": 1,\n"b" 2}')
     with pytest.raises(FormatError, match=r"bad\.json:2: not valid JSON"):

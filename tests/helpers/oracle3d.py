@@ -117,3 +117,10 @@ def build_bad() -> Bad:
 def build() -> Oracle:
     """For the data set that ORACLE_DATA names."""
     return Oracle(Path(os.environ["ORACLE_DATA"]))
+
+
+def build_flat() -> Oracle:
+    """One that says it finds boxes in pictures."""
+    found = build()
+    found.task = "2d"
+    return found

@@ -11,7 +11,8 @@ import pytest
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
-from ssad.jobs.store import Store, read_run
+from ssad.jobs import store as stores
+from ssad.jobs.store import Store, locked, read_run
 
 RUN: dict[str, Any] = {"identity": "a", "suite": {"name": "s", "seed": 0}}
 
@@ -33,15 +34,17 @@ def test_append_and_reopen(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="already"):
             store.append(result("a"), None)
     assert read_run(tmp_path)["identity"] == "a"
+    assert '\n "identity": "a"' in (tmp_path / "run.json").read_text(), "people read it"
     assert [r["key"] for r in read_lines(tmp_path / "episodes.jsonl")] == ["a", "b"]
 
 
 def test_every_cut_of_the_files_is_mended(tmp_path: Path) -> None:
+    """At each byte of the second of three lines, and at the ends of the others."""
     fill(tmp_path / "whole", "a", "b", "c")
     results = (tmp_path / "whole" / "results.jsonl").read_bytes()
     episodes = (tmp_path / "whole" / "episodes.jsonl").read_bytes()
     line = len(results) // 3
-    for cut in range(len(results)):
+    for cut in (0, 1, line - 1, *range(line, 2 * line + 2), 3 * line - 1):
         folder = tmp_path / str(cut)
         fill(folder)
         done = cut // line
@@ -101,8 +104,11 @@ def test_a_doubled_key_is_reported(tmp_path: Path) -> None:
 
 
 def test_two_runs_cannot_share_a_folder(tmp_path: Path) -> None:
-    with Store.open(tmp_path, RUN), pytest.raises(StoreError, match="another ssad run"):
-        Store.open(tmp_path, RUN)
+    with Store.open(tmp_path, RUN):
+        before = open_files()
+        with pytest.raises(StoreError, match="another ssad run"):
+            Store.open(tmp_path, RUN)
+        assert open_files() == before
     Store.open(tmp_path, RUN).close()
 
 
@@ -128,3 +134,153 @@ def test_results_without_run_json(tmp_path: Path) -> None:
         Store.open(tmp_path, RUN)
     with pytest.raises(StoreError, match="not a results folder"):
         read_run(tmp_path)
+
+
+def open_files() -> list[str]:
+    return sorted(os.listdir("/proc/self/fd"))
+
+
+def test_nothing_is_left_open(tmp_path: Path) -> None:
+    before = open_files()
+    fill(tmp_path, "a")
+    with locked(tmp_path / "other", "ssad toolbox"):
+        pass
+    with open(tmp_path / "results.jsonl", "a") as file:
+        file.write(json.dumps(result("a")) + "\n")
+    with pytest.raises(StoreError, match="twice"):
+        Store.open(tmp_path, RUN)
+    assert open_files() == before
+
+
+def test_what_an_episode_lacks_is_not_written(tmp_path: Path) -> None:
+    with Store.open(tmp_path, RUN) as store:
+        store.append(result("a"), None)
+        store.append(result("b"), {"key": "b"})
+        assert list(store.results) == ["a", "b"]
+    assert [r["key"] for r in read_lines(tmp_path / "episodes.jsonl")] == ["b"]
+
+
+def test_a_write_that_is_cut_short_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path / "whole", "a", "b")
+    write, synced = os.write, []
+    with Store.open(tmp_path / "cut", RUN) as store, monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:7]))
+        patch.setattr(os, "fsync", synced.append)
+        for key in "ab":
+            store.append(result(key), {"key": key, "raw": key})
+    for name in ("results.jsonl", "episodes.jsonl"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert len(synced) == 4, "a line is on disk before the next is written"
+
+
+def test_a_full_disk_is_one_line_and_the_cell_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int, data: bytes) -> int:
+        raise OSError(28, "No space left on device")
+
+    with Store.open(tmp_path, RUN) as store:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", full)
+            with pytest.raises(
+                StoreError, match=r"episodes\.jsonl: cannot be written: No space left on device; make room"
+            ):
+                store.append(result("a"), {"key": "a"})
+        assert not store.results
+        store.append(result("a"), {"key": "a"})
+
+
+def test_a_folder_that_cannot_be_locked_or_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = open_files()
+
+    def refused(name: str, *, word: str = "") -> Any:
+        real = os.open
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            if str(arguments[0]).endswith(word) or not word:
+                raise OSError(13, f"{name} is refused")
+            return real(*arguments, **options)
+
+        return call
+
+    for place, name, words in (
+        ("fcntl.flock", "", r"\.lock: cannot be locked: fcntl\.flock is refused"),
+        ("os.open", ".lock", r"\.lock: cannot be written: os\.open is refused"),
+        ("os.open", "results.jsonl", r"results\.jsonl: cannot be written: os\.open is refused"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, refused(place, word=name))
+            with pytest.raises(StoreError, match=words):
+                Store.open(tmp_path, RUN)
+    assert open_files() == before
+    fill(tmp_path, "a")
+
+
+def test_files_can_be_read_by_others_and_not_written(tmp_path: Path) -> None:
+    mask = os.umask(0)
+    try:
+        fill(tmp_path, "a")
+    finally:
+        os.umask(mask)
+    for name in (".lock", "results.jsonl", "episodes.jsonl"):
+        assert (tmp_path / name).stat().st_mode & 0o777 == 0o644, name
+
+
+def test_a_run_that_began_meanwhile_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = stores._lock
+
+    def lock(folder: Path) -> int:
+        (folder / "run.json").write_text(json.dumps({"identity": "b", "suite": {"name": "other"}}))
+        return real(folder)
+
+    monkeypatch.setattr(stores, "_lock", lock)
+    with pytest.raises(StoreError, match="holds another run"):
+        Store.open(tmp_path, RUN)
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '["identity"]'])
+def test_a_run_json_of_somebody_else(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(StoreError, match=r"run\.json: not written by ssad run"):
+        read_run(tmp_path)
+
+
+def test_what_differs_is_told(tmp_path: Path) -> None:
+    fill(tmp_path, "a")
+    for suite, words in (
+        ({"name": "s", "seed": 0}, "differs in the code, a system or a town"),
+        ({"name": "s", "kind": "x"}, "differs in kind, seed"),
+    ):
+        with pytest.raises(StoreError, match=words):
+            Store.open(tmp_path, {"identity": "b", "suite": suite})
+    with pytest.raises(StoreError, match="differs in name, seed"):
+        Store.open(tmp_path, {"identity": "b"})
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StoreError, match="file: is a file; choose a folder with --out"):
+        Store.open(tmp_path / "file", RUN)
+
+
+def test_a_folder_is_for_one_command_at_a_time(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    with (
+        locked(folder, "ssad record"),
+        pytest.raises(StoreError, match="another ssad record is writing there"),
+        locked(folder, "ssad record"),
+    ):
+        pytest.fail("twice")
+    with locked(folder, "ssad record"), pytest.raises(StoreError, match="another ssad run is writing there"):
+        Store.open(folder, RUN)
+    assert os.listdir(folder) == [".lock"]
+
+
+def test_episodes_without_a_result_go_and_no_others(tmp_path: Path) -> None:
+    fill(tmp_path, "a", "b")
+    whole = (tmp_path / "episodes.jsonl").read_bytes()
+    with open(tmp_path / "episodes.jsonl", "a") as file:
+        file.write('{"key": "c"}\n{"key": "d"}\n{"ke')
+    fill(tmp_path)
+    assert (tmp_path / "episodes.jsonl").read_bytes() == whole
+    (tmp_path / "results.jsonl").write_bytes(b"")
+    fill(tmp_path)
+    assert (tmp_path / "episodes.jsonl").read_bytes() == b""

@@ -148,3 +148,84 @@ def test_fields_and_document_know_every_metric():
     for metric in METRICS.values():
         assert metric.field in fields or metric.symbol == "OS"
         assert f"| {metric.symbol} |" in text
+
+
+# field, unit, better, kind, upper bound, what a failed episode counts as: docs/metrics.md
+PUBLISHED = {
+    "CR": ("collision", "", "lower", "share", 1.0, None),
+    "OR": ("off_road", "m", "lower", "mean", 1.0, None),
+    "DR": ("distance_to_route", "m", "lower", "mean", 1.0, None),
+    "RC": ("route_completion", "", "higher", "bounded", 1.0, 0.0),
+    "TS": ("time", "s", "lower", "mean", 1.0, None),
+    "RR": ("red_lights", "", "lower", "mean", 1.0, None),
+    "SS": ("stop_signs", "", "lower", "mean", 1.0, None),
+    "RF": ("route_following", "", "higher", "bounded", 1.0, None),
+    "ACC": ("acceleration", "m/s^2", "lower", "mean", 1.0, None),
+    "YV": ("yaw_velocity", "rad/s", "lower", "mean", 1.0, None),
+    "LI": ("lane_invasions", "", "lower", "mean", 1.0, None),
+    "CE": ("collision_events", "", "lower", "mean", 1.0, None),
+    "CR_vehicle": ("collisions_vehicle", "", "lower", "share", 1.0, None),
+    "CR_walker": ("collisions_walker", "", "lower", "share", 1.0, None),
+    "CR_cyclist": ("collisions_cyclist", "", "lower", "share", 1.0, None),
+    "CR_static": ("collisions_static", "", "lower", "share", 1.0, None),
+    "IF": ("in_route_failure", "", "lower", "share", 1.0, None),
+    "DS": ("driving_score", "", "higher", "bounded", 100.0, 0.0),
+    "TTC": ("min_ttc", "s", "higher", "bounded", 10.0, None),
+    "PET": ("pet", "s", "higher", "bounded", 10.0, None),
+    "MD": ("min_distance", "m", "higher", "mean", 1.0, None),
+    "OS": ("", "", "lower", "mean", 1.0, None),
+}
+
+
+def test_the_metrics_are_the_published_ones():
+    found = {
+        symbol: (m.field, m.unit, m.better, m.kind, m.scale, None if math.isnan(m.failed) else m.failed)
+        for symbol, m in METRICS.items()
+    }
+    assert found == PUBLISHED
+    assert all(symbol == m.symbol for symbol, m in METRICS.items())
+
+
+def test_counts_are_shares_of_the_episodes_that_have_any():
+    several = [replace(episode(), collisions_vehicle=k, collision_events=k) for k in (0, 1, 3, 0, 2)]
+    result = aggregate(outcomes(several))
+    assert result["CR_vehicle"].mean == 3 / 5
+    assert result["CE"].mean == pytest.approx(6 / 5)
+
+
+def test_the_score_of_a_failed_episode_is_unknown_only_in_its_collision():
+    several = [episode(hit=k % 3 == 0, complete=50 + 5 * k, distance=0.3 * k, steps=20 + k) for k in range(10)]
+    found = aggregate(outcomes([*several, None]))["OS"]
+    # as if it had driven nothing of its route, and everything else were the mean of the others
+    means = {f: np.mean([getattr(e, f) for e in several]) for f in ("off_road", "distance_to_route", "time")}
+    ends = {}
+    for hit in (False, True):
+        lost = replace(episode(hit=hit, complete=0.0), **{f: float(value) for f, value in means.items()})
+        ends[hit] = aggregate(outcomes([*several, lost]))["OS"]
+    assert (found.low, found.high) == (pytest.approx(ends[False].low), pytest.approx(ends[True].high))
+    assert (found.failed, found.n, found.clusters) == (1, 11, 11)
+
+
+def test_the_score_of_several_groups_is_the_mean_of_theirs():
+    one = [episode(hit=True, complete=40.0, steps=31)] * 5
+    two = [episode(distance=2.0)] * 5
+    each = [aggregate(outcomes(group))["OS"].mean for group in (one, two)]
+    both = aggregate([*outcomes(one, "a"), *outcomes(two, "b")])["OS"]
+    assert both.mean == pytest.approx(sum(each) / 2)
+    # a group of which nothing is known is left out
+    more = aggregate([*outcomes(one, "a"), *outcomes([None, None], "c")])["OS"]
+    assert more.mean == pytest.approx(each[0])
+    assert aggregate(outcomes([None, None]))["OS"].failed == 2
+
+
+def test_the_score_is_not_below_zero():
+    perfect = [replace(episode(), time=float(k % 2) * 0.2 + 1e-3 * k, off_road=0.0) for k in range(10)]
+    assert 0.0 <= aggregate(outcomes(perfect))["OS"].low <= aggregate(outcomes(perfect))["OS"].mean
+
+
+def test_a_family_of_the_papers_has_an_average_of_one_group():
+    rows = aggregate_groups([("a", o) for o in outcomes([episode()], "RightTurn", "pre-crash")])
+    assert [row.group for row in rows] == ["RightTurn", "Avg."]
+    rows = aggregate_groups([("a", o) for g in ("x", "y") for o in outcomes([episode()], g)])
+    assert [row.group for row in rows] == ["x", "y", "Avg. other"]
+    assert [row.group for row in aggregate_groups([("a", o) for o in outcomes([episode()], "x")])] == ["x"]

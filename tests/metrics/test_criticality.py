@@ -167,3 +167,45 @@ def test_pet_agrees_with_all_pairs_of_times():
 def test_scene_of_the_ego_alone():
     trace = make_trace(5)
     assert (min_ttc(trace), post_encroachment_time(trace)) == (10.0, 10.0)
+
+
+def test_the_nearest_of_several_agents():
+    def three(*gaps):
+        return make_trace(1, [(0, 0, 0, 10), *((gap + 4, 0, 0, 0) for gap in gaps)])
+
+    for gaps in ((9, 3, 6), (3, 9, 6), (9, 6, 3)):
+        assert min_distance(three(*gaps)) == pytest.approx(3.0)
+        assert min_ttc(three(*gaps)) == pytest.approx(0.3)
+    # those that are not there do not count
+    active = [[True, True, False, True]]
+    there = make_trace(1, [(0, 0, 0, 0), (13, 0, 0, 0), (7, 0, 0, 0), (10, 0, 0, 0)], active=active)
+    assert min_distance(there) == pytest.approx(6.0)
+    assert np.isinf(ttc(there)).all()
+
+
+def test_an_ego_that_is_not_there_meets_nobody():
+    trace = make_trace(2, [(0, 0, 0, 0), (1, 0, 0, 0)], active=[[False, True], [True, False]])
+    assert min_ttc(trace) == 10.0
+    assert math.isnan(min_distance(trace))
+    # but where it is later, somebody was before
+    assert post_encroachment_time(trace) == pytest.approx(0.1)
+
+
+def test_bodies_that_only_touch_have_overlapped():
+    for x, pet in ((4.0, 0.0), (4.001, 10.0)):  # corner at corner
+        assert post_encroachment_time(make_trace(1, [(0, 0, 0, 0), (x, 2.0, 0, 0)])) == pet
+    for x, pet in ((3.999, 0.0), (4.001, 10.0)):  # bumper at bumper, one long and one short agent beside it
+        assert post_encroachment_time(make_trace(1, [(0, 0, 0, 0), (90, 0, 0, 0), (x, 0.0, 0, 0)])) == pet
+
+
+def test_the_last_step_and_the_cap_count():
+    # the other is where the ego was at the start, first in the last row
+    def late(steps):
+        x = np.where(np.arange(steps) < steps - 1, 300.0, 0.0)
+        ego = np.where(np.arange(steps) < 1, 0.0, 600.0)
+        return make_trace(steps, [(ego, 0, 0, 0), (x, 0, 0, 0)])
+
+    assert post_encroachment_time(late(31)) == pytest.approx(3.0)
+    assert post_encroachment_time(late(101)) == pytest.approx(10.0)
+    assert post_encroachment_time(late(31), cap=2.9) == 2.9
+    assert min_ttc(make_trace(1, [(0, 0, 0, 10), (44, 0, 0, 0)]), cap=3.0) == 3.0

@@ -17,13 +17,14 @@ from ssad.metrics.detection import (
     BikeRacks,
     BoxTable,
     DetectionConfig,
+    DetectionScores,
     check_counts,
     filter_boxes,
     keep_boxes,
     match,
     scene_intervals,
-    score_detections,
 )
+from ssad.metrics.detection_match import pairs_of
 
 CAR, PEDESTRIAN, BICYCLE, CONE, BARRIER = (
     CLASSES.index(name) for name in ("car", "pedestrian", "bicycle", "traffic_cone", "barrier")
@@ -46,6 +47,10 @@ def boxes(rows: list[tuple[Any, ...]], **columns: Any) -> BoxTable:
         ego_distance=np.hypot(x, y) if n else np.zeros(0),
     )
     return replace(table, **columns)
+
+
+def score_detections(truth: BoxTable, found: BoxTable, samples: int) -> DetectionScores:
+    return match(truth, found, samples=samples).scores()
 
 
 def random_tables(key: int, *, samples: int = 6, grid: float = 0.0, levels: int = 0) -> tuple[BoxTable, BoxTable]:
@@ -282,3 +287,129 @@ def test_the_settings_are_the_official_ones() -> None:
     assert list(summary) == keys
     full = score_detections(*random_tables(2), samples=6).summary(eval_time=1.0, meta={"use_lidar": True})
     assert set(full) - set(keys) == {"eval_time", "meta"}
+
+
+def test_scores_below_0_are_fine_where_the_recall_is_complete() -> None:
+    truth = boxes([(0, CAR, 0.0, 0.0), (0, CAR, 9.0, 0.0)])
+    found = boxes([(0, CAR, 0.0, 0.0, -0.5), (0, CAR, 9.0, 0.0, -2.0)])
+    assert score_detections(truth, found, samples=1).label_aps["car"]["0.5"] == pytest.approx(1.0)
+    # one of them is found at 4 m alone: that curve ends before the others do
+    away = boxes([(0, CAR, 0.0, 0.0, -0.5), (0, CAR, 12.0, 0.0, -2.0)])
+    with pytest.raises(FormatError, match=r"class car: scores below 0 cannot be evaluated; scale them to 0 \.\. 1"):
+        score_detections(truth, away, samples=1)
+    mixed = boxes([(0, CAR, 0.0, 0.0, 0.5), (0, CAR, 12.0, 0.0, 0.0)])
+    assert score_detections(truth, mixed, samples=1).label_aps["car"]["4.0"] == pytest.approx(1.0)
+
+
+def curve(hits: list[int], truth: int, config: DetectionConfig = CVPR_2019) -> float:
+    """AP of predictions from best to worst, of which the i-th is a hit or not."""
+    right = np.cumsum(hits)
+    precision = np.interp(np.linspace(0, 1, 101), right / truth, right / np.arange(1, len(hits) + 1), right=0)
+    least = int(100 * config.min_recall) + 1
+    above = np.maximum(precision[least:] - config.min_precision, 0.0)
+    return float(above.mean() / (1.0 - config.min_precision))
+
+
+@pytest.mark.parametrize(
+    "hits", [[1, 0, 1], [0, 1, 1], [0, 0, 0, 1], [1, 1, 0, 0, 0], [1, 0, 0, 0, 1, 0, 1, 1, 0], [0, 1, 0]]
+)
+@pytest.mark.parametrize("settings_", [{}, {"min_recall": 0.3, "min_precision": 0.4}])
+def test_average_precision_of_a_curve(hits: list[int], settings_: dict[str, float]) -> None:
+    config = DetectionConfig(dist_ths=(1.0, 2.0), **settings_)  # type: ignore[arg-type]
+    truth = boxes([(0, CAR, 10.0 * k, 0.0) for k in range(5)])
+    places = iter(range(5))
+    rows = [(0, CAR, 10.0 * next(places) if hit else 500.0, 0.0, 1.0 - 0.1 * i) for i, hit in enumerate(hits)]
+    scores = match(truth, boxes(rows), samples=1, config=config).scores()
+    for threshold in ("1.0", "2.0"):
+        assert scores.label_aps["car"][threshold] == pytest.approx(curve(hits, 5, config))
+    assert scores.mean_dist_aps["car"] == pytest.approx(curve(hits, 5, config))
+    assert scores.mean_ap == pytest.approx(curve(hits, 5, config) / 10)
+    assert (scores.truth[CAR], scores.predictions[CAR]) == (5, len(hits))
+    assert list(scores.label_aps["car"]) == ["1.0", "2.0"]
+
+
+def test_errors_of_matched_boxes_by_hand() -> None:
+    truth = boxes([(0, CAR, 0.0, 0.0)], velocity=np.array([[3.0, 0.0]]), attribute=np.array([1], np.int8))
+    turn = math.radians(30.0) / 2
+    found = boxes(
+        [(0, CAR, 0.6, 0.8, 0.5)],
+        size_lwh=np.array([[2.0, 4.0, 1.5]]),
+        rotation=np.array([[math.cos(turn), 0.0, 0.0, math.sin(turn)]]),
+        velocity=np.array([[0.0, 4.0]]),
+        attribute=np.array([2], np.int8),
+    )
+    scores = score_detections(truth, found, samples=1)
+    # 2 x 2 x 1.5 of the sizes are shared
+    expected = {"trans_err": 1.0, "scale_err": 1 - 6 / 18, "orient_err": math.pi / 6, "vel_err": 5.0, "attr_err": 1.0}
+    assert scores.label_tp_errors["car"] == pytest.approx(expected)
+    other = {name: (error + 9.0) / 10 for name, error in expected.items()}
+    # classes without ground truth count as 1, those for which an error means nothing do not count
+    other |= {"orient_err": (math.pi / 6 + 8) / 9, "vel_err": (5.0 + 7) / 8, "attr_err": 1.0}
+    assert scores.tp_errors == pytest.approx(other)
+    assert scores.tp_scores["vel_err"] == 0.0
+    assert scores.nd_score == pytest.approx((5 * scores.mean_ap + sum(scores.tp_scores.values())) / 10)
+
+
+def test_an_error_is_averaged_up_to_the_recall_that_was_reached() -> None:
+    truth = boxes([(0, CAR, 10.0 * k, 0.0) for k in range(4)], attribute=np.zeros(4, np.int8))
+    # three found, off by 0, 1 and 0.5 m in the order of their scores
+    found = boxes([(0, CAR, 0.0, 0.0, 0.9), (0, CAR, 11.0, 0.0, 0.8), (0, CAR, 20.5, 0.0, 0.7)])
+    error = score_detections(truth, found, samples=1).label_tp_errors["car"]["trans_err"]
+    recall = np.arange(11, 76) / 100
+    confidence = np.interp(recall, [0.25, 0.5, 0.75], [0.9, 0.8, 0.7])
+    means = np.interp(-confidence, [-0.9, -0.8, -0.7], [0.0, 0.5, 0.5])
+    assert error == pytest.approx(means.mean())
+    # where too little is found, every error is 1
+    few = boxes([(0, CAR, 10.0 * k, 0.0) for k in range(20)])
+    assert score_detections(few, found.take(np.arange(1)), samples=1).label_tp_errors["car"]["trans_err"] == 1.0
+
+
+@pytest.mark.parametrize("most", [1, 3, 7, 1000])
+def test_pairs_come_in_parts(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ssad.metrics.detection_match.PAIRS", most)
+    count, start = np.array([2, 0, 3, 1, 0, 4]), np.array([5, 0, 1, 9, 3, 2])
+    parts = [(pred.tolist(), box.tolist()) for pred, box in pairs_of(count, start)]
+    whole = [(i, int(start[i]) + k) for i in range(6) for k in range(count[i])]
+    assert [pair for pred, box in parts for pair in zip(pred, box, strict=True)] == whole
+    assert all(len(pred) <= max(most, 4) for pred, _ in parts)
+    assert len(parts) <= {1: 6, 3: 4, 7: 2, 1000: 1}[most]
+
+
+def test_the_settings_as_the_devkit_writes_them() -> None:
+    assert CVPR_2019.serialize() == {
+        "class_range": {
+            "car": 50, "truck": 50, "bus": 50, "trailer": 50, "construction_vehicle": 50, "pedestrian": 40,
+            "motorcycle": 40, "bicycle": 40, "traffic_cone": 30, "barrier": 30,
+        },
+        "dist_fcn": "center_distance", "dist_ths": [0.5, 1.0, 2.0, 4.0], "dist_th_tp": 2.0, "min_recall": 0.1,
+        "min_precision": 0.1, "max_boxes_per_sample": 500, "mean_ap_weight": 5,
+    }  # fmt: skip
+    found = DetectionConfig(class_range={"car": 12.5, "bus": 8.0}).serialize()["class_range"]
+    assert found == {"car": 12.5, "bus": 8}
+    assert [type(v) for v in found.values()] == [float, int]
+
+
+def test_an_empty_table_knows_nothing() -> None:
+    table = BoxTable.empty(2)
+    assert (table.attribute.tolist(), table.score.tolist()) == ([-1, -1], [-1.0, -1.0])
+    assert np.isnan(table.velocity).all()
+    assert np.isnan(table.ego_distance).all()
+    assert len(BoxTable.empty()) == 0
+    assert not table.centre.any()
+
+
+@pytest.mark.parametrize("side", [0, 1, 2])
+@pytest.mark.parametrize("what", ["prediction", "ground truth"])
+def test_a_box_without_one_of_its_sides_is_named(side: int, what: str) -> None:
+    size = np.tile([4.0, 2.0, 1.5], (2, 1))
+    size[1, side] = 0.0
+    rows = [(0, CAR, 0.0, 0.0, 0.5), (1, CAR, 9.0, 0.0, 0.5)]
+    good, flat = boxes(rows), boxes(rows, size_lwh=size)
+    pair = (good, flat) if what == "prediction" else (flat, good)
+    with pytest.raises(
+        FormatError, match=rf"sample 1: a {what} box has the size \[.*0\.0.*\]; all sides must be positive"
+    ):
+        match(*pair, samples=2)
+    # not only where errors are taken: 3 m apart
+    with pytest.raises(FormatError, match="sample b"):
+        match(pair[0], replace(pair[1], centre=pair[1].centre + np.array([3.0, 0.0, 0.0])), samples=2, names=["a", "b"])

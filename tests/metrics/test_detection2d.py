@@ -10,7 +10,7 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from ssad.core.seeding import generator
-from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d, precision_recall
+from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 
 
 def coco_ap(truth: Boxes2D, found: Boxes2D, labels: int, threshold: float, most: int) -> np.ndarray:
@@ -99,11 +99,6 @@ def test_by_hand() -> None:
     # a false one between two right ones: precision 1 up to recall 0.5, then 2/3
     found = one([0, 0, 0], [A, FAR, B], [0.9, 0.8, 0.7])
     assert average_precision(truth, found, labels=1)[0] == pytest.approx((51 + 50 * 2 / 3) / 101)
-    precision, recall = precision_recall(truth, found, labels=1, score=0.75)
-    assert (precision[0], recall[0]) == (0.5, 0.5)
-    precision, recall = precision_recall(truth, found, labels=1, score=0.95)
-    assert np.isnan(precision[0])
-    assert recall[0] == 0.0
 
 
 def test_the_second_detection_of_a_box_is_wrong_and_one_in_a_crowd_is_not() -> None:
@@ -113,7 +108,7 @@ def test_the_second_detection_of_a_box_is_wrong_and_one_in_a_crowd_is_not() -> N
     matched = match_2d(crowd, found, labels=1)
     assert matched.hit.tolist() == [True, False]
     assert matched.ignored.tolist() == [False, True]
-    assert matched.precision_recall(0.0)[0][0] == 1.0
+    assert matched.average_precision()[0] == pytest.approx(1.0)
 
 
 def test_other_images_and_labels_do_not_match() -> None:
@@ -131,3 +126,28 @@ def test_nothing_at_all() -> None:
     assert np.isnan(average_precision(one([], []), one([0], [A], [0.5]), labels=1)[0])
     with pytest.raises(ValueError, match="scores"):
         match_2d(one([0], [A]), one([0], [A]), labels=1)
+
+
+@pytest.mark.parametrize(("side", "threshold", "hit"), [(5.0, 0.5, True), (4.99, 0.5, False), (5.0, 0.51, False)])
+def test_an_overlap_at_the_threshold_counts(side: float, threshold: float, hit: bool) -> None:
+    found = one([0], [[0, 0, 10, side]], [0.5])
+    assert match_2d(one([0], [A]), found, labels=1, threshold=threshold).hit.tolist() == [hit]
+
+
+@pytest.mark.parametrize(("off", "hit"), [(0.0, True), (5e-10, True), (5e-9, False)])
+def test_a_threshold_of_1_leaves_room_for_rounding(off: float, hit: bool) -> None:
+    found = one([0], [[0, 0, 10, 10 + off]], [0.5])
+    assert match_2d(one([0], [A]), found, labels=1, threshold=1.0).hit.tolist() == [hit]
+
+
+def test_boxes_that_touch_do_not_overlap() -> None:
+    for box in ([10, 0, 20, 10], [0, 10, 10, 20], [-5, -5, 0, 0], [20, 20, 30, 30]):
+        assert not match_2d(one([0], [A]), one([0], [box], [0.5]), labels=1, threshold=0.0 + 1e-12).hit.any()
+    assert match_2d(one([0], [A]), one([0], [[9, 9, 19, 19]], [0.5]), labels=1, threshold=1 / 199).hit.all()
+
+
+def test_the_best_so_many_of_an_image_count() -> None:
+    truth = one([0, 1], [A, A])
+    found = one([0, 0, 0, 1], [FAR, FAR, A, A], [0.9, 0.8, 0.7, 0.6])
+    for most, hits in ((1, [False, True]), (2, [False, False, True]), (3, [False, False, True, True])):
+        assert match_2d(truth, found, labels=1, max_detections=most).hit.tolist() == hits

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,12 @@ from helpers.metric_traces import make_trace
 from ssad.core.types import Contact
 from ssad.metrics import EpisodeMetrics, episode_metrics, frea_score, overall_score
 from ssad.metrics.driving import (
+    DIVISORS,
+    PENALTIES,
+    WEIGHTS,
     collision_events,
     driving_score,
+    in_route_failure,
     mean_yaw_velocity,
     normalised,
     off_road_distance,
@@ -174,3 +179,98 @@ def test_dict_round_trip_ignores_other_keys_and_leaves_out_what_is_absent():
     assert math.isnan(less.driven)
     assert less.stop_signs is None
     assert EpisodeMetrics.from_dict(m.as_dict() | {"stop_signs": 2}).stop_signs == 2
+
+
+def test_the_numbers_of_safebench_frea_and_the_leaderboard():
+    # SafeBench's cal_out_of_road_length and final_score; ACC and YV: FREA; leaderboard 1.0: statistics_manager.py
+    assert DIVISORS == {"CR": 1.0, "OR": 10.0, "DR": 5.0, "IR": 1.0, "TS": 30.0, "ACC": 8.0, "YV": 1.0}
+    assert WEIGHTS == {"CR": 0.4, "OR": 0.1, "DR": 0.1, "IR": 0.3, "TS": 0.1}
+    assert PENALTIES == {
+        "collisions_walker": 0.5, "collisions_cyclist": 0.6, "collisions_vehicle": 0.6, "collisions_static": 0.65,
+        "red_lights": 0.7, "stop_signs": 0.8,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("distance", "driven", "failure"),
+    [
+        ([0, 30, 0], [0, 1, 2], False),
+        ([0, 30.1, 0], [0, 1, 2], True),
+        ([99, 0, 0], [0, 1, 2], False),  # the start does not count
+        ([0, 15, 15], [0, 50, 100], False),
+        ([0, 15.1, 0], [0, 30, 100], False),  # 30 m of 100 m
+        ([0, 15.1, 0], [0, 30.5, 100], True),
+        ([0], [0], False),
+    ],
+)
+def test_limits_of_the_in_route_test(distance, driven, failure):
+    trace = make_trace(len(distance), route_distance=distance, driven=driven)
+    assert in_route_failure(trace) is failure
+
+
+def test_in_route_failure_without_a_route():
+    trace = make_trace(3, route_distance=[0, 16, 0], driven=[0, 1, 2])
+    assert in_route_failure(replace(trace, route=trace.route[:1])) is True
+    assert in_route_failure(replace(make_trace(3), route=trace.route[:0])) is False
+
+
+@pytest.mark.parametrize(
+    ("steps", "x", "agents", "events"),
+    [
+        (51, 20.0, (1, 1), 1),  # 5.0 s later, far away
+        (52, 20.0, (1, 1), 2),  # 5.1 s later
+        (11, 3.0, (1, 2), 1),  # 3 m away
+        (11, 3.1, (1, 2), 2),
+        (52, 2.0, (-2, -2), 1),  # a place has no time
+        (52, 2.0, (1, 1), 1),
+        (11, 20.0, (0, 0), 1),  # agent 0 is an agent like any other
+    ],
+)
+def test_where_an_event_ends(steps, x, agents, events):
+    contact = np.zeros(steps)
+    contact[[0, -1]] = 1
+    agent = np.full(steps, -1)
+    agent[[0, -1]] = agents
+    ego = np.linspace(0.0, x, steps)
+    assert collision_events(make_trace(steps, [(ego, 0, 0, 0)], contact=contact, contact_agent=agent)).sum() == events
+
+
+@pytest.mark.parametrize(("away", "events"), [(5.0, 1), (5.1, 2)])
+def test_a_place_is_forgotten_beyond_5_m(away, events):
+    # away in y and back to 1 m beside the place, past the time of the agent
+    y = np.concatenate([np.linspace(0.0, away, 31), np.linspace(away, 1.0, 30)])
+    contact = np.zeros(61)
+    contact[[0, 60]] = 1
+    trace = make_trace(61, [(0, y, 0, 0)], contact=contact, contact_agent=np.where(contact, 1, -1))
+    assert collision_events(trace).sum() == events
+
+
+def test_an_event_is_compared_with_all_before_it():
+    # agents 1 and 2 at different places, then each of them again
+    contact = np.ones(4)
+    trace = make_trace(4, [(np.array([0, 10, 20, 30]), 0, 0, 0)], contact=contact, contact_agent=[1, 2, 1, 2])
+    assert collision_events(trace).tolist() == [True, True, False, False]
+    kinds = [Contact.WALKER, Contact.CYCLIST, 0, 0]
+    m = episode_metrics(make_trace(4, contact=kinds, contact_agent=[1, 2, -1, -1]))
+    assert (m.collisions_walker, m.collisions_cyclist) == (1, 0)  # the second at the same place is no event
+
+
+def test_shares_stay_between_0_and_1():
+    m = episode_metrics(make_trace(3, off_road=True, driven=[0, 1, 2], route_complete=130))
+    assert (m.off_road_fraction, m.route_completion, m.driving_score) == (1.0, 1.0, 0.0)
+    assert episode_metrics(make_trace(3, off_road=True)).off_road_fraction == 0.0  # nothing driven
+    assert episode_metrics(make_trace(3, route_complete=-5)).route_completion == 0.0
+    assert episode_metrics(make_trace(3, driven=[0, 0.25, 0.5], off_road=[0, 0, 1])).off_road_fraction == 0.5
+    assert episode_metrics(make_trace(3, route_distance=[0, 1, 1])).route_following == pytest.approx(0.8)
+
+
+def test_an_episode_that_ended_in_a_collision_has_one():
+    assert episode_metrics(make_trace(3, end="collision")).collision
+    assert episode_metrics(make_trace(3, contact=[0, 1, 0])).collision
+    assert not episode_metrics(make_trace(3, end="timeout")).collision
+
+
+def test_two_rows_are_enough_for_means():
+    m = episode_metrics(make_trace(2, [(0, 0, [0, 0.05], 10)], accel=[9, 0], route_distance=[9, 3], dt=0.1))
+    assert (m.acceleration, m.yaw_velocity) == (pytest.approx(5.0, abs=1e-4), pytest.approx(0.5, abs=1e-5))
+    assert (m.distance_to_route, m.time) == (3.0, pytest.approx(0.1))

@@ -6,34 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 
 from benchmarks.interval_coverage import design, detection_coverage, mean_coverage, share_coverage
 from ssad.metrics.intervals import (
     Clusters,
-    beta_quantile,
     bounded_limits,
     mean_limits,
     replicate_limits,
     share_limits,
     t_quantile,
 )
-
-
-# scipy.special.betaincinv(a, b, p), version 1.17
-@pytest.mark.parametrize(
-    ("probability", "a", "b", "value"),
-    [
-        (0.025, 1.0, 8.0, 0.00315972353),
-        (0.975, 2.0, 7.0, 0.52650967088),
-        (0.025, 82.0, 183.0, 0.25530184788),
-        (0.975, 0.5, 0.5, 0.99845866687),
-        (0.025, 0.1, 30.0, 1.95987706e-18),
-    ],
-)
-def test_beta_quantiles(probability, a, b, value):
-    alone = beta_quantile(probability, np.array([a]), np.array([b]))[0]
-    assert alone == pytest.approx(value, rel=1e-8)
-    assert beta_quantile(probability, np.array([3.0, a]), np.array([5.0, b]))[1] == pytest.approx(alone, rel=1e-10)
 
 
 def test_student_quantiles():
@@ -181,3 +164,181 @@ def test_replicates_of_few_clusters_are_widened():
     assert low * high == pytest.approx(1.44)
     assert (low, high) == (pytest.approx(1.2 - 0.0196, abs=3e-4), pytest.approx(1.2 + 0.0196, abs=3e-4))
     assert replicate_limits(np.asarray(0.0), np.asarray(0.0), 24, bounded=True)[1] > 0.1
+
+
+# ---------------------------------------------------------------- the formulas, one cluster after the other
+
+
+def by_hand(sums, size, stratum, assumed=None):
+    """Mean, variance, degrees of freedom, skewness, and what each cluster adds (docs/metrics.md); no arrays."""
+    strata = sorted(set(stratum))
+    cases = {h: sum(n for n, g in zip(size, stratum, strict=True) if g == h) for h in strata}
+    total = {h: sum(x for x, g in zip(sums, stratum, strict=True) if g == h) for h in strata}
+    count = {h: stratum.count(h) for h in strata}
+    mean = sum(total[h] / cases[h] for h in strata) / len(strata)
+    merged = min(count.values()) < 2
+    parts = []
+    for k, (x, n, h) in enumerate(zip(sums, size, stratum, strict=True)):
+        weight = n / cases[h] / len(strata)
+        part = (x / n - (mean if merged else total[h] / cases[h])) * weight
+        if assumed is not None and assumed[k] is not None:
+            part = assumed[k] * weight
+        parts.append((part, len(size) if merged else count[h]))
+    variance = sum(p**2 * m / (m - 1) for p, m in parts)
+    most = len(size) - 1 if merged else sum(m - 1 for m in count.values())
+    square, fourth = sum(p**2 for p, _ in parts), sum(p**4 for p, _ in parts)
+    kurtosis = len(size) * fourth / square**2
+    freedom = min(max(2 * len(size) / (kurtosis - 1), 1), most)
+    skew = sum(p**3 * m**2 / ((m - 1) * (m - 2)) for p, m in parts) / variance**1.5
+    return mean, variance, freedom, skew, [p for p, _ in parts]
+
+
+def layout_of(size, stratum):
+    return Clusters(np.array(size, float), np.array(stratum))
+
+
+DESIGNS = {
+    "one group": ([3, 1, 2, 2, 5, 1, 1, 4, 2, 3, 1, 2], [0] * 12),
+    "two groups": ([3, 1, 2, 2, 5, 1, 1, 4, 2, 3, 1, 2], [0] * 5 + [1] * 7),
+    "three groups": ([1, 2, 1, 2, 1, 2, 1, 2, 1, 2, 1, 2], [0, 1, 2] * 4),
+    "a group of one cluster": ([3, 1, 2, 2, 5, 1, 1, 4, 2, 3, 1, 2], [0] * 4 + [1] * 7 + [2]),
+}
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("seed", range(4))
+def test_student_limits_are_those_of_the_formulas(name, seed):
+    size, stratum = DESIGNS[name]
+    values = np.random.Generator(np.random.Philox(seed)).exponential(size=12) ** (1 + seed)
+    sums = values * np.array(size) * (-1.0 if seed % 2 else 1.0)
+    mean, variance, freedom, skew, parts = by_hand(sums.tolist(), size, stratum)
+    t = stats.t.ppf(0.975, freedom)
+    error = math.sqrt(variance)
+    tail = skew * (2 * t**2 + 1) / 6 * error
+    found = mean_limits(sums, layout_of(size, stratum))
+    assert (found.mean, found.method) == (pytest.approx(mean), "t")
+    assert found.low == pytest.approx(mean - t * error + min(tail, 0.0) + 0.5 * min(parts))
+    assert found.high == pytest.approx(mean + t * error + max(tail, 0.0) + 0.5 * max(parts))
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("cap", [math.inf, 30.0])
+def test_bounded_limits_are_those_of_the_formulas(name, seed, cap):
+    size, stratum = DESIGNS[name]
+    values = np.random.Generator(np.random.Philox(seed)).beta(5.0, 1.0 + seed, size=12)
+    sums = values * np.array(size)
+    mean, variance, freedom, _, _ = by_hand(sums.tolist(), size, stratum)
+    effective = mean * (1 - mean) / variance * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, freedom)) ** 2
+    layout = layout_of(size, stratum)
+    effective = min(max(effective, 1 / sum(layout.weight**2)), cap)
+    found = bounded_limits(sums, layout, cap=cap)
+    low, high = share_limits(mean, effective)
+    assert (found.mean, found.low, found.high) == (pytest.approx(mean), pytest.approx(low), pytest.approx(high))
+    assert found.method == "beta"
+
+
+@pytest.mark.parametrize("name", ["two groups", "three groups", "a group of one cluster"])
+@pytest.mark.parametrize("end", [0.0, 1.0])
+def test_a_group_at_an_end_is_taken_to_vary_by_half_an_event(name, end):
+    size, stratum = DESIGNS[name]
+    values = np.random.Generator(np.random.Philox(9)).beta(2.0, 2.0, size=12)
+    group = np.array(stratum)
+    merged = name == "a group of one cluster"
+    # a group of one cluster joins the others, so only all groups together can be at an end
+    values[group == 0 if not merged else group >= 0] = end
+    count = {h: len(size) if merged else stratum.count(h) for h in stratum}
+    share = {h: 0.5 / (count[h] + 1) for h in count}
+    deviation = {h: math.sqrt(share[h] * (1 - share[h]) * (count[h] - 1) / count[h]) for h in count}
+    at_end = [deviation[h] if merged or h == 0 else None for h in stratum]
+    sums = values * np.array(size)
+    mean, variance, freedom, _, _ = by_hand(sums.tolist(), size, stratum, at_end)
+    effective = mean * (1 - mean) / variance * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, freedom)) ** 2
+    layout = layout_of(size, stratum)
+    effective = max(effective, 1 / sum(layout.weight**2))
+    low, high = share_limits(mean, effective)
+    found = bounded_limits(sums, layout)
+    assert (found.low, found.high) == (pytest.approx(low), pytest.approx(high))
+
+
+def test_independent_cases_are_counted_and_not_estimated():
+    values = np.array([1.0, 0, 0, 1, 0, 0, 0, 0, 1, 0])
+    found = bounded_limits(values, design(10, 1), cap=20.0)
+    assert (found.low, found.high) == tuple(share_limits(0.3, 10.0))
+    # whole clusters are not independent cases, nor is what lies between 0 and 1
+    assert bounded_limits(2 * values, design(10, 2), cap=40.0).high != share_limits(0.3, 20.0)[1]
+    assert bounded_limits(values, design(10, 1)).high != share_limits(0.3, 10.0)[1]
+
+
+def test_values_that_do_not_vary():
+    inside = bounded_limits(np.full(10, 0.4), design(10, 1))
+    assert (inside.mean, math.isnan(inside.low), math.isnan(inside.high)) == (pytest.approx(0.4), True, True)
+    capped = bounded_limits(np.full(10, 0.8), design(10, 2), cap=40.0)  # shares of two cases, all alike
+    assert (capped.low, capped.high) == tuple(map(pytest.approx, share_limits(0.4, 40.0)))
+    # several data sets at once: each for itself
+    both = bounded_limits(np.array([np.full(10, 0.4), np.linspace(0, 1, 10)]), design(10, 1))
+    assert np.isnan(both.low).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e9])
+def test_rounding_is_no_spread(scale):
+    noise = 1.0 + 1e-15 * np.arange(20)
+    assert math.isnan(mean_limits(scale * noise, design(20, 1)).low)
+    real = scale * (1.0 + 1e-7 * np.arange(20))
+    assert mean_limits(real, design(20, 1)).low < real.mean()
+
+
+def test_clusters_that_all_differ_are_all_counted():
+    values = np.arange(8.0)
+    assert not math.isnan(mean_limits(values, design(8, 1)).low)
+    assert math.isnan(mean_limits(np.arange(7.0), design(7, 1)).low)
+    # two alike: six differ from them
+    assert math.isnan(mean_limits(np.array([0.0, 0, 1, 2, 3, 4, 5, 6]), design(8, 1)).low)
+    # alike is what agrees to a billionth
+    assert math.isnan(mean_limits(np.array([5.0, 5.0 + 1e-10, 1, 2, 3, 4, 6, 7]), design(8, 1)).low)
+    assert not math.isnan(mean_limits(np.array([5.0, 5.0 + 1e-7, 1, 2, 3, 4, 6, 7]), design(8, 1)).low)
+
+
+@pytest.mark.parametrize(
+    ("share", "n"), [(0.3, 10.0), (0.25, 6.0), (0.5, 3.0), (0.02, 800.0), (0.98, 800.0), (0.5, 1000.0), (0.123, 57.3)]
+)
+def test_limits_of_a_share_are_quantiles(share, n):
+    """Half-way between Clopper and Pearson's parameters and Jeffreys' from two events on; from one to two between."""
+    events, rest = share * n, (1 - share) * n
+    a = 0.25 * min(max(min(events, rest) - 1.0, 0.0), 1.0)
+    low, high = share_limits(share, n)
+    assert stats.beta.cdf(low, events + a, rest + 1 - a) == pytest.approx(0.025)
+    assert stats.beta.cdf(high, events + 1 - a, rest + a) == pytest.approx(0.975)
+
+
+@pytest.mark.parametrize(("share", "n"), [(0.5, 1001.0), (0.3, 5000.0), (0.999, 1e6), (0.01, 1e9)])
+def test_limits_of_a_share_of_many_events_are_score_limits(share, n):
+    # Wilson (1927): the shares that differ from the one seen by the normal quantile times their own deviation
+    for limit in share_limits(share, n):
+        assert abs(share - limit) == pytest.approx(1.959963985 * math.sqrt(limit * (1 - limit) / n), rel=1e-6)
+
+
+def test_the_interval_of_a_score_is_that_of_its_replicates():
+    value, variance = 0.3, 0.04**2
+    for clusters in (5, 24):
+        ours = variance * clusters / (clusters - 1)
+        t = stats.t.ppf(0.975, clusters - 1)
+        effective = max(value * (1 - value) / ours * (stats.norm.ppf(0.975) / t) ** 2, clusters)
+        found = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=True)
+        assert found == tuple(map(pytest.approx, share_limits(value, effective)))
+        low, high = replicate_limits(np.asarray(value), np.asarray(variance), clusters, bounded=False)
+        assert math.log(high / value) == pytest.approx(t * math.sqrt(ours) / value)
+        assert math.log(value / low) == pytest.approx(t * math.sqrt(ours) / value)
+    # never fewer cases than clusters, and a score that does not vary is taken to be known to a billion cases
+    wide = replicate_limits(np.asarray(value), np.asarray(1.0), 24, bounded=True)
+    assert wide == tuple(map(pytest.approx, share_limits(value, 24.0)))
+    sure = replicate_limits(np.asarray(value), np.asarray(0.0), 24, bounded=True)
+    assert sure == tuple(map(pytest.approx, share_limits(value, 1e9)))
+    perfect = replicate_limits(np.asarray(1.0), np.asarray(0.0), 24, bounded=True)
+    assert perfect == tuple(map(pytest.approx, share_limits(1.0, 24.0)))
+
+
+def test_weights_of_clusters():
+    layout = layout_of([1, 3, 2], [0, 0, 1])
+    assert layout.weight.tolist() == [0.125, 0.375, 0.5]
+    assert layout.member.tolist() == [[1, 0], [1, 0], [0, 1]]

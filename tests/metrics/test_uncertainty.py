@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssad.metrics.intervals import Clusters, bounded_limits, mean_limits, replicate_limits
 from ssad.metrics.uncertainty import CaseValue, estimate, paired_difference, replicate_estimate
 
 NAN = math.nan
@@ -151,3 +152,97 @@ def test_scores_by_replicates():
     assert ratio.low < 1.1 < ratio.high
     assert ratio.low * ratio.high == pytest.approx(1.21)
     assert math.isnan(replicate_estimate(1.0, [1.0] * 50, n=500, clusters=24, bounded=False).low)
+
+
+def test_what_there_is_nothing_of():
+    nothing = estimate([CaseValue(NAN, "x", "x"), CaseValue(NAN, "y", "y", failed=True)], "mean")
+    assert (nothing.n, nothing.failed, nothing.clusters, nothing.method) == (0, 1, 0, "none")
+    assert math.isnan(nothing.low + nothing.high)
+
+
+def test_of_copies_that_disagree_one_that_ran_counts():
+    ran, failed, lost = CaseValue(1.0, "c", "x"), CaseValue(NAN, "c", "x", failed=True), CaseValue(NAN, "c", "x")
+    for values in ([ran, failed, lost], [lost, failed, ran], [failed, ran, lost]):
+        e = estimate(values, "share")
+        assert (e.mean, e.n, e.failed) == (1.0, 1, 0)
+    assert estimate([failed, lost], "share").failed == 0
+    assert estimate([replace(ran, failed=True), replace(ran, value=0.0)], "mean").mean == 0.0
+
+
+def test_a_failed_case_is_unknown_in_a_share_alone():
+    values = [*cases([0.2, 0.4, 0.6, 0.8, 1.0, 0.5]), CaseValue(NAN, "x", "x", failed=True)]
+    assert (estimate(values, "bounded").n, estimate(values, "bounded").failed) == (6, 1)
+    assert estimate(values, "bounded").mean == pytest.approx(3.5 / 6)
+    # one that failed and has a value (a route completion of 0) counts with it
+    known = [*values[:-1], CaseValue(0.0, "x", "x", failed=True)]
+    assert (estimate(known, "bounded").mean, estimate(known, "bounded").failed) == (pytest.approx(0.5), 1)
+    share = [*cases([0, 0, 1]), CaseValue(NAN, "x", "x", failed=True)]
+    e = estimate(share, "share")
+    assert (e.mean, e.low, e.high, e.method) == (0.25, 0.0, 1.0, "range")
+
+
+def test_the_limits_are_those_of_the_intervals():
+    values = np.random.Generator(np.random.Philox(3)).random(24)
+    layout = Clusters(np.full(12, 2.0), np.repeat([0, 1], 6))
+    of_pairs = [CaseValue(float(v), f"c{k // 2}", str(k), "ab"[k // 12]) for k, v in enumerate(values)]
+    for kind, limits in (("mean", mean_limits), ("bounded", bounded_limits)):
+        e, found = estimate(of_pairs, kind), limits(values.reshape(12, 2).sum(axis=1), layout)
+        assert (e.mean, e.low, e.high, e.method) == (found.mean, found.low, found.high, found.method)
+    ones = [replace(v, value=float(v.value < 0.3)) for v in of_pairs]
+    found = bounded_limits((values < 0.3).reshape(12, 2).sum(axis=1).astype(float), layout, cap=48.0)
+    assert (estimate(ones, "share").low, estimate(ones, "share").high) == (found.low, found.high)
+    # with a scale and a least value
+    e = estimate(of_pairs, "mean", scale=4.0)
+    assert (e.low, e.high) == (
+        pytest.approx(estimate(of_pairs, "mean").low),
+        pytest.approx(estimate(of_pairs, "mean").high),
+    )
+    assert estimate(of_pairs, "mean", scale=4.0, least=0.45).low == pytest.approx(0.45)
+
+
+def test_the_range_is_that_of_the_clusters_means():
+    e = estimate(cases([1.0, 3.0, 5.0, 9.0], per_cluster=2), "mean")
+    assert (e.mean, e.low, e.high, e.method) == (4.5, 2.0, 7.0, "range")
+    one = estimate(cases([1.0, 3.0], per_cluster=2), "mean")
+    assert (one.mean, one.method, one.clusters) == (2.0, "none", 1)
+    # groups weigh the same, whatever the number of their cases
+    groups = [
+        CaseValue(v, c, c + str(k), s) for k, (v, c, s) in enumerate([(1, "a", "x"), (2, "b", "x"), (6, "c", "y")])
+    ]
+    assert estimate(groups, "mean").mean == 3.75
+    # five clusters that are too alike for an interval
+    flat = estimate(cases([2.0] * 5), "mean")
+    assert (flat.low, flat.high, flat.method) == (2.0, 2.0, "range")
+
+
+@pytest.mark.parametrize(
+    ("value", "replicates", "clusters", "bounded", "known"),
+    [
+        (0.4, [0.3, 0.5], 5, True, True),
+        (0.4, [0.3, 0.5], 4, True, False),
+        (0.4, [0.3], 5, True, False),
+        (0.4, [0.3, NAN], 5, True, False),
+        (NAN, [0.3, 0.5], 5, True, False),
+        (0.4, [0.4, 0.4], 5, True, True),
+        (0.4, [0.4, 0.4], 5, False, False),
+        (0.0, [0.3, 0.5], 5, False, False),
+        (0.0, [0.0, 0.0], 5, True, True),
+        (0.4, [0.3, 0.5], 5, False, True),
+    ],
+)
+def test_which_scores_have_an_interval(value, replicates, clusters, bounded, known):
+    e = replicate_estimate(value, replicates, n=7, clusters=clusters, bounded=bounded)
+    assert (not math.isnan(e.low), e.n, e.failed, e.clusters) == (known, 7, 0, clusters)
+    assert e.method == (("beta" if bounded else "t") if known else "none")
+    if known:
+        limits = replicate_limits(np.asarray(value), np.asarray(np.var(replicates, ddof=1)), clusters, bounded=bounded)
+        assert (e.low, e.high) == limits
+
+
+def test_pairs_of_cells():
+    first = {"a": CaseValue(3.0, "c", "1"), "b": CaseValue(5.0, "d", "2")}
+    second = {"b": CaseValue(1.0, "x", "2"), "c": CaseValue(9.0, "c", "3")}
+    e = paired_difference(first, second)
+    assert (e.mean, e.n, e.failed, e.clusters) == (4.0, 1, 2, 1)
+    nothing = paired_difference({"a": first["a"]}, {"c": second["c"]})
+    assert (nothing.n, nothing.failed) == (0, 2)

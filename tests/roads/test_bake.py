@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from roads.towns import IMPORTED, built_in, imported
 
+from benchmarks.make_towns import generate_town
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import LaneGraph, equal
 from ssad.core.types import LaneType
 from ssad.roads import bake, import_map, load_graph, load_town, town_names
 from ssad.roads import bake as bake_function
-from ssad.roads.generate import generate_town
 from ssad.roads.query import nearest_all, segments
 
 carla = pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")

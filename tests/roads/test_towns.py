@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from roads.towns import BUILT_IN, built_in
 
+from benchmarks.make_towns import TOWNS, generate_town
 from ssad.core.errors import MapError, UnknownNameError
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, bake, load_town, town_names
-from ssad.roads.generate import TOWNS, generate_town
 from ssad.roads.router import _across
 
 

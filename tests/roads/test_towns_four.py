@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.make_scenario_sets import natural
+from benchmarks.make_towns import TOWNS, generate_town
 from ssad.core.lane_graph import load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import Controller, LaneType
 from ssad.roads import LaneGraph, bake, random_route
-from ssad.roads.generate import TOWNS, generate_town
 from ssad.roads.library import BUILT_IN
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.make_sets import natural
 from ssad.world.world import ENDS, World
 
 NEW = ("Oldmarket", "Larkhill")

@@ -1,4 +1,7 @@
-"""A crossroads small enough to know every number of: four arms of 100 m, two lanes of 3.5 m each way."""
+"""A crossroads small enough to know every number of: four arms of 100 m, two lanes of 3.5 m each way.
+
+The lane of an ego from the south and the junction have the number 0, which is easily taken for none.
+"""
 
 from __future__ import annotations
 
@@ -65,17 +68,17 @@ def _bend(a: complex, da: complex, b: complex, db: complex) -> np.ndarray:
 
 
 def crossroads_graph() -> LaneGraph:
-    """Arms 0 east, 1 north, 2 west, 3 south; roads 10 + arm; junction 7 with a signal an approach."""
+    """Arms 0 east, 1 north, 2 west, 3 south; roads 10 + arm; junction 0 with a signal an approach."""
     draft = Draft()
     into: dict[tuple[int, int], int] = {}
     out: dict[tuple[int, int], int] = {}
-    for arm in range(4):
+    for arm in (3, 0, 1, 2):
         d = 1j**arm  # away from the centre
         for k in range(2):
             off = (0.5 + k) * LANE
             # right-hand traffic: seen outwards, lanes that leave are to the right (-1j)
-            out[arm, k] = draft.add(_line(d * HALF - 1j * d * off, d * (HALF + ARM) - 1j * d * off), 10 + arm, -1 - k)
             into[arm, k] = draft.add(_line(d * (HALF + ARM) + 1j * d * off, d * HALF + 1j * d * off), 10 + arm, 1 + k)
+            out[arm, k] = draft.add(_line(d * HALF - 1j * d * off, d * (HALF + ARM) - 1j * d * off), 10 + arm, -1 - k)
         for table, sign in ((out, -1), (into, 1)):
             edge = (2 * LANE + SHOULDER / 2) * sign
             ends = (HALF, HALF + ARM) if sign < 0 else (HALF + ARM, HALF)
@@ -97,7 +100,7 @@ def crossroads_graph() -> LaneGraph:
                 a, b = draft.xy[into[arm, k]][-1], draft.xy[out[to, k]][0]
                 start, end = complex(*a), complex(*b)
                 path = _line(start, end) if turn == 2 else _bend(start, -(1j**arm), end, 1j**to)
-                lane = draft.add(path, 100 + 10 * arm + turn, -1 - k, junction=7)
+                lane = draft.add(path, 100 + 10 * arm + turn, -1 - k, junction=0)
                 draft.succ.setdefault(into[arm, k], []).append(lane)
                 draft.succ[lane] = [out[to, k]]
     count = len(draft.xy)
@@ -129,7 +132,7 @@ def crossroads_graph() -> LaneGraph:
         succ=np.concatenate([np.array(n, int) for n in succ]),
         signal_xy=np.array([draft.xy[n][-1] for n in signals]),
         signal_yaw=np.array([yaw[n][-1] for n in signals]),
-        signal_junction=np.full(4, 7),
+        signal_junction=np.zeros(4),
         signal_phase=[0, 1, 0, 1],
         signal_virtual=np.ones(4, bool),
         stop_signal=np.repeat(np.arange(4), 2),

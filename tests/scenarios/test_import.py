@@ -173,6 +173,181 @@ def test_a_leaderboard_folder_gives_a_scenario_for_each_trigger(tmp_path: Path) 
         import_routes(tmp_path / "absent")
 
 
+def at(x: float, y: float = 10.0, yaw: float = 0.0, **more: Any) -> dict[str, Any]:
+    return event(transform={"x": x, "y": y, "yaw": yaw}, **more)
+
+
+@pytest.mark.parametrize(
+    ("on", "off"),
+    [
+        (at(20, y=11.9), at(20, y=12.1)),  # 2 m beside the route
+        (at(20, y=8.1), at(20, y=7.9)),
+        (at(-1.9), at(-2.1)),  # before its first point
+        (at(20, yaw=9.9), at(20, yaw=10.1)),
+        (at(20, yaw=-9.9), at(20, yaw=-10.1)),
+        (at(20, yaw=360.0), at(20, yaw=180.0)),
+        (at(55, y=15, yaw=45), at(55, y=15, yaw=34)),  # the last stretch goes from (50, 10) to (60, 20)
+        (at(61.3, y=21.3, yaw=45), at(61.5, y=21.5, yaw=45)),  # beyond its last point
+    ],
+)
+def test_what_counts_as_on_the_route(on: dict[str, Any], off: dict[str, Any], tmp_path: Path) -> None:
+    assert import_routes(make(tmp_path, events=[on]))
+    with pytest.raises(FormatError, match="no trigger of RedlightRunning in T lies on the route"):
+        import_routes(make(tmp_path, events=[off]))
+
+
+@pytest.mark.parametrize("first", [(3.0, 10.0, 0.0), (49.0, 10.0, 0.0), (52.0, 12.0, 45.0)])
+def test_the_first_trigger_is_the_one_that_comes_first(first: tuple[float, ...], tmp_path: Path) -> None:
+    doubled = ROUTE.replace('<waypoint x="50"', '<waypoint x="0" y="10" yaw="0"/><waypoint x="50"')
+    for route in (ROUTE, doubled):  # the same point twice has no direction
+        (s,) = import_routes(
+            make(tmp_path, events=[at(58, y=18, yaw=45), at(*first), at(55, y=15, yaw=45)], route=route)
+        )
+        assert s.trigger is not None
+        assert (s.trigger.x, s.trigger.y) == (first[0], -first[1])
+
+
+def test_triggers_of_other_towns_and_later_routes_do_not_count(tmp_path: Path) -> None:
+    make(tmp_path)
+    table = {"available_scenarios": [{"Elsewhere": [{"scenario_name": "SignalizedJunctionTurn"}]}]}
+    table["available_scenarios"][0]["Elsewhere"][0]["available_event_configurations"] = [at(20)]  # type: ignore[assignment]
+    (tmp_path / TABLE).write_text(json.dumps(table))
+    with pytest.raises(FormatError, match="no trigger of RedlightRunning in T"):
+        import_routes(tmp_path)
+    (tmp_path / XML).write_text(ROUTE.replace("</routes>", ROUTE[len("<routes>") :]))
+    with pytest.raises(FormatError, match="expected one route, found 2"):
+        import_routes(tmp_path)
+
+
+def listed(folder: Path, number: int, rows: list[tuple[int, int]], name: str) -> Path:
+    """A folder with one list of (data id, route id) of one kind of scenario."""
+    entries = [{"data_id": data, "scenario_id": number, "route_id": route} for data, route in rows]
+    configurations = {"available_event_configurations": [event()]}
+    table = {"available_scenarios": [{"T": [{**configurations, "scenario_name": name}]}]}
+    files = {
+        "scenario_type/list.json": json.dumps(entries),
+        f"route/scenarios/scenario_{number:02d}.json": json.dumps(table),
+    }
+    for _, route in rows:
+        files[f"route/scenario_{number:02d}_routes/scenario_{number:02d}_route_{route:02d}.xml"] = ROUTE
+    for path, text in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text)
+    return folder
+
+
+def test_names_groups_and_sources(tmp_path: Path) -> None:
+    found = import_routes(listed(tmp_path / "a", 9, [(0, 1), (2, 4), (1, 1)], "SignalizedJunctionTurn"))
+    assert [(s.name, s.group, s.seed, s.source) for s in found] == [
+        ("frea/T_01/00", "T", 0, "FREA scenario 9 route 01"),
+        ("frea/T_01/01", "T", 1, "FREA scenario 9 route 01"),
+        ("frea/T_04", "T", 0, "FREA scenario 9 route 04"),
+    ]
+    assert all(s.placements == () and s.trigger is not None for s in found)
+    (one,) = import_routes(listed(tmp_path / "b", 1, [(0, 0)], "DynamicObjectCrossing"))
+    assert (one.name, one.group, one.source) == (
+        "safebench/StraightObstacle/00", "StraightObstacle", "SafeBench scenario 1 route 00",
+    )  # fmt: skip
+    assert one.placements == ()  # it puts its own actors
+
+
+def test_a_natural_junction_needs_no_trigger(tmp_path: Path) -> None:
+    listed(tmp_path, 9, [(0, 1)], "SignalizedJunctionTurn")
+    (tmp_path / "route/scenarios/scenario_09.json").write_text('{"available_scenarios": []}')
+    (found,) = import_routes(tmp_path)
+    assert found.trigger is None
+
+
+def test_the_longest_list_is_taken_or_the_one_named(tmp_path: Path) -> None:
+    make(tmp_path)
+    entry = {"scenario_id": 5, "route_id": 3}
+    (tmp_path / "scenario_type/all.json").write_text(json.dumps([entry | {"data_id": k} for k in range(3)]))
+    assert len(import_routes(tmp_path)) == 3
+    assert len(import_routes(tmp_path / "scenario_type/standard.json")) == 1
+    with pytest.raises(FormatError, match="no such folder"):
+        import_routes(tmp_path / TABLE)
+
+
+def test_more_broken_lists_and_tables(tmp_path: Path) -> None:
+    entry = {"data_id": 0, "scenario_id": 5, "route_id": 3}
+    for entries, says in (
+        ([entry, entry | {"data_id": -1}], "entry 1: data_id should be a whole number, not -1"),
+        ([entry | {"route_id": True}], "entry 0: route_id should be a whole number, not True"),
+        ([entry | {"scenario_id": 0}], "entry 0: unknown scenario_id 0"),
+        ([entry | {"scenario_id": 10}], "entry 0: unknown scenario_id 10"),
+    ):
+        with pytest.raises(FormatError, match=says):
+            import_routes(make(tmp_path, entries=entries))
+    make(tmp_path)
+    for table, says in (
+        ({"available_scenarios": {}}, "expected an object with the list available_scenarios"),
+        ([], "expected an object with the list available_scenarios"),
+        ({"available_scenarios": [{"T": [3]}]}, "T: expected objects with available_event_configurations"),
+        ({"available_scenarios": [{"T": [{"scenario_name": "Scenario7"}]}]}, "T: Scenario7: expected a list"),
+        (
+            {"available_scenarios": [{"T": [{"scenario_name": "Scenario7", "available_event_configurations": [1]}]}]},
+            "T: Scenario7: event 0: expected an object with a transform",
+        ),
+    ):
+        (tmp_path / TABLE).write_text(json.dumps(table))
+        with pytest.raises(FormatError, match=says):
+            import_routes(tmp_path)
+    for others, says in (
+        ([1], "should map front, left, right to lists"),
+        ({"left": 3}, "other_actors: left: expected a list"),
+    ):
+        with pytest.raises(FormatError, match=says):
+            import_routes(make(tmp_path, events=[event(other_actors=others)]))
+    with pytest.raises(FormatError, match="other_actors: front 1: yaw is 'x', not a number"):
+        import_routes(make(tmp_path, events=[event(other_actors={"front": [TRANSFORM, {**TRANSFORM, "yaw": "x"}]})]))
+
+
+def test_angles_and_numbers_of_carla(tmp_path: Path) -> None:
+    others = {
+        "right": [{"x": 1, "y": 0, "yaw": 0}],
+        "front": [{"x": 2, "y": -3.5, "yaw": "-270"}, {"x": 3, "y": 1, "yaw": 725}],
+    }
+    (s,) = import_routes(make(tmp_path, events=[event(other_actors=others)]))
+    assert s.placements == (Pose(2.0, 3.5, -math.pi / 2), Pose(3.0, -1.0, -math.radians(5.0)), Pose(1.0, 0.0, 0.0))
+    assert math.copysign(1.0, s.placements[2].y) == math.copysign(1.0, s.placements[2].yaw) == 1.0  # no minus zero
+
+
+def test_leaderboard_scenarios_that_need_an_actor_and_routes_without_a_number(tmp_path: Path) -> None:
+    second = ROUTE.replace('id="0" ', "")
+    (tmp_path / "a.xml").write_text(ROUTE.replace("</routes>", second[len("<routes>") :]))
+    events = [at(30), at(10, other_actors={}), at(55, y=15, yaw=45)]
+    table = {
+        "available_scenarios": [
+            {
+                "T": [
+                    {"available_event_configurations": events, "scenario_type": kind}
+                    for kind in ("Scenario7", "Scenario3")
+                ]
+            }
+        ]
+    }
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    (tmp_path / "other.json").write_text("[1, 2]")  # a file of another kind
+    found = import_routes(tmp_path)
+    assert [s.name for s in found] == [
+        f"leaderboard/a_{route}/{kind}"
+        for route in (0, 1)
+        for kind in (
+            "StraightObstacle_00", "RedlightRunning_00", "StraightObstacle_01", "RedlightRunning_01",
+            "StraightObstacle_02",
+        )
+    ]  # fmt: skip
+    assert [len(s.placements) for s in found[:5]] == [0, 2, 0, 2, 0]
+    assert (found[0].group, found[0].source) == ("StraightObstacle", "leaderboard route 0 of a.xml")
+    (tmp_path / "t.json").write_text(json.dumps(table).replace('"T"', '"Elsewhere"'))
+    with pytest.raises(FormatError, match="no trigger lies on any route"):
+        import_routes(tmp_path)
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    (tmp_path / "a.xml").write_text(ROUTE.replace('x="0"', 'x="-5e7"'))
+    with pytest.raises(FormatError, match=r"a\.xml: route\[0\]: beyond 100000 m"):
+        import_routes(tmp_path)
+
+
 @pytest.mark.data
 def test_safebench_has_32_episodes(data_dir: Path, tmp_path: Path) -> None:
     found = import_routes(data_dir / "routes" / "safebench")
@@ -202,8 +377,9 @@ def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["safebench", "frea"])
-def test_every_imported_scenario_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
-    found = import_routes(data_dir / "routes" / name)
+def test_every_imported_route_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
+    # the ten repetitions of FREA's routes differ in the draw of traffic alone
+    found = [s for s in import_routes(data_dir / "routes" / name) if s.seed < 3]
     graphs = {town: load_graph(carla_home / "towns" / f"{town}.npz") for town in sorted({s.town for s in found})}
     for scenario in found:
         graph = graphs[scenario.town]

@@ -16,6 +16,7 @@ from ssad.core.types import (
     Condition,
     Controller,
     EpisodeAgent,
+    LaneType,
     Phase,
     Pose,
     Route,
@@ -23,11 +24,32 @@ from ssad.core.types import (
     SignalPlan,
     SignalState,
 )
-from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, parameter_box, scenario_type
+from ssad.scenarios.dynamic import PRECRASH, SCENARIOS, Parameter, ScenarioType, parameter_box, scenario_type
 from ssad.scenarios.dynamic.episode import forced_signals
-from ssad.scenarios.dynamic.knowledge._meeting import ego_times, time_to_cover
-from ssad.scenarios.dynamic.knowledge._placing import polyline_route
+from ssad.scenarios.dynamic.knowledge._junction import FROM_LEFT, FROM_RIGHT, ONCOMING
+from ssad.scenarios.dynamic.knowledge._meeting import ego_times, meeting_place, time_to_cover
+from ssad.scenarios.dynamic.knowledge._placing import (
+    Place,
+    ahead,
+    bending_route,
+    beside,
+    go,
+    junction_span,
+    lane_path,
+    polyline_route,
+    project,
+    scripted,
+    standing,
+    straightest,
+    to_outermost,
+    trigger_index,
+    trigger_place,
+    turn_of,
+    width_at,
+)
 from ssad.world.models import model
+
+from .conftest import lane_of
 
 
 def scenario(kind: str, **changes: Any) -> Scenario:
@@ -165,6 +187,7 @@ def test_a_trigger_off_the_route_is_an_error(crossroads: LaneGraph, routes: Any)
 
 def test_time_to_cover_is_that_of_uniform_acceleration() -> None:
     assert time_to_cover(8.0, 10.0, 4.0) == pytest.approx(2.0)  # still accelerating
+    assert time_to_cover(0.5, 10.0, 4.0) == pytest.approx(0.5)
     assert time_to_cover(12.5 + 20.0, 10.0, 4.0) == pytest.approx(2.5 + 2.0)
 
 
@@ -222,3 +245,323 @@ def test_parameter_boxes_hold_safebench_defaults_inside_their_ranges() -> None:
         scenario_type("RightTurn").values({"speed": 20.0})
     with pytest.raises(ConfigError, match="no such parameter"):
         scenario_type("RightTurn").values({"sped": 12.0})
+
+
+# ---------------------------------------------------------------- where two cars meet
+
+
+def turned(route: Route, angle: float, index: slice = slice(None)) -> Route:
+    """The route with other headings at some of its points; what an ego needs for it is the same if all are turned."""
+    yaw = route.yaw.copy()
+    yaw[index] += np.float32(angle)
+    return replace(route, yaw=yaw)
+
+
+def meet(graph: LaneGraph, route: Route, *sides: float) -> Place:
+    return meeting_place(
+        graph, scenario("RedlightRunning"), route, sides=sides, trigger_distance=35.0, speed=10.0, body="coupe"
+    )
+
+
+ARM_OF_SIDE = {FROM_LEFT: 12, FROM_RIGHT: 10, ONCOMING: 11}
+
+
+@pytest.mark.parametrize("side", ARM_OF_SIDE)
+def test_an_approach_may_be_40_degrees_off_its_side(side: float, crossroads: LaneGraph, routes: Any) -> None:
+    # oncoming traffic crosses the path of a left turn alone
+    route = routes.left if side == ONCOMING else routes.straight
+    for angle in (-39.0, 39.0):
+        place = meet(crossroads, turned(route, math.radians(angle)), side)
+        assert crossroads.road[place.lane] == ARM_OF_SIDE[side]
+    for angle in (-41.0, 41.0):
+        with pytest.raises(RouteError, match="no lane into junction 0 crosses the ego's route; give placements"):
+            meet(crossroads, turned(route, math.radians(angle)), side)
+
+
+def test_the_side_is_seen_from_just_before_the_junction(crossroads: LaneGraph, routes: Any) -> None:
+    enter = 70
+    assert crossroads.junction[routes.straight.lane[enter - 1 : enter + 1]].tolist() == [-1, 0]
+    with pytest.raises(RouteError):
+        meet(crossroads, turned(routes.straight, 1.0, slice(enter - 1, enter)), FROM_LEFT)
+    for near in (enter - 2, enter):
+        assert meet(crossroads, turned(routes.straight, 1.0, slice(near, near + 1)), FROM_LEFT)
+
+
+def test_the_first_side_with_an_approach_wins(crossroads: LaneGraph, routes: Any) -> None:
+    first, second = (meet(crossroads, routes.straight, *sides) for sides in ((FROM_LEFT, FROM_RIGHT), (FROM_RIGHT,)))
+    assert (crossroads.road[first.lane], crossroads.road[second.lane]) == (12, 10)
+    assert meet(crossroads, routes.straight, ONCOMING, FROM_RIGHT) == second
+
+
+def test_only_cars_that_go_straight_on_are_met(crossroads: LaneGraph, routes: Any) -> None:
+    through = np.flatnonzero((crossroads.junction == 0) & (crossroads.road == 122))
+
+    def bent(angle: float) -> LaneGraph:
+        yaw = crossroads.yaw.copy()
+        yaw[crossroads.offset[through + 1] - 1] += np.float32(angle)
+        return replace(crossroads, yaw=yaw)
+
+    assert meet(bent(math.radians(34.5)), routes.straight, FROM_LEFT) == meet(crossroads, routes.straight, FROM_LEFT)
+    with pytest.raises(RouteError, match="crosses"):
+        meet(bent(math.radians(35.5)), routes.straight, FROM_LEFT)
+
+
+@pytest.mark.parametrize(("speed", "trigger"), [(10.0, 35.0), (5.0, 35.0), (15.0, 50.0), (8.0, 25.0)])
+def test_of_all_places_the_one_with_the_least_wait_is_taken(
+    speed: float, trigger: float, crossroads: LaneGraph, routes: Any
+) -> None:
+    route = routes.straight
+    found = meeting_place(
+        crossroads, scenario("RedlightRunning"), route, sides=(FROM_LEFT,), trigger_distance=trigger, speed=speed,
+        body="coupe",
+    )  # fmt: skip
+    # the car comes along y = -1.75 or -5.25 and the ego along x = 1.75: they meet at (1.75, y)
+    times, xy = ego_times(route), route.xy.astype(float)
+
+    def wait(place: Place) -> float:
+        x, y = crossroads.at(place.lane, place.s)[:2]
+        off = np.hypot(xy[:, 0] - x, xy[:, 1] - y)
+        start = int(np.argmax(off < trigger))
+        if start == 0:  # never, or from the beginning
+            return math.inf
+        conflict = int(np.argmin(np.abs(xy[:, 1] - y)))
+        return abs(time_to_cover(1.75 - x, speed, model("coupe").max_accel) - float(times[conflict] - times[start]))
+
+    lanes = [lane_of(crossroads, 12, k) for k in (1, 2)]
+    every = [wait(Place(lane, s)) for lane in lanes for s in np.arange(70.0, 99.5, 0.5)]
+    # points of the route are 1 m apart, so the place where they meet is known to half a metre
+    assert wait(found) < min(every) + 0.12
+
+
+def test_signals_of_a_junction_that_the_route_does_not_pass(crossroads: LaneGraph, routes: Any) -> None:
+    before = Route(
+        **{name: getattr(routes.straight, name)[:40] for name in ("xy", "yaw", "lane", "speed_limit", "width")}
+    )
+    plan = SignalPlan("red", "green")
+    assert forced_signals(crossroads, before, plan) == {}
+    real = replace(crossroads, signal_virtual=np.array([False, False, True, False]))
+    green = dict.fromkeys((0, 1, 3), SignalState.GREEN)
+    assert forced_signals(real, before, plan, whole_town=True) == green
+    assert forced_signals(real, routes.straight, plan, whole_town=True) == green | {3: SignalState.RED}
+    lost = replace(routes.straight, lane=np.where(np.arange(len(routes.straight.lane)) < 40, -1, routes.straight.lane))
+    assert forced_signals(crossroads, lost, plan) == forced_signals(crossroads, routes.straight, plan)
+
+
+# ---------------------------------------------------------------- arithmetic on lanes
+
+
+def test_lanes_of_the_ego_from_the_south(crossroads: LaneGraph) -> None:
+    inner, outer = lane_of(crossroads, 13, 1), lane_of(crossroads, 13, 2)
+    assert inner == 0
+    assert beside(crossroads, Place(outer, 30.0), "left") == Place(inner, pytest.approx(30.0))
+    assert beside(crossroads, Place(inner, 30.0), "right") == Place(outer, pytest.approx(30.0))
+    opposite = beside(crossroads, Place(inner, 30.0), "left")
+    assert opposite == Place(lane_of(crossroads, 13, -1), pytest.approx(70.0))
+    assert beside(crossroads, Place(lane_of(crossroads, 13, 3), 30.0), "right") is None
+    assert width_at(crossroads, Place(inner, 30.0)) == 3.5
+
+
+@pytest.mark.parametrize(("at", "s"), [((2.0, -85.25), 29.75), ((9.0, -200.0), 0.0), ((0.0, 40.0), 100.0)])
+def test_a_point_is_projected_onto_its_lane(at: tuple[float, float], s: float, crossroads: LaneGraph) -> None:
+    assert project(crossroads, 0, *at) == Place(0, pytest.approx(s, abs=1e-4))
+
+
+def test_a_point_is_projected_onto_a_bend(crossroads: LaneGraph) -> None:
+    lane = lane_of(crossroads, 133, -1)
+    for s in (0.3, 7.0, float(crossroads.length[lane]) - 0.2):
+        x, y, yaw, _ = crossroads.at(lane, s)
+        aside = project(crossroads, lane, x - 0.1 * math.sin(yaw), y + 0.1 * math.cos(yaw))
+        assert aside.s == pytest.approx(s, abs=0.05)
+
+
+def test_turns_at_the_crossroads(crossroads: LaneGraph) -> None:
+    turns = {road: turn_of(crossroads, lane_of(crossroads, road, k)) for road, k in ((132, -1), (133, -1), (131, -2))}
+    assert turns == pytest.approx({132: 0.0, 133: math.pi / 2, 131: -math.pi / 2}, abs=0.12)
+    assert straightest(crossroads, 0) == lane_of(crossroads, 132, -1)
+    assert straightest(crossroads, lane_of(crossroads, 11, -1)) is None
+    # where no lane for cars goes on, another one does
+    kind = crossroads.kind.copy()
+    kind[lane_of(crossroads, 132, -1)] = LaneType.BIKING
+    assert straightest(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 133, -1)
+    kind[lane_of(crossroads, 133, -1)] = LaneType.BIKING
+    assert straightest(replace(crossroads, kind=kind), 0) == lane_of(crossroads, 132, -1)
+
+
+def test_places_ahead(crossroads: LaneGraph) -> None:
+    inside, after = lane_of(crossroads, 132, -1), lane_of(crossroads, 11, -1)
+    assert ahead(crossroads, Place(0, 60.0), 40.0) == Place(0, 100.0)
+    assert ahead(crossroads, Place(0, 60.0), 45.0) == Place(inside, 5.0)
+    assert ahead(crossroads, Place(0, 60.0), 75.0) == Place(after, 5.0)
+    assert ahead(crossroads, Place(0, 60.0), 500.0) == Place(after, 100.0)  # the end of the road
+    assert ahead(crossroads, Place(0, 60.0), 75.0, stop_at_junction=True) == Place(0, 100.0)
+    # one who is in the junction leaves it
+    assert ahead(crossroads, Place(inside, 20.0), 15.0, stop_at_junction=True) == Place(after, 5.0)
+
+
+def test_a_lanes_path_goes_on_over_the_lanes_that_follow(crossroads: LaneGraph) -> None:
+    for start, distance in ((60.25, 20.0), (60.25, 60.0), (99.96, 110.0)):
+        path = lane_path(crossroads, Place(0, start), distance)
+        assert np.allclose(path[:, 0], 1.75)
+        assert path[0, 1] == pytest.approx(start - 115.0, abs=1e-4)
+        steps = np.diff(path[:, 1])
+        assert ((steps >= 0.0) & (steps <= 1.05)).all()
+        # the last point is the last one of the lane not beyond the distance; where lanes join, one point more or less
+        assert start - 115.0 + distance - 1.1 < path[-1, 1] <= start - 115.0 + distance + 1e-3
+    assert lane_path(crossroads, Place(0, 60.0), 500.0)[-1, 1] == pytest.approx(115.0)  # the end of the road
+
+
+def test_only_a_path_that_bends_is_followed(crossroads: LaneGraph, routes: Any) -> None:
+    assert bending_route(crossroads, Place(0, 20.0)) is None
+    bend = bending_route(crossroads, Place(lane_of(crossroads, 133, -1), 0.0))
+    assert bend is not None
+    assert np.allclose(bend.xy[0], (1.75, -15.0), atol=1e-3)
+    assert np.allclose(bend.xy[-1], (-115.0, 1.75), atol=1.1)
+
+    def straying(by: float) -> LaneGraph:
+        xy = crossroads.xy.copy()
+        xy[80, 0] += by
+        return replace(crossroads, xy=xy)
+
+    for by, bends in ((0.25, False), (-0.25, False), (0.35, True), (-0.35, True)):
+        assert (bending_route(straying(by), Place(0, 20.0)) is not None) == bends
+    assert bending_route(crossroads, Place(lane_of(crossroads, 11, -1), 99.5)) is None  # no road is left to bend
+
+
+def test_a_path_off_the_lane_graph() -> None:
+    route = polyline_route(np.array([[0.0, 0.0], [1.0, 0.0]]))  # as short as it may be
+    assert np.allclose(route.xy, [[0, 0], [1, 0]])
+    assert route.lane.tolist() == [-1, -1]
+    assert (route.speed_limit.tolist(), route.width.tolist(), route.spacing) == ([50.0] * 2, [3.5] * 2, 1.0)
+    wide = polyline_route(np.array([[0.0, 0.0], [5.0, 0.0]]), spacing=2.0)
+    assert np.allclose(wide.xy[:, 0], [0, 2, 4])
+    with pytest.raises(RouteError, match=r"a path of 0\.00 m is too short; give it at least 1 m"):
+        polyline_route(np.array([[2.0, 2.0], [2.0, 2.0]]))
+
+
+def test_the_outermost_lane(crossroads: LaneGraph) -> None:
+    both, inner, outer = (LaneType.DRIVING, LaneType.SHOULDER), 0, lane_of(crossroads, 13, 2)
+    place, crossed = to_outermost(crossroads, Place(inner, 30.0), kinds=both)
+    assert (place, crossed) == (Place(outer, pytest.approx(30.0)), 1)
+    assert to_outermost(crossroads, Place(inner, 30.0), kinds=(LaneType.SHOULDER,)) == (Place(inner, 30.0), 0)
+
+    def with_shoulders(width: float) -> LaneGraph:
+        wide = np.repeat(crossroads.kind == LaneType.SHOULDER, np.diff(crossroads.offset))
+        return replace(crossroads, width=np.where(wide, np.float32(width), crossroads.width))
+
+    # a shoulder of up to 2 m is none, a wider one is where cars park
+    assert to_outermost(with_shoulders(2.0), Place(inner, 30.0), kinds=both)[1] == 1
+    place, crossed = to_outermost(with_shoulders(2.1), Place(inner, 30.0), kinds=both)
+    assert (place.lane, crossed) == (lane_of(crossroads, 13, 3), 2)
+    assert to_outermost(with_shoulders(2.1), Place(inner, 30.0), kinds=(LaneType.DRIVING,))[1] == 1
+
+
+# ---------------------------------------------------------------- the trigger and the junction
+
+
+def test_the_trigger_is_a_point_of_the_route(crossroads: LaneGraph, routes: Any) -> None:
+    route: Route = routes.straight
+    assert trigger_index(scenario("RightTurn"), route) == 30
+    short = Route(**{name: getattr(route, name)[:20] for name in ("xy", "yaw", "lane", "speed_limit", "width")})
+    assert trigger_index(scenario("RightTurn"), short) == 19
+    assert trigger_index(scenario("RightTurn"), replace(route, spacing=2.0)) == 15
+    near = scenario("RightTurn", trigger=Pose(1.75 + 4.9, -80.0))
+    assert trigger_index(near, route) == 5
+    with pytest.raises(RouteError, match=r"the trigger is 5\.1 m off the route; put it on the route"):
+        trigger_index(scenario("RightTurn", trigger=Pose(1.75 + 5.1, -80.0)), route)
+    place = trigger_place(crossroads, near, route)
+    assert place == Place(0, pytest.approx(35.0, abs=1e-3))
+    lost = replace(route, lane=np.full_like(route.lane, -1))
+    with pytest.raises(RouteError, match="no lane under the route at 5 m"):
+        trigger_place(crossroads, near, lost)
+
+
+def test_the_junction_after_the_trigger(crossroads: LaneGraph, routes: Any) -> None:
+    route: Route = routes.straight
+    assert junction_span(crossroads, scenario("RightTurn"), route) == (70, 100)
+    # a trigger in the junction: the rest of it; one behind it: none
+    inside = scenario("RightTurn", trigger=Pose(1.75, 5.0))
+    assert junction_span(crossroads, inside, route) == (90, 100)
+    with pytest.raises(RouteError, match="passes no junction after its trigger"):
+        junction_span(crossroads, scenario("RightTurn", trigger=Pose(1.75, 25.0)), route)
+    ends = Route(**{name: getattr(route, name)[:80] for name in ("xy", "yaw", "lane", "speed_limit", "width")})
+    assert junction_span(crossroads, scenario("RightTurn"), ends) == (70, 79)
+    # points off the lane graph are in no junction
+    lane = route.lane.copy()
+    lane[:75] = lane[90:] = -1
+    assert junction_span(crossroads, scenario("RightTurn"), replace(route, lane=lane)) == (75, 90)
+
+
+# ---------------------------------------------------------------- the actors
+
+
+def test_a_car_in_a_junction_takes_its_shift_along_the_lane(crossroads: LaneGraph, routes: Any) -> None:
+    (car,) = build(scenario("RedlightRunning"), crossroads, routes.straight)
+    (further,) = build(scenario("RedlightRunning", parameters={"longitudinal": 3.5}), crossroads, routes.straight)
+    assert (further.pose.x - car.pose.x, further.pose.y) == pytest.approx((3.5, car.pose.y), abs=1e-3)
+
+
+def test_the_cyclists_parameters(crossroads: LaneGraph, routes: Any) -> None:
+    values = {"yaw": 0.4, "longitudinal": -2.0, "lateral": 1.5, "exit_distance": 12.0, "speed": 5.0}
+    (cyclist,) = build(scenario("TurningObstacle", parameters=values), crossroads, routes.left)
+    # 12 m on and 1 m for the lane crossed, 2 m back; 1.5 lane widths right of y = 5.25
+    assert at(cyclist) == (-15.0 - 11.0, 5.25 + 1.5 * 3.5, -math.pi / 2 + 0.4)
+    assert (cyclist.model, cyclist.phases[0].speed) == ("bicycle", 5.0)
+    # an ego that turns from one outer lane into another crosses none
+    (cyclist,) = build(scenario("TurningObstacle"), crossroads, routes.right)
+    assert at(cyclist) == (15.0 + 8.0, -5.25 - 3.5, math.pi / 2)
+
+
+def test_a_walker_whose_road_begins_in_a_junction_leaves_it(crossroads: LaneGraph, routes: Any) -> None:
+    s = scenario("StraightObstacle", trigger=Pose(5.25, -10.0, math.pi / 2))
+    walker, _ = build(s, crossroads, routes.straight_outer)
+    assert walker.pose.y == pytest.approx(-10.0 + 45.0, abs=1e-3)
+
+
+def test_agents_that_wait_and_agents_that_stand(crossroads: LaneGraph) -> None:
+    pose = Pose(1.0, 2.0, 0.5)
+    agent = scripted("a", "car", pose, [go(3.0, 20.0), go(7.0, 20.0), go(5.0, 20.0)])
+    assert (agent.target_speed, agent.speed, agent.pose) == (7.0, 0.0, pose)
+    still = standing("b", "cone", pose)
+    assert (still.target_speed, still.controller, still.phases) == (0.0, Controller.NONE, ())
+
+
+def test_only_actors_with_phases_and_an_engine_move(crossroads: LaneGraph, routes: Any) -> None:
+    phases = (Phase(3.0), Phase(1.0))
+    actors = (
+        Actor("car", "car", Pose(0, 0), phases),
+        Actor("parked", "car", Pose(9, 0)),
+        Actor("cone", "cone", Pose(0, 9), phases),
+    )
+    car, parked, cone = build(scenario("Custom", actors=actors), crossroads, routes.straight)
+    assert [a.controller for a in (car, parked, cone)] == [Controller.SCRIPT, Controller.NONE, Controller.NONE]
+    assert [a.target_speed for a in (car, parked, cone)] == [3.0, 0.0, 3.0]
+
+
+def test_what_a_parameter_allows() -> None:
+    number = Parameter("length", 1.0, 3.0, 2.0, "m", "a length", 2.0)
+    assert number.problem(1.0) is number.problem(3.0) is None
+    assert number.problem(0.9) == "0.9 is outside 1 to 3 m (a length)"
+    assert number.problem(math.nan) == "nan is outside 1 to 3 m (a length)"
+    without_end = Parameter("count", 0.0, math.inf, 0.0, "", "a count")
+    assert without_end.problem(1e9) is None
+    assert without_end.problem(math.inf) == "inf is outside 0 to inf (a count)"
+    assert Parameter("a", 1.0, 1.0, 1.0, "m", "fixed").spread == 0.0
+    for default in (0.9, 3.1):
+        with pytest.raises(ValueError, match=r"default .* outside \[1\.0, 3\.0\]"):
+            Parameter("length", 1.0, 3.0, default, "m", "")
+    with pytest.raises(ValueError, match=r"spread 2\.1 outside \[0, 2\.0\]"):
+        Parameter("length", 1.0, 3.0, 2.0, "m", "", 2.1)
+
+
+def test_a_class_has_its_own_parameters_and_those_of_the_start() -> None:
+    kind = ScenarioType("A", "a", "a", lambda s, g, r, n: [], (Parameter("height", 1.0, 9.0, 5.0, "m", ""),))
+    assert list(kind.box) == ["height", "ego_speed", "ego_longitudinal", "ego_lateral", "ego_heading"]
+    assert kind.values({"height": 2}) == {
+        "height": 2.0, "ego_speed": 0.0, "ego_longitudinal": 0.0, "ego_lateral": 0.0, "ego_heading": 0.0,
+    }  # fmt: skip
+    assert (kind.max_distance, kind.whole_town, kind.traffic) == (1.0e9, False, None)
+    assert {name: scenario_type(name).max_distance for name in SCENARIOS} == {
+        "StraightObstacle": 150.0, "TurningObstacle": 180.0, "LaneChanging": 200.0, "VehiclePassing": 200.0,
+        "RedlightRunning": 150.0, "UnprotectedLeftTurn": 150.0, "RightTurn": 150.0, "CrossingNegotiation": 150.0,
+        "NaturalJunction": 1.0e9,
+    }  # fmt: skip

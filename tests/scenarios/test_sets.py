@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.make_scenario_sets import make
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode, LaneType, Scenario, SignalState
 from ssad.roads import LaneQuery, load_town
 from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scenario_type
-from ssad.scenarios.dynamic.make_sets import make
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.world.models import model
 from ssad.world.rollout import rollout
@@ -44,7 +44,7 @@ def boxes(e: Episode) -> np.ndarray:
 
 def test_the_generator_makes_the_shipped_files() -> None:
     for name, text in make().items():
-        assert (DATA / name).read_text() == text, f"{name}: run python -m ssad.scenarios.dynamic.make_sets"
+        assert (DATA / name).read_text() == text, f"{name}: run python benchmarks/make_scenario_sets.py"
 
 
 @pytest.mark.parametrize("name", [s.name for s in SHIPPED])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -30,7 +32,9 @@ from ssad.scenarios.dynamic import (
     scenario_data,
     scenario_from,
     scenario_text,
+    set_names,
 )
+from ssad.scenarios.dynamic.schema import check
 from ssad.world.models import MODELS
 
 number = st.floats(-1.0e5, 1.0e5, allow_subnormal=False)
@@ -78,7 +82,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     )
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(scenarios(), min_size=1, max_size=3, unique_by=lambda s: s.name))
 def test_round_trip(tmp_path: Path, several: list[Scenario]) -> None:
     path = tmp_path / "several.yaml"
@@ -146,6 +150,16 @@ BAD: list[tuple[dict[str, Any], int, str]] = [
     ({"name": "a b"}, 1, "'a b' is not a name"),
     ({"name": "../a"}, 1, "is not a name"),
     ({"town": "''"}, 3, "name the town"),
+    (
+        {"route": "[{x: 0, y: 0}, {x: 9, y: 0}]\nseed: 2000-01-01"},
+        5,
+        'seed: should be a valid integer, not "2000-01-01"',
+    ),
+    (
+        {"town": "{long: [aaaaaaaaaaaaaaaaaaaa, bbbbbbbbbbbbbbbbbbbb, cccccccccccccccccc]}"},
+        3,
+        'a valid string, not {"long": ["aaaaaaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbbbbbb",...',
+    ),
     ({"route": "[{x: 0, y: 0}]"}, 4, "at least two key points"),
     ({"route": "[{x: 0, y: 0}, {x: nine, y: 0}]"}, 4, 'route[1].x: should be a valid number, not "nine"'),
     ({"route": "[{x: 0, y: 0}, {x: '9', y: 0}]"}, 4, "route[1].x: should be a valid number"),
@@ -285,3 +299,154 @@ def test_the_shipped_sets_have_the_numbers_of_the_paper() -> None:
     assert len(load_scenarios("natural")) == 150
     assert len({s.name for s in load_scenarios("natural") + precrash}) == 182
     assert load_scenarios("RightTurn/02") == (load_scenarios("RightTurn")[2],)
+
+
+PLAIN: dict[str, Any] = {"name": "a", "type": "RightTurn", "town": "T", "route": [{"x": 0, "y": 0}, {"x": 9, "y": 0}]}
+START, END = PLAIN["route"]
+
+
+def test_of_several_mistakes_the_misspelt_key_is_shown() -> None:
+    data = {"name": "a", "type": "RightTurn", "twon": "T", "route": [{"x": 0, "y": 0}, {"x": 9, "y": 0}]}
+    with pytest.raises(ConfigError, match="twon: unknown key; known: name, type, town, route"):
+        scenario_from(data)
+    with pytest.raises(ConfigError, match="key 'town' is missing"):
+        scenario_from({key: value for key, value in data.items() if key != "twon"})
+    for inner, known in (
+        ({"signals": {"ega": "red"}}, r"signals\.ega: unknown key; known: ego, others, until"),
+        ({"limits": {"max_step": 3}}, r"limits\.max_step: unknown key; known: max_steps, max_time, max_distance"),
+        ({"traffic": {"maxi": 3}}, r"traffic\.maxi: unknown key; known: intensity, minimum, maximum, wake_distance"),
+        (
+            {"actors": [{"pose": {"x": 0, "y": 0}, "phases": [{"when": {"knd": 1}}]}]},
+            r"when\.knd: unknown key; known: kind",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=known):
+            scenario_from(data | {"town": "T"} | inner)
+    with pytest.raises(ConfigError, match="a scenario is a mapping of keys, not 3"):
+        scenario_from(3)
+    loop: list[Any] = []
+    loop.append(loop)
+    with pytest.raises(ConfigError, match="not plain data: Circular reference"):
+        scenario_from(data | {"town": loop})
+
+
+@pytest.mark.parametrize(("length", "shown"), [(58, '"' + "x" * 58 + '"'), (59, '"' + "x" * 56 + "...")])
+def test_long_values_are_cut(length: int, shown: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        scenario_from({**PLAIN, "seed": "x" * length})
+    assert str(raised.value).endswith(f"not {shown}")
+
+
+def actor(**changes: Any) -> dict[str, Any]:
+    return {"type": "Custom", "actors": [{"name": "v", "model": "walker", "pose": {"x": 0, "y": 0}, **changes}]}
+
+
+def waiting(**when: Any) -> dict[str, Any]:
+    return actor(phases=[{"speed": 1.0, "when": {"kind": "time", **when}}])
+
+
+# what is the last value allowed, what is the first one refused, and what is said about it
+BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    ({"target_speed": 60}, {"target_speed": 60.1}, "target_speed: 60.1 is outside 0 to 60 m/s"),
+    ({"target_speed": 0.01}, {"target_speed": 0}, "target_speed: 0 is outside"),
+    ({"seed": 0}, {"seed": -1}, "seed: must not be negative"),
+    ({"limits": {"max_steps": 1}}, {"limits": {"max_steps": 0}}, "max_steps: 0 is outside 1 to 100000"),
+    ({"limits": {"max_steps": 100000}}, {"limits": {"max_steps": 100001}}, "max_steps: 100001 is outside"),
+    ({"limits": {"max_time": 0.01}}, {"limits": {"max_time": 0}}, "max_time: must be more than 0 s"),
+    ({"limits": {"max_distance": 0.01}}, {"limits": {"max_distance": 0}}, "max_distance: must be more than 0 m"),
+    ({"signals": {"until": 0}}, {"signals": {"until": -0.01}}, "until: must not be negative"),
+    ({"traffic": {"intensity": 0}}, {"traffic": {"intensity": -0.01}}, "intensity: -0.01 is outside 0 to 1"),
+    ({"traffic": {"intensity": 1}}, {"traffic": {"intensity": 1.01}}, "intensity: 1.01 is outside 0 to 1"),
+    ({"traffic": {"minimum": 0}}, {"traffic": {"minimum": -1}}, "minimum: -1 is outside 0 to 64"),
+    (
+        {"traffic": {"minimum": 64, "maximum": 64}},
+        {"traffic": {"minimum": 65, "maximum": 64}},
+        "minimum: 65 is outside 0 to 64",
+    ),
+    ({"traffic": {"maximum": 64}}, {"traffic": {"maximum": 65}}, "maximum: 65 is outside minimum (5) to 64"),
+    ({"traffic": {"maximum": 5}}, {"traffic": {"maximum": 4}}, "maximum: 4 is outside minimum (5) to 64"),
+    ({"traffic": {"wake_distance": 0}}, {"traffic": {"wake_distance": -0.01}}, "wake_distance: must not be negative"),
+    ({"route": [START, {"x": 1e5, "y": 0}]}, {"route": [START, {"x": 100001, "y": 0}]}, "route[1]: beyond 100000 m"),
+    ({"route": [START, {"x": 9, "y": -1e5}]}, {"route": [START, {"x": 9, "y": -100001}]}, "route[1]: beyond"),
+    ({"trigger": {"x": 0, "y": 0, "yaw": 1e5}}, {"trigger": {"x": 0, "y": 0, "yaw": 100001}}, "trigger: beyond 100000"),
+    ({"placements": [END]}, {"placements": [END, {"x": 0, "y": 1e6}]}, "placements[1]: beyond 100000 m"),
+    ({"route": [START, END]}, {"route": [START]}, "route: a route needs at least two key points"),
+    (actor(pose={"x": 1e5, "y": 0}), actor(pose={"x": 100001, "y": 0}), "actors[0].pose: beyond 100000 m"),
+    (actor(path=[[0, 0], [1, 0]]), actor(path=[[0, 0]]), "actors[0].path: a path needs at least two points"),
+    (actor(phases=[{"speed": 4}]), actor(phases=[{"speed": 4.01}]), "phases[0].speed: 4.01 is outside 0 to 4 m/s"),
+    (actor(phases=[{"speed": 0}]), actor(phases=[{"speed": -0.01}]), "phases[0].speed: -0.01 is outside 0 to 4 m/s"),
+    (waiting(value=0), waiting(value=-0.01), "phases[0].when.value: must not be negative"),
+    (waiting(actor=0), waiting(actor=1), "phases[0].when.actor: there are actors 0 to 0"),
+    (waiting(actor=0), waiting(actor=-1), "phases[0].when.actor: there are actors 0 to 0"),
+    ({"type": "Custom"}, {"type": "Nothing"}, "type: "),
+    ({"name": "a/b-1_c.d:e@f+g"}, {"name": "a//b"}, "name: 'a//b' is not a name; use letters, digits, and -_.:@+/"),
+    ({"parameters": {"speed": 17}}, {"parameters": {"speed": 17.01}}, "parameters.speed: 17.01 is outside 7 to 17 m/s"),
+    (actor(), actor() | {"type": "RightTurn"}, "actors: only type Custom takes actors; RightTurn makes its own"),
+]
+
+
+@pytest.mark.parametrize(("allowed", "refused", "message"), BOUNDS, ids=[b[2][:40] for b in BOUNDS])
+def test_where_the_bounds_are(allowed: dict[str, Any], refused: dict[str, Any], message: str) -> None:
+    check(scenario_from(PLAIN | allowed))
+    with pytest.raises(ConfigError) as raised:
+        scenario_from(PLAIN | refused)
+    assert message in str(raised.value)
+
+
+def test_values_made_in_python_are_checked_too() -> None:
+    good = scenario_from(PLAIN)
+    for bad, says in (
+        (replace(good, trigger=Pose(0.0, float("nan"))), r"scenario a: trigger: beyond 100000 m or not a number"),
+        (replace(good, route=(Pose(0, 0), Pose(float("inf"), 0))), r"scenario a: route\[1\]: beyond"),
+        (replace(good, town=""), r"scenario a: town: name the town"),
+    ):
+        with pytest.raises(ConfigError, match=says):
+            check(bad)
+
+
+def test_numpy_numbers_are_written_as_plain_ones() -> None:
+    scenario = replace(scenario_from(PLAIN), route=(Pose(0, 0), Pose(9, 0)), parameters={"speed": np.float64(9.5)})
+    data = scenario_data(scenario)
+    assert (type(data["parameters"]["speed"]), data["parameters"]) == (float, {"speed": 9.5})
+    assert list(data) == ["name", "type", "town", "route", "parameters"]
+
+
+def test_nothing_cannot_be_saved_and_one_of_several_may_be_wrong(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no scenario to save"):
+        save_scenarios(tmp_path / "x.yaml", [])
+    good = scenario_from(PLAIN)
+    with pytest.raises(ConfigError, match="scenario b: seed"):
+        scenario_text([good, replace(good, name="b", seed=-1)])
+    two = tmp_path / "two.yaml"
+    two.write_text(f"{scenario_text([good, replace(good, name='b')])}{scenario_text([replace(good, name='b')])}")
+    with pytest.raises(ConfigError, match=r"\[2\]\.name: 'b' is the name of the scenario in line 7 too"):
+        read_scenarios(two)
+
+
+def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert set_names() == ("natural", "natural-crossgate", "natural-twinford", "precrash")
+    mine = scenario_from({**PLAIN, "name": "mine/0"})
+    save_scenarios(ssad_home / "scenarios" / "mine.yaml", mine)
+    assert set_names() == ("mine", "natural", "natural-crossgate", "natural-twinford", "precrash")
+    assert load_scenarios("mine") == load_scenarios("mine/0") == (mine,)
+    # a set is read again once its file is another one
+    save_scenarios(ssad_home / "scenarios" / "mine.yaml", [mine, replace(mine, name="mine/another")])
+    assert len(load_scenarios("mine")) == 2
+    # the shipped sets keep their names
+    save_scenarios(ssad_home / "scenarios" / "precrash.yaml", mine)
+    assert len(load_scenarios("precrash")) == 32
+    assert {s.town for s in load_scenarios("natural-twinford")} == {"Twinford"}
+    assert {s.town for s in load_scenarios("natural-crossgate")} == {"Crossgate"}
+    # a class is that of the shipped scenarios
+    assert [s.name for s in load_scenarios("RightTurn")] == [f"RightTurn/{k:02d}" for k in range(4)]
+    assert len(load_scenarios("NaturalJunction")) == 150
+    for name in ("safebench/RightTurn/00", "frea", "frea/Town05_00/00"):
+        with pytest.raises(ConfigError, match=rf"scenario '{name}' is not in .*; import it: ssad import routes FOLDER"):
+            load_scenarios(name)
+    for name in ("mine/1", "NaturalJunctions", "natural/Twinford_00/99"):
+        with pytest.raises(UnknownNameError):
+            load_scenarios(name)
+    for path in ("absent.yaml", "absent.yml", Path("absent")):
+        with pytest.raises(SSADError, match=r"absent.*no such file"):
+            load_scenarios(path)

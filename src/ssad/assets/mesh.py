@@ -79,18 +79,9 @@ class Mesh:
         p = self.corners()
         return np.asarray(0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=-1))
 
-    def volume(self) -> float:
-        """Signed volume, m^3: positive where closed surfaces face outwards."""
-        p = self.corners()
-        return float(np.einsum("fi,fi->", p[:, 0], np.cross(p[:, 1], p[:, 2])) / 6.0)
-
     def painted(self) -> npt.NDArray[np.bool_]:
         """Faces that take the paint [F]."""
         return np.array([m.paint for m in self.materials], dtype=bool)[self.material]
-
-    def panel_faces(self, name: str) -> npt.NDArray[np.bool_]:
-        """Faces of a panel, or of all parts of it [F]. ConfigError for an unknown name."""
-        return np.isin(self.panel, self._panel_indices(name))
 
     def panel_rectangle(self, name: str) -> Rectangle:
         """Rectangle (u0, v0, u1, v1) of a panel in the atlas. ConfigError for an unknown name."""
@@ -103,13 +94,6 @@ class Mesh:
             raise ConfigError(f"panel '{name}' has no faces; choose another panel")
         low, high = uv.min(axis=0), uv.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-    def panel_scale(self, name: str) -> float:
-        """Metres on the surface for one unit of u or v, averaged over the panel. ConfigError."""
-        chosen = self.panel_faces(name)
-        a, b = (self.uv[chosen, k].astype(np.float64) - self.uv[chosen, 0] for k in (1, 2))
-        flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()
-        return float(np.sqrt(self.areas()[chosen].sum() / max(flat, 1e-12)))
 
     def _panel_indices(self, name: str) -> list[int]:
         indices = [i for i, panel in enumerate(self.panels) if panel == name or panel.startswith(f"{name}/")]
@@ -146,16 +130,6 @@ class Mesh:
     def with_panel(self, name: str) -> Mesh:
         """The mesh with all faces in one panel of this name."""
         return replace(self, panel=np.zeros(len(self.faces), np.int32), panels=(name,), rectangles=())
-
-    def repainted(self, colours: dict[str, tuple[float, float, float]]) -> Mesh:
-        """The mesh with new colours (linear RGB) for the materials of these names."""
-        swapped = tuple(replace(m, colour=colours.get(m.name, m.colour)) for m in self.materials)
-        return replace(self, materials=swapped)
-
-    def relit(self, emissions: dict[str, float]) -> Mesh:
-        """The mesh with new emissions for the materials of these names, e.g. {"tail_lamp": 0.9} for brake lights."""
-        swapped = tuple(replace(m, emission=emissions.get(m.name, m.emission)) for m in self.materials)
-        return replace(self, materials=swapped)
 
     def check(self, name: str = "mesh") -> None:
         """FormatError (one line) for wrong shapes, values not finite, indices out of range, too many empty faces."""
@@ -385,12 +359,10 @@ def prism(
     return build(np.concatenate([low, high]), faces, materials=material, uv=uv, smooth=smooth, outward=True)
 
 
-def loft(
-    sections: npt.ArrayLike, *, material: Material, closed: bool = True, caps: bool = True, smooth: float = SMOOTH
-) -> Mesh:
+def loft(sections: npt.ArrayLike, *, material: Material, closed: bool = True, smooth: float = SMOOTH) -> Mesh:
     """A surface through cross sections [S, P, 3].
 
-    `closed` joins last and first point of a section, `caps` fills both ends (convex sections).
+    `closed` joins last and first point of a section and fills both ends (convex sections).
     """
     s = np.asarray(sections, np.float64)
     rows, columns = s.shape[:2]
@@ -405,13 +377,13 @@ def loft(
 
     quads = [at(r, c), at(r, c + 1), at(r + 1, c + 1), at(r + 1, c)]
     uv = np.stack([np.stack([quads[k] for k in t], 1) for t in ((0, 1, 2), (0, 2, 3))], 1).reshape(-1, 3, 2)
-    if closed and caps:
+    if closed:
         fan = np.stack([np.zeros(columns - 2), np.arange(1, columns - 1), np.arange(2, columns)], 1).astype(np.int32)
         last = fan + (rows - 1) * columns
         circle = 0.5 + 0.5 * np.stack([np.cos(2 * np.pi * across[:-1]), np.sin(2 * np.pi * across[:-1])], -1)
         faces = np.concatenate([faces, fan[:, ::-1], last])
         uv = np.concatenate([uv, circle[fan[:, ::-1]], circle[fan]])
-    return build(s.reshape(-1, 3), faces, materials=material, uv=uv, smooth=smooth, outward=closed and caps)
+    return build(s.reshape(-1, 3), faces, materials=material, uv=uv, smooth=smooth, outward=closed)
 
 
 def lathe(
@@ -449,10 +421,8 @@ def ring(radius: float, thickness: float, *, material: Material, segments: int =
     return build(*weld(grid.reshape(-1, 3), faces), materials=material, smooth=1.2, outward=True)
 
 
-def tube(
-    path: npt.ArrayLike, radius: npt.ArrayLike, *, material: Material, segments: int = 8, flat: float = 1.0
-) -> Mesh:
-    """A round bar along a path [S, 3] with one radius or one for each point; `flat` makes it oval."""
+def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, material: Material, segments: int = 8) -> Mesh:
+    """A round bar along a path [S, 3] with one radius or one for each point."""
     p = np.asarray(path, np.float64)
     r = np.broadcast_to(np.asarray(radius, np.float64), len(p))
     along = np.gradient(p, axis=0)
@@ -462,5 +432,5 @@ def tube(
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
     up = np.cross(along, side)
     angle = np.arange(segments) * (2.0 * np.pi / segments)
-    ring = np.cos(angle)[None, :, None] * side[:, None] + flat * np.sin(angle)[None, :, None] * up[:, None]
+    ring = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * up[:, None]
     return loft(p[:, None] + r[:, None, None] * ring, material=material)

@@ -1,4 +1,4 @@
-"""Reader and writer of Wavefront OBJ meshes with MTL colours."""
+"""Reader of Wavefront OBJ meshes with MTL colours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ssad.assets.face_list import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
-from ssad.assets.mesh import F64, Material, Mesh, triangulate
+from ssad.assets.mesh import F64, Material, triangulate
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 
@@ -157,33 +157,3 @@ def _read_mtl(file: Path) -> dict[str, Material]:
             else:
                 found[name] = replace(found[name], gloss=float(np.sqrt(min(values[0], 1000.0) / 1000.0)))
     return found
-
-
-def save_obj(mesh: Mesh, path: str | Path) -> None:
-    """Write an OBJ and, beside it, an MTL of the same name; `load_mesh` reads back the same mesh. StoreError."""
-    file = Path(path)
-    lines = [f"mtllib {file.stem}.mtl"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.9g} {1.0 - v:.9g}" for u, v in mesh.uv.reshape(-1, 2).tolist()]
-    lines += [f"vn {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.normals.reshape(-1, 3).tolist()]
-    last: tuple[int, int] | None = None
-    for k, (face, look, panel) in enumerate(
-        zip(mesh.faces.tolist(), mesh.material.tolist(), mesh.panel.tolist(), strict=True)
-    ):
-        if (look, panel) != last:
-            lines += [f"g {mesh.panels[panel] if panel >= 0 else 'none'}", f"usemtl {mesh.materials[look].name}"]
-            last = look, panel
-        lines.append("f " + " ".join(f"{v + 1}/{3 * k + c + 1}/{3 * k + c + 1}" for c, v in enumerate(face)))
-    looks: list[str] = []
-    for m in mesh.materials:
-        looks += [f"newmtl {m.name}"]
-        glow = min(m.emission, 1.0)
-        for key, values in (
-            ("Kd", m.colour),
-            ("Ks", (m.specular,) * 3),
-            ("Ke", (glow,) * 3),
-            ("Ns", (1000.0 * m.gloss**2,)),
-        ):
-            looks.append(f"{key} " + " ".join(f"{v:.6g}" for v in values))
-    safeio.write_atomic(file.with_suffix(".mtl"), "\n".join(looks) + "\n")
-    safeio.write_atomic(file, "\n".join(lines) + "\n")

@@ -168,7 +168,7 @@ class _Schedule:
                 seconds = result.pop("wall_s", outcome.seconds / len(batch)) + self.shared.get(cell.key, 0.0)
                 self._record(cell, "ok", "", result, seconds)
         elif len(batch) > 1:
-            for cell in reversed(batch):
+            for cell in batch:
                 self._add([cell], first=True)
         else:
             reason = outcome.reason

@@ -60,6 +60,15 @@ def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
     return np.where(apart, gap, 0.0).astype(gap.dtype)
 
 
+def in_polygon(points: ArrayLike, corners: ArrayLike) -> npt.NDArray[np.bool_]:
+    """Whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
+    x, y = np.asarray(points).T[:, :, None]
+    (ax, ay), (bx, by) = np.asarray(corners).T, np.roll(corners, -1, axis=0).T
+    crosses = (ay > y) != (by > y)
+    at = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
+    return np.asarray((crosses & (x < at)).sum(axis=1) % 2 == 1)
+
+
 def _point_to_box(points: Floats, half: Floats) -> Floats:
     """Least distance [...] of points [..., 4, 2] from the box of half extents [..., 1, 2] at the origin."""
     outside = np.maximum(np.abs(points) - half, 0.0)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ssad.core.errors import FormatError, MapError
 from ssad.core.safeio import load_npz, save_npz
-from ssad.core.types import F32, I32, U8, Bool, LaneType
+from ssad.core.types import F32, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
@@ -135,28 +134,10 @@ class LaneGraph:
         return bool(self.lane_id[lane] * self.lane_id[other] > 0 and self.road[lane] == self.road[other])
 
 
-_DTYPES: dict[str, Any] = {
-    "xy": np.float32, "z": np.float32, "yaw": np.float32, "width": np.float32, "s": np.float32,
-    "offset": np.int32, "kind": np.uint8, "road": np.int32, "section": np.int32, "lane_id": np.int32,
-    "junction": np.int32, "speed_limit": np.float32, "left": np.int32, "right": np.int32,
-    "left_marking": np.uint8, "right_marking": np.uint8, "succ_offset": np.int32, "succ": np.int32,
-    "signal_xy": np.float32, "signal_yaw": np.float32, "signal_junction": np.int32, "signal_phase": np.int32,
-    "signal_virtual": np.bool_, "stop_signal": np.int32, "stop_lane": np.int32, "stop_s": np.float32,
-    "crosswalk_offset": np.int32, "crosswalk_xy": np.float32,
-}  # fmt: skip
+_DTYPES = array_dtypes(LaneGraph)
 _PER = {
     "P": ("z", "yaw", "width", "s"),
-    "L": (
-        "road",
-        "section",
-        "lane_id",
-        "junction",
-        "speed_limit",
-        "left",
-        "right",
-        "left_marking",
-        "right_marking",
-    ),
+    "L": ("road", "section", "lane_id", "junction", "speed_limit", "left", "right", "left_marking", "right_marking"),
     "S": ("signal_yaw", "signal_junction", "signal_phase", "signal_virtual"),
     "K": ("stop_signal", "stop_lane", "stop_s"),
 }
@@ -176,18 +157,7 @@ def _check(graph: LaneGraph) -> None:
     for letter, names in _PER.items():
         for name in names:
             require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")
-    for name in (
-        "xy",
-        "z",
-        "yaw",
-        "width",
-        "s",
-        "speed_limit",
-        "signal_xy",
-        "signal_yaw",
-        "stop_s",
-        "crosswalk_xy",
-    ):
+    for name in (name for name, dtype in _DTYPES.items() if dtype == np.float32):
         require(bool(np.isfinite(getattr(graph, name)).all()), f"{name} holds a number that is not finite")
     for name, rows, total in (
         ("offset", size["L"], size["P"]),
@@ -235,7 +205,7 @@ def load_graph(path: Path | str) -> LaneGraph:
         wrong = ", ".join(sorted(set(arrays) ^ set(_DTYPES)))
         raise MapError(f"{source}: missing or unknown arrays: {wrong}; {mend}")
     for name, dtype in _DTYPES.items():
-        if arrays[name].dtype != np.dtype(dtype):
+        if arrays[name].dtype != dtype:
             raise MapError(f"{source}: array {name} is {arrays[name].dtype}; {mend}")
     return LaneGraph(name=str(header[1]), **arrays)
 

@@ -39,24 +39,14 @@ USUAL_ATTRIBUTE: Final[Mapping[str, str]] = MappingProxyType({
     "bicycle": "cycle.without_rider", "traffic_cone": "", "barrier": "",
 })  # fmt: skip
 
-CATEGORY_TO_CLASS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "movable_object.barrier": "barrier",
-        "vehicle.bicycle": "bicycle",
-        "vehicle.bus.bendy": "bus",
-        "vehicle.bus.rigid": "bus",
-        "vehicle.car": "car",
-        "vehicle.construction": "construction_vehicle",
-        "vehicle.motorcycle": "motorcycle",
-        "human.pedestrian.adult": "pedestrian",
-        "human.pedestrian.child": "pedestrian",
-        "human.pedestrian.construction_worker": "pedestrian",
-        "human.pedestrian.police_officer": "pedestrian",
-        "movable_object.trafficcone": "traffic_cone",
-        "vehicle.trailer": "trailer",
-        "vehicle.truck": "truck",
-    }
-)
+CATEGORY_TO_CLASS: Final[Mapping[str, str]] = MappingProxyType({
+    "movable_object.barrier": "barrier", "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus", "vehicle.car": "car", "vehicle.construction": "construction_vehicle",
+    "vehicle.motorcycle": "motorcycle", "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian", "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "movable_object.trafficcone": "traffic_cone",
+    "vehicle.trailer": "trailer", "vehicle.truck": "truck",
+})  # fmt: skip
 BICYCLE_RACK: Final = "static_object.bicycle_rack"
 CATEGORIES: Final = (
     *CATEGORY_TO_CLASS, "animal", "human.pedestrian.personal_mobility", "human.pedestrian.stroller",

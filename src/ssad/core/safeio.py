@@ -43,7 +43,7 @@ def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
     """The whole file, refused beyond `limit` bytes. FormatError."""
     try:
         with open(path, "rb") as file:
-            # room is made for as much as is asked for: no more than the file says it has, and what a pipe holds in parts
+            # room is made for as much as is asked for: what the file says it has; a pipe is read in parts
             data = file.read(min(os.fstat(file.fileno()).st_size, limit) + 1)
             while len(data) <= limit and (part := file.read(MIB)):
                 data += part
@@ -231,11 +231,6 @@ def parse_yaml(text: str, name: str = "<text>") -> Any:
 def read_yaml_document(path: str | Path, *, limit: int = 16 * MIB) -> Document:
     """Parse a YAML file and keep line numbers for later errors (`Document.error`). FormatError."""
     return parse_yaml_document(read_text(path, limit=limit), str(path))
-
-
-def read_yaml(path: str | Path, *, limit: int = 16 * MIB) -> Any:
-    """Plain data of a YAML file. FormatError."""
-    return read_yaml_document(path, limit=limit).data
 
 
 def dump_yaml(data: Any) -> str:

@@ -12,13 +12,10 @@ import numpy.typing as npt
 
 from ssad.core import safeio
 from ssad.core.errors import FormatError
-from ssad.core.types import EpisodeTrace
+from ssad.core.types import EpisodeTrace, array_dtypes
 
 FORMAT = 1
-_DTYPES: dict[str, type[np.generic]] = {"F32": np.float32, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
-_ARRAYS: dict[str, np.dtype[Any]] = {
-    f.name: np.dtype(_DTYPES[str(f.type)]) for f in fields(EpisodeTrace) if str(f.type) in _DTYPES
-}
+_ARRAYS = array_dtypes(EpisodeTrace)
 _META = [f.name for f in fields(EpisodeTrace) if f.name not in _ARRAYS]
 _PER_AGENT = ("x", "y", "yaw", "speed", "active")
 

@@ -9,9 +9,9 @@ CARLA's left-handed frame is converted where CARLA's files are read, and nowhere
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum, IntFlag
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,19 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
+_DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8, "Bool": np.bool_}
+
+
+def array_dtypes(table: Any) -> dict[str, np.dtype[Any]]:
+    """Read from a dataclass which of its fields are arrays.
+
+    Args:
+        table: A dataclass with postponed annotations.
+
+    Returns:
+        Name -> dtype of the fields that are given to it and annotated F32, F64, I32, U8 or Bool, in their order.
+    """
+    return {f.name: np.dtype(_DTYPES[str(f.type)]) for f in fields(table) if f.init and str(f.type) in _DTYPES}
 
 
 class LaneType(IntEnum):

@@ -24,7 +24,7 @@ AHEAD = 2  # tasks at hand for each place of the cluster, so that none waits for
 _BACKENDS: dict[str, LocalProcesses] = {}  # of this Ray worker, by start
 
 
-def _on_node(parts: tuple[Any, Any, float], start: Start | None, threads: int) -> Any:
+def _on_node(parts: tuple[Any, Any, float], start: Start | None) -> Any:
     """What a Ray worker does with a task: has its child process do it, and says how that ended."""
     function, argument, timeout_s = parts
     name = repr(start)
@@ -32,7 +32,7 @@ def _on_node(parts: tuple[Any, Any, float], start: Start | None, threads: int) -
         for other in _BACKENDS.values():
             other.close()
         _BACKENDS.clear()
-        _BACKENDS[name] = LocalProcesses(1, start=start, threads=threads)
+        _BACKENDS[name] = LocalProcesses(1, start=start)
     backend = _BACKENDS[name]
     backend.submit(Task(function, argument, timeout_s))
     while True:
@@ -54,13 +54,12 @@ class RayCluster:
         address: of a running cluster, "auto", or "local" to start one for as long as this lives.
         start: see `LocalProcesses`.
         gpu_share: of a GPU for each task; 0: none is asked for.
-        threads: of linear algebra in each worker.
 
     Raises:
         ConfigError: Ray is not installed, or there is no such cluster.
     """
 
-    def __init__(self, address: str, *, start: Start | None = None, gpu_share: float = 0.0, threads: int = 1) -> None:
+    def __init__(self, address: str, *, start: Start | None = None, gpu_share: float = 0.0) -> None:
         try:
             import ray
         except ImportError:
@@ -81,7 +80,7 @@ class RayCluster:
         if gpu_share:
             options["num_gpus"] = gpu_share
         self._remote = ray.remote(**options)(_on_node)
-        self._arguments = ray.put(start), threads
+        self._start = ray.put(start)
         self._tasks: dict[Any, Task] = {}
 
     @property
@@ -96,7 +95,7 @@ class RayCluster:
 
     def submit(self, task: Task) -> None:
         """Take a task; only while `busy` is below `capacity`."""
-        self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), *self._arguments)] = task
+        self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), self._start)] = task
 
     def wait(self, seconds: float) -> list[Outcome]:
         """What has ended, after so many seconds at the latest. SSADError: no worker can start."""
@@ -110,9 +109,8 @@ class RayCluster:
             try:
                 status, value, reason, error, spent = self._ray.get(reference)
             except self._ray.exceptions.RayTaskError as problem:
-                raise (
-                    problem.cause if isinstance(problem.cause, SSADError) else StoreError(str(problem.cause))
-                ) from None
+                cause = problem.cause
+                raise (cause if isinstance(cause, SSADError) else StoreError(str(cause))) from None
             except self._ray.exceptions.RayError as problem:
                 why = f"the cluster lost its node {LOST_NODES + 1} times: {' '.join(str(problem).split())[:200]}"
                 status, value, reason, error, spent = "crashed", None, why, None, 0.0

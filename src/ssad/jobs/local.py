@@ -19,10 +19,8 @@ from ssad.core.registry import describe
 from ssad.jobs.task import Outcome, Status, Task
 
 START_S = 600.0  # a worker may compile kernels when it starts
-SCARCE, SCARCE_S = (
-    0.04,
-    2.0,
-)  # share of the memory that must not be lacking for so many seconds: the largest worker ends
+SCARCE = 0.04  # share of the memory: with less left
+SCARCE_S = 2.0  # for so many seconds, the largest worker ends
 WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: bytes that a worker may hold
 LOOK_S = 0.2  # from one look at the memory to the next
 
@@ -47,8 +45,8 @@ class Worker:
         )
         os.close(theirs)
         os.close(theirs_too)
-        self.answers = Connection(answers, writable=False)
-        self._orders = Connection(orders, readable=False)
+        self.answers = Connection(answers)
+        self._orders = Connection(orders)
         self.ready = False
         self.task: Task | None = None
         self.began = time.monotonic()
@@ -161,7 +159,7 @@ class LocalProcesses:
         self._waiting: list[Task] = []
         self._unsent: list[Outcome] = []
         self._started = 0
-        self._looked = 0.0
+        self._looked = time.monotonic()
         self._plenty = (0, time.monotonic())  # memory of the machine, and when there was enough of it
 
     @property

@@ -9,15 +9,15 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+EVERY_S = 10.0  # from one plain line to the next
+
 
 class Live:
-    """A context: a Rich bar on a terminal, else a line every `every` seconds."""
+    """A context: a Rich bar on a terminal, else a line every ten seconds."""
 
-    def __init__(
-        self, title: str, total: int, done: int, *, console: Console, every: float = 10.0, unit: str = "cells"
-    ) -> None:
+    def __init__(self, title: str, total: int, done: int, *, console: Console, unit: str = "cells") -> None:
         self.total, self.done, self.failed, self.first = total, done, 0, done
-        self.title, self.console, self.every, self.unit = title, console, every, unit
+        self.title, self.console, self.unit = title, console, unit
         self.began = self.said = time.monotonic()
         self.bar: Progress | None = None
         if console.is_terminal:
@@ -53,13 +53,13 @@ class Live:
         """Show where things are."""
         if self.bar:
             self.bar.update(self.task, completed=self.done, note=self.note())
-        elif time.monotonic() - self.said >= self.every:
+        elif time.monotonic() - self.said >= EVERY_S:
             self.said = time.monotonic()
             self.line()
 
     def line(self) -> None:
         """One plain line."""
-        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}", highlight=False)
+        self.console.print(f"{self.title}: {self.done}/{self.total} {self.unit}  {self.note()}")
 
     def __enter__(self) -> Self:
         if self.bar:

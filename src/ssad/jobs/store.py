@@ -183,7 +183,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 
 
 def _cut(path: Path, size: int) -> None:
-    if path.exists() and path.stat().st_size > size:
+    if path.exists():
         os.truncate(path, size)
 
 

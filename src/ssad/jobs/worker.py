@@ -46,7 +46,7 @@ def main(orders: int, answers: int) -> None:
     """Serve until the input ends."""
     _die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    reader, out = Connection(orders, writable=False), Connection(answers, readable=False)
+    reader, out = Connection(orders), Connection(answers)
     path, starts = reader.recv()
     sys.path[:] = list(dict.fromkeys([*path, *sys.path]))
     received: queue.SimpleQueue[Any] = queue.SimpleQueue()

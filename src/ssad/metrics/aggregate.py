@@ -193,5 +193,5 @@ def _overall(outcomes: Sequence[Outcome]) -> Estimate:
     if not scores:
         return replace(NOTHING, failed=sum(o.metrics is None for o in outcomes))
     mean = math.fsum(scores) / len(scores)
-    first, second = estimate(least, "mean", least=0.0), estimate(most, "mean", least=0.0)
+    first, second = estimate(least, "mean", least=0.0), estimate(most, "mean")
     return replace(first, mean=mean, low=min(first.low, mean), high=max(second.high, mean))

@@ -87,9 +87,9 @@ def post_encroachment_time(trace: EpisodeTrace, *, cap: float = CAP) -> float:
     follows on the same path counts: its value is the time gap.
     """
     box = boxes(trace)
-    steps, agents = box.shape[:2]
+    steps = len(box)
     active = trace.active
-    radius = 0.5 * np.hypot(box[0, :, 3], box[0, :, 4]) if steps else np.zeros(agents)
+    radius = 0.5 * np.hypot(trace.length, trace.width).astype(np.float64)
     for lag in range(min(round(cap / trace.dt), steps - 1) + 1):
         early, late = slice(0, steps - lag), slice(lag, steps)
         for ego, other in ((early, late), (late, early)):

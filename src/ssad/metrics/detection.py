@@ -45,7 +45,6 @@ __all__ = [
     "keep_boxes",
     "match",
     "scene_intervals",
-    "score_detections",
 ]
 
 RECALL = np.linspace(0.0, 1.0, 101)
@@ -73,15 +72,16 @@ class DetectionScores:
     @property
     def label_aps(self) -> dict[str, dict[str, float]]:
         """class -> threshold as text -> AP."""
-        names = [str(t) for t in self.config.dist_ths]
+        rows = self.ap.tolist()
         return {
-            c: dict(zip(names, row, strict=True)) for c, row in zip(self.config.classes, self.ap.tolist(), strict=True)
+            c: {str(t): rows[i][j] for j, t in enumerate(self.config.dist_ths)}
+            for i, c in enumerate(self.config.classes)
         }
 
     @property
     def mean_dist_aps(self) -> dict[str, float]:
         """class -> mean AP over the thresholds."""
-        return {c: float(np.mean(row)) for c, row in zip(self.config.classes, self.ap, strict=True)}
+        return {c: float(np.mean(self.ap[i])) for i, c in enumerate(self.config.classes)}
 
     @property
     def mean_ap(self) -> float:
@@ -92,12 +92,12 @@ class DetectionScores:
     def label_tp_errors(self) -> dict[str, dict[str, float]]:
         """class -> error -> value, NaN where it has no meaning."""
         rows = self.errors.tolist()
-        return {c: dict(zip(TP_METRICS, row, strict=True)) for c, row in zip(self.config.classes, rows, strict=True)}
+        return {c: {name: rows[i][j] for j, name in enumerate(TP_METRICS)} for i, c in enumerate(self.config.classes)}
 
     @property
     def tp_errors(self) -> dict[str, float]:
         """error -> mean over the classes for which it has a meaning."""
-        return {name: float(np.nanmean(column)) for name, column in zip(TP_METRICS, self.errors.T, strict=True)}
+        return {name: float(np.nanmean(self.errors[:, j])) for j, name in enumerate(TP_METRICS)}
 
     @property
     def tp_scores(self) -> dict[str, float]:
@@ -147,18 +147,18 @@ class Matches:
 
     def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> DetectionScores:
         """The scores; weights [S]: how often each sample counts, as if it stood there so many times in a row."""
-        times = None if weights is None else np.asarray(weights, np.int64)
-        if times is not None and (times.shape != (self.samples,) or (times < 0).any()):
+        times = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
+        if times.shape != (self.samples,) or (times < 0).any():
             raise ValueError(f"weights: expected {self.samples} numbers that are not negative")
         ap = np.zeros((len(self.classes), len(self.config.dist_ths)))
         errors = np.ones((len(self.classes), len(TP_METRICS)))
         truth, predictions = np.zeros((2, len(self.classes)), np.int64)
-        for c, (name, matches) in enumerate(zip(self.config.classes, self.classes, strict=True)):
-            truth[c] = matches.truth if times is None else int(self.truth_counts[c] @ times)
-            ranking = _Ranking.of(matches, times)
+        for c, name in enumerate(self.config.classes):
+            truth[c] = self.truth_counts[c] @ times
+            ranking = _Ranking.of(self.classes[c], times)
             predictions[c] = ranking.total
             if truth[c]:
-                ap[c], errors[c] = _class_scores(matches, ranking, int(truth[c]), self.config, name)
+                ap[c], errors[c] = _class_scores(self.classes[c], ranking, int(truth[c]), self.config, name)
             for error in UNDEFINED.get(name, ()):
                 errors[c, TP_METRICS.index(error)] = np.nan
         return DetectionScores(self.config, ap, errors, truth, predictions)
@@ -183,18 +183,6 @@ def match(
         for c in range(len(config.classes))
     )
     return Matches(config, samples, classes, counts.reshape(-1, samples).astype(np.int32))
-
-
-def score_detections(
-    truth: BoxTable,
-    predictions: BoxTable,
-    *,
-    samples: int,
-    config: DetectionConfig = CVPR_2019,
-    weights: npt.NDArray[np.integer[Any]] | None = None,
-) -> DetectionScores:
-    """`match` and `Matches.scores` in one step; both tables are filtered already (`filter_boxes`)."""
-    return match(truth, predictions, samples=samples, config=config).scores(weights)
 
 
 def scene_intervals(
@@ -224,52 +212,42 @@ def scene_intervals(
 class _Ranking:
     """The predictions of a class from best to worst, each as often as its sample counts.
 
-    weight, end [n]: how often, and cumulated; first, length [n]: the run of equal scores of one sample it is in. All
-    None without weights.
+    weight, end [n]: how often, and cumulated; runs: as `ClassMatches` has them.
     """
 
     score: F64
-    total: int
-    weight: I64 | None = None
-    end: I64 | None = None
-    first: I64 | None = None
-    length: I64 | None = None
+    weight: I64
+    end: I64
+    runs: tuple[I64, I64] | None
 
     @staticmethod
-    def of(matches: ClassMatches, weights: I64 | None) -> _Ranking:
+    def of(matches: ClassMatches, weights: I64) -> _Ranking:
         """The ranking of a class."""
-        n = len(matches.score)
-        if weights is None:
-            return _Ranking(matches.score, n)
         weight = weights[matches.sample]
-        end = np.cumsum(weight)
-        first = length = None
-        if matches.tied:
-            same = (matches.sample[1:] == matches.sample[:-1]) & (matches.score[1:] == matches.score[:-1])
-            head = np.flatnonzero(np.r_[True, ~same])
-            size = np.diff(np.r_[head, n])
-            first, length = np.repeat(head, size), np.repeat(size, size)
-        return _Ranking(matches.score, int(end[-1]) if n else 0, weight, end, first, length)
+        return _Ranking(matches.score, weight, np.cumsum(weight), matches.runs)
+
+    @property
+    def total(self) -> int:
+        """How many predictions there are."""
+        return int(self.weight.sum())
 
     def places(self, hits: I64) -> tuple[I64, I64]:
         """Places [T'] of the matched predictions among all, ascending, and which of the hits [T] each one is."""
-        if self.weight is None or self.end is None:
-            return hits, np.arange(len(hits))
         weight = self.weight[hits]
         source = np.repeat(np.arange(len(hits)), weight)
         copy = np.arange(len(source)) - np.repeat(np.cumsum(weight) - weight, weight)
-        if self.first is None or self.length is None:
+        if self.runs is None:
             return (self.end[hits] - weight)[source] + copy, source
         # copies of a sample follow each other, so a run of equal scores comes whole, once for each copy
-        first = self.first[hits]
+        first, length = (values[hits] for values in self.runs)
         start = self.end[first] - self.weight[first] + hits - first
-        place = start[source] + copy * self.length[hits][source]
+        place = start[source] + copy * length[source]
         order = np.argsort(place)
         return place[order], source[order]
 
     def scores_at(self, places: I64) -> F64:
         """Scores at these places."""
-        return self.score[places if self.end is None else np.searchsorted(self.end, places, side="right")]
+        return self.score[np.searchsorted(self.end, places, side="right")]
 
 
 def _class_scores(
@@ -279,7 +257,8 @@ def _class_scores(
     ap = np.zeros(len(config.dist_ths))
     errors = np.ones(len(TP_METRICS))
     negative = bool(len(ranking.score)) and ranking.score[-1] < 0.0
-    for i, (threshold, hits) in enumerate(zip(config.dist_ths, matches.hits, strict=True)):
+    for i, threshold in enumerate(config.dist_ths):
+        hits = matches.hits[i]
         place, source = ranking.places(hits)
         if not len(place):
             continue

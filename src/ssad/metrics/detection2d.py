@@ -1,4 +1,4 @@
-"""Average precision of 2D boxes as COCO computes it, and precision and recall at a score.
+"""Average precision of 2D boxes as COCO computes it.
 
 Equal to pycocotools 2.0 (COCOeval, one IoU threshold, all areas): greedy matching by score, crowd regions that take any
 number of detections and count for nothing, 101-point interpolation of the precision envelope.
@@ -34,10 +34,9 @@ class Boxes2D:
 
 @dataclass(frozen=True)
 class Matched2D:
-    """Detections from best to worst: label, score, hit (took a box), ignored (lies in a crowd region); truth [L]."""
+    """Detections from best to worst: label, hit (took a box), ignored (lies in a crowd region); truth [L]."""
 
     label: I32
-    score: F64
     hit: Bool
     ignored: Bool
     truth: I64
@@ -51,15 +50,6 @@ class Matched2D:
                 result[label] = _interpolated(self.hit[own], count)
         return result
 
-    def precision_recall(self, score: float) -> tuple[F64, F64]:
-        """Precision and recall [L] of the detections with this score or more; NaN where nothing is counted."""
-        own = (self.score >= score) & ~self.ignored
-        found = np.bincount(self.label[own], minlength=len(self.truth)).astype(np.float64)
-        right = np.bincount(self.label[own & self.hit], minlength=len(self.truth)).astype(np.float64)
-        unknown = np.full(len(self.truth), np.nan)
-        precision = np.divide(right, found, out=unknown.copy(), where=found > 0)
-        return precision, np.divide(right, self.truth, out=unknown, where=self.truth > 0)
-
 
 def match_2d(
     truth: Boxes2D, detections: Boxes2D, *, labels: int, threshold: float = 0.5, max_detections: int = 100
@@ -72,7 +62,7 @@ def match_2d(
     if detections.score is None:
         raise ValueError("detections need scores")
     crowd = np.zeros(len(truth.image), np.bool_) if truth.ignore is None else truth.ignore
-    images = int(max(truth.image.max(initial=-1), detections.image.max(initial=-1))) + 1
+    images = len(np.bincount(np.concatenate([truth.image, detections.image])))  # as many as the greatest index needs
     real_group = truth.label.astype(np.int64) * images + truth.image
     real = np.argsort(real_group, kind="stable")
     group = detections.label.astype(np.int64) * images + detections.image
@@ -86,7 +76,7 @@ def match_2d(
         overlap = _iou(detections.box[rank[pred]], truth.box[real[box]], crowd[box])
         near = np.flatnonzero(overlap >= min(threshold, 1.0 - 1e-10))
         found.append((pred[near], box[near], overlap[near]))
-    pred, box, overlap = (np.concatenate(part) for part in zip(*found, strict=True))
+    pred, box, overlap = (np.concatenate([part[k] for part in found]) for k in range(3))
     ignored = np.bincount(pred[crowd[box]], minlength=len(rank)) > 0
     pred, box, overlap = pred[~crowd[box]], box[~crowd[box]], overlap[~crowd[box]]
     # of equal overlaps COCO takes the last
@@ -95,7 +85,7 @@ def match_2d(
     hit = np.zeros(len(rank), np.bool_)
     hit[took] = True
     counts = np.bincount(truth.label[real[~crowd]], minlength=labels)
-    return Matched2D(detections.label[rank], detections.score[rank], hit, ignored & ~hit, counts)
+    return Matched2D(detections.label[rank], hit, ignored & ~hit, counts)
 
 
 def average_precision(
@@ -104,14 +94,6 @@ def average_precision(
     """AP [labels], NaN for a label without ground truth; their mean (np.nanmean) is COCO's AP at the threshold."""
     matched = match_2d(truth, detections, labels=labels, threshold=threshold, max_detections=max_detections)
     return matched.average_precision()
-
-
-def precision_recall(
-    truth: Boxes2D, detections: Boxes2D, *, labels: int, score: float, threshold: float = 0.5, max_detections: int = 100
-) -> tuple[F64, F64]:
-    """Precision and recall [labels] of the detections with this score or more; NaN where nothing is counted."""
-    matched = match_2d(truth, detections, labels=labels, threshold=threshold, max_detections=max_detections)
-    return matched.precision_recall(score)
 
 
 def _best(group: I64, score: F64, most: int) -> I64:
@@ -128,7 +110,7 @@ def _iou(box: F64, real: F64, crowd: Bool) -> F64:
     size, real_size = box[:, 2:] - box[:, :2], real[:, 2:] - real[:, :2]
     side = np.minimum(box[:, :2] + size, real[:, :2] + real_size) - np.maximum(box[:, :2], real[:, :2])
     area = size[:, 0] * size[:, 1]
-    both = np.where((side > 0.0).all(axis=-1), side[:, 0] * side[:, 1], 0.0)
+    both = np.where((side > 0.0).all(axis=1), side[:, 0] * side[:, 1], 0.0)
     union = np.where(crowd, area, area + real_size[:, 0] * real_size[:, 1] - both)
     return np.divide(both, union, out=np.zeros_like(both), where=both > 0.0)
 

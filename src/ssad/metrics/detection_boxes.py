@@ -160,6 +160,6 @@ def _in_racks(sample: I32, centre: F64, racks: BikeRacks) -> Bool:
     offset = centre[point] - corner[0]
     inside = np.ones(len(rack), np.bool_)
     for edge in corner[1:] - corner[0]:
-        along = (edge * offset).sum(axis=-1)
-        inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=-1))
+        along = (edge * offset).sum(axis=1)
+        inside &= (along >= 0.0) & (along <= (edge * edge).sum(axis=1))
     return np.bincount(point[inside], minlength=len(sample)) > 0

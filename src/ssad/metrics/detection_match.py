@@ -28,16 +28,15 @@ class ClassMatches:
     """The predictions of a class from best to worst, and which of them are matched.
 
     sample [n], score [n]; hits: for each threshold the places [T] in that order of the matched ones, ascending;
-    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); truth: number of
-    ground-truth boxes; tied: whether equal scores occur within a sample.
+    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of
+    equal scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
     """
 
     sample: I32
     score: F64
     hits: tuple[I64, ...]
     errors: F64
-    truth: int
-    tied: bool
+    runs: tuple[I64, I64] | None
 
 
 def match_class(
@@ -74,9 +73,18 @@ def match_class(
         score=score,
         hits=tuple(hit for hit, _ in pairs),
         errors=_errors(truth.take(real[taken]), predictions.take(rank[hit]), np.pi if name == "barrier" else 2 * np.pi),
-        truth=len(real),
-        tied=bool(((sample[1:] == sample[:-1]) & (score[1:] == score[:-1])).any()),
+        runs=_runs(sample, score),
     )
+
+
+def _runs(sample: I32, score: F64) -> tuple[I64, I64] | None:
+    """Begin and length [n] of the runs of equal sample and score."""
+    same = (sample[1:] == sample[:-1]) & (score[1:] == score[:-1])
+    if not same.any():
+        return None
+    head = np.flatnonzero(np.r_[True, ~same])
+    length = np.diff(np.r_[head, len(score)])
+    return np.repeat(head, length), np.repeat(length, length)
 
 
 def _near_pairs(
@@ -97,7 +105,7 @@ def _near_pairs(
         distance = np.sqrt(dx * dx + dy * dy)
         near = np.flatnonzero(distance < limit)
         found.append((pred[near], box[near], distance[near]))
-    pred, box, distance = (np.concatenate(part) for part in zip(*found, strict=True))
+    pred, box, distance = (np.concatenate([part[k] for part in found]) for k in range(3))
     order = np.lexsort((distance, pred))
     return pred[order], box[order], distance[order]
 
@@ -123,7 +131,7 @@ def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequen
     n = len(thresholds)
     head = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)
     who = pred[head]
-    end = np.stack([np.add.reduceat(distance < t, head) if len(head) else head for t in thresholds], axis=-1)
+    end = np.stack([np.add.reduceat(distance < t, head) if len(head) else head for t in thresholds], axis=1)
     end = (end + head[:, None]).ravel()  # proposer i * n + t
     choice = np.repeat(head, n)
     nobody = len(end)
@@ -152,7 +160,7 @@ def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequen
 def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, names: Sequence[str] | None) -> None:
     """The devkit refuses a matched box one of whose sides is not positive."""
     for what, boxes, rows in (("prediction", predictions, rank), ("ground truth", truth, real)):
-        flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=-1))
+        flat: Bool = np.asarray(~(boxes.size_lwh[rows] > 0.0).all(axis=1))
         if flat.any():
             row = int(rows[flat.argmax()])
             sample = int(boxes.sample[row])
@@ -165,8 +173,8 @@ def _check_sizes(truth: BoxTable, real: I64, predictions: BoxTable, rank: I64, n
 def _errors(truth: BoxTable, found: BoxTable, period: float) -> F64:
     """Errors [5, T] of matched pairs: translation m, 1 - IoU of the sizes, yaw rad, velocity m/s, attribute 0 or 1."""
     dx, dy = (found.centre[:, :2] - truth.centre[:, :2]).T
-    shared = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=-1)
-    union = np.prod(truth.size_lwh, axis=-1) + np.prod(found.size_lwh, axis=-1) - shared
+    shared = np.prod(np.minimum(truth.size_lwh, found.size_lwh), axis=1)
+    union = np.prod(truth.size_lwh, axis=1) + np.prod(found.size_lwh, axis=1) - shared
     off = quaternion_to_yaw(truth.rotation) - quaternion_to_yaw(found.rotation)
     turn = np.abs((off + period / 2) % period - period / 2)
     vx, vy = (found.velocity - truth.velocity).T

@@ -199,10 +199,8 @@ def in_route_failure(trace: EpisodeTrace) -> bool:
 
     CARLA's InRouteTest ends the episode here; SafeBench only records it.
     """
-    if len(trace.route_distance) < 2:
-        return False
     distance = trace.route_distance[1:]
-    length = float(np.hypot(*np.diff(trace.route.astype(np.float64), axis=0).T).sum()) if len(trace.route) > 1 else 0.0
+    length = float(np.hypot(*np.diff(trace.route.astype(np.float64), axis=0).T).sum())
     away = float(np.diff(trace.driven.astype(np.float64))[distance > OFF_ROUTE_DISTANCE].sum())
     return bool((distance > MAX_ROUTE_DISTANCE).any()) or away > OFF_ROUTE_SHARE * length
 

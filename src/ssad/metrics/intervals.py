@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from statistics import NormalDist
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +25,6 @@ MIN_DIFFERENT = 8
 
 _Z = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
 _TAIL = 0.5 - 0.5 * LEVEL
-_log_gamma = np.frompyfunc(math.lgamma, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -81,10 +78,8 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
     """
     means, mean, part = _contributions(sums, clusters)
     count = clusters.member.sum(axis=0)
-    edge = (means <= 0.0) | (means >= 1.0)
-    if count.min() < 2:  # the strata are merged below, so none is at an edge unless all are
-        edge = np.broadcast_to(((mean <= 0.0) | (mean >= 1.0))[..., None], edge.shape)
-        count = np.full(len(count), len(clusters.size))
+    # with a stratum of one cluster all are merged below, and none is at an edge of its own
+    edge = ((means <= 0.0) | (means >= 1.0)) & (count.min() >= 2)
     share = 0.5 / (count + 1.0)
     assumed = np.sqrt(share * (1.0 - share) * (count - 1.0) / count)[clusters.stratum] * clusters.weight
     spread = _spread(np.where(edge[..., clusters.stratum], assumed, part), clusters)
@@ -150,84 +145,29 @@ def share_limits(share: npt.ArrayLike, n: npt.ArrayLike) -> tuple[F64, F64]:
     Half-way between Clopper and Pearson's exact limits and Jeffreys' (the exact ones alone hold in 98 to 99 % of cases
     for small n, Jeffreys' in as few as 88 %); with one event or none, or all or all but one, the exact limits.
     """
-    shape = np.broadcast_shapes(np.shape(share), np.shape(n))
-    p = np.broadcast_to(np.asarray(share, np.float64), shape).ravel()
-    n = np.broadcast_to(np.asarray(n, np.float64), shape).ravel()
+    from scipy.special import betaincinv
+
+    p, n = np.broadcast_arrays(np.asarray(share, np.float64), np.asarray(n, np.float64))
     events, rest = p * n, (1.0 - p) * n
     fewer = np.minimum(events, rest)
     a = 0.25 * np.clip(fewer - 1.0, 0.0, 1.0)
-    # beyond 500 events beta and score limits are the same to three digits, and the continued fraction gets long
-    centre, half = (p + _Z**2 / (2 * n)) / (1 + _Z**2 / n), np.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
-    half = half * _Z / (1 + _Z**2 / n)
-    low = np.where(events > 0.0, centre - half, 0.0)
-    high = np.where(rest > 0.0, centre + half, 1.0)
-    some = (fewer <= 500.0) & (events > 0.0)
-    low[some] = beta_quantile(_TAIL, (events + a)[some], (rest + 1.0 - a)[some])
-    some = (fewer <= 500.0) & (rest > 0.0)
-    high[some] = beta_quantile(1.0 - _TAIL, (events + 1.0 - a)[some], (rest + a)[some])
-    return low.reshape(shape), high.reshape(shape)
+    # beyond 500 events beta and score limits are the same to three digits
+    many = fewer > 500.0
+    centre, half = p + _Z**2 / (2.0 * n), _Z * np.sqrt(p * (1.0 - p) / n + _Z**2 / (4.0 * n * n))
+    low = np.where(many, (centre - half) / (1.0 + _Z**2 / n), 0.0)
+    high = np.where(many, (centre + half) / (1.0 + _Z**2 / n), 1.0)
+    some = ~many & (events > 0.0)
+    low[some] = betaincinv((events + a)[some], (rest + 1.0 - a)[some], _TAIL)
+    some = ~many & (rest > 0.0)
+    high[some] = betaincinv((events + 1.0 - a)[some], (rest + a)[some], 1.0 - _TAIL)
+    return low, high
 
 
-def t_quantile(freedom: npt.ArrayLike, level: float = LEVEL) -> F64:
+def t_quantile(freedom: npt.ArrayLike) -> F64:
     """Two-sided quantile of Student's distribution; the degrees of freedom need not be whole."""
-    values, where = np.unique(np.asarray(freedom, np.float64), return_inverse=True)
-    x = beta_quantile(1.0 - level, values / 2.0, np.full(values.shape, 0.5))
-    return np.asarray(np.sqrt(values * (1.0 - x) / x)[where].reshape(np.shape(freedom)))
+    from scipy.special import stdtrit
 
-
-def beta_quantile(probability: float, a: F64, b: F64) -> F64:
-    """Quantile of the beta distribution with parameters a and b [N]: Newton's method within a bracket."""
-    if len(a) == 1:
-        return np.array([_one_quantile(probability, float(a[0]), float(b[0]))])
-    return _quantiles(probability, a, b)
-
-
-@lru_cache(maxsize=1 << 16)
-def _one_quantile(probability: float, a: float, b: float) -> float:
-    """The same few shares come again all over a report."""
-    return float(_quantiles(probability, np.array([a]), np.array([b]))[0])
-
-
-def _quantiles(probability: float, a: F64, b: F64) -> F64:
-    low, high = np.zeros(a.shape), np.ones(a.shape)
-    x = a / (a + b)
-    scale = _log(a + b) - _log(a) - _log(b)
-    open_ = np.arange(len(a))
-    for _ in range(200):
-        y, p, q = x[open_], a[open_], b[open_]
-        excess = beta_probability(y, p, q) - probability
-        low[open_], high[open_] = np.where(excess < 0.0, y, low[open_]), np.where(excess < 0.0, high[open_], y)
-        with np.errstate(all="ignore"):
-            step = y - excess / np.exp(scale[open_] + (p - 1.0) * np.log(y) + (q - 1.0) * np.log1p(-y))
-        inside = (step > low[open_]) & (step < high[open_])  # False for NaN
-        x[open_] = np.where(inside, step, 0.5 * (low[open_] + high[open_]))
-        open_ = open_[np.abs(x[open_] - y) > 1e-11 * np.minimum(x[open_], 1.0 - x[open_]) + 1e-300]
-        if not len(open_):
-            break
-    return x
-
-
-def beta_probability(x: F64, a: F64, b: F64) -> F64:
-    """Regularised incomplete beta function by its continued fraction (Abramowitz and Stegun 26.5.8)."""
-    flip = x > (a + 1.0) / (a + b + 2.0)
-    x, a, b = np.where(flip, 1.0 - x, x), np.where(flip, b, a), np.where(flip, a, b)
-    with np.errstate(divide="ignore"):
-        front = np.exp(_log(a + b) - _log(a) - _log(b) + a * np.log(x) + b * np.log1p(-x)) / a
-    # Lentz's algorithm
-    tiny = 1e-300
-    d = 1.0 / _away(1.0 - (a + b) * x / (a + 1.0), tiny)
-    c, total = np.ones(a.shape), d
-    for m in range(1, 2000):
-        for step in (
-            m * (b - m) * x / ((a + 2 * m - 1) * (a + 2 * m)),
-            -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1)),
-        ):
-            d = 1.0 / _away(1.0 + step * d, tiny)
-            c = _away(1.0 + step / c, tiny)
-            total = total * d * c
-        if (np.abs(d * c - 1.0) < 1e-13).all():
-            break
-    return np.asarray(np.where(flip, 1.0 - front * total, front * total))
+    return np.asarray(stdtrit(freedom, 0.5 + 0.5 * LEVEL), np.float64)
 
 
 @dataclass(frozen=True)
@@ -277,12 +217,3 @@ def _different(means: F64) -> npt.NDArray[np.intp]:
 def _flat(variance: F64, mean: F64) -> Bool:
     """Where the contributions are alike but for rounding."""
     return np.asarray(np.sqrt(variance) <= 1e-12 * np.maximum(np.abs(mean), 1e-12))
-
-
-def _away(value: F64, tiny: float) -> F64:
-    return np.asarray(np.where(np.abs(value) < tiny, tiny, value), np.float64)
-
-
-def _log(value: F64) -> Any:
-    """Logarithm of the gamma function."""
-    return np.asarray(_log_gamma(value), np.float64)

@@ -99,13 +99,13 @@ def estimate(values: Iterable[CaseValue], kind: Kind, *, scale: float = 1.0, lea
     """
     distinct = _distinct(values)
     failed = sum(v.failed for v in distinct)
-    unknown = [v.failed and math.isnan(v.value) and kind == "share" for v in distinct]
-    used = [v for v, known in zip(distinct, unknown, strict=True) if known or not math.isnan(v.value)]
+    used = [v for v in distinct if not math.isnan(v.value) or (v.failed and kind == "share")]
     if not used:
         return replace(NOTHING, failed=failed)
     clusters, index = _clusters(used)
     found = []
-    for outcome in (0.0, 1.0) if any(unknown) else (0.0,):
+    unknown = any(math.isnan(v.value) for v in used)
+    for outcome in (0.0, 1.0) if unknown else (0.0,):
         numbers = np.array([outcome if math.isnan(v.value) else v.value for v in used]) / scale
         sums = np.bincount(index, numbers, len(clusters.size)).astype(np.float64)
         found.append(_ends(sums, clusters, kind, least / scale))

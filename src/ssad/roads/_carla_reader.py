@@ -38,16 +38,8 @@ def main(source: str, request: str, answer: str) -> int:
                 continue
             place = point.transform
             # CARLA's frame is left-handed: y and yaw change sign
-            rows.append(
-                (
-                    s,
-                    place.location.x,
-                    -place.location.y,
-                    place.location.z,
-                    -np.radians(place.rotation.yaw),
-                    point.lane_width,
-                )
-            )
+            at, yaw = place.location, -np.radians(place.rotation.yaw)
+            rows.append((s, at.x, -at.y, at.z, yaw, point.lane_width))
         count.append(len(rows) - before)
     table = np.array(rows, np.float64).reshape(-1, 6)
     crosswalk = []

@@ -41,8 +41,8 @@ class Grid:
     """Segments of centre lines, and for each cell those that can be the nearest to a point of that cell.
 
     seg [M, 4]: x0, y0, x1, y1; seg_half [M, 2]: half widths at both ends; seg_lane [M]; seg_s [M]: arc length
-    at the first end; cell_offset [nx*ny+1], cell_seg [.]: segments of cell iy*nx+ix; origin: lower left
-    corner; cell: m. Nearness is distance from the centre line less the half width there, so that two lanes of
+    at the first end; cell_offset [nx*ny+1], cell_seg [.]: segments of cell iy*nx+ix, `CELL` m wide; origin: lower left
+    corner. Nearness is distance from the centre line less the half width there, so that two lanes of
     different width meet at their common edge. A cell answers exactly for every point up to `MARGIN` outside a
     lane; it is empty beyond.
     """
@@ -54,38 +54,22 @@ class Grid:
     cell_offset: I32
     cell_seg: I32
     origin: tuple[float, float]
-    cell: float
     nx: int
     ny: int
 
 
 class LaneQuery:
-    """Nearest lane of a town, batched. The grid of `types` is public and flat: seg, seg_half, cell_offset,
-    ...
+    """Nearest lane of a town, batched. The grid over lanes of some types is built once and kept."""
 
-    nearest() with other lane types builds their grid once and keeps it.
-    """
-
-    def __init__(self, graph: LaneGraph, types: Sequence[LaneType] = DRIVABLE, *, cell: float = CELL) -> None:
+    def __init__(self, graph: LaneGraph) -> None:
         self.graph = graph
-        self.types = tuple(types)
-        self.cell = float(cell)
         self._grids: dict[tuple[int, ...], Grid] = {}
-        grid = self.grid(self.types)
-        self.seg, self.seg_half, self.seg_lane, self.seg_s = (
-            grid.seg,
-            grid.seg_half,
-            grid.seg_lane,
-            grid.seg_s,
-        )
-        self.cell_offset, self.cell_seg = grid.cell_offset, grid.cell_seg
-        self.origin, self.nx, self.ny = grid.origin, grid.nx, grid.ny
 
     def grid(self, types: Sequence[LaneType]) -> Grid:
         """The grid over lanes of the given types."""
         key = tuple(sorted({int(t) for t in types}))
         if key not in self._grids:
-            self._grids[key] = build_grid(self.graph, key, self.cell)
+            self._grids[key] = build_grid(self.graph, key)
         return self._grids[key]
 
     def nearest(self, xy: npt.ArrayLike, types: Sequence[LaneType] = DRIVABLE) -> Nearest:
@@ -96,7 +80,7 @@ class LaneQuery:
         lane = np.full(n, -1, np.int32)
         s, lateral = np.zeros(n, np.float32), np.zeros(n, np.float32)
         inside = np.zeros(n, np.bool_)
-        where = np.floor((points - np.array(grid.origin, np.float32)) / np.float32(grid.cell))
+        where = np.floor((points - np.array(grid.origin, np.float32)) / np.float32(CELL))
         size = np.array([grid.nx, grid.ny], np.float32)
         known = np.flatnonzero(((where >= 0) & (where < size)).all(axis=1))
         cell = where[known, 1].astype(np.int64) * grid.nx + where[known, 0].astype(np.int64)
@@ -155,34 +139,34 @@ def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32
     return seg, half.astype(np.float32), lane[i], graph.s[i]
 
 
-def build_grid(graph: LaneGraph, types: Sequence[int], cell: float) -> Grid:
+def build_grid(graph: LaneGraph, types: Sequence[int]) -> Grid:
     """List for each cell the segments that can be nearest to some point of it (see `Grid`)."""
     seg, half, lane, s = segments(graph, types)
     if not len(seg):
         empty = np.zeros(0, np.int32)
-        return Grid(seg, half, lane, s, np.zeros(2, np.int32), empty, (0.0, 0.0), cell, 1, 1)
+        return Grid(seg, half, lane, s, np.zeros(2, np.int32), empty, (0.0, 0.0), 1, 1)
     ends = seg.reshape(-1, 2, 2).astype(np.float64)
     wide = half.max(axis=1).astype(np.float64)
     reach = wide + MARGIN
     low = ends.min(axis=1) - reach[:, None]
     high = ends.max(axis=1) + reach[:, None]
-    origin = np.floor(low.min(axis=0) / cell) * cell
-    nx, ny = (np.floor((high.max(axis=0) - origin) / cell).astype(int) + 1).tolist()
-    first = np.floor((low - origin) / cell).astype(np.int64)
-    span = np.floor((high - origin) / cell).astype(np.int64) - first + 1
+    origin = np.floor(low.min(axis=0) / CELL) * CELL
+    nx, ny = (np.floor((high.max(axis=0) - origin) / CELL).astype(int) + 1).tolist()
+    first = np.floor((low - origin) / CELL).astype(np.int64)
+    span = np.floor((high - origin) / CELL).astype(np.int64) - first + 1
     count = span[:, 0] * span[:, 1]
     pick = np.repeat(np.arange(len(seg)), count)
     item = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
     ix = first[pick, 0] + item % span[pick, 0]
     iy = first[pick, 1] + item // span[pick, 0]
-    centre = (np.stack([ix, iy], axis=1) + 0.5) * cell + origin
+    centre = (np.stack([ix, iy], axis=1) + 0.5) * CELL + origin
     a, d = ends[pick, 0], ends[pick, 1] - ends[pick, 0]
     p = centre - a
     t = np.clip((p * d).sum(axis=1) / np.maximum((d * d).sum(axis=1), 1e-12), 0.0, 1.0)
     rest = p - t[:, None] * d
     away: F64 = np.hypot(rest[:, 0], rest[:, 1])
     # a point of the cell is at most `corner` from its centre: bounds on its distance from each strip
-    corner = cell * np.sqrt(0.5) + 1e-3
+    corner = CELL * np.sqrt(0.5) + 1e-3
     narrow = half.min(axis=1).astype(np.float64)
     least, most = away - wide[pick] - corner, away - narrow[pick] + corner
     here = iy * nx + ix
@@ -193,7 +177,7 @@ def build_grid(graph: LaneGraph, types: Sequence[int], cell: float) -> Grid:
     order = np.lexsort((pick, here))
     offset = np.concatenate([[0], np.cumsum(np.bincount(here, minlength=nx * ny))]).astype(np.int32)
     place = (float(origin[0]), float(origin[1]))
-    return Grid(seg, half, lane, s, offset, pick[order].astype(np.int32), place, float(cell), nx, ny)
+    return Grid(seg, half, lane, s, offset, pick[order].astype(np.int32), place, nx, ny)
 
 
 def nearest_all(graph: LaneGraph, xy: tuple[float, float], types: Sequence[LaneType]) -> tuple[I32, F64, F64]:

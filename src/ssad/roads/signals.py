@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.geometry import in_polygon
 from ssad.core.types import F64, LaneType
 from ssad.roads.xodr import Network
 
@@ -148,16 +149,7 @@ def _stop(data: Approaches, lane: int) -> float:
     points = np.stack([np.interp(at, s, xy[:, k]) for k in range(2)], axis=1)
     stop = float(s[-1])
     for area in data.crosswalks:
-        hit = _within(points, area)
+        hit = in_polygon(points, area)
         if hit.any():
             stop = min(stop, float(at[hit][0]) - SETBACK)
     return max(stop, 0.0)
-
-
-def _within(points: F64, area: F64) -> npt.NDArray[np.bool_]:
-    """Whether points [n, 2] lie in a polygon [m, 2] (even-odd rule)."""
-    x, y = points[:, None, 0], points[:, None, 1]
-    (ax, ay), (bx, by) = area.T, np.roll(area, -1, axis=0).T
-    crosses = (ay > y) != (by > y)
-    at = ax + (y - ay) / np.where(by == ay, 1.0, by - ay) * (bx - ax)
-    return np.asarray((crosses & (x < at)).sum(axis=1) % 2 == 1)

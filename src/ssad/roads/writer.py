@@ -161,10 +161,8 @@ def _turn(start: Point, heading: float, end: Point, turn: float) -> list[_Piece]
 
 def _street(number: int, street: RoadSpec, pieces: list[_Piece], ends: tuple[_Junction, _Junction]) -> Element:
     road = _road(f"street {number}", number, -1, pieces)
-    link = road.find("link")
-    assert link is not None
-    SubElement(link, "predecessor", elementType="junction", elementId=str(ends[0].id))
-    SubElement(link, "successor", elementType="junction", elementId=str(ends[1].id))
+    for name, junction in zip(("predecessor", "successor"), ends, strict=True):
+        SubElement(road[0], name, elementType="junction", elementId=str(junction.id))
     kind = Element("type", s="0", type="rural" if not street.sidewalk else "town")
     SubElement(kind, "speed", max=f"{street.limit:g}", unit="mph")
     road.insert(1, kind)
@@ -192,7 +190,7 @@ def _street(number: int, street: RoadSpec, pieces: list[_Piece], ends: tuple[_Ju
         if len(junction.arms) > 2 and street.sidewalk:
             aside = CROSSWALK_END + 0.5 * CROSSWALK
             _crosswalk(objects, number, k, length - aside if k else aside, street)
-    SubElement(road, "signals")
+    SubElement(road, "signals")  # the last child: `_signals` fills it
     return road
 
 
@@ -246,11 +244,9 @@ def _way(number: int, junction: _Junction, start: _Arm, end: _Arm, *, pairs: lis
     a = _edge(junction, start, -(pairs[0][0] - 1) * start.street.width, inward=True)
     b = _edge(junction, end, -(pairs[0][1] - 1) * end.street.width, inward=False)
     road = _road(f"way {number}", number, junction.id, _turn(a, heading, b, turn))
-    link = road.find("link")
-    assert link is not None
     for name, arm in (("predecessor", start), ("successor", end)):
         contact = "end" if arm.at_end else "start"
-        SubElement(link, name, elementType="road", elementId=str(arm.road), contactPoint=contact)
+        SubElement(road[0], name, elementType="road", elementId=str(arm.road), contactPoint=contact)
     # a kerb lies to the right of a right turn, and of a way straight on where no arm leaves to the right
     right = _wrap(heading - math.pi / 2.0)
     open_right = any(abs(_wrap(arm.heading - right)) < 0.1 for arm in junction.arms)
@@ -278,10 +274,8 @@ def _ways(road: Element, start: _Arm, end: _Arm, pairs: list[tuple[int, int]], *
     for k, (what, width, final, before, after) in enumerate(rows):
         mark = "curb" if what == "shoulder" and one.sidewalk else "none"
         lane = _lane(group, -k - 1, what, width, (final - width) / length, mark=(mark, "white"))
-        link = lane.find("link")
-        assert link is not None
-        SubElement(link, "predecessor", id=str(before))
-        SubElement(link, "successor", id=str(after))
+        SubElement(lane[0], "predecessor", id=str(before))
+        SubElement(lane[0], "successor", id=str(after))
 
 
 def _signals(root: Element, roads: list[Element], junction: _Junction, lengths: dict[int, float]) -> None:
@@ -293,11 +287,9 @@ def _signals(root: Element, roads: list[Element], junction: _Junction, lengths: 
         phase = 0 if abs(math.cos(arm.heading)) > 0.5 else 1
         groups.setdefault(phase, []).append(number)
         half = arm.street.lanes * arm.street.width + arm.street.shoulder + 0.5
-        signals = roads[arm.road - 1].find("signals")
-        assert signals is not None
         s = lengths[arm.road] - 0.1 if arm.at_end else 0.1
         # orientation "+": it faces traffic that drives along the road's own direction
-        light = SubElement(signals, "signal", name="Signal_3Light_Post01", id=number, s=_f(s),
+        light = SubElement(roads[arm.road - 1][-1], "signal", name="Signal_3Light_Post01", id=number, s=_f(s),
                            t=_f(-half if arm.at_end else half), zOffset="0", hOffset="0", roll="0", pitch="0",
                            orientation="+" if arm.at_end else "-", dynamic="yes", country="OpenDRIVE",
                            type="1000001", subtype="-1", value="-1", text="", height="1.2", width="0.5")  # fmt: skip
@@ -319,6 +311,7 @@ def _edge(junction: _Junction, arm: _Arm, offset: float, *, inward: bool) -> Poi
 
 
 def _road(name: str, number: int, junction: int, pieces: list[_Piece]) -> Element:
+    """A road without lanes; its first child is its link."""
     total = sum(piece.length for piece in pieces)
     road = Element("road", name=name, length=_f(total), id=str(number), junction=str(junction))
     SubElement(road, "link")
@@ -344,6 +337,7 @@ def _section(road: Element) -> Element:
 
 
 def _lane(group: Element, number: int, kind: str, width: float, slope: float, *, mark: tuple[str, str]) -> Element:
+    """A lane whose width changes by `slope` a metre; its first child is its link."""
     lane = SubElement(group, "lane", id=str(number), type=kind, level="false")
     SubElement(lane, "link")
     SubElement(lane, "width", sOffset="0", a=_f(width), b=_f(slope), c="0", d="0")

@@ -27,22 +27,16 @@ PLANS = ("line", "arc", "spiral", "poly3", "paramPoly3")
 TRAFFIC_LIGHT = "1000001"
 
 _KINDS = {
-    "driving": LaneType.DRIVING,
-    "bidirectional": LaneType.DRIVING,
-    "entry": LaneType.DRIVING,
-    "exit": LaneType.DRIVING,
-    "onRamp": LaneType.DRIVING,
-    "offRamp": LaneType.DRIVING,
-    "connectingRamp": LaneType.DRIVING,
-    "shoulder": LaneType.SHOULDER,
-    "border": LaneType.SHOULDER,
-    "stop": LaneType.SHOULDER,
-    "sidewalk": LaneType.SIDEWALK,
-    "walking": LaneType.SIDEWALK,
-    "parking": LaneType.PARKING,
-    "biking": LaneType.BIKING,
-    "median": LaneType.MEDIAN,
-    "restricted": LaneType.MEDIAN,
+    name: kind
+    for kind, names in (
+        (LaneType.DRIVING, "driving bidirectional entry exit onRamp offRamp connectingRamp"),
+        (LaneType.SHOULDER, "shoulder border stop"),
+        (LaneType.SIDEWALK, "sidewalk walking"),
+        (LaneType.PARKING, "parking"),
+        (LaneType.BIKING, "biking"),
+        (LaneType.MEDIAN, "median restricted"),
+    )
+    for name in names.split()
 }
 _MARKS = {
     "none": Marking.NONE,
@@ -52,43 +46,12 @@ _MARKS = {
     "curb": Marking.CURB,
 }
 _SPEED = {"mph": 0.44704, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "m/s": 1.0, "": 1.0}
-_NUMBERS = frozenset(  # attributes that must be numbers wherever they stand in a road
-    {
-        "s",
-        "t",
-        "x",
-        "y",
-        "z",
-        "a",
-        "b",
-        "c",
-        "d",
-        "hdg",
-        "length",
-        "curvature",
-        "curvStart",
-        "curvEnd",
-        "sOffset",
-        "tOffset",
-        "zOffset",
-        "hOffset",
-        "width",
-        "height",
-        "u",
-        "v",
-        "aU",
-        "bU",
-        "cU",
-        "dU",
-        "aV",
-        "bV",
-        "cV",
-        "dV",
-        "pRange",
-        "pitch",
-        "roll",
-    }
-)
+# attributes that must be numbers wherever they stand in a road
+_NUMBERS = frozenset({
+    "s", "t", "x", "y", "z", "a", "b", "c", "d", "hdg", "length", "curvature", "curvStart", "curvEnd", "sOffset",
+    "tOffset", "zOffset", "hOffset", "width", "height", "u", "v", "aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV",
+    "pRange", "pitch", "roll",
+})  # fmt: skip
 
 
 @dataclass(frozen=True)

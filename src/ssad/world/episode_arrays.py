@@ -11,9 +11,9 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Route
-from ssad.roads.query import LaneQuery
-from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, TurnRank, When
+from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, Route
+from ssad.roads.query import CELL, DRIVABLE, build_grid
+from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, TurnRank, When, array_types
 from ssad.world.models import MODELS, model
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
@@ -229,84 +229,41 @@ def build(
     a["body"] = np.array(body, np.float32)
     a["power"] = np.array(power, np.float32)
     bank = EpisodeArrays()
-    types = {
-        "start": wp.vec4,
-        "cruise": wp.vec2,
-        "route": wp.vec2i,
-        "phase_when": wp.vec3,
-        "limits": wp.vec4,
-        "body": wp.vec4,
-        "power": wp.vec4,
-    }
-    for name, value in a.items():
-        kind = types.get(name, wp.int32 if value.dtype == np.int32 else wp.float32)
-        setattr(bank, name, wp.array(value, dtype=kind, device=device))
+    for name, array in array_types(EpisodeArrays).items():
+        setattr(bank, name, wp.array(a[name], dtype=array.dtype, device=device))
     return bank, _roads([graphs[t] for t in towns], pool, device), count
 
 
 def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
-    parts: dict[str, list[npt.NDArray[np.generic]]] = {
-        k: []
-        for k in (
-            "segment",
-            "segment_half",
-            "segment_lane",
-            "lane_junction",
-            "cell_first",
-            "cell_segment",
-            "grid",
-            "grid_size",
-            "signal_first",
-            "signal_program",
-        )
-    }
+    parts: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in array_types(Roads)}
     segments = lanes = cells = entries = signals = 0
     for graph in graphs:
-        query = LaneQuery(graph)
-        kind = graph.kind[query.seg_lane]
-        # only lanes that a car may be on count as road under its centre
-        keep = (kind == LaneType.DRIVING) | (kind == LaneType.PARKING)
-        number = np.cumsum(keep) - 1
-        listed = keep[query.cell_seg]
-        before = np.concatenate([[0], np.cumsum(listed)])
-        first = before[query.cell_offset]
-        parts["segment"].append(query.seg[keep])
-        parts["segment_half"].append(query.seg_half[keep])
-        parts["segment_lane"].append(query.seg_lane[keep] + lanes)
+        grid = build_grid(graph, DRIVABLE)  # only lanes that a car may be on count as road under its centre
+        parts["segment"].append(grid.seg)
+        parts["segment_half"].append(grid.seg_half)
+        parts["segment_lane"].append(grid.seg_lane + lanes)
         parts["lane_junction"].append((graph.junction >= 0).astype(np.int32))
-        parts["cell_first"].append(first + entries)
-        parts["cell_segment"].append(number[query.cell_seg[listed]] + segments)
-        parts["grid"].append(np.array([[*query.origin, 1.0 / query.cell, 0.0]]))
-        parts["grid_size"].append(np.array([[query.nx, query.ny, cells]]))
+        parts["cell_first"].append(grid.cell_offset + entries)
+        parts["cell_segment"].append(grid.cell_seg + segments)
+        parts["grid"].append(np.array([[*grid.origin, 1.0 / CELL, 0.0]]))
+        parts["grid_size"].append(np.array([[grid.nx, grid.ny, cells]]))
         parts["signal_first"].append(np.array([signals]))
         parts["signal_program"].append(signal_programs(graph))
-        segments += int(keep.sum())
+        segments += len(grid.seg)
         lanes += len(graph.kind)
-        cells += len(first)
-        entries += int(listed.sum())
+        cells += len(grid.cell_offset)
+        entries += len(grid.cell_seg)
         signals += len(graph.signal_phase)
     roads = Roads()
-    types = {
-        "segment": wp.vec4,
-        "segment_half": wp.vec2,
-        "grid": wp.vec4,
-        "grid_size": wp.vec3i,
-        "signal_program": wp.vec4,
-        "path": wp.vec4,
-        "rule": wp.vec4,
-        "bend": wp.float32,
-    }
     parts["path"] = [t.path for t in pool.tables]
     parts["rule"] = [t.rule for t in pool.tables]
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
-    for name, values in parts.items():
-        kind = types.get(name, wp.int32)
-        dtype = np.int32 if kind in (wp.int32, wp.vec3i) else np.float32
-        joined = np.concatenate(values).astype(dtype)
+    for name, array in array_types(Roads).items():
+        joined = np.concatenate(parts[name])
         if len(joined) == 0:  # a town without signals
-            joined = np.zeros((1, *joined.shape[1:]), dtype)
-        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=kind, device=device))
+            joined = np.zeros((1, *joined.shape[1:]), joined.dtype)
+        setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array.dtype, device=device))
     return roads
 
 

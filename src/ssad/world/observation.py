@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ssad.core.geometry import to_local
 from ssad.core.protocols import Observation
 from ssad.core.types import AgentKind
 from ssad.world.kernels.data import FAR, End, Presence
@@ -21,23 +22,17 @@ def make_observation(world: World) -> Observation:
     speed = world.array("speed")
     episode = world.array("episode")
     here = pose[:, 0]
-    c, s = np.cos(here[:, 2]), np.sin(here[:, 2])
-
     first = world.bank.route.numpy()[episode, 0]
     at = world.array("progress")[:, 0]
     path = world.roads.path.numpy()
     index = np.minimum(at[:, None] + 1 + np.arange(AHEAD), first[:, 1:2] - 1) + first[:, :1]
-    ahead = path[index]
-    dx, dy = ahead[..., 0] - here[:, None, 0], ahead[..., 1] - here[:, None, 1]
-    route = np.stack([c[:, None] * dx + s[:, None] * dy, -s[:, None] * dx + c[:, None] * dy], -1)
+    route = to_local(here[:, None], path[index, :2])
     point = path[first[:, 0] + at]
-    pc, ps = np.cos(point[:, 2]), np.sin(point[:, 2])
-    ox, oy = here[:, 0] - point[:, 0], here[:, 1] - point[:, 1]
-    offset = -ps * ox + pc * oy
+    offset = to_local(point[:, :3], here[:, :2])[:, 1]
     error = np.angle(np.exp(1j * (here[:, 2] - point[:, 2])))
 
-    dx, dy = pose[..., 0] - here[:, None, 0], pose[..., 1] - here[:, None, 1]
-    distance = np.hypot(dx, dy)
+    place = to_local(here[:, None], pose[..., :2])
+    distance = np.hypot(*np.moveaxis(pose[..., :2] - here[:, None, :2], -1, 0))
     there = (world.array("active") != Presence.ABSENT) & (world.kind != AgentKind.NONE) & (distance <= SIGHT)
     there[:, 0] = False
     order = np.argsort(np.where(there, distance, np.inf), axis=1, kind="stable")[:, :NEAREST]
@@ -45,18 +40,8 @@ def make_observation(world: World) -> Observation:
     models = np.maximum(world.bank.model.numpy()[episode], 0)
     body = world.bank.body.numpy()[models]
     turn = np.angle(np.exp(1j * (pose[..., 2] - here[:, None, 2])))
-    table = np.stack(
-        [
-            c[:, None] * dx + s[:, None] * dy,
-            -s[:, None] * dx + c[:, None] * dy,
-            turn,
-            speed,
-            2 * body[..., 0],
-            2 * body[..., 1],
-            world.kind.astype(np.float32),
-        ],
-        -1,
-    )
+    columns = (place[..., 0], place[..., 1], turn, speed, 2 * body[..., 0], 2 * body[..., 1], world.kind)
+    table = np.stack([column.astype(np.float32) for column in columns], -1)
     table = np.where(there[..., None], table, 0.0)[rows, order]
     others = np.zeros((batch, NEAREST, 7), np.float32)
     others[:, : table.shape[1]] = table

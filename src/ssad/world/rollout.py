@@ -17,24 +17,10 @@ from ssad.world.observation import make_observation
 from ssad.world.world import ENDS, World, signal_states
 
 _AGENT = ("x", "y", "yaw", "speed", "active")
-_EGO = {
-    "accel": np.float32,
-    "contact": np.uint8,
-    "contact_agent": np.int32,
-    "off_road": np.bool_,
-    "route_distance": np.float32,
-    "route_complete": np.float32,
-    "driven": np.float32,
-    "lane_invasion": np.uint8,
-    "red_light": np.uint8,
-    "throttle": np.float32,
-    "brake": np.float32,
-    "steer": np.float32,
-}
 
 
 def _row(world: World) -> dict[str, npt.NDArray[np.generic]]:
-    """One step of all scenes."""
+    """One step of all scenes, in the terms and types of `EpisodeTrace`: first what all agents have, then the ego's."""
     pose = world.array("pose")
     control = world.array("control")[:, 0]
     return {
@@ -107,9 +93,9 @@ def _trace(world: World, rows: list[dict[str, npt.NDArray[np.generic]]], b: int,
     kinds = world.kind[b, :n]
     models = world.bank.model.numpy()[b, :n]
     body = world.bank.body.numpy()[models]
-    agent = {name: np.stack([row[name][b, :n] for row in rows[:steps]]) for name in _AGENT}
-    ego: dict[str, npt.NDArray[Any]] = {
-        name: np.array([row[name][b] for row in rows[:steps]], dtype) for name, dtype in _EGO.items()
+    agent: dict[str, Any] = {name: np.stack([row[name][b, :n] for row in rows[:steps]]) for name in _AGENT}
+    ego: dict[str, Any] = {
+        name: np.stack([row[name][b] for row in rows[:steps]]) for name in rows[0] if name not in _AGENT
     }
     times = np.arange(steps) * world.dt
     route = episode.agents[0].route
@@ -125,26 +111,11 @@ def _trace(world: World, rows: list[dict[str, npt.NDArray[np.generic]]], b: int,
         kind=kinds.astype(np.uint8),
         length=(2 * body[:, 0]).astype(np.float32),
         width=(2 * body[:, 1]).astype(np.float32),
-        x=agent["x"],
-        y=agent["y"],
-        yaw=agent["yaw"],
-        speed=agent["speed"],
-        active=agent["active"],
-        accel=ego["accel"],
-        contact=ego["contact"],
-        contact_agent=ego["contact_agent"],
-        off_road=ego["off_road"],
-        route_distance=ego["route_distance"],
-        route_complete=ego["route_complete"],
-        driven=ego["driven"],
-        lane_invasion=ego["lane_invasion"],
-        red_light=ego["red_light"],
         stop_sign=np.zeros(steps, np.uint8),
-        throttle=ego["throttle"],
-        brake=ego["brake"],
-        steer=ego["steer"],
         signal_ids=near,
         signal=signal_states(episode, graph, times)[:, near],
         route=route.xy,
         end=ENDS[int(world.ended()[b])] or "max_steps",
+        **agent,
+        **ego,
     )

@@ -15,7 +15,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Controller, Episode, SignalState
 from ssad.world.episode_arrays import agent_kinds, build, signal_programs
-from ssad.world.kernels.data import HORIZON, Ego, End, State, Work
+from ssad.world.kernels.data import HORIZON, Ego, End, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.look import OBSERVATION, look
 from ssad.world.kernels.motion import move
@@ -26,44 +26,7 @@ from ssad.world.kernels.traffic import meet, sight
 ENDS = tuple("" if end == End.RUNNING else end.name.lower() for end in End)
 VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
-_STATE: dict[str, tuple[str, Any]] = {
-    "episode": ("B", wp.int32),
-    "step": ("B", wp.int32),
-    "end": ("B", wp.int32),
-    "pose": ("BA", wp.vec3),
-    "previous": ("BA", wp.vec3),
-    "speed": ("BA", wp.float32),
-    "wheel": ("BA", wp.float32),
-    "active": ("BA", wp.int32),
-    "progress": ("BA", wp.int32),
-    "phase": ("BA", wp.int32),
-    "travelled": ("BA", wp.float32),
-    "waited": ("BA", wp.float32),
-    "control": ("BA", wp.vec4),
-    "forecast": ("BAH", wp.vec3),
-    "span": ("BA", wp.vec4),
-    "aim": ("BA", wp.vec2),
-    "react": ("BA", wp.float32),
-    "lane": ("BA", wp.int32),
-    "lateral": ("BA", wp.vec2),
-    "touch": ("BA", wp.int64),
-}
-_EGO: dict[str, Any] = {
-    "contact": wp.int32,
-    "contact_agent": wp.int32,
-    "touching": wp.int64,
-    "off_road": wp.int32,
-    "over_line": wp.int32,
-    "invasion": wp.int32,
-    "red_light": wp.int32,
-    "complete": wp.float32,
-    "mark": wp.int32,
-    "route_distance": wp.float32,
-    "driven": wp.float32,
-    "accel": wp.float32,
-    "speed": wp.float32,
-    "reward": wp.float32,
-}
+_STATE, _EGO = array_types(State), array_types(Ego)
 
 
 @dataclass(frozen=True)
@@ -111,16 +74,12 @@ class World:
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
         self.state = State()
-        shapes = {
-            "B": (self.batch,),
-            "BA": (self.batch, self.agents),
-            "BAH": (self.batch, self.agents, HORIZON),
-        }
-        for name, (shape, kind) in _STATE.items():
-            setattr(self.state, name, wp.zeros(shapes[shape], dtype=kind, device=device))
+        shape = (self.batch, self.agents, HORIZON)
+        for name, array in _STATE.items():
+            setattr(self.state, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
         self.ego = Ego()
-        for name, kind in _EGO.items():
-            setattr(self.ego, name, wp.zeros(self.batch, dtype=kind, device=device))
+        for name, array in _EGO.items():
+            setattr(self.ego, name, wp.zeros(self.batch, dtype=array.dtype, device=device))
         self.actions = wp.zeros((self.batch, self.agents), dtype=wp.vec4, device=device)
         self.observation = wp.zeros((self.batch, OBSERVATION), dtype=wp.float32, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
@@ -134,16 +93,9 @@ class World:
         self._assign(order.astype(np.int32))
         flat = (self.batch, self.agents)
         again = [self.bank, self.roads, self.state, self.ego, self._mask]
-        self._restart = [
-            self._launch(restart, flat, [*again, 0]),
-            self._launch(restart_record, self.batch, [*again, 0]),
-        ]
-        self._step = []
-        if autoreset:
-            self._step += [
-                self._launch(restart, flat, [*again, 1]),
-                self._launch(restart_record, self.batch, [*again, 1]),
-            ]
+        restarts = ((restart, flat), (restart_record, self.batch))
+        self._restart = [self._launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
+        self._step = [self._launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
         self._step += [
             self._launch(sight, flat, [self.bank, self.roads, self.state, self.work, self.agents, dt]),
             self._launch(meet, workers, [self.bank, self.roads, self.state, self.work, self.agents, workers]),
@@ -168,9 +120,11 @@ class World:
 
     def array(self, name: str) -> npt.NDArray[Any]:
         """A state or ego array by name as numpy: a view on CPU, a copy on CUDA. Ego's come as `ego.<name>`."""
-        source = getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
-        out: npt.NDArray[Any] = source.numpy()
+        out: npt.NDArray[Any] = self._source(name).numpy()
         return out
+
+    def _source(self, name: str) -> Any:
+        return getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
 
     def reset(
         self,
@@ -257,7 +211,7 @@ class World:
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world; raises ConfigError if it is of another shape."""
         for name, value in snapshot.arrays.items():
-            target = getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
+            target = self._source(name)
             if tuple(target.numpy().shape) != value.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
             target.assign(value)
@@ -286,11 +240,8 @@ def signal_states(episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floa
     for s, (cycle, begin, green, yellow) in enumerate(programs):
         if cycle > 0:
             t = (times - begin) % cycle
-            out[:, s] = np.where(
-                t < green,
-                SignalState.GREEN,
-                np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED),
-            )
+            then = np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED)
+            out[:, s] = np.where(t < green, SignalState.GREEN, then)
     for s, state in episode.signal_override.items():
         out[times < episode.override_until, s] = int(state)
     return out

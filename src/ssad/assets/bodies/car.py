@@ -15,6 +15,7 @@ from ssad.assets.bodies.parts import (
     STEEL,
     TAIL,
     TRIM,
+    as_point,
     both_sides,
     finish,
     wheels,
@@ -118,12 +119,10 @@ def car(style: str, size: Point, *, generator: np.random.Generator, detail: int)
     places = [(axle_x(shell, size, a), outer) for a in shell.axles]
     rim = 0.60 if style in ("suv", "pickup", "van") else 0.66
     metal = STEEL if style == "van" else RIM
-    parts.append(
-        wheels(places, radius, shell.wheel_width, detail=detail, rim=rim, spokes=spokes, steel=metal, top=False)
-    )
-    parts += fittings(
-        shell, size, detail=detail, chrome=chrome > 0.6, rails=roof_rails > 0.4 and style in ("suv", "estate")
-    )
+    look: dict[str, object] = {"rim": rim, "spokes": spokes, "steel": metal, "top": False}
+    parts.append(wheels(places, radius, shell.wheel_width, detail=detail, **look))
+    rails = roof_rails > 0.4 and style in ("suv", "estate")
+    parts += fittings(shell, size, detail=detail, chrome=chrome > 0.6, rails=rails)
     return finish(parts, charts(shell, size), size)
 
 
@@ -136,18 +135,13 @@ def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: boo
     reach = 0.5 * width - base[1]
     bright: Material = CHROME if chrome else TRIM
     middle = (base[0], 0.5 * width - 0.5 * reach, base[2] + 0.075)
-    parts: list[Mesh] = []
     if detail == 2:
-        cap = sphere((0.075, 0.5 * reach, 0.085), material=TRIM, centre=middle, segments=10)
-        parts.append(both_sides(cap))
+        mirror = sphere((0.075, 0.5 * reach, 0.085), material=TRIM, centre=middle, segments=10)
+    elif detail == 1:
+        mirror = box((0.12, reach, 0.15), material=TRIM, centre=middle)
     else:
-        parts.append(
-            both_sides(
-                _plate_x(middle, (reach, 0.14), TRIM)
-                if detail == 0
-                else box((0.12, reach, 0.15), material=TRIM, centre=middle)
-            )
-        )
+        mirror = _plate_x(middle, (reach, 0.14), TRIM)
+    parts = [both_sides(mirror)]
     lamps = ((cut[1], shell.lamps, HEAD, 1.0, shell.lamp_from), (cut[2], shell.tail_lamps, TAIL, -1.0, shell.tail_from))
     if detail == 0:
         for section, rows, look, sign, start in lamps:
@@ -162,25 +156,15 @@ def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: boo
         parts.append(box((0.03, 0.50, 0.115), material=PLATE, centre=(x, 0.0, float(z))))
     if detail == 2:
         for section in cut[3:]:
-            handle = section[S5]
-            parts.append(
-                both_sides(box((0.17, 0.03, 0.028), material=bright, centre=(handle[0], handle[1], handle[2] - 0.03)))
-            )
-        parts.append(
-            box(
-                (0.09, 0.10, 0.07),
-                material=DARK,
-                centre=(float(cut[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height),
-            )
-        )
+            handle = as_point(section[S5] - [0.0, 0.0, 0.03])
+            parts.append(both_sides(box((0.17, 0.03, 0.028), material=bright, centre=handle)))
+        outlet = (float(cut[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
+        parts.append(box((0.09, 0.10, 0.07), material=DARK, centre=outlet))
         if chrome:
             low, high = cut[1, shell.grille[0]], cut[1, shell.grille[1]]
-            bar = box(
-                (0.02, 0.78 * low[1], 0.025),
-                material=CHROME,
-                centre=(end_x(shell, size, float(0.5 * (low[2] + high[2])), front=True), 0.0, 0.5 * (low[2] + high[2])),
-            )
-            parts.append(bar)
+            z = float(0.5 * (low[2] + high[2]))
+            centre = (end_x(shell, size, z, front=True), 0.0, z)
+            parts.append(box((0.02, 0.78 * low[1], 0.025), material=CHROME, centre=centre))
         if rails:
             ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
             middle = tuple(0.5 * (ends[0] + ends[1]) + [0.0, -0.05, 0.05])

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from ssad.assets.bodies.parts import STEEL, TRIM, Chart, crate, finish, side_charts, sided
 from ssad.assets.mesh import F64, Material, Mesh, Point, lathe, merge, prism, tube
 
-STYLES = {
-    "traffic_cone": ("cone", "tall", "drum"),
-    "barrier": ("jersey", "fence", "board", "water"),
-    "traffic_signal": ("post", "mast", "walker"),
-    "street_lamp": ("curved", "straight"),
-    "sign": ("stop", "yield", "limit", "warning", "direction"),
-}
 ORANGE = Material("orange", (0.75, 0.12, 0.01), specular=0.04, gloss=0.3)
 WHITE = Material("reflective", (0.78, 0.78, 0.78), specular=0.1, gloss=0.6)
 RED = Material("red", (0.52, 0.015, 0.02), specular=0.06, gloss=0.5)
@@ -26,8 +20,8 @@ LAMPS = (
     Material("lamp_yellow", (0.30, 0.19, 0.012), gloss=0.7),
     Material("lamp_green", (0.015, 0.22, 0.11), gloss=0.7),
 )
+BEACON = Material("beacon", (0.6, 0.3, 0.02), emission=0.2)
 STREET_LIGHT = Material("street_light", (0.80, 0.78, 0.70), emission=0.0)
-SIGN_FACE = Material("sign_face", (0.75, 0.75, 0.75), specular=0.08, gloss=0.5)
 SIGN_INK = Material("sign_ink", (0.02, 0.02, 0.022), specular=0.08, gloss=0.5)
 SIGN_BLUE = Material("sign_blue", (0.02, 0.09, 0.38), specular=0.08, gloss=0.5)
 SIGN_BACK = Material("sign_back", (0.30, 0.31, 0.31), specular=0.1, gloss=0.3)
@@ -42,9 +36,8 @@ def traffic_cone(style: str, size: Point, *, generator: np.random.Generator, det
         "tall": [(0.22, 0.06), (0.19, 0.30), (0.175, 0.45), (0.16, 0.55), (0.145, 0.70), (0.13, 0.82), (0.10, 1.0)],
         "drum": [(0.48, 0.06), (0.48, 0.24), (0.45, 0.40), (0.45, 0.56), (0.42, 0.72), (0.42, 0.86), (0.38, 1.0)],
     }
-    parts = []
-    for k, (a, b) in enumerate(zip(rows[style][:-1], rows[style][1:], strict=True)):
-        parts.append(lathe([a, b], material=WHITE if k % 2 else shade, segments=n))
+    bands = enumerate(pairwise(rows[style]))
+    parts = [lathe(band, material=WHITE if k % 2 else shade, segments=n) for k, band in bands]
     base = TRIM if style == "drum" else shade
     if style == "drum":
         parts.append(lathe([(0.5, 0.0), (0.5, 0.06)], material=base, segments=n))
@@ -67,7 +60,7 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
         cuts = np.linspace(-half, half, pieces + 1)
         for k in range(pieces):
             look = CONCRETE if style == "jersey" else RED if (k % 2 == 0) == first else WHITE
-            parts.append(sided(_across(outline, float(cuts[k]), float(cuts[k + 1]), look), "face"))
+            parts.append(sided(prism(outline, (cuts[k], cuts[k + 1]), axis=1, material=look, smooth=0.2), "face"))
     elif style == "fence":
         rail = [[(0.0, -half + 0.03, z * height), (0.0, half - 0.03, z * height)] for z in (0.16, 0.97)]
         ends = [[(0.0, s * (half - 0.03), 0.05), (0.0, s * (half - 0.03), 0.98 * height)] for s in (-1.0, 1.0)]
@@ -76,57 +69,32 @@ def barrier(style: str, size: Point, *, generator: np.random.Generator, detail: 
         n = 3 if detail == 0 else 6
         parts += [tube(p, 0.02, material=STEEL, segments=n) for p in rail + ends]
         parts += [tube(p, 0.009, material=STEEL, segments=3 if detail < 2 else 5) for p in thin]
-        parts += [
-            crate((-deep, s * (half - 0.06) - 0.03, 0.0), (deep, s * (half - 0.06) + 0.03, 0.03), STEEL)
-            for s in (-1.0, 1.0)
-        ]
+        for y in (0.06 - half, half - 0.06):
+            parts.append(crate((-deep, y - 0.03, 0.0), (deep, y + 0.03, 0.03), STEEL))
     else:
         stripes = 8
         edges = np.linspace(-half, half, stripes + 1)
-        for k in range(stripes):
-            slant = 0.18 * width / stripes
+        slant = 0.18 * width / stripes
+        for k, (y0, y1) in enumerate(pairwise(edges.tolist())):
+            look = RED if (k % 2 == 0) == first else WHITE
             for low, high in ((0.68, 0.98), (0.28, 0.50)) if detail else ((0.68, 0.98),):
-                y0, y1 = float(edges[k]), float(edges[k + 1])
-                quad = [
-                    (y0, low * height),
-                    (y1, low * height),
-                    (min(y1 + slant, half), high * height),
-                    (min(y0 + slant, half) if k else -half, high * height),
-                ]
-                parts.append(
-                    sided(
-                        prism(
-                            quad, (-0.03, 0.03), axis=0, material=RED if (k % 2 == 0) == first else WHITE, smooth=0.0
-                        ),
-                        "face",
-                    )
-                )
+                upper = min(y1 + slant, half), min(y0 + slant, half) if k else -half
+                quad = [(y0, low * height), (y1, low * height), (upper[0], high * height), (upper[1], high * height)]
+                parts.append(sided(prism(quad, (-0.03, 0.03), axis=0, material=look, smooth=0.0), "face"))
         for s in (-1.0, 1.0):
             y = s * 0.82 * half
             for e in (-1.0, 1.0):
-                parts.append(
-                    tube([(e * deep * 0.9, y, 0.02), (e * 0.04, y, 0.98 * height)], 0.025, material=TRIM, segments=4)
-                )
+                leg = [(e * deep * 0.9, y, 0.02), (e * 0.04, y, 0.98 * height)]
+                parts.append(tube(leg, 0.025, material=TRIM, segments=4))
             parts.append(crate((-deep, y - 0.05, 0.0), (deep, y + 0.05, 0.05), TRIM))
-        parts.append(
-            lathe(
-                [(0.06, 0.98 * height), (0.06, height)],
-                material=Material("beacon", (0.6, 0.3, 0.02), emission=0.2),
-                segments=6,
-            )
-        )
+        parts.append(lathe([(0.06, 0.98 * height), (0.06, height)], material=BEACON, segments=6))
     return finish(parts, charts, size)
-
-
-def _across(outline: list[tuple[float, float]], y0: float, y1: float, material: Material) -> Mesh:
-    """An outline of (x, z) drawn out along y."""
-    return prism(outline, (y0, y1), axis=1, material=material, smooth=0.2)
 
 
 def signal_head(*, lamps: tuple[Material, ...] = LAMPS, detail: int = 2) -> Mesh:
     """A signal head that looks along +x, its base at the origin: 0.30 m wide, 0.32 m for each lamp.
 
-    Its materials lamp_red, lamp_yellow and lamp_green have no emission: `Mesh.relit` turns one on.
+    Its materials lamp_red, lamp_yellow and lamp_green have no emission.
     """
     n = (6, 8, 14)[detail]
     high = 0.32 * len(lamps)
@@ -204,10 +172,8 @@ def sign(style: str, size: Point, *, generator: np.random.Generator, detail: int
     elif style in ("yield", "warning"):
         layers = [(triangle, RED), ((triangle - [0.0, z]) * 0.66 + [0.0, z], WHITE)]
         if style == "warning":
-            layers += [
-                (_bar(0.0, z + 0.05 * r, 0.06 * r, 0.22 * r), SIGN_INK),
-                (_bar(0.0, z - 0.28 * r, 0.06 * r, 0.05 * r), SIGN_INK),
-            ]
+            layers.append((_bar(0.0, z + 0.05 * r, 0.06 * r, 0.22 * r), SIGN_INK))
+            layers.append((_bar(0.0, z - 0.28 * r, 0.06 * r, 0.05 * r), SIGN_INK))
     elif style == "limit":
         layers = [(polygon(n, 0.0, r), RED), (polygon(n, 0.0, 0.80 * r), WHITE)]
         layers += [(_bar(y * r, z, (0.06 + 0.03 * digits) * r, 0.38 * r), SIGN_INK) for y in (-0.28, 0.24)]

@@ -24,14 +24,16 @@ from ssad.assets.bodies.parts import (
     Chart,
     both_sides,
     crate,
+    crates,
     finish,
     shifted,
     side_charts,
     sided,
+    tubes,
     wheels,
 )
 from ssad.assets.bodies.shell import S1, S2, S3, S4, Shell, axle_x, charts, skin
-from ssad.assets.mesh import Material, Mesh, Point, box, loft, merge, prism, tube
+from ssad.assets.mesh import Material, Mesh, Point, box, loft, merge, prism
 
 _BLUNT = ((0.0, 0.93), (0.03, 0.985), (0.08, 1.0), (0.95, 1.0), (1.0, 0.98))
 CAB = Shell(
@@ -52,11 +54,6 @@ BUS = Shell(
     tail_from=0.82,
     grille=(S4, S4), glass_gap=0.03, wheel_width=0.3,
 )  # fmt: skip
-STYLES = {
-    "truck": ("box", "flatbed", "tractor", "tipper"),
-    "bus": ("city", "coach", "bendy"),
-    "trailer": ("box", "flatbed", "tank", "utility"),
-}
 
 
 def truck(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
@@ -96,49 +93,22 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
             ]
             parts.append(both_sides(merge(stakes)))
         if load > 0.4:
-            parts += _load(
-                (rear + 0.4, -0.8 * half, deck + 0.14),
-                (back - 0.5, 0.8 * half, min(height, deck + 1.4)),
-                generator=generator,
-            )
+            high = (back - 0.5, 0.8 * half, min(height, deck + 1.4))
+            parts += _load((rear + 0.4, -0.8 * half, deck + 0.14), high, generator=generator)
     elif style == "tractor":
         plate = prism([(-0.55, -0.5), (0.55, -0.5), (0.55, 0.5), (-0.55, 0.5)], (deck, deck + 0.12), material=FRAME)
         parts.append(plate.moved(behind[0] + 0.5))
-        parts.append(
-            both_sides(
-                tube(
-                    [(back - 0.9, half - 0.35, 0.62), (back - 2.1, half - 0.35, 0.62)],
-                    0.3,
-                    material=CHROME,
-                    segments=12,
-                )
-            )
-        )
-        parts.append(
-            both_sides(
-                crate(
-                    (rear, half - 0.62, 2.0 * radius + 0.03),
-                    (behind[-1] + radius, half - 0.06, 2.0 * radius + 0.07),
-                    TRIM,
-                )
-            )
-        )
+        tanks = [(back - 0.9, half - 0.35, 0.62), (back - 2.1, half - 0.35, 0.62)]
+        parts.append(tubes(tanks, 0.3, CHROME, 12))
+        guard = (rear, half - 0.62, 2.0 * radius + 0.03), (behind[-1] + radius, half - 0.06, 2.0 * radius + 0.07)
+        parts.append(crates(*guard, TRIM))
         shield = [(back + 0.2, cab_height - 0.05), (0.5 * length - 0.35, cab_height - 0.05), (back + 0.2, height)]
         parts.append(prism(shield, (-0.42 * body, 0.42 * body), axis=1, material=PAINT).with_panel("roof"))
     else:
         top = min(height, deck + 1.35)
-        slope = [
-            (rear, deck + 0.35),
-            (rear + 0.5, deck + 0.05),
-            (back, deck + 0.05),
-            (back, height),
-            (back + 0.75, height),
-            (back + 0.75, height - 0.05),
-            (back - 0.02, height - 0.08),
-            (back - 0.12, top),
-            (rear - 0.0, top),
-        ]
-        tub = prism(slope[:4] + slope[7:], (-half, half), axis=1, material=PAINT)
+        lower = [(rear, deck + 0.35), (rear + 0.5, deck + 0.05), (back, deck + 0.05)]
+        outline = [*lower, (back, height), (back - 0.12, top), (rear, top)]
+        tub = prism(outline, (-half, half), axis=1, material=PAINT)
         parts.append(sided(tub, "cargo"))
         panels += side_charts("cargo", (rear, -half, deck), (back, half, height))
         parts.append(crate((rear + 0.1, 0.1 - half, top - 0.1), (back - 0.25, half - 0.1, top + 0.02), SOIL))
@@ -158,27 +128,27 @@ def _cab_fittings(front: float, size: Point, cab: Point, detail: int) -> list[Me
     mirror = crate((front - 0.30, inner - 0.02, 0.56 * cab[2]), (front - 0.16, half, 0.80 * cab[2]), TRIM)
     parts = [both_sides(mirror)]
     if detail > 0:
-        parts.append(box((0.02, 0.52, 0.12), material=PLATE, centre=(front - 0.005, 0.0, 0.29 * cab[2])))
-        parts.append(
-            both_sides(
-                crate(
-                    (front - 0.1, 0.43 * cab[1], 0.40 * cab[2]), (front - 0.05, 0.47 * cab[1], 0.44 * cab[2]), BLINKER
-                )
-            )
-        )
+        parts.append(_plate(front - 0.005, 0.29 * cab[2]))
+        blinker = (front - 0.1, 0.43 * cab[1], 0.40 * cab[2]), (front - 0.05, 0.47 * cab[1], 0.44 * cab[2])
+        parts.append(crates(*blinker, BLINKER))
     else:
-        lamp = crate((front - 0.1, 0.32 * cab[1], 0.22 * cab[2]), (front - 0.005, 0.46 * cab[1], 0.29 * cab[2]), HEAD)
-        parts.append(both_sides(lamp))
+        lamp = (front - 0.1, 0.32 * cab[1], 0.22 * cab[2]), (front - 0.005, 0.46 * cab[1], 0.29 * cab[2])
+        parts.append(crates(*lamp, HEAD))
     return parts
 
 
 def _rear_fittings(rear: float, half: float, z: float, detail: int) -> list[Mesh]:
     """Tail lamps, under-run bar, plate and mud flaps."""
-    parts = [both_sides(crate((rear, 0.62 * half, z), (rear + 0.06, 0.95 * half, z + 0.14), TAIL))]
+    parts = [crates((rear, 0.62 * half, z), (rear + 0.06, 0.95 * half, z + 0.14), TAIL)]
     if detail > 0:
         parts.append(crate((rear + 0.03, -0.95 * half, z - 0.25), (rear + 0.12, 0.95 * half, z - 0.12), STEEL))
-        parts.append(box((0.02, 0.52, 0.12), material=PLATE, centre=(rear + 0.01, 0.0, z + 0.07)))
+        parts.append(_plate(rear + 0.01, z + 0.07))
     return parts
+
+
+def _plate(x: float, z: float) -> Mesh:
+    """A number plate."""
+    return box((0.02, 0.52, 0.12), material=PLATE, centre=(x, 0.0, z))
 
 
 def _cargo(low: Point, high: Point, material: Material = CARGO) -> Mesh:
@@ -228,11 +198,8 @@ def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int)
         parts.append(crate((-0.12 * length, -0.3 * width, 0.94 * height), (0.16 * length, 0.3 * width, height), CARGO))
     if stripe > 0.5 and detail > 0:
         skirt = 0.5 * width * shell.body + 0.003
-        parts.append(
-            both_sides(
-                crate((-0.44 * length, skirt - 0.02, 0.30 * height), (0.43 * length, skirt, 0.325 * height), TRIM)
-            )
-        )
+        band = (-0.44 * length, skirt - 0.02, 0.30 * height), (0.43 * length, skirt, 0.325 * height)
+        parts.append(crates(*band, TRIM))
     return finish(parts, charts(shell, lower), size)
 
 
@@ -241,11 +208,8 @@ def _bus_fittings(shell: Shell, size: Point, detail: int, *, rear: bool, front: 
     length, width, height = size
     radius, side = shell.radius * height, 0.5 * width * shell.body
     axles = dict.fromkeys(shell.axles)
-    parts = [
-        wheels(
-            [(axle_x(shell, size, a), side - 0.02) for a in axles], radius, 0.30, detail=detail, spokes=10, steel=STEEL
-        )
-    ]
+    places = [(axle_x(shell, size, a), side - 0.02) for a in axles]
+    parts = [wheels(places, radius, 0.30, detail=detail, spokes=10, steel=STEEL)]
     if detail > 0:
         for _, a, b in shell.doors:
             x1, x0 = axle_x(shell, size, a), axle_x(shell, size, b)
@@ -253,25 +217,22 @@ def _bus_fittings(shell: Shell, size: Point, detail: int, *, rear: bool, front: 
             for s, e in ((x0 + 0.03, cut - 0.02), (cut + 0.02, x1 - 0.03)):
                 parts.append(crate((s, -side - 0.006, 0.11 * height), (e, -side + 0.15, 0.78 * height), GLASS))
     if front:
-        mirror = crate(
-            (0.5 * length - 0.15, side - 0.05, 0.56 * height), (0.5 * length - 0.02, 0.5 * width, 0.72 * height), TRIM
-        )
-        parts.append(both_sides(mirror))
+        x = 0.5 * length
+        parts.append(crates((x - 0.15, side - 0.05, 0.56 * height), (x - 0.02, 0.5 * width, 0.72 * height), TRIM))
         if detail > 0:
-            x = 0.5 * length
             sign = crate((x - 0.10, -0.62 * side, 0.875 * height), (x - 0.012, 0.62 * side, 0.945 * height), TRIM)
             amber = Material("sign_lamp", (0.55, 0.30, 0.03), emission=0.6)
             text = crate((x - 0.05, -0.45 * side, 0.895 * height), (x - 0.006, 0.35 * side, 0.925 * height), amber)
-            parts += [sign, text, box((0.02, 0.52, 0.12), material=PLATE, centre=(x - 0.004, 0.0, 0.16 * height))]
+            parts += [sign, text, _plate(x - 0.004, 0.16 * height)]
     if rear:
         x = -0.5 * length
         if detail > 0:
             parts.append(crate((x, -0.6 * side, 0.15 * height), (x + 0.08, 0.6 * side, 0.30 * height), TRIM))
         else:
-            parts.append(both_sides(crate((x, 0.75 * side, 0.2 * height), (x + 0.05, 0.97 * side, 0.3 * height), TAIL)))
+            parts.append(crates((x, 0.75 * side, 0.2 * height), (x + 0.05, 0.97 * side, 0.3 * height), TAIL))
     if front and detail == 0:
         x = 0.5 * length
-        parts.append(both_sides(crate((x - 0.06, 0.62 * side, 0.15 * height), (x, 0.93 * side, 0.22 * height), HEAD)))
+        parts.append(crates((x - 0.06, 0.62 * side, 0.15 * height), (x, 0.93 * side, 0.22 * height), HEAD))
     return parts
 
 
@@ -287,18 +248,11 @@ def _bendy(size: Point, detail: int) -> Mesh:
     )  # fmt: skip
     parts: list[Mesh] = []
     panels: list[Chart] = []
-    for shell, own, x, is_first in (
-        (first, ahead, 0.5 * (length - ahead), True),
-        (second, behind, -0.5 * (length - behind), False),
-    ):
+    sections = ((first, ahead, 0.5 * (length - ahead), True), (second, behind, -0.5 * (length - behind), False))
+    for shell, own, x, is_first in sections:
         sub = (own, width, height)
-        parts += [
-            m.moved(x)
-            for m in (
-                skin(shell, sub, detail=detail),
-                *_bus_fittings(shell, sub, detail, rear=not is_first, front=is_first),
-            )
-        ]
+        fittings = _bus_fittings(shell, sub, detail, rear=not is_first, front=is_first)
+        parts += [part.moved(x) for part in (skin(shell, sub, detail=detail), *fittings)]
         for chart in charts(shell, sub):
             head, *tail = chart.name.split("/")
             if not is_first and head == "front":
@@ -338,51 +292,31 @@ def trailer(style: str, size: Point, *, generator: np.random.Generator, detail: 
         parts.append(_cargo(low, high, PAINT))
         panels += side_charts("cargo", low, high)
         if shade < 0.5:
-            parts.append(
-                crate((rear + 0.05, -half + 0.23, top - 0.02), (box_front - 0.05, half - 0.23, top + 0.005), DARK)
-            )
+            inside = (rear + 0.05, -half + 0.23, top - 0.02), (box_front - 0.05, half - 0.23, top + 0.005)
+            parts.append(crate(*inside, DARK))
             parts.append(crate((box_front - 0.05, -half + 0.2, top), (box_front, half - 0.2, height), STEEL))
-        parts.append(
-            both_sides(
-                tube(
-                    [(box_front - 0.2, 0.5 * half, deck - 0.05), (front - 0.05, 0.03, deck - 0.08)],
-                    0.04,
-                    material=STEEL,
-                    segments=6,
-                )
-            )
-        )
+        drawbar = [(box_front - 0.2, 0.5 * half, deck - 0.05), (front - 0.05, 0.03, deck - 0.08)]
+        parts.append(tubes(drawbar, 0.04, STEEL, 6))
         parts.append(crate((front - 0.12, -0.05, deck - 0.14), (front, 0.05, deck), STEEL))
         parts.append(crate((front - 0.35, -0.04, 0.0), (front - 0.28, 0.04, deck), STEEL))
-        parts.append(
-            wheels([(rear + 0.42 * (box_front - rear), half - 0.02)], radius, 0.16, detail=detail, steel=STEEL)
-        )
-        parts.append(
-            both_sides(
-                crate(
-                    (rear + 0.42 * (box_front - rear) - 0.40, half - 0.2, 2 * radius + 0.02),
-                    (rear + 0.42 * (box_front - rear) + 0.40, half, 2 * radius + 0.06),
-                    TRIM,
-                )
-            )
-        )
+        axle = rear + 0.42 * (box_front - rear)
+        parts.append(wheels([(axle, half - 0.02)], radius, 0.16, detail=detail, steel=STEEL))
+        guard = (axle - 0.40, half - 0.2, 2 * radius + 0.02), (axle + 0.40, half, 2 * radius + 0.06)
+        parts.append(crates(*guard, TRIM))
         parts += _rear_fittings(rear, half - 0.15, deck + 0.05, 0)
         return finish(parts, panels, size)
     axles = [rear + 0.12 * length + k * 1.31 for k in range(3 if length > 10.0 else 2)]
     parts.append(crate((rear + 0.1, -0.5, deck - 0.32), (front - 0.3, 0.5, deck), FRAME))
-    parts.append(
-        wheels([(x, half - 0.06) for x in axles], radius, 0.40, detail=detail, spokes=10, rim=0.55, steel=STEEL)
-    )
-    legs = crate((front - 0.27 * length, 0.5, 0.0), (front - 0.27 * length + 0.14, 0.65, deck - 0.05), STEEL)
-    parts.append(both_sides(legs))
+    places = [(x, half - 0.06) for x in axles]
+    parts.append(wheels(places, radius, 0.40, detail=detail, spokes=10, rim=0.55, steel=STEEL))
+    legs = (front - 0.27 * length, 0.5, 0.0), (front - 0.27 * length + 0.14, 0.65, deck - 0.05)
+    parts.append(crates(*legs, STEEL))
     if detail > 0:
-        parts.append(
-            both_sides(
-                crate(
-                    (axles[-1] + 0.9, half - 0.10, 0.45), (front - 0.30 * length, half - 0.06, 0.62 * deck + 0.3), STEEL
-                )
-            )
+        guard_low, guard_high = (
+            (axles[-1] + 0.9, half - 0.10, 0.45),
+            (front - 0.30 * length, half - 0.06, 0.62 * deck + 0.3),
         )
+        parts.append(crates(guard_low, guard_high, STEEL))
     if style == "box":
         low, high = (rear, -half, deck), (front, half, height)
         parts.append(_cargo(low, high))
@@ -396,23 +330,14 @@ def trailer(style: str, size: Point, *, generator: np.random.Generator, detail: 
     elif style == "flatbed":
         parts.append(crate((rear, -half, deck), (front, half, deck + 0.16), WOOD))
         parts.append(crate((front - 0.08, -half, deck), (front, half, height), STEEL))
-        parts += _load(
-            (rear + 0.5, -0.85 * half, deck + 0.16),
-            (front - 0.8, 0.85 * half, height - 0.2 * load),
-            generator=generator,
-        )
+        high = (front - 0.8, 0.85 * half, height - 0.2 * load)
+        parts += _load((rear + 0.5, -0.85 * half, deck + 0.16), high, generator=generator)
     else:
         z = 0.5 * (deck - 0.1 + height)
         angle = np.linspace(0.0, 2.0 * np.pi, 24 if detail == 2 else 10, endpoint=False) - np.pi / 2
         ring = np.stack([np.zeros_like(angle), half * np.cos(angle), (height - z) * np.sin(angle)], 1)
-        ends = [
-            (rear, 0.78),
-            (rear + 0.12, 0.95),
-            (rear + 0.4, 1.0),
-            (front - 0.4, 1.0),
-            (front - 0.12, 0.95),
-            (front, 0.78),
-        ]
+        ends = [(rear, 0.78), (rear + 0.12, 0.95), (rear + 0.4, 1.0)]
+        ends += [(front - 0.4, 1.0), (front - 0.12, 0.95), (front, 0.78)]
         tank = loft(np.stack([ring * s + [x, 0.0, z] for x, s in ends]), material=PAINT)
         parts.append(sided(tank, "cargo"))
         panels += side_charts("cargo", (rear, -half, deck - 0.1), (front, half, height))

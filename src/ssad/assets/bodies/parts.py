@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ssad.assets.mesh import F64, SMOOTH, Material, Mesh, Point, Rectangle, box, build, grid_faces, lathe, merge
+from ssad.assets.mesh import F64, SMOOTH, Material, Mesh, Point, Rectangle, box, build, grid_faces, lathe, merge, tube
 
 PAINT = Material("paint", (0.45, 0.45, 0.46), specular=0.06, gloss=0.85, paint=True)
 CARGO = Material("cargo", (0.72, 0.72, 0.70), specular=0.04, gloss=0.4)
@@ -137,6 +137,12 @@ def fit(mesh: Mesh, size: Point) -> Mesh:
     return mesh.transformed(matrix)
 
 
+def as_point(value: npt.ArrayLike) -> Point:
+    """Three numbers as a point."""
+    x, y, z = np.asarray(value, np.float64).tolist()
+    return x, y, z
+
+
 def finish(parts: Sequence[Mesh], charts: Sequence[Chart], size: Point) -> Mesh:
     """One mesh of a body's parts: fitted to its size (m), then unwrapped."""
     return unwrap(fit(merge(parts), size), charts)
@@ -156,9 +162,8 @@ def both_sides(mesh: Mesh) -> Mesh:
 
 def crate(low: Point, high: Point, material: Material, panels: Mapping[str, str] | None = None) -> Mesh:
     """A box between two corners; `panels` names the panel of some of its sides (front, rear, left, right, top)."""
-    centre = tuple(0.5 * (a + b) for a, b in zip(low, high, strict=True))
-    size = tuple(b - a for a, b in zip(low, high, strict=True))
-    mesh = box((size[0], size[1], size[2]), material=material, centre=(centre[0], centre[1], centre[2]))
+    a, b = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    mesh = box(as_point(b - a), material=material, centre=as_point(0.5 * (a + b)))
     if not panels:
         return mesh
     names = tuple(panels.values())
@@ -172,6 +177,16 @@ def crate(low: Point, high: Point, material: Material, panels: Mapping[str, str]
         material=np.array(look, np.int32),
         materials=(material, DARK),
     )
+
+
+def crates(low: Point, high: Point, material: Material) -> Mesh:
+    """A box between two corners, and its mirror image on the other side of the vehicle."""
+    return both_sides(crate(low, high, material))
+
+
+def tubes(path: npt.ArrayLike, radius: npt.ArrayLike, material: Material, segments: int) -> Mesh:
+    """A round bar along a path [S, 3], and its mirror image on the other side of the vehicle."""
+    return both_sides(tube(path, radius, material=material, segments=segments))
 
 
 SIDES = ("front", "rear", "left", "right", "top")
@@ -227,16 +242,9 @@ def wheel(
         return build(points, np.concatenate([around, fan]), materials=RUBBER, smooth=0.0)
     segments = 20 if detail == 2 else 10
     soft = min(0.18 * radius, 0.3 * width)
-    outline = [
-        (rim, 0.3 * half),
-        (rim, 0.86 * half),
-        (0.93, half),
-        (1.0, half - soft),
-        (1.0, soft - half),
-        (0.93, -half),
-        (rim, -half),
-    ]
-    tyre = lathe([(r * radius, y) for r, y in outline[::-1]], material=RUBBER, segments=segments, axis=1)
+    rubber = ((rim, -half), (0.93, -half), (1.0, soft - half), (1.0, half - soft), (0.93, half), (rim, 0.86 * half))
+    outline = [(r * radius, y) for r, y in (*rubber, (rim, 0.3 * half))]
+    tyre = lathe(outline, material=RUBBER, segments=segments, axis=1)
     depth = [(rim, 0.88), (rim - 0.05, 0.80), (0.20, 0.88), (0.0, 0.92)]
     if detail == 1:
         depth = [(rim, 0.88), (0.2, 0.90), (0.0, 0.90)]

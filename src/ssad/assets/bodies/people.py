@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
-from ssad.assets.bodies.parts import Chart, crate, unwrap
+from ssad.assets.bodies.parts import Chart, as_point, crate, unwrap
 from ssad.assets.mesh import F64, Material, Mesh, Point, loft, merge, sphere, tube
 
-STYLES = ("adult", "child", "standing")
 SKINS = ((0.62, 0.40, 0.29), (0.50, 0.31, 0.21), (0.35, 0.20, 0.13), (0.20, 0.11, 0.07), (0.10, 0.055, 0.035))
 HAIRS = ((0.015, 0.012, 0.010), (0.05, 0.03, 0.02), (0.13, 0.075, 0.04), (0.38, 0.27, 0.14), (0.40, 0.40, 0.40))
 CLOTHS = ((0.02, 0.02, 0.025), (0.03, 0.045, 0.11), (0.14, 0.14, 0.15), (0.55, 0.55, 0.54), (0.30, 0.03, 0.04),
@@ -86,7 +84,7 @@ def walking(height: float, *, phase: float, swing: float, spread: float, child: 
     neck_z = (0.80 if child else 0.845) * h
     neck = np.array([np.sin(lean) * (neck_z - hip_z), 0.0, neck_z])
     head = neck + np.array([0.012 * h, 0.0, (0.10 if child else 0.083) * h])
-    joints: dict[str, list[F64]] = {k: [] for k in ("hips", "knees", "ankles", "toes", "shoulders", "elbows", "hands")}
+    limbs: list[tuple[F64, ...]] = []
     for sign, turn in ((1.0, phase), (-1.0, phase + np.pi)):
         thigh_angle = swing * np.sin(turn) + 0.04
         flex = swing / 0.45 * (0.10 + 0.95 * max(0.0, np.cos(turn + 0.25)) ** 1.5)
@@ -102,10 +100,8 @@ def walking(height: float, *, phase: float, swing: float, spread: float, child: 
         elbow = at + arm * (np.array([np.sin(back), 0.0, -np.cos(back)]) * np.cos(spread) + out)
         bent = back + 0.15 + 0.6 * swing + 0.4 * max(0.0, back)
         hand = elbow + fore * (np.array([np.sin(bent), 0.0, -np.cos(bent)]) * np.cos(0.6 * spread) + 0.6 * out)
-        for key, value in zip(joints, (hip, knee, ankle, toe, at, elbow, hand), strict=True):
-            joints[key].append(value)
-    pairs = {k: (v[0], v[1]) for k, v in joints.items()}
-    return Pose(pelvis=pelvis, neck=neck, head=head, **pairs)
+        limbs.append((hip, knee, ankle, toe, at, elbow, hand))
+    return Pose(pelvis, neck, head, *zip(*limbs, strict=True))
 
 
 def seated(
@@ -124,18 +120,15 @@ def seated(
     up = np.array([np.sin(lean), 0.0, np.cos(lean)])
     neck = seat + trunk * up
     head = neck + 0.088 * h * np.array([np.sin(0.35 * lean) + 0.12, 0.0, np.cos(0.35 * lean)])
-    joints: dict[str, list[F64]] = {k: [] for k in ("hips", "knees", "ankles", "toes", "shoulders", "elbows", "hands")}
+    limbs: list[tuple[F64, ...]] = []
     for sign, hand, foot in ((1.0, hands[0], feet[0]), (-1.0, hands[1], feet[1])):
         hip = seat + np.array([0.0, sign * 0.052 * h, 0.0])
         ankle = np.array(foot) + np.array([-0.05 * h, 0.0, 0.045 * h])
         knee, ankle = reach(hip, ankle, 0.245 * h, 0.24 * h, np.array([1.0, sign * knees_out, 0.3]))
         at = neck + np.array([0.0, sign * 0.108 * h, 0.0]) - 0.035 * h * up
         elbow, wrist = reach(at, np.array(hand), 0.165 * h, 0.15 * h, np.array([-0.4, sign * 0.7, -0.7]))
-        values = (hip, knee, ankle, ankle + np.array([0.10 * h, 0.0, -0.035 * h]), at, elbow, wrist)
-        for key, value in zip(joints, values, strict=True):
-            joints[key].append(value)
-    pairs = {k: (v[0], v[1]) for k, v in joints.items()}
-    return Pose(pelvis=seat, neck=neck, head=head, **pairs)
+        limbs.append((hip, knee, ankle, ankle + np.array([0.10 * h, 0.0, -0.035 * h]), at, elbow, wrist))
+    return Pose(seat, neck, head, *zip(*limbs, strict=True))
 
 
 def reach(start: F64, goal: F64, first: float, second: float, bend: F64) -> tuple[F64, F64]:
@@ -167,39 +160,24 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
             arm = np.array([0.03, 0.025, 0.02]) * h
             parts.append(tube([shoulder, elbow, hand], arm, material=look.shirt, segments=4))
             continue
-        leg = [
-            hip + 0.03 * h * up,
-            0.6 * hip + 0.4 * knee,
-            0.1 * hip + 0.9 * knee,
-            0.9 * knee + 0.1 * ankle,
-            0.6 * knee + 0.4 * ankle,
-            ankle,
-        ]
+        leg = [hip + 0.03 * h * up, 0.6 * hip + 0.4 * knee, 0.1 * hip + 0.9 * knee]
+        leg += [0.9 * knee + 0.1 * ankle, 0.6 * knee + 0.4 * ankle, ankle]
         parts.append(tube(leg, np.array([0.050, 0.048, 0.038, 0.036, 0.034, 0.024]) * h, material=leg_look, segments=n))
         heel = ankle - 0.28 * (toe - ankle) * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.018 * h]
-        shoe = tube(
-            [heel, 0.5 * (ankle + toe), toe], np.array([0.022, 0.030, 0.018]) * h, material=look.shoes, segments=n
-        )
-        parts.append(shoe)
+        shoe = [heel, 0.5 * (ankle + toe), toe]
+        parts.append(tube(shoe, np.array([0.022, 0.030, 0.018]) * h, material=look.shoes, segments=n))
         wrist = 0.88 * hand + 0.12 * elbow
         inward = np.array([0.0, -np.sign(shoulder[1] - pose.neck[1]), 0.0])
-        sleeve = [
-            shoulder + (0.030 * up + 0.030 * inward) * h,
-            shoulder + 0.006 * h * up,
-            0.5 * (shoulder + elbow),
-            elbow,
-            wrist,
-        ]
+        sleeve = [shoulder + (0.030 * up + 0.030 * inward) * h, shoulder + 0.006 * h * up]
+        sleeve += [0.5 * (shoulder + elbow), elbow, wrist]
         parts.append(tube(sleeve, np.array([0.014, 0.031, 0.030, 0.025, 0.019]) * h, material=look.shirt, segments=n))
-        parts.append(
-            sphere((0.020 * h, 0.014 * h, 0.030 * h), material=look.skin, centre=_point(pose.hands[k]), segments=n)
-        )
+        fist = (0.020 * h, 0.014 * h, 0.030 * h)
+        parts.append(sphere(fist, material=look.skin, centre=as_point(hand), segments=n))
     parts += _head(pose, look, h, detail, 1.35 if child else 1.0)
     if look.pack and detail > 0:
         back = pose.pelvis + 0.62 * (pose.neck - pose.pelvis) - 0.10 * h * forward
-        bag = crate(
-            (-0.045 * h, -0.075 * h, -0.11 * h), (0.045 * h, 0.075 * h, 0.11 * h), replace(look.trousers, name="pack")
-        )
+        half = (0.045 * h, 0.075 * h, 0.11 * h)
+        bag = crate((-half[0], -half[1], -half[2]), half, replace(look.trousers, name="pack"))
         turn = np.eye(4)
         turn[:3, :3] = np.stack([forward, [0.0, 1.0, 0.0], up], axis=1)
         turn[:3, 3] = back
@@ -250,51 +228,24 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
     x, y, z = (float(v) for v in pose.head)
     n = (6, 8, 14)[detail]
     s = big * h
-    parts = [sphere((0.050 * s, 0.042 * s, 0.064 * s), material=look.skin, centre=(x, y, z), segments=n)]
+
+    def ball(half_axes: Point, material: Material, ahead: float = 0.0, up: float = 0.0, segments: int = n) -> Mesh:
+        """An ellipsoid in units of the head's size, about a place in the frame of its middle."""
+        a, b, c = half_axes
+        centre = (x + ahead * s, y, z + up * s)
+        return sphere((a * s, b * s, c * s), material=material, centre=centre, segments=segments)
+
+    parts = [ball((0.050, 0.042, 0.064), look.skin)]
     if look.helmet is not None:
-        parts.append(
-            sphere(
-                (0.068 * s, 0.060 * s, 0.060 * s),
-                material=look.helmet,
-                centre=(x - 0.006 * s, y, z + 0.022 * s),
-                segments=n,
-            )
-        )
+        parts.append(ball((0.068, 0.060, 0.060), look.helmet, -0.006, 0.022))
     else:
-        parts.append(
-            sphere(
-                (0.051 * s, 0.047 * s, 0.054 * s),
-                material=look.hair,
-                centre=(x - 0.012 * s, y, z + 0.018 * s),
-                segments=n,
-            )
-        )
+        parts.append(ball((0.051, 0.047, 0.054), look.hair, -0.012, 0.018))
         if look.long_hair and detail > 0:
-            parts.append(
-                sphere(
-                    (0.030 * s, 0.042 * s, 0.070 * s),
-                    material=look.hair,
-                    centre=(x - 0.030 * s, y, z - 0.035 * s),
-                    segments=n,
-                )
-            )
+            parts.append(ball((0.030, 0.042, 0.070), look.hair, -0.030, -0.035))
     if detail == 2:
-        parts.append(
-            sphere(
-                (0.012 * s, 0.009 * s, 0.012 * s),
-                material=look.skin,
-                centre=(x + 0.050 * s, y, z - 0.008 * s),
-                segments=6,
-            )
-        )
-        parts.append(
-            tube(
-                [pose.neck - np.array([0.0, 0.0, 0.02 * h]), pose.head - [0.01 * h, 0.0, 0.02 * h]],
-                0.030 * h,
-                material=look.skin,
-                segments=8,
-            )
-        )
+        parts.append(ball((0.012, 0.009, 0.012), look.skin, 0.050, -0.008, segments=6))
+        neck = [pose.neck - np.array([0.0, 0.0, 0.02 * h]), pose.head - [0.01 * h, 0.0, 0.02 * h]]
+        parts.append(tube(neck, 0.030 * h, material=look.skin, segments=8))
     return parts
 
 
@@ -308,11 +259,6 @@ def _extent(pose: Pose, h: float) -> F64:
     )
     high = (joints + flesh[:, None]).max(axis=0)
     return np.array([[low[0], low[1], 0.0], [high[0], high[1], high[2] - floor + 0.008 * h]])
-
-
-def _point(value: npt.ArrayLike) -> Point:
-    x, y, z = (float(v) for v in np.asarray(value))
-    return x, y, z
 
 
 def torso_charts(low: Point, high: Point) -> list[Chart]:

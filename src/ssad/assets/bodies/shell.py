@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -156,9 +157,7 @@ def charts(shell: Shell, size: Point) -> list[Chart]:
     length, width, height = size
     side, front_x, rear_x = 0.5 * width, 0.5 * length, -0.5 * length
 
-    def x(t: float) -> float:
-        return float(length * (0.5 - shell.nose - t * (1.0 - shell.nose - shell.tail)))
-
+    x = partial(axle_x, shell, size)
     low = 0.8 * shell.sill * height
     found: list[Chart] = []
     cuts = side_parts(shell)

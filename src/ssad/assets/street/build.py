@@ -7,7 +7,7 @@ import hashlib
 
 import numpy as np
 
-from ssad.assets.mesh import F32, I32
+from ssad.assets.mesh import F32
 from ssad.assets.street.dressing import Masts, furnish, light_streets, plant, signals
 from ssad.assets.street.free_ground import FreeGround, sides
 from ssad.assets.street.markings import paint
@@ -16,7 +16,7 @@ from ssad.assets.street.palette import STYLES, Look, style_of
 from ssad.assets.street.paving import pave
 from ssad.assets.street.plots import fill_blocks, line_streets
 from ssad.assets.street.region import survey
-from ssad.assets.street.triangles import Palette, TriangleBuilder, tiles
+from ssad.assets.street.triangles import Palette, TriangleBuilder, join, tiles
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import home
@@ -45,7 +45,7 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
     fill_blocks(soup, site, look, tries=int(ground.paved.size / 700))
     furnish(soup, site, look, along)
     plant(soup, site, look, plots.parks)
-    piece = soup.joined()
+    piece = join(soup.pieces)
     origin, nx, ny, order, offset = tiles(np.concatenate(soup.owner), piece.levels)
     return Street(
         name=graph.name,
@@ -65,17 +65,13 @@ def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = No
         lamps=_f32(masts.lamps, 4),
         heads=_f32(masts.heads, 4),
         head_signal=np.array(masts.signal, np.int32),
-        head_lens=_lens(masts),
+        head_lens=np.array(masts.lens, np.int32).reshape(-1, 3, 2),
         parking=_f32(plots.parking, 3),
     )
 
 
 def _f32(rows: object, columns: int) -> F32:
     return np.asarray(rows, np.float32).reshape(-1, columns)
-
-
-def _lens(masts: Masts) -> I32:
-    return np.array(masts.lens, np.int32).reshape(-1, 3, 2)
 
 
 def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:

@@ -56,13 +56,10 @@ def _dormers(count: int, width: float, y: float, z: float, look: Look, *, wall: 
     for x in rows(width, count, 1.5).tolist():
         left = x - width / 2
         spans = (left, left + 1.5), (y, y + 2.4), (z, z + 1.5)
-        parts += [
-            block(*spans, wall),
-            *gable(spans[0], spans[1], z + 1.5, 0.6, roof=roof, wall=wall, across=True, eaves=0.15),
-        ]
-        parts += panes(
-            walls(*spans)[0], np.array([0.3]), np.array([0.35]), (0.9, 0.95), look, frame=look.frame[0], sill=False
-        )
+        parts.append(block(*spans, wall))
+        parts += gable(spans[0], spans[1], z + 1.5, 0.6, roof=roof, wall=wall, across=True, eaves=0.15)
+        at = np.array([0.3]), np.array([0.35])
+        parts += panes(walls(*spans)[0], *at, (0.9, 0.95), look, frame=look.frame[0], sill=False)
     return parts
 
 
@@ -97,9 +94,8 @@ def _terrace(size: Size, look: Look, *, shop: bool = False) -> list[Piece]:
         level = ground + storey * np.arange(floors - 1)
         parts.append(flat(front.quads(0.0, level - 0.1, w, 0.2, 0.05), look.stone[0], levels=VISIBLE))
     if rng.random() < 0.5 and not shop:
-        parts.append(
-            flat(front.quads(0.0, 0.0, w, 0.5, 0.03), look.palette.shade(material, 0.6, "plinth"), levels=VISIBLE)
-        )
+        plinth = look.palette.shade(material, 0.6, "plinth")
+        parts.append(flat(front.quads(0.0, 0.0, w, 0.5, 0.03), plinth, levels=VISIBLE))
     if not turned:
         parts.append(_chimney(x[0] + 0.5, d / 2, h + rise, look))
         if rng.random() < 0.4 and rise > 2.6:
@@ -126,18 +122,13 @@ def _shop_front(w: float, ground: float, front: Wall, look: Look) -> list[Piece]
             parts.append(flat(front.quads(a + 0.08, 0.55, b - a - 0.16, ground - 1.5, 0.05), glass, levels=VISIBLE))
     parts.append(flat(front.quads(at - 0.5, 0.05, 1.0, 2.2, 0.05), look.shop[0], levels=VISIBLE))
     colour = look.pick("awning")
-    low, high = (
-        front.quads(0.2, ground - 0.85, w - 0.4, 0.55, 0.12),
-        front.quads(0.2, ground - 0.85, w - 0.4, 0.55, 0.0),
-    )
+    low, high = (front.quads(0.2, ground - 0.85, w - 0.4, 0.55, away) for away in (0.12, 0.0))
     parts.append(flat(low, colour, levels=VISIBLE))
     parts.append(flat(np.stack([low[:, 3], low[:, 2], high[:, 2], high[:, 3]], axis=1), colour, levels=NEAR))
     parts.append(flat(front.quads(w * 0.3, ground - 0.68, w * 0.4, 0.2, 0.14), look.sign["white"], levels=NEAR))
     if rng.random() < 0.45:
-        wall, edge = (
-            front.quads(0.3, ground - 0.95, w - 0.6, 0.0, 0.02),
-            front.quads(0.3, ground - 1.35, w - 0.6, 0.0, 1.1),
-        )
+        wall = front.quads(0.3, ground - 0.95, w - 0.6, 0.0, 0.02)
+        edge = front.quads(0.3, ground - 1.35, w - 0.6, 0.0, 1.1)
         stripe = look.pick("awning")
         top = np.stack([edge[:, 0], edge[:, 1], wall[:, 1], wall[:, 0]], axis=1)
         parts += [flat(top, stripe, levels=VISIBLE), flat((top - [0, 0, 0.02])[:, ::-1], stripe, levels=VISIBLE)]
@@ -176,21 +167,17 @@ def _house(size: Size, look: Look, *, floors: int = 2) -> list[Piece]:
     # porch over the door
     px = x[0] + at
     if rng.random() < 0.6:
-        parts += gable(
-            (px - 1.0, px + 1.0), (-1.2, 0.1), 2.45, 0.6, roof=roof, wall=look.wood[1], across=True, eaves=0.12
-        )
+        porch = (px - 1.0, px + 1.0), (-1.2, 0.1)
+        parts += gable(*porch, 2.45, 0.6, roof=roof, wall=look.wood[1], across=True, eaves=0.12)
         posts = np.array([[px - 0.9, -1.1, 0.0], [px + 0.8, -1.1, 0.0]])
         parts.append(box(posts, posts + np.array([0.1, 0.1, 2.4]), look.wood[1], levels=VISIBLE))
-    parts.append(
-        _chimney(float(rng.uniform(x[0] + 1.0, x[1] - 1.0)) if not across else (x[0] + x[1]) / 2, d / 2, h + rise, look)
-    )
+    stack = (x[0] + x[1]) / 2 if across else float(rng.uniform(x[0] + 1.0, x[1] - 1.0))
+    parts.append(_chimney(stack, d / 2, h + rise, look))
     if wing:
         wx = (w / 2 - wing, w / 2) if side > 0 else (-w / 2, -w / 2 + wing)
         wy = (1.2, min(d, 7.5))
-        parts += [
-            block(wx, wy, (0.0, 2.6), material),
-            *gable(wx, wy, 2.6, 1.2, roof=roof, wall=material, across=True, eaves=0.25),
-        ]
+        parts.append(block(wx, wy, (0.0, 2.6), material))
+        parts += gable(wx, wy, 2.6, 1.2, roof=roof, wall=material, across=True, eaves=0.25)
         parts += door(walls(wx, wy, (0.0, 2.6))[0], wing / 2, look, size=(2.5, 2.1))
     return parts
 
@@ -205,10 +192,8 @@ def _flats(size: Size, look: Look) -> list[Piece]:
     storey, floors = 2.9, int(rng.integers(3, 7))
     h = storey * floors
     x, y = (-w / 2, w / 2), (0.0, d)
-    material, frame = (
-        look.pick(str(rng.choice(["plaster", "plaster", "brick", "cladding"]))),
-        int(rng.choice(look.frame)),
-    )
+    material = look.pick(str(rng.choice(["plaster", "plaster", "brick", "cladding"])))
+    frame = int(rng.choice(look.frame))
     parts = [block(x, y, (0.0, h), material)]
     sides = walls(x, y, (0.0, h))
     window, bay = (rng.uniform(1.1, 1.7), rng.uniform(1.3, 1.6)), rng.uniform(2.6, 3.3)
@@ -227,9 +212,8 @@ def _flats(size: Size, look: Look) -> list[Piece]:
         parts += flat_roof(x, y, h, look, coping=look.palette.shade(material, 0.8))
     else:
         parts += gable(x, y, h, 0.25 * d, roof=look.pick("roof_tiles"), wall=material, hip=0.3 * d)
-    parts.append(
-        flat(sides[0].quads(0.0, 0.0, w, 0.6, 0.03), look.palette.shade(material, 0.6, "plinth"), levels=VISIBLE)
-    )
+    plinth = look.palette.shade(material, 0.6, "plinth")
+    parts.append(flat(sides[0].quads(0.0, 0.0, w, 0.6, 0.03), plinth, levels=VISIBLE))
     return parts
 
 
@@ -283,10 +267,8 @@ def _hall(size: Size, look: Look) -> list[Piece]:
     count = int(rng.integers(1, 4))
     at = rows(w, count, 4.0, margin=0.1 * w)
     parts.append(flat(sides[0].quads(at, 0.0, 4.0, 4.2, 0.04), look.pick("cladding"), levels=VISIBLE))
-    lines = np.repeat(at, 9)
-    parts.append(
-        flat(sides[0].quads(lines, np.tile(0.4 + 0.42 * np.arange(9), count), 4.0, 0.03, 0.05), frame, levels=NEAR)
-    )
+    grooves = sides[0].quads(np.repeat(at, 9), np.tile(0.4 + 0.42 * np.arange(9), count), 4.0, 0.03, 0.05)
+    parts.append(flat(grooves, frame, levels=NEAR))
     parts += door(sides[0], w - 1.5, look)
     for wall in sides:
         count = max(1, int(wall.length // 6))
@@ -303,10 +285,8 @@ def _shed(size: Size, look: Look) -> list[Piece]:
     (w, d), h = size, look.generator.uniform(2.1, 2.7)
     x, y = (-w / 2, w / 2), (0.0, d)
     material = int(look.generator.choice([*look.wood, look.pick("boards")]))
-    parts = [
-        block(x, y, (0.0, h), material),
-        *gable(x, y, h, 0.8, roof=look.pick("roof_tiles"), wall=material, eaves=0.2),
-    ]
+    roof = gable(x, y, h, 0.8, roof=look.pick("roof_tiles"), wall=material, eaves=0.2)
+    parts = [block(x, y, (0.0, h), material), *roof]
     return parts + door(walls(x, y, (0.0, h))[0], w / 2, look, size=(min(1.6, w - 0.8), 1.9))
 
 
@@ -321,14 +301,12 @@ def _chapel(size: Size, look: Look) -> list[Piece]:
     for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
         parts.append(flat(np.array([[[*a, top], [*b, top], [0.0, 2.6, top + 11.0]]]), roof))
     for wall in walls(*tower, (0.0, top)):
-        parts += panes(
-            wall, np.array([2.0, 2.0]), np.array([7.0, top - 3.6]), (1.2, 2.4), look, frame=look.stone[0], blinds=0.0
-        )
+        at = np.array([2.0, 2.0]), np.array([7.0, top - 3.6])
+        parts += panes(wall, *at, (1.2, 2.4), look, frame=look.stone[0], blinds=0.0)
     for wall in walls(x, y, (0.0, h))[1::2]:
         count = int(wall.length // 3.5)
-        parts += panes(
-            wall, rows(wall.length, count, 1.1), np.full(count, 2.2), (1.1, 3.6), look, frame=look.stone[0], blinds=0.0
-        )
+        at = rows(wall.length, count, 1.1), np.full(count, 2.2)
+        parts += panes(wall, *at, (1.1, 3.6), look, frame=look.stone[0], blinds=0.0)
     return parts + door(walls(*tower, (0.0, top))[0], 2.6, look, size=(1.8, 2.9))
 
 

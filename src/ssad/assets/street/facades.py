@@ -14,6 +14,7 @@ from ssad.assets.street.palette import Look
 from ssad.assets.street.triangles import ALL, Piece, box, flat
 
 VISIBLE = NEAR | MID
+PARAPET = 0.7  # m, of flat roofs
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -122,15 +123,13 @@ def grid(
     return panes(wall, xx, zz, size, look, frame=frame, sill=sill)
 
 
-def door(
-    wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1), kind: str = "door"
-) -> list[Piece]:
+def door(wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 2.1)) -> list[Piece]:
     """A door in a frame, its middle at x, with a step."""
     wide, high = size
     left = x - wide / 2
     return [
         flat(wall.quads(left - 0.12, 0.0, wide + 0.24, high + 0.14, 0.03), look.stone[0], levels=NEAR),
-        flat(wall.quads(left, 0.04, wide, high, 0.05), look.pick(kind), levels=VISIBLE),
+        flat(wall.quads(left, 0.04, wide, high, 0.05), look.pick("door"), levels=VISIBLE),
     ]
 
 
@@ -167,7 +166,7 @@ def gable(
         parts.append(flat(points((a1, b0, z), (a1, b1, z), (a1, middle, top)), wall))
         parts.append(flat(points((a0, b1, z), (a0, b0, z), (a0, middle, top)), wall))
     # undersides and edges of the overhang
-    down = np.array([0.0, 0.0, thick])
+    down = thick * UP
     parts += [flat((p - down)[:, ::-1], roof, levels=NEAR) for p in sides]
     rim = [
         points((o0, c0, low - thick), (o1, c0, low - thick), (o1, c0, low), (o0, c0, low)),
@@ -192,7 +191,6 @@ def flat_roof(
     look: Look,
     *,
     coping: int,
-    parapet: float = 0.7,
     plant: int = 2,
 ) -> list[Piece]:
     """A flat roof with a parapet above z and boxes of building services."""
@@ -200,7 +198,7 @@ def flat_roof(
     t = 0.3
     low = np.array([[x[0], y[0], z], [x[0], y[1] - t, z], [x[0], y[0] + t, z], [x[1] - t, y[0] + t, z]])
     high = np.array([[x[1], y[0] + t, 0], [x[1], y[1], 0], [x[0] + t, y[1] - t, 0], [x[1], y[1] - t, 0]])
-    high[:, 2] = z + parapet
+    high[:, 2] = z + PARAPET
     parts = [box(low, high, coping, levels=VISIBLE)]
     deck = [[x[0], y[0], z + 0.1], [x[1], y[0], z + 0.1], [x[1], y[1], z + 0.1], [x[0], y[1], z + 0.1]]
     parts.append(flat(np.array([deck]), look.flat_roof, levels=ALL))
@@ -221,21 +219,13 @@ def balcony(wall: Wall, x: F64, z: F64, wide: float, look: Look, *, deep: float 
     base = wall.foot + x[:, None] * wall.along + z[:, None] * UP
     right, out = wide * wall.along, deep * wall.out
     ring = [base, base + out, base + out + right, base + right]
-    slab = np.array([0.0, 0.0, 0.16])
-    rail = np.array([0.0, 0.0, 1.05])
+    slab, rail = 0.16 * UP, 1.05 * UP
     quads = [np.stack([p - slab, q - slab, q, p], axis=1) for p, q in pairwise(ring)]
-    quads += [np.stack([base, base + out, base + out + right, base + right], axis=1)]
-    quads += [np.stack([base + right - slab, base + out + right - slab, base + out - slab, base - slab], axis=1)]
+    quads += [np.stack(ring, axis=1), np.stack([p - slab for p in ring[::-1]], axis=1)]
     parts = [flat(np.concatenate(quads), look.stone[1], levels=VISIBLE)]
     sides = [np.stack([p + 0.12 * UP, q + 0.12 * UP, q + rail, p + rail], axis=1) for p, q in pairwise(ring)]
-    inner = [
-        (q - 0.04 * outward)[:, ::-1] for q, outward in zip(sides, (-wall.along, wall.out, wall.along), strict=True)
-    ]
-    parts.append(
-        flat(
-            np.concatenate(sides + inner),
-            look.frame[1] if look.generator.random() < 0.5 else look.glass[3],
-            levels=VISIBLE,
-        )
-    )
+    outwards = (-wall.along, wall.out, wall.along)
+    inner = [(side - 0.04 * away)[:, ::-1] for side, away in zip(sides, outwards, strict=True)]
+    railing = look.frame[1] if look.generator.random() < 0.5 else look.glass[3]
+    parts.append(flat(np.concatenate(sides + inner), railing, levels=VISIBLE))
     return parts

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ssad.assets.mesh import F64
 from ssad.assets.street.paving import Edge, lane_edge
 from ssad.assets.street.region import Ground
+from ssad.core.geometry import in_polygon
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import LaneType
 
@@ -60,9 +61,8 @@ class FreeGround:
         for k in range(len(self.crosswalks)):
             near = np.hypot(*(p - self.crosswalks[k]).T) < 20.0
             if near.any():
-                least[near] = np.minimum(
-                    least[near], polygon_distance(p[near], self.graph.crosswalk(k).astype(np.float64))
-                )
+                gap = polygon_distance(p[near], self.graph.crosswalk(k).astype(np.float64))
+                least[near] = np.minimum(least[near], gap)
         return least
 
 
@@ -72,11 +72,7 @@ def polygon_distance(xy: F64, corners: F64) -> F64:
     d = b - a
     t = np.einsum("nmi,mi->nm", xy[:, None] - a, d) / np.maximum((d * d).sum(axis=1), 1e-12)
     gap = np.hypot(*np.moveaxis(xy[:, None] - a - np.clip(t, 0.0, 1.0)[..., None] * d, -1, 0)).min(axis=1)
-    x, y = xy[:, None, 0], xy[:, None, 1]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    at = a[:, 0] + (y - a[:, 1]) / np.where(d[:, 1] == 0.0, 1.0, d[:, 1]) * d[:, 0]
-    inside = (crosses & (x < at)).sum(axis=1) % 2 == 1
-    return np.where(inside, 0.0, gap)
+    return np.where(in_polygon(xy, corners), 0.0, gap)
 
 
 @dataclass(frozen=True)
@@ -101,12 +97,8 @@ class Side:
         at = float(np.clip(s, 0.0, self.length))
         yaw = float(np.interp(at, edge.s, np.unwrap(edge.yaw)))
         x, y = (float(np.interp(at, edge.s, edge.xy[:, k])) for k in range(2))
-        over = s - at
-        return (
-            x + over * np.cos(yaw) + away * np.sin(yaw),
-            y + over * np.sin(yaw) - away * np.cos(yaw),
-            yaw,
-        )
+        over, cos, sin = s - at, np.cos(yaw), np.sin(yaw)
+        return x + over * cos + away * sin, y + over * sin - away * cos, yaw
 
 
 def sides(graph: LaneGraph) -> list[Side]:
@@ -130,6 +122,6 @@ def footprint(pose: tuple[float, float, float], x: tuple[float, float], y: tuple
 
 
 def place(pose: tuple[float, float, float], local: F64) -> F64:
-    """Points [n, 2] of the frame of a pose in the world."""
+    """Points [..., 2] of the frame of a pose in the world."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.asarray(local @ np.array([[c, s], [-s, c]]) + np.array(pose[:2]))

@@ -77,22 +77,16 @@ def signal_mast(look: Look, reach: float) -> SignalMast:
     lens = []
     count, sides = sum(len(p.faces) for p in parts), 10
     for y, z in heads:
-        case = box(
-            (0.06 if y == 0.0 else -0.1, y - 0.17, z - 0.5),
-            (0.24, y + 0.17, z + 0.5),
-            look.black,
-            levels=ALL,
-            base=True,
-        )
+        face = 0.06 if y == 0.0 else -0.1
+        case = box((face, y - 0.17, z - 0.5), (0.24, y + 0.17, z + 0.5), look.black, levels=ALL, base=True)
         plate = box((0.10, y - 0.30, z - 0.62), (0.12, y + 0.30, z + 0.62), look.black, levels=VISIBLE, base=True)
         parts += [case, plate]
         count += len(case.faces) + len(plate.faces)
         mine = []
         for k, material in enumerate((look.red, look.amber, look.green)):
             up = z + 0.31 - 0.31 * k
-            hood = box(
-                (0.24, y - 0.13, up + LENS), (0.42, y + 0.13, up + LENS + 0.02), look.black, levels=VISIBLE, base=True
-            )
+            roof = (0.24, y - 0.13, up + LENS), (0.42, y + 0.13, up + LENS + 0.02)
+            hood = box(*roof, look.black, levels=VISIBLE, base=True)
             light = disc((0.25, y, up), LENS, material, sides=sides, levels=ALL)
             mine.append(count)
             parts += [light, hood]
@@ -117,16 +111,9 @@ def sign(kind: str, look: Look) -> Piece:
         parts.append(disc((0.05 + 0.006 * k, 0.0, z), radius, material, sides=sides, turn=angle, levels=VISIBLE))
     radius, sides, angle, _ = shapes[kind][0]
     back = disc((0.0, 0.0, z), radius, s["back"], sides=sides, turn=angle, levels=VISIBLE)
-    parts.append(
-        Piece(
-            back.vertices + np.array([0.045, 0, 0]),
-            back.faces[:, ::-1].copy(),
-            -back.normals,
-            back.uv[:, ::-1],
-            back.material,
-            back.levels,
-        )
-    )
+    away = back.vertices + np.array([0.045, 0, 0])
+    faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
+    parts.append(Piece(away, faces, -back.normals, uv, back.material, back.levels))
     bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
         "stop": [
             (-0.26, -0.07, -0.16, 0.07),
@@ -177,12 +164,8 @@ def wheelie_bin(look: Look) -> Piece:
 
 def bollard(look: Look) -> Piece:
     """A bollard."""
-    return join(
-        [
-            cylinder((0.07, 0.06), (0.0, 0.9), look.iron, sides=6, levels=NEAR),
-            disc((0.071, 0.0, 0.78), 0.03, look.white),
-        ]
-    )
+    post = cylinder((0.07, 0.06), (0.0, 0.9), look.iron, sides=6, levels=NEAR)
+    return join([post, disc((0.071, 0.0, 0.78), 0.03, look.white)])
 
 
 def shelter(look: Look) -> Piece:

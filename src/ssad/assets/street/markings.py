@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.assets.mesh import F64
-from ssad.assets.street.free_ground import polygon_distance
+from ssad.assets.street.free_ground import place, polygon_distance
 from ssad.assets.street.model import MID, NEAR
 from ssad.assets.street.palette import Look
 from ssad.assets.street.paving import Edge, lane_edge, ribbon
@@ -121,13 +121,6 @@ def _paint(soup: TriangleBuilder, corners: F64, material: int, *, z: float = PAI
     soup.add(flat(np.concatenate([corners, np.full((*corners.shape[:2], 1), z)], axis=2), material, levels=levels))
 
 
-def _local(pose: tuple[float, float, float], points: F64) -> F64:
-    """Points [..., 2] in the frame of a pose."""
-    x, y, yaw = pose
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + np.array([x, y]))
-
-
 def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_way: bool, look: Look) -> None:
     """A stop line across a lane; where no signal stands, the teeth of a give-way line; arrows on multi-lane arms."""
     x, y, yaw, width = graph.at(lane, s)
@@ -135,10 +128,10 @@ def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_
     if give_way:
         at = np.arange(-half, half - 0.3, 0.75)[:, None, None]
         tooth = np.array([[0.5, 0.0], [0.5, 0.44], [0.0, 0.22]])
-        _paint(soup, _local((x, y, yaw), tooth + at * [0.0, 1.0]), look.white)
+        _paint(soup, place((x, y, yaw), tooth + at * [0.0, 1.0]), look.white)
     else:
         box = np.array([[[0.0, -half], [STOP, -half], [STOP, half], [0.0, half]]])
-        _paint(soup, _local((x, y, yaw), box), look.white)
+        _paint(soup, place((x, y, yaw), box), look.white)
     beside = [int(n) for n in (graph.left[lane], graph.right[lane]) if n >= 0]
     if any(graph.kind[n] == LaneType.DRIVING and graph.same_direction(lane, n) for n in beside) and s > 30.0:
         _arrows(soup, graph, lane, s, look)
@@ -158,7 +151,7 @@ def _arrows(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, look: 
                 points = np.array([polygon])
                 if way == "right":
                     points = points[:, ::-1] * [1.0, -1.0]
-                _paint(soup, _local((x, y, yaw), points), look.white)
+                _paint(soup, place((x, y, yaw), points), look.white)
 
 
 def _crosswalk(soup: TriangleBuilder, corners: F64, look: Look) -> None:
@@ -188,18 +181,12 @@ def _worn(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> Non
         x, y, yaw, width = graph.at(lane, float(rng.uniform(2.0, max(2.1, length - 6.0))))
         long, wide = rng.uniform(1.0, 4.0), rng.uniform(0.6, 0.8 * width)
         aside = rng.uniform(-0.5, 0.5) * (width - wide)
-        box = np.array(
-            [[[0.0, aside - wide / 2], [long, aside - wide / 2], [long, aside + wide / 2], [0.0, aside + wide / 2]]]
-        )
-        _paint(soup, _local((x, y, yaw), box), look.patch, z=WEAR, levels=NEAR)
+        low, high = aside - wide / 2, aside + wide / 2
+        box = np.array([[[0.0, low], [long, low], [long, high], [0.0, high]]])
+        _paint(soup, place((x, y, yaw), box), look.patch, z=WEAR, levels=NEAR)
     angle = np.arange(8) * np.pi / 4
     disc = 0.32 * np.stack([np.cos(angle), np.sin(angle)], axis=1)[None]
     for _ in range(rng.poisson(length / 40.0)):
         x, y, yaw, width = graph.at(lane, float(rng.uniform(1.0, max(1.1, length - 1.0))))
-        _paint(
-            soup,
-            _local((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width])),
-            look.iron,
-            z=1.4 * WEAR,
-            levels=NEAR,
-        )
+        cover = place((x, y, yaw), disc + np.array([0.0, rng.uniform(-0.3, 0.3) * width]))
+        _paint(soup, cover, look.iron, z=1.4 * WEAR, levels=NEAR)

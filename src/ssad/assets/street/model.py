@@ -15,6 +15,7 @@ import numpy.typing as npt
 from ssad.assets.mesh import F32, I32, Material
 from ssad.core.errors import FormatError
 from ssad.core.safeio import load_npz, save_npz
+from ssad.core.types import array_dtypes
 
 FORMAT = 1  # of the .npz file
 TILE = 32.0  # m
@@ -113,6 +114,7 @@ class Street:
 
 
 _MATERIAL = ("specular", "gloss", "emission")
+_ARRAYS = array_dtypes(Street)
 
 
 def save_street(street: Street, path: Path | str) -> None:
@@ -128,13 +130,6 @@ def save_street(street: Street, path: Path | str) -> None:
     save_npz(path, arrays | {name: getattr(street, name) for name in _ARRAYS})
 
 
-_ARRAYS: dict[str, Any] = {
-    "vertices": np.float32, "faces": np.int32, "normals": np.float32, "uv": np.float32, "material": np.int32,
-    "order": np.int32, "offset": np.int32, "lamps": np.float32, "heads": np.float32, "head_signal": np.int32,
-    "head_lens": np.int32, "parking": np.float32,
-}  # fmt: skip
-
-
 def load_street(path: Path | str) -> Street:
     """Read what `save_street` wrote. FormatError: missing, broken, or not a street."""
     arrays = load_npz(path)
@@ -143,7 +138,7 @@ def load_street(path: Path | str) -> Street:
     if header is None or header.shape != (3,) or str(header[0]) != f"ssad-street {FORMAT}" or set(arrays) != wanted:
         raise FormatError(f"{path}: not a street of format {FORMAT}; delete it and build the street again")
     for name, dtype in _ARRAYS.items():
-        if arrays[name].dtype != np.dtype(dtype):
+        if arrays[name].dtype != dtype:
             raise FormatError(f"{path}: array {name} is {arrays[name].dtype}; delete it and build the street again")
     size, value = arrays["size"], arrays["material_value"]
     if size.shape != (5,) or value.shape != (len(arrays["material_name"]), 7):

@@ -84,29 +84,13 @@ _BOARD = [(0.72, 0.72, 0.70), (0.32, 0.40, 0.46), (0.58, 0.54, 0.44), (0.24, 0.3
 _CLADDING = [(0.45, 0.47, 0.50), (0.30, 0.33, 0.37), (0.62, 0.62, 0.60), (0.42, 0.38, 0.33), (0.18, 0.20, 0.23)]
 _SHEET = [(0.42, 0.46, 0.50), (0.16, 0.26, 0.40), (0.50, 0.48, 0.44), (0.22, 0.32, 0.26), (0.46, 0.16, 0.12)]
 _ROOF = [(0.20, 0.095, 0.062), (0.08, 0.08, 0.09), (0.14, 0.092, 0.075), (0.12, 0.125, 0.14), (0.22, 0.13, 0.09)]
-_DOOR = [
-    (0.05, 0.12, 0.08),
-    (0.20, 0.03, 0.03),
-    (0.05, 0.08, 0.18),
-    (0.16, 0.09, 0.05),
-    (0.60, 0.60, 0.58),
-    (0.03, 0.03, 0.03),
-]
+_DOOR = [(0.05, 0.12, 0.08), (0.20, 0.03, 0.03), (0.05, 0.08, 0.18), (0.16, 0.09, 0.05), (0.60, 0.60, 0.58),
+         (0.03, 0.03, 0.03)]  # fmt: skip
 _AWNING = [(0.45, 0.06, 0.05), (0.06, 0.22, 0.12), (0.08, 0.14, 0.36), (0.62, 0.48, 0.12), (0.60, 0.58, 0.54)]
-_EARTH = {
-    "grass": (0.10, 0.165, 0.045),
-    "lawn": (0.095, 0.19, 0.045),
-    "meadow": (0.17, 0.185, 0.065),
-    "cobbles": (0.21, 0.195, 0.175),
-}
-_LEAF = {
-    "round": (0.065, 0.125, 0.028),
-    "tall": (0.085, 0.145, 0.035),
-    "birch": (0.125, 0.18, 0.05),
-    "conifer": (0.022, 0.062, 0.028),
-}
-
-
+_EARTH = {"grass": (0.10, 0.165, 0.045), "lawn": (0.095, 0.19, 0.045), "meadow": (0.17, 0.185, 0.065),
+          "cobbles": (0.21, 0.195, 0.175)}  # fmt: skip
+_LEAF = {"round": (0.065, 0.125, 0.028), "tall": (0.085, 0.145, 0.035), "birch": (0.125, 0.18, 0.05),
+         "conifer": (0.022, 0.062, 0.028)}  # fmt: skip
 _WALLS = {"plaster": _PLASTER, "brick": _BRICK, "boards": _BOARD, "cladding": _CLADDING, "sheet": _SHEET,
           "roof_tiles": _ROOF, "door": _DOOR, "awning": _AWNING}  # fmt: skip
 
@@ -143,11 +127,10 @@ class Look:
         self.centre = self.yellow if self.style.yellow else self.white
         self.iron = add("cast_iron", (0.045, 0.045, 0.048), gloss=0.4)
         self.metal = add("galvanised", (0.36, 0.37, 0.38), specular=0.3, gloss=0.5)
-        self.pole = add(
-            "lamp_post", self._jitter((0.06, 0.075, 0.07) if self.style.old else (0.30, 0.31, 0.32), 0.1), gloss=0.4
-        )
+        post = (0.06, 0.075, 0.07) if self.style.old else (0.30, 0.31, 0.32)
+        self.pole = add("lamp_post", self._jitter(post, 0.1), gloss=0.4)
         self.black = add("black_plastic", (0.02, 0.02, 0.022), gloss=0.4)
-        self.glow = add("lamp_light", (0.85, 0.80, 0.68), emission=0.0, gloss=0.5)
+        self.glow = add("lamp_light", (0.85, 0.80, 0.68), gloss=0.5)
         self.red = add("signal_red", (0.30, 0.02, 0.015), gloss=0.6)
         self.amber = add("signal_amber", (0.30, 0.14, 0.01), gloss=0.6)
         self.green = add("signal_green", (0.01, 0.22, 0.10), gloss=0.6)
@@ -177,12 +160,8 @@ class Look:
 
     def _jitter(self, colour: npt.ArrayLike, amount: float) -> npt.NDArray[np.float64]:
         """A colour a little lighter or darker, and a little off in hue."""
-        rng = self.generator
-        return (
-            np.asarray(colour, np.float64)
-            * rng.uniform(1 - amount, 1 + amount)
-            * rng.uniform(1 - amount / 3, 1 + amount / 3, 3)
-        )
+        lighter = self.generator.uniform(1 - amount, 1 + amount)
+        return np.asarray(colour, np.float64) * lighter * self.generator.uniform(1 - amount / 3, 1 + amount / 3, 3)
 
     def pick(self, name: str) -> int:
         """One of the wall, roof or door materials of this name."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -119,7 +120,7 @@ def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) ->
         if not len(neighbours):
             p, q = (left.xy[at], right.xy[at])[order[0]], (left.xy[at], right.xy[at])[order[1]]
             corners = [[*p, -0.02], [*q, -0.02], [*q, KERB], [*p, KERB]]
-            soup.polygons(np.array([corners]), look.kerb)
+            soup.add(flat(np.array([corners]), look.kerb))
 
 
 def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:
@@ -137,10 +138,9 @@ def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:
     rings = [inner]
     for radius in (1.2 * float(np.hypot(*away.T).max()), FAR_AWAY):
         rings.append(middle + radius * away / np.hypot(*away.T)[:, None])
-    height = (EARTH - 0.04, EARTH - 0.04, EARTH - 0.04)
-    for a, b, za, zb in zip(rings[:-1], rings[1:], height[:-1], height[1:], strict=True):
+    for a, b in pairwise(rings):
         low, high = np.vstack([a, a[:1]]), np.vstack([b, b[:1]])
-        soup.add(ribbon(low, high, (za, zb), look.earth_far), HORIZON_OWNER)
+        soup.add(ribbon(low, high, (EARTH - 0.04, EARTH - 0.04), look.earth_far), HORIZON_OWNER)
     # a plane under everything, so that no pixel between two triangles shows the sky
     corners = [[x0, y0, -0.4], [x1, y0, -0.4], [x1, y1, -0.4], [x0, y1, -0.4]]
     soup.add(flat(np.array([corners]), look.earth_far), HORIZON_OWNER)

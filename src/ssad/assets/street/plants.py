@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from ssad.assets.mesh import F64
 from ssad.assets.street.model import FAR, MID, NEAR
@@ -49,18 +50,22 @@ def leaves(centre: F64, radius: F64, look: Look, *, count: int, size: float, mat
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     tilt *= np.sign((tilt * unit).sum(axis=1, keepdims=True) + 1e-9)
     side = np.cross(tilt, rng.normal(size=(count, 3)))
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    up = np.cross(tilt, side)
-    turns = np.array([0.0, 2.0, 4.2])
     half = size * rng.uniform(0.6, 1.1, (count, 1, 1))
-    corners = place[:, None] + half * (
-        np.cos(turns)[None, :, None] * side[:, None] + np.sin(turns)[None, :, None] * up[:, None]
-    )
     normal = np.repeat(unit / radius + [0.0, 0.0, 0.15], 3, axis=0)
     # the upper leaves catch more light: lighter greens come first in the table
     index = np.clip((0.5 * (1.0 - z) * len(materials) + rng.normal(0.0, 0.9, count)).astype(int), 0, len(materials) - 1)
-    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    return smooth(corners.reshape(-1, 3), faces, normal, np.array(materials)[index], levels=NEAR)
+    return _scraps(place, tilt, side, half, (0.0, 2.0, 4.2), normal, np.array(materials)[index])
+
+
+def _scraps(  # noqa: PLR0917
+    place: F64, out: F64, side: F64, half: F64 | float, turns: tuple[float, ...], normal: F64, material: npt.ArrayLike
+) -> Piece:
+    """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
+    side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
+    cos, sin = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
+    corners = place[:, None] + half * (cos * side[:, None] + sin * np.cross(out, side)[:, None])
+    faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
+    return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 
 
 def _greens(kind: str, look: Look) -> list[int]:
@@ -152,21 +157,11 @@ def hedge(look: Look, material: int) -> Piece:
         [rng.uniform(-0.5, 0.5, count), rng.choice([-0.34, 0.34], count), rng.uniform(0.05, 1.0, count)]
     )
     place[::3, 1], place[::3, 2] = rng.uniform(-0.33, 0.33, len(place[::3])), 0.98
-    out = np.where(
-        (np.arange(count) % 3 == 0)[:, None],
-        [0.0, 0.0, 1.0],
-        np.column_stack([0 * place[:, 0], np.sign(place[:, 1]), 0 * place[:, 0]]),
-    )
+    out = np.column_stack([np.zeros(count), np.sign(place[:, 1]), np.zeros(count)])
+    out[::3] = 0.0, 0.0, 1.0
     tilt = out + 0.5 * rng.normal(size=(count, 3))
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     side = np.cross(tilt, [0.3, 0.2, 0.9])
-    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    up = np.cross(tilt, side)
-    turns = np.array([0.0, 2.1, 4.2])
-    corners = place[:, None] + 0.12 * (
-        np.cos(turns)[None, :, None] * side[:, None] + np.sin(turns)[None, :, None] * up[:, None]
-    )
     index = np.where(rng.random(count) < 0.5, light, material)
-    faces = np.arange(3 * count, dtype=np.int32).reshape(-1, 3)
-    parts.append(smooth(corners.reshape(-1, 3), faces, np.repeat(out, 3, axis=0), index, levels=NEAR))
+    parts.append(_scraps(place, tilt, side, 0.12, (0.0, 2.1, 4.2), np.repeat(out, 3, axis=0), index))
     return join(parts)

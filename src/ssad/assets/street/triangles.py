@@ -34,24 +34,16 @@ class Palette:
     def __init__(self) -> None:
         self.table: dict[Material, int] = {}
 
-    def add(
-        self,
-        name: str,
-        colour: ArrayLike,
-        *,
-        specular: float = 0.04,
-        gloss: float = 0.1,
-        emission: float = 0.0,
-    ) -> int:
+    def add(self, name: str, colour: ArrayLike, *, specular: float = 0.04, gloss: float = 0.1) -> int:
         """Index of a material (colour: linear RGB)."""
         r, g, b = np.round(np.clip(np.asarray(colour, np.float64), 0.0, 1.0), 4).tolist()
-        return self.table.setdefault(Material(name, (r, g, b), specular, gloss, emission), len(self.table))
+        return self.table.setdefault(Material(name, (r, g, b), specular, gloss), len(self.table))
 
     def shade(self, index: int, factor: float, name: str | None = None) -> int:
         """A darker or lighter material like another one."""
         like = list(self.table)[index]
         colour = factor * np.array(like.colour)
-        return self.add(name or like.name, colour, specular=like.specular, gloss=like.gloss, emission=like.emission)
+        return self.add(name or like.name, colour, specular=like.specular, gloss=like.gloss)
 
 
 class TriangleBuilder:
@@ -73,19 +65,6 @@ class TriangleBuilder:
         self.owner.append(place)
         self.size += count
         return first
-
-    def polygons(
-        self, corners: ArrayLike, material: ArrayLike, *, levels: int = ALL, uv: ArrayLike | None = None
-    ) -> int:
-        """Flat convex polygons [n, k, 3], counter-clockwise seen from outside; uv [n, k, 2] (default: metres from the
-        first corner along the first edge, upwards from there on walls)."""
-        return self.add(flat(corners, material, levels=levels, uv=uv))
-
-    def boxes(
-        self, low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = ALL, base: bool = False
-    ) -> int:
-        """Boxes along the axes from low [n, 3] to high [n, 3]; the underside is left out unless `base`."""
-        return self.add(box(low, high, material, levels=levels, base=base))
 
     def place(self, piece: Piece, poses: ArrayLike, *, scale: ArrayLike = 1.0) -> int:
         """Copies of a piece at poses [n, 4] (x, y, z, yaw), each a thing of its own; scale: [n] or [n, 3]."""
@@ -112,10 +91,6 @@ class TriangleBuilder:
         )
         return self.add(copies, np.repeat(pose[:, :2], f, axis=0))
 
-    def joined(self) -> Piece:
-        """Everything as one piece."""
-        return join(self.pieces)
-
 
 def join(pieces: list[Piece]) -> Piece:
     """One piece of many."""
@@ -130,8 +105,11 @@ def join(pieces: list[Piece]) -> Piece:
     )
 
 
-def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL, uv: ArrayLike | None = None) -> Piece:
-    """Flat convex polygons [n, k, 3] as a piece (see `TriangleBuilder.polygons`)."""
+def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL) -> Piece:
+    """Flat convex polygons [n, k, 3], counter-clockwise seen from outside.
+
+    Their uv are metres from the first corner along the first edge, upwards from there on walls.
+    """
     p = np.asarray(corners, np.float64)
     n, k = p.shape[:2]
     fan = np.stack([np.zeros(k - 2, int), np.arange(1, k - 1), np.arange(2, k)], axis=1)
@@ -139,17 +117,14 @@ def flat(corners: ArrayLike, material: ArrayLike, *, levels: int = ALL, uv: Arra
     edge = p[:, 1] - p[:, 0]
     normal = _cross(edge, p[:, 2] - p[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    if uv is None:
-        u = edge / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
-        v = _cross(normal, u)
-        wall = np.abs(normal[:, 2]) < 0.5
-        start = np.where(wall[:, None], p[:, 0] * np.array([1.0, 1.0, 0.0]), p[:, 0])
-        away = p - start[:, None]
-        place = np.stack([np.einsum("nki,ni->nk", away, u), np.einsum("nki,ni->nk", away, v)], axis=-1)
-        ground = normal[:, 2] > 0.99
-        place = np.where(ground[:, None, None], p[..., :2], place)
-    else:
-        place = np.asarray(uv, np.float64)
+    u = edge / np.maximum(np.linalg.norm(edge, axis=1, keepdims=True), 1e-12)
+    v = _cross(normal, u)
+    wall = np.abs(normal[:, 2]) < 0.5
+    start = np.where(wall[:, None], p[:, 0] * np.array([1.0, 1.0, 0.0]), p[:, 0])
+    away = p - start[:, None]
+    place = np.stack([np.einsum("nki,ni->nk", away, u), np.einsum("nki,ni->nk", away, v)], axis=-1)
+    ground = normal[:, 2] > 0.99
+    place = np.where(ground[:, None, None], p[..., :2], place)
     index = np.repeat(np.broadcast_to(np.asarray(material, np.int32), n), k - 2)
     return Piece(
         p.reshape(-1, 3),
@@ -172,7 +147,7 @@ _SIDES = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5
 
 
 def box(low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = ALL, base: bool = False) -> Piece:
-    """Boxes along the axes as a piece (see `TriangleBuilder.boxes`)."""
+    """Boxes along the axes from low [n, 3] to high [n, 3]; the underside is left out unless `base`."""
     a, b = (np.asarray(v, np.float64).reshape(-1, 3) for v in (low, high))
     corner = np.stack(
         [np.stack([(a, b)[i][:, 0], (a, b)[j][:, 1], (a, b)[k][:, 2]], axis=1)
@@ -209,13 +184,13 @@ def cylinder(
     return join([wall, flat(high[None], material, levels=levels)]) if radius[1] > 1e-3 else wall
 
 
-def tiles(owner: F64, levels: I32, *, tile: float = TILE) -> tuple[tuple[float, float], int, int, I32, I32]:
+def tiles(owner: F64, levels: I32) -> tuple[tuple[float, float], int, int, I32, I32]:
     """origin, nx, ny, order and offset (see `Street`) for faces with owners [F, 2] and levels [F]."""
     far = ~np.isfinite(owner[:, 0])
-    low = np.floor(owner[~far].min(axis=0) / tile) * tile
-    nx, ny = (np.floor((owner[~far].max(axis=0) - low) / tile).astype(int) + 1).tolist()
+    low = np.floor(owner[~far].min(axis=0) / TILE) * TILE
+    nx, ny = (np.floor((owner[~far].max(axis=0) - low) / TILE).astype(int) + 1).tolist()
     place = np.where(far[:, None], low, owner)
-    cell = np.floor((place - low) / tile).astype(np.int64)
+    cell = np.floor((place - low) / TILE).astype(np.int64)
     index = np.where(far, nx * ny, cell[:, 1] * nx + cell[:, 0])
     order, offset, start = [], [], 0
     for k in range(LEVELS):
@@ -224,10 +199,5 @@ def tiles(owner: F64, levels: I32, *, tile: float = TILE) -> tuple[tuple[float, 
         count = np.bincount(index[mine], minlength=nx * ny + 1)
         offset.append(start + np.concatenate([[0], np.cumsum(count)]))
         start += len(mine)
-    return (
-        (float(low[0]), float(low[1])),
-        nx,
-        ny,
-        np.concatenate(order).astype(np.int32),
-        np.stack(offset).astype(np.int32),
-    )
+    listed, starts = np.concatenate(order).astype(np.int32), np.stack(offset).astype(np.int32)
+    return (float(low[0]), float(low[1])), nx, ny, listed, starts

@@ -169,19 +169,16 @@ def forced_signals(
     lanes = np.unique(route.lane[route.lane >= 0])
     approach = {(int(graph.road[n]), int(graph.section[n]), int(np.sign(graph.lane_id[n]))) for n in lanes}
     own = {
-        int(signal)
-        for signal, lane in zip(graph.stop_signal, graph.stop_lane, strict=True)
+        int(graph.stop_signal[k])
+        for k, lane in enumerate(graph.stop_lane)
         if (int(graph.road[lane]), int(graph.section[lane]), int(np.sign(graph.lane_id[lane]))) in approach
     }
     junctions = {int(n) for n in np.unique(graph.junction[lanes]) if n >= 0}
     forced: dict[int, SignalState] = {}
     for signal in range(len(graph.signal_junction)):
         here = int(graph.signal_junction[signal]) in junctions
-        in_town = whole_town and not bool(graph.signal_virtual[signal])
-        if whole_town and not in_town:
-            continue
-        want = plan.ego if signal in own and here else plan.others if here or in_town else "program"
-        if want != "program":
+        want = plan.ego if signal in own and here else plan.others
+        if want != "program" and (not graph.signal_virtual[signal] if whole_town else here):
             forced[signal] = _FORCED[want]
     return forced
 

@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -181,9 +182,8 @@ def _checked(scenario: Scenario, path: Path) -> Scenario:
 
 
 def _along(road: _Road, trigger: Pose) -> float | None:
-    """Metres along the key points to the trigger; None beyond 2 m or 10 degrees from them."""
-    before = 0.0
-    for a, b in zip(road.points[:-1], road.points[1:], strict=True):
+    """How far along the key points the trigger is, counted in key points; None beyond 2 m or 10 degrees from them."""
+    for k, (a, b) in enumerate(pairwise(road.points)):
         dx, dy = b.x - a.x, b.y - a.y
         length = math.hypot(dx, dy)
         if length > 1e-6:
@@ -192,8 +192,7 @@ def _along(road: _Road, trigger: Pose) -> float | None:
             near = math.hypot(a.x + t * dx - trigger.x, a.y + t * dy - trigger.y) <= _NEAR
             turn = math.remainder(math.atan2(dy, dx) - trigger.yaw, 2.0 * math.pi)
             if near and abs(turn) <= _ALIGNED:
-                return before + t * length
-        before += length
+                return k + t
     return None
 
 

@@ -69,9 +69,10 @@ def sample_parameters(scenario: Scenario, generator: np.random.Generator, *, spr
         ConfigError: As in `sampling_ranges`.
     """
     ranges = sampling_ranges(scenario, spread=spread)
+    shares = generator.random(len(ranges)).tolist()
     values = {
-        name: min(max(low + share * (high - low), low), high)
-        for (name, (low, high)), share in zip(ranges.items(), generator.random(len(ranges)).tolist(), strict=True)
+        name: min(max(low + shares[k] * (high - low), low), high)
+        for k, (name, (low, high)) in enumerate(ranges.items())
     }
     target_speed = values.pop(TARGET_SPEED, scenario.target_speed)
     return dataclasses.replace(scenario, parameters={**scenario.parameters, **values}, target_speed=target_speed)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -165,8 +164,7 @@ def _poses(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
 
 
 def _finite(pose: Pose) -> bool:
-    values = (pose.x, pose.y, pose.yaw)
-    return all(math.isfinite(v) and abs(v) <= _MAX_COORDINATE for v in values)
+    return all(abs(value) <= _MAX_COORDINATE for value in (pose.x, pose.y, pose.yaw))  # False for NaN
 
 
 def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:

@@ -2,6 +2,7 @@
 N route points of the pool, M lane segments, S signals."""
 
 from enum import IntEnum
+from typing import Any
 
 import warp as wp
 
@@ -139,3 +140,8 @@ class Work:
 
     count: wp.array(dtype=wp.int32)  # [1]
     pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)
+
+
+def array_types(struct: Any) -> dict[str, Any]:
+    """Name -> array type (`dtype`, `ndim`) of the members of one of these structs, in their order."""
+    return dict(struct.cls.__annotations__)

@@ -37,7 +37,7 @@ def time_to_cover(distance: float, top_speed: float, acceleration: float) -> flo
     """Seconds that a standing vehicle takes for `distance` m at full throttle up to `top_speed`."""
     ramp = top_speed**2 / (2.0 * acceleration)
     if distance <= ramp:
-        return math.sqrt(2.0 * max(distance, 0.0) / acceleration)
+        return math.sqrt(2.0 * distance / acceleration)
     return top_speed / acceleration + (distance - ramp) / top_speed
 
 

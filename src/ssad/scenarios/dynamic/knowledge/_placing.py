@@ -203,7 +203,7 @@ def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[i
 @remembered()
 def _first_junction(graph: LaneGraph, route: Route, first: int) -> tuple[int, int] | None:
     """Route points where the first junction from point `first` on begins and where it has ended."""
-    inside = (route.lane >= 0) & (graph.junction[np.maximum(route.lane, 0)] >= 0)
+    inside = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
     entries = np.flatnonzero(inside[first:])
     if not len(entries):
         return None

@@ -63,7 +63,7 @@ def spawn_places(graph: LaneGraph) -> list[Place]:
         free = float(graph.length[lane]) - 2.0 * _FROM_END
         if free < 0.0:
             continue
-        count = int(free // _SPACING) + 1
+        count = int(free / _SPACING) + 1
         first = _FROM_END + (free - (count - 1) * _SPACING) / 2.0
         places += [Place(int(lane), first + k * _SPACING) for k in range(count)]
     return places
@@ -90,11 +90,11 @@ def candidates(graph: LaneGraph, route: Route) -> tuple[tuple[Place, Pose], ...]
     # a route may begin inside a junction; "the ego's road" is then the one after it
     roads = on_graph[graph.junction[on_graph] < 0]
     first = int(roads[0] if len(roads) else on_graph[0])
-    inside = (route.lane >= 0) & (graph.junction[np.maximum(route.lane, 0)] >= 0)
+    inside = (route.lane >= 0) & (graph.junction[route.lane] >= 0)
     near = [(route.xy[0], NEAR_START), (route.xy[-1], NEAR_END)]
     if inside.any():
         near.append((route.xy[inside].mean(axis=0), NEAR_JUNCTION))
-    start = route.xy[: max(round(CLEAR_AHEAD / route.spacing), 1) + 1]
+    start = route.xy[: round(CLEAR_AHEAD / route.spacing) + 1]
     found = []
     for place in spawn_places(graph):
         road, lane_id = int(graph.road[place.lane]), int(graph.lane_id[place.lane])
@@ -120,7 +120,7 @@ def fits(body: str, route: Route) -> bool:
     turn = np.abs(np.diff(np.unwrap(route.yaw.astype(np.float64)))) / route.spacing
     # over 3 m, as a single kink between two lanes is none
     smooth = np.convolve(turn, np.ones(3) / 3.0, mode="valid")
-    slip = min(0.5 * float(smooth.max(initial=0.0)) * vehicle.wheelbase, 1.0)
+    slip = 0.5 * float(smooth.max()) * vehicle.wheelbase
     return 0.5 * vehicle.length * slip + 0.5 * vehicle.width <= _NOSE
 
 

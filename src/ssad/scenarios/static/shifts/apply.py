@@ -107,9 +107,7 @@ def _dispatch(
 def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneContext] | None) -> SceneContext:
     if contexts is not None and frame.scene in contexts:
         return contexts[frame.scene]
-    row = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
-    light = sky_light([row.reshape(batch.height, batch.width, 3)[:, : batch.seen]], [frame.depth])
-    return SceneContext(frame.scene, light, viewing_direction(frame))
+    return SceneContext(frame.scene, sky_light([batch.picture(b)], [frame.depth]), viewing_direction(frame))
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:

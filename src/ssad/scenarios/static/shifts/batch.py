@@ -11,7 +11,9 @@ import numpy as np
 import warp as wp
 
 from ssad.core.errors import ConfigError
+from ssad.core.frames import Frame
 from ssad.core.types import U8
+from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 wp.config.log_level = wp.LOG_ERROR
 
@@ -51,6 +53,20 @@ class Batch:
         view = wp.array(ptr=self.data.ptr, dtype=wp.uint32, shape=size, device=self.device)
         view._keep = self.data  # the memory belongs to the bytes
         return view
+
+    def picture(self, index: int) -> U8:
+        """One image [H, W, 3] in main memory."""
+        row = self.data[index * self.stride : (index + 1) * self.stride].numpy()
+        return np.asarray(row.reshape(self.height, self.width, 3)[:, : self.seen])
+
+    def launch(self, kernel: Any, dim: tuple[int, ...], inputs: list[Any], *outputs: Any) -> None:
+        """Runs a kernel of `dim` threads on the device of the batch."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=list(outputs), device=self.device)
+
+    def chunks(self) -> tuple[tuple[int, int], int, int]:
+        """For kernels that go word by word: threads [B, chunks of an image], words of an image, words of a chunk."""
+        words, chunk = self.stride // 4, max(256, self.width * 3 // 4)
+        return (self.count, -(-words // chunk)), words, chunk
 
     def numpy(self) -> U8:
         """The images [B, H, W, 3] in main memory."""
@@ -117,17 +133,23 @@ def like_input(batch: Batch, images: Any) -> Any:
     return batch.numpy().reshape(np.asarray(images).shape)
 
 
-def on(batch: Batch, values: Any, dtype: Any) -> Any:
+def on(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
     """Small parameters on the device of a batch."""
     return wp.array(values, dtype=dtype, device=batch.device)
 
 
 def keys_on(batch: Batch, keys: Sequence[int]) -> Any:
     """64-bit keys on the device of a batch."""
-    return wp.array(np.asarray(keys, np.uint64), dtype=wp.uint64, device=batch.device)
+    return on(batch, np.asarray(keys, np.uint64), wp.uint64)
 
 
-def check_batch(batch: Batch, frames: Sequence[Any]) -> None:
+def file_keys(batch: Batch, specs: Sequence[ShiftSpec], frames: Sequence[Frame], purpose: str) -> Any:
+    """A key of its own for each file, on the device of a batch."""
+    found = [s.key(purpose, f.scene, f.sample, f.camera.channel) for s, f in zip(specs, frames, strict=True)]
+    return keys_on(batch, found)
+
+
+def check_batch(batch: Batch, frames: Sequence[Frame]) -> None:
     """ConfigError unless there is a frame of the right size for each image."""
     if len(frames) != batch.count:
         raise ConfigError(f"{batch.count} images, but {len(frames)} frames")
@@ -141,4 +163,4 @@ def check_batch(batch: Batch, frames: Sequence[Any]) -> None:
 
 def structs(batch: Batch, rows: Sequence[tuple[Any, ...]], kind: Any) -> Any:
     """Rows of a kernel's struct on the device of a batch."""
-    return wp.array(np.array(rows, dtype=kind.numpy_dtype()), dtype=kind, device=batch.device)
+    return on(batch, np.array(rows, dtype=kind.numpy_dtype()), kind)

@@ -17,7 +17,7 @@ import warp as wp
 
 from ssad.core.frames import Frame, camera_to_world
 from ssad.core.types import F32
-from ssad.scenarios.static.shifts.batch import Batch
+from ssad.scenarios.static.shifts.batch import Batch, on
 
 FARTHEST = 1000.0
 _ROAD_WEIGHT, _SKY_WEIGHT = 0.02, 0.002
@@ -35,11 +35,9 @@ def depth_grid(batch: Batch, frames: Sequence[Frame]) -> tuple[Any, list[str]]:
     """
     rows, columns = grid_size(batch)
     pixels = batch.numpy() if any(frame.depth is None for frame in frames) else None
-    found = [
-        depth_of(frame, None if pixels is None else pixels[b], rows, columns) for b, frame in enumerate(frames)
-    ]  # fmt: skip
+    found = [depth_of(frame, None if pixels is None else pixels[b], rows, columns) for b, frame in enumerate(frames)]
     grids, sources = zip(*found, strict=True)
-    return wp.array(np.stack(grids), dtype=wp.float32, device=batch.device), list(sources)
+    return on(batch, np.stack(grids)), list(sources)
 
 
 def depth_of(frame: Frame, image: Any, rows: int, columns: int) -> tuple[F32, str]:
@@ -167,17 +165,15 @@ def _pull_push(value: F32, weight: F32) -> F32:
     return np.asarray(near + (value - near) * np.minimum(weight, 1), np.float32)
 
 
-def _guided(guide: F32, value: F32, *, radius: int = 6, softness: float = 0.003) -> F32:
-    """Guided filter: a locally linear function of the guide."""
-    size = (2 * radius + 1, 2 * radius + 1)
+def _guided(guide: F32, value: F32) -> F32:
+    """Guided filter over 13 x 13 cells: a locally linear function of the guide."""
+    size = (13, 13)
     mean_g, mean_v = cv2.blur(guide, size), cv2.blur(value, size)
-    slope = (cv2.blur(guide * value, size) - mean_g * mean_v) / (cv2.blur(guide * guide, size) - mean_g**2 + softness)
+    slope = (cv2.blur(guide * value, size) - mean_g * mean_v) / (cv2.blur(guide * guide, size) - mean_g**2 + 0.003)
     return np.asarray(cv2.blur(slope, size) * guide + cv2.blur(mean_v - slope * mean_g, size), np.float32)
 
 
 def lens(batch: Batch, frames: Sequence[Frame]) -> Any:
     """(fx, fy, cx, cy) of each image, pixels, on the device."""
     ks = [f.camera.intrinsic for f in frames]
-    return wp.array(
-        np.array([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in ks], np.float32), dtype=wp.vec4, device=batch.device
-    )
+    return on(batch, np.array([[k[0, 0], k[1, 1], k[0, 2], k[1, 2]] for k in ks]), wp.vec4)

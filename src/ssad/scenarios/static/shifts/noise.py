@@ -16,7 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from ssad.core.frames import Applied, Frame
-from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
+from ssad.scenarios.static.shifts.batch import Batch, file_keys, keys_on, on
 from ssad.scenarios.static.shifts.kernels import noise as kernels
 from ssad.scenarios.static.shifts.parameters import GAUSSIAN, IMPULSE, STUCK, UNIFORM
 from ssad.scenarios.static.shifts.spec import ShiftSpec
@@ -43,17 +43,11 @@ def noise_table(name: str, severity: int, calibration: str) -> npt.NDArray[np.in
 def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
     """uniform or gaussian."""
     out = batch.like()
-    words = batch.stride // 4
-    chunk = max(256, batch.width * 3 // 4)
-    keys = [spec.key("noise", f.scene, f.sample, f.camera.channel) for spec, f in zip(specs, frames, strict=True)]
+    dim, words, chunk = batch.chunks()
+    keys = file_keys(batch, specs, frames, "noise")
     tables = np.stack([noise_table(spec.name, spec.severity, spec.calibration) for spec in specs])
-    wp.launch(
-        kernels.add_noise,
-        dim=(batch.count, -(-words // chunk)),
-        inputs=[batch.words(), keys_on(batch, keys), on(batch, tables, wp.int16), words, chunk],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+    inputs = [batch.words(), keys, on(batch, tables, wp.int16), words, chunk]
+    batch.launch(kernels.add_noise, dim, inputs, out.words())
     scale = {"gaussian": GAUSSIAN, "uniform": UNIFORM}
     return out, [Applied(True, {"level": scale[s.name][s.severity - 1]}) for s in specs]
 
@@ -61,27 +55,14 @@ def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec])
 def add_impulses(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
     """impulse: of the share p of all values, a fifth is stuck at the same sites of a camera (physical)."""
     out = batch.like()
-    words = batch.stride // 4
-    chunk = max(256, batch.width * 3 // 4)
+    dim, words, chunk = batch.chunks()
     share = [IMPULSE[s.severity - 1] for s in specs]
     stuck = [p * STUCK if s.calibration == "physical" else 0.0 for p, s in zip(share, specs, strict=True)]
     # the two draws overlap: 1 - (1 - fresh)(1 - fixed) = share
     fresh = [1 - (1 - p) / (1 - q) for p, q in zip(share, stuck, strict=True)]
-    wp.launch(
-        kernels.add_impulses,
-        dim=(batch.count, -(-words // chunk)),
-        inputs=[
-            batch.words(),
-            keys_on(
-                batch, [s.key("noise", f.scene, f.sample, f.camera.channel) for s, f in zip(specs, frames, strict=True)]
-            ),
-            keys_on(batch, [s.key("stuck", f.camera.channel) for s, f in zip(specs, frames, strict=True)]),
-            on(batch, [round(p * 32768) * 2 for p in fresh], wp.int32),
-            on(batch, [round(p * 32768) * 2 for p in stuck], wp.int32),
-            words,
-            chunk,
-        ],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+    keys = file_keys(batch, specs, frames, "noise")
+    fixed_keys = keys_on(batch, [s.key("stuck", f.camera.channel) for s, f in zip(specs, frames, strict=True)])
+    rates = [on(batch, [round(p * 32768) * 2 for p in shares], wp.int32) for shares in (fresh, stuck)]
+    inputs = [batch.words(), keys, fixed_keys, *rates, words, chunk]
+    batch.launch(kernels.add_impulses, dim, inputs, out.words())
     return out, [Applied(True, {"share": p, "stuck": q}) for p, q in zip(share, stuck, strict=True)]

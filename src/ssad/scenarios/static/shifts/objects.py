@@ -52,11 +52,9 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
     elif spec.name == "scale":
         matrix = np.eye(3) * (1 + sign[0] * table.SCALE[step])
     elif spec.name == "rotation":
-        degrees = (
-            table.PAPER_LIDAR_ROTATION[step] + spread[0]
-            if other
-            else table.ROTATION[step] + spread[0] * table.ROTATION_SPREAD
-        )
+        degrees = table.ROTATION[step] + spread[0] * table.ROTATION_SPREAD
+        if other:
+            degrees = table.PAPER_LIDAR_ROTATION[step] + spread[0]
         a = np.radians(sign[0] * degrees)
         matrix = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
     else:
@@ -69,9 +67,8 @@ def _draw(spec: ShiftSpec, scope: tuple[str, ...], lidar: bool) -> tuple[tuple[f
 def deformations(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, lidar: bool = False) -> F64:
     """[N, 3, 3]: what happens to each object, in its own axes. The paper draws anew for the LiDAR."""
     if spec.calibration == "paper":
-        return np.broadcast_to(
-            np.array(_draw(spec, ("lidar" if lidar else "sample", sample), lidar)), (len(boxes), 3, 3)
-        )
+        drawn = _draw(spec, ("lidar" if lidar else "sample", sample), lidar)
+        return np.broadcast_to(np.array(drawn), (len(boxes), 3, 3))
     found = [_draw(spec, ("instance", scene, name), lidar) for name in boxes.instance]
     return np.array(found).reshape(-1, 3, 3)
 
@@ -104,9 +101,8 @@ def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sampl
     matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)
     length = matrix[:, :, 0] / np.linalg.norm(matrix[:, :, 0], axis=1, keepdims=True)
     rotation = boxes.axes()
-    turn = np.arctan2(
-        np.einsum("ni,ni->n", length, rotation[:, :, 1]), np.einsum("ni,ni->n", length, rotation[:, :, 0])
-    )
+    forward, aside = (np.einsum("ni,ni->n", length, rotation[:, :, k]) for k in (0, 1))
+    turn = np.arctan2(aside, forward)
     quaternion = quaternion_product(boxes.rotation, yaw_to_quaternion(turn))
     axes = quaternion_to_matrix(quaternion)
     corners = np.einsum("nji,nkj->nki", axes, np.einsum("nij,kj->nki", matrix, UNIT_CORNERS))
@@ -272,13 +268,10 @@ def _add_item(
 
 def _stamp(batch: Batch, plan: _Plan) -> tuple[Any, Any, Any, Any]:
     """Items, outlines and where each image's items start, on the device; and whose pixel each pixel is."""
-    device = batch.device
     items = structs(batch, plan.items, kernels.Item)
-    points = on(batch, np.concatenate(plan.points).astype(np.float32), wp.vec2)
-    first = on(batch, plan.first, wp.int32)
-    owner = wp.zeros((batch.count, batch.height, batch.width), dtype=wp.int16, device=device)
-    dim = (batch.count, batch.height)
-    wp.launch(kernels.stamp, dim=dim, inputs=[items, first, points], outputs=[owner], device=device)
+    points, first = on(batch, np.concatenate(plan.points), wp.vec2), on(batch, plan.first, wp.int32)
+    owner = wp.zeros((batch.count, batch.height, batch.width), dtype=wp.int16, device=batch.device)
+    batch.launch(kernels.stamp, (batch.count, batch.height), [items, first, points], owner)
     return items, points, first, owner
 
 
@@ -299,34 +292,18 @@ def move_objects(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpe
     out = batch.copy()
     if not any(d.applied for d in done):
         return out, done
-    device = batch.device
     items, points, first, owner = _stamp(batch, plan)
     respect = int(specs[0].calibration == "physical")
     if plan.lines:
         for rank in sorted({r for r, _, _ in plan.lines}):
             chosen = [(item, lines) for r, item, lines in plan.lines if r == rank]
-            wp.launch(
-                kernels.smear,
-                dim=(len(chosen), max(lines for _, lines in chosen) * 2),
-                inputs=[batch.data, items, on(batch, [c[0] for c in chosen], wp.int32), owner, batch.stride],
-                outputs=[out.data],
-                device=device,
-            )
+            ranked = on(batch, [item for item, _ in chosen], wp.int32)
+            dim = (len(chosen), max(lines for _, lines in chosen) * 2)
+            batch.launch(kernels.smear, dim, [batch.data, items, ranked, owner, batch.stride], out.data)
         return out, done
-    nodes = wp.zeros(plan.node_count, dtype=wp.vec4, device=device)
+    nodes = wp.zeros(plan.node_count, dtype=wp.vec4, device=batch.device)
     tallest = max(row[16] for row in plan.items)
-    wp.launch(
-        kernels.displace,
-        dim=(len(plan.items), tallest),
-        inputs=[items, points, lens(batch, frames)],
-        outputs=[nodes],
-        device=device,
-    )
-    wp.launch(
-        kernels.paint,
-        dim=(batch.count, batch.height),
-        inputs=[batch.words(), items, first, owner, nodes, respect, batch.stride],
-        outputs=[out.data],
-        device=device,
-    )
+    batch.launch(kernels.displace, (len(plan.items), tallest), [items, points, lens(batch, frames)], nodes)
+    inputs = [batch.words(), items, first, owner, nodes, respect, batch.stride]
+    batch.launch(kernels.paint, (batch.count, batch.height), inputs, out.data)
     return out, done

@@ -17,7 +17,7 @@ import warp as wp
 
 from ssad.core.frames import Applied, Frame
 from ssad.scenarios.static.shifts import parameters as table
-from ssad.scenarios.static.shifts.batch import Batch, keys_on, on
+from ssad.scenarios.static.shifts.batch import Batch, file_keys, on
 from ssad.scenarios.static.shifts.kernels import falling, layers
 from ssad.scenarios.static.shifts.noise import unit_normal
 from ssad.scenarios.static.shifts.objects import owners
@@ -39,18 +39,9 @@ def _draws(spec: ShiftSpec, frame: Frame) -> np.random.Generator:
     return spec.generator("paper", frame.scene, frame.sample, frame.camera.channel)
 
 
-def _key(spec: ShiftSpec, frame: Frame) -> int:
-    return spec.key("paper", frame.scene, frame.sample, frame.camera.channel)
-
-
 def _places(scale: float) -> int:
     """Places along a side of each pixel whose mean a layer takes: a smaller picture averages what it shows."""
     return max(1, round(1 / scale))
-
-
-def _numbers(batch: Batch, values: Any, dtype: Any = wp.float32) -> Any:
-    """Values of each picture on the device of the batch: int32, else floats and vectors of them."""
-    return on(batch, np.array(values, np.int32 if dtype is wp.int32 else np.float32), dtype)
 
 
 def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
@@ -66,14 +57,14 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         shapes.append([n + 1 for n in count])
     small = (batch.count, *np.max(shapes, axis=0).tolist())
     noise = wp.empty(small, dtype=float, device=batch.device)
-    keys = keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)])
-    inputs = [keys, _numbers(batch, mean), _numbers(batch, deviation), _numbers(batch, unit_normal())]
-    wp.launch(falling.specks, dim=small[:2], inputs=inputs, outputs=[noise], device=batch.device)
+    keys = file_keys(batch, specs, frames, "paper")
+    inputs = [keys, on(batch, mean), on(batch, deviation), on(batch, unit_normal())]
+    batch.launch(falling.specks, small[:2], inputs, noise)
     # flakes fall steeply: half the rows lose nothing
     half = (batch.count, -(-batch.height // 2))
     field, layer = (wp.empty((*half, batch.width), dtype=float, device=batch.device) for _ in range(2))
-    inputs = [noise, _numbers(batch, steps, wp.vec2), _numbers(batch, threshold), scale, _places(scale), batch.height]
-    wp.launch(falling.flakes, dim=half, inputs=inputs, outputs=[field], device=batch.device)
+    inputs = [noise, on(batch, steps, wp.vec2), on(batch, threshold), scale, _places(scale), batch.height]
+    batch.launch(falling.flakes, half, inputs, field)
     # half a gaussian over 2 radius + 1 published pixels, where it is more than nothing
     offsets, weights = [], []
     for a, r, deviate in zip(np.radians(angle), radius, sigma, strict=True):
@@ -84,15 +75,15 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     offset, weight = np.zeros((batch.count, taps, 2), np.int32), np.zeros((batch.count, taps), np.float32)
     for b, (o, w) in enumerate(zip(offsets, weights, strict=True)):
         offset[b, : len(o)], weight[b, : len(w)] = o, w / w.sum()
-    inputs = [field.flatten(), on(batch, offset, wp.vec2i), on(batch, weight, wp.float32), half[1], batch.width]
-    wp.launch(falling.streaks, dim=half, inputs=inputs, outputs=[layer.flatten()], device=batch.device)
+    inputs = [field.flatten(), on(batch, offset, wp.vec2i), on(batch, weight), half[1], batch.width]
+    batch.launch(falling.streaks, half, inputs, layer.flatten())
     dim = (batch.count, batch.height)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     inputs = [
-        batch.words(), layer.flatten(), _numbers(batch, keep), table.PAPER_GREY, batch.height, batch.width,
+        batch.words(), layer.flatten(), on(batch, keep), table.PAPER_GREY, batch.height, batch.width,
         batch.stride // 4, highest,
     ]  # fmt: skip
-    wp.launch(falling.blend_snow, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
+    batch.launch(falling.blend_snow, dim, inputs, out.words())
     _darken(out, highest)
     return out, [Applied(True, {"angle_deg": round(float(a), 1)}) for a in angle]
 
@@ -124,31 +115,31 @@ def _rain(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
         drawn.append([across, lean * across, -left * across, along])
         seen.append([cells / scale, -lean, left])
         first.append(rows)
-    inputs = [keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)]), _numbers(batch, density)]
+    inputs = [file_keys(batch, specs, frames, "paper"), on(batch, density)]
     most = 0.6 / scale
     rows, columns = int(batch.height * most) + 3 + max(length), int(batch.width * most) + 4
     shape = (batch.count, rows, columns + int(np.ceil(rows * np.tan(np.radians(15)))))
     salt, layer = (wp.empty(shape, dtype=float, device=batch.device) for _ in range(2))
-    inputs += [_numbers(batch, drawn, wp.vec4), _numbers(batch, first), on(batch, gates, wp.float32)]
-    wp.launch(falling.drops, dim=shape[:2], inputs=inputs, outputs=[salt], device=batch.device)
+    inputs += [on(batch, drawn, wp.vec4), on(batch, first), on(batch, gates)]
+    batch.launch(falling.drops, shape[:2], inputs, salt)
     sums = [wp.zeros((batch.count, shape[2]), dtype=float, device=batch.device) for _ in range(2)]
     # the source enlarges with cubic splines and cuts off what is negative: so much more light in the mean (measured)
     gain = [1.28 - 0.95 * d + 0.9 * d**2 for d in density]
     # columns a thread: neighbours in memory, or as many threads as there can be
     block = 64 if batch.device == "cpu" else 1
-    inputs = [salt, _numbers(batch, length, wp.int32), _numbers(batch, gain), block, *sums]
+    inputs = [salt, on(batch, length, wp.int32), on(batch, gain), block, *sums]
     dim = (batch.count, -(-shape[2] // block))
-    wp.launch(falling.fall, dim=dim, inputs=inputs, outputs=[layer], device=batch.device)
+    batch.launch(falling.fall, dim, inputs, layer)
     dim = (batch.count, batch.height)
     hidden = wp.empty((*dim, batch.width), dtype=wp.uint8, device=batch.device)
-    inputs = [layer, _numbers(batch, seen, wp.vec3), _numbers(batch, first), _places(scale)]
-    wp.launch(falling.curtain, dim=dim, inputs=inputs, outputs=[hidden], device=batch.device)
+    inputs = [layer, on(batch, seen, wp.vec3), on(batch, first), _places(scale)]
+    batch.launch(falling.curtain, dim, inputs, hidden)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     size = batch.count * batch.stride // 12
     parts = wp.array(ptr=hidden.ptr, dtype=wp.uint32, shape=size, device=batch.device)
     parts._keep = hidden  # the memory belongs to the bytes
     inputs = [batch.words(), parts, table.PAPER_GREY, batch.width, batch.stride // 4, highest]
-    wp.launch(falling.blend_rain, dim=dim, inputs=inputs, outputs=[out.words()], device=batch.device)
+    batch.launch(falling.blend_rain, dim, inputs, out.words())
     _darken(out, highest)
     told = zip(density, streaks, strict=True)
     return out, [Applied(True, {"density": round(float(d), 3), "streak_px": round(float(n))}) for d, n in told]
@@ -158,39 +149,36 @@ def _darken(out: Batch, highest: Any) -> None:
     """The brightest value becomes 0.7 of 256, the others in proportion, in place."""
     brightest = np.maximum(highest.numpy().max(1), 1)
     gain = np.rint(table.PAPER_DARK * 256 / brightest * 256).astype(np.int32)
-    words = out.stride // 4
-    chunk = max(256, out.width * 3 // 4)
-    dim = (out.count, -(-words // chunk))
-    inputs = [on(out, gain, wp.int32), words, chunk]
-    wp.launch(falling.darken, dim=dim, inputs=inputs, outputs=[out.words()], device=out.device)
+    dim, words, chunk = out.chunks()
+    out.launch(falling.darken, dim, [on(out, gain, wp.int32), words, chunk], out.words())
 
 
 def _fog(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> Result:
     """ImageNet-C's clouds without depth, then a share of grey. The clouds lack what is under 4 published pixels."""
     amount, decay, grey = zip(*[table.PAPER_FOG[s.severity - 1] for s in specs], strict=True)
-    keys = keys_on(batch, [_key(s, f) for s, f in zip(specs, frames, strict=True)])
+    keys = file_keys(batch, specs, frames, "paper")
     size = CLOUDS // 4
     levels = size.bit_length() - 1
     # the source multiplies its wibble with itself: an octave is 1 / decay ** 2 of the one before
-    wibble = _numbers(batch, [[float(d) ** (-2 * level) for level in range(levels)] for d in decay])
+    wibble = on(batch, [[float(d) ** (-2 * level) for level in range(levels)] for d in decay])
     clouds = wp.zeros((batch.count, size, size), dtype=float, device=batch.device)
     for level in range(levels):
         for kernel in (layers.squares, layers.diamonds):
             wide = (batch.count, 1 << level, 1 << level)
-            wp.launch(kernel, dim=wide, inputs=[keys, wibble, level], outputs=[clouds], device=batch.device)
+            batch.launch(kernel, wide, [keys, wibble, level], clouds)
     ends = [wp.empty((batch.count, size), dtype=float, device=batch.device) for _ in range(2)]
-    wp.launch(layers.extremes, dim=(batch.count, size), inputs=[clouds], outputs=ends, device=batch.device)
+    batch.launch(layers.extremes, (batch.count, size), [clouds], *ends)
     low, high = ends[0].numpy().min(1), ends[1].numpy().max(1)
     span = np.maximum(high - low, 1e-6)
     highest = wp.empty((batch.count, batch.height), dtype=int, device=batch.device)
     dim = (batch.count, batch.height)
     inputs = [batch.words(), batch.width * 3 // 4, batch.stride // 4]
-    wp.launch(layers.brightest, dim=dim, inputs=inputs, outputs=[highest], device=batch.device)
+    batch.launch(layers.brightest, dim, inputs, highest)
     most = highest.numpy().max(1) / 255
     out = batch.like()
-    numbers = [_numbers(batch, v) for v in (low, span, amount, most, grey)]
+    numbers = [on(batch, v) for v in (low, span, amount, most, grey)]
     inputs = [batch.data, clouds, *numbers, WIDTH / batch.width / 4, batch.width, batch.stride]
-    wp.launch(layers.blend_clouds, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    batch.launch(layers.blend_clouds, dim, inputs, out.data)
     return out, [Applied(True, {"amount": float(a), "decay": float(d)}) for a, d in zip(amount, decay, strict=True)]
 
 
@@ -213,10 +201,10 @@ def _sun(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> R
         suns.append([x, y, table.PAPER_SUN[spec.severity - 1] * scale])
         done.append(Applied(True, {"x": round(float(x)), "y": round(float(y)), "radius_px": float(suns[-1][2])}))
     out = batch.copy()
-    numbers = [_numbers(batch, values, wp.vec3) for values in (suns, flares, colours)]
-    inputs = [batch.data, *numbers, _numbers(batch, strengths), batch.width, batch.stride]
+    numbers = [on(batch, values, wp.vec3) for values in (suns, flares, colours)]
+    inputs = [batch.data, *numbers, on(batch, strengths), batch.width, batch.stride]
     dim = (batch.count, batch.height)
-    wp.launch(layers.blend_sun, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+    batch.launch(layers.blend_sun, dim, inputs, out.data)
     return out, done
 
 
@@ -234,5 +222,5 @@ def _blur(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     dim = (batch.count, batch.height)
     for kernel, values, kind in ((layers.smear_rows, lengths, wp.int32), (layers.zoom_blur, zooms, wp.float32)):
         inputs = [batch.data, owner, on(batch, values, kind), batch.stride]
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+        batch.launch(kernel, dim, inputs, out.data)
     return out, done

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import count, islice
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -104,11 +105,6 @@ def add_sun(
     strength, gain = np.zeros(batch.count), np.ones(batch.count)
     done: list[Applied] = []
 
-    def picture(b: int) -> U8:
-        """One image [H, W, 3] of the batch in main memory."""
-        rows = batch.data[b * batch.stride : (b + 1) * batch.stride].numpy()
-        return np.asarray(rows.reshape(batch.height, batch.width, 3)[:, : batch.seen])
-
     for b, (frame, spec, context) in enumerate(zip(frames, specs, contexts, strict=True)):
         if context.light < NIGHT:
             done.append(Applied(False, {"light": round(context.light, 2)}, {AT_NIGHT: 1}))
@@ -123,13 +119,9 @@ def add_sun(
         place[b] = x, y, 1
         inside, free = sun_in_picture(frame, world), frame.sun
         if free is None:
-            free = free_sun(frame, sun_depth(frame, picture(b)), world) if inside else 1.0
-        details = {
-            "angle_deg": round(angle, 1),
-            "in_view": inside,
-            "free": round(free, 2),
-            "direction": [round(float(v), 6) for v in world],
-        }
+            free = free_sun(frame, sun_depth(frame, batch.picture(b)), world) if inside else 1.0
+        details: dict[str, Any] = {"angle_deg": round(angle, 1), "in_view": inside, "free": round(free, 2)}
+        details["direction"] = [round(float(v), 6) for v in world]
         if not free:
             done.append(Applied(False, details, {HIDDEN: 1}))
             continue
@@ -141,32 +133,10 @@ def add_sun(
     rows, columns = grid_size(batch)
     light = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
     rays = [float(s.generator("star", f.camera.channel).uniform(0, 1)) for s, f in zip(specs, frames, strict=True)]
-    wp.launch(
-        veil.glare,
-        dim=(batch.count, rows),
-        inputs=[
-            on(batch, toward.astype(np.float32), wp.vec3),
-            on(batch, place.astype(np.float32), wp.vec3),
-            lens(batch, frames),
-            on(batch, strength, wp.float32),
-            on(batch, rays, wp.float32),
-        ],
-        outputs=[light],
-        device=batch.device,
-    )
+    sight = [on(batch, toward, wp.vec3), on(batch, place, wp.vec3), lens(batch, frames)]
+    batch.launch(veil.glare, (batch.count, rows), [*sight, on(batch, strength), on(batch, rays)], light)
     out = batch.like()
-    wp.launch(
-        veil.blend_glare,
-        dim=(batch.count, batch.height),
-        inputs=[
-            batch.words(),
-            light,
-            on(batch, np.tile(np.array([1.0, 0.97, 0.9], np.float32), (batch.count, 1)), wp.vec3),
-            on(batch, gain, wp.float32),
-            batch.width,
-            batch.stride // 4,
-        ],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+    tint = on(batch, np.tile([1.0, 0.97, 0.9], (batch.count, 1)), wp.vec3)
+    inputs = [batch.words(), light, tint, on(batch, gain), batch.width, batch.stride // 4]
+    batch.launch(veil.blend_glare, (batch.count, batch.height), inputs, out.words())
     return out, done

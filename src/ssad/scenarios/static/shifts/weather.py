@@ -67,66 +67,36 @@ def extinction(spec: ShiftSpec) -> float:
 
 
 def _clear(
-    batch: Batch,
-    frames: Sequence[Frame],
-    specs: Sequence[ShiftSpec],
-    weathers: Sequence[Weather],
-    ages: Sequence[float],
-) -> tuple[Any, list[str]]:
-    """Transmittance of the air [B, h, w] at the nodes of the quarter grid, and where the depth comes from."""
+    batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
+) -> tuple[list[Weather], Any, list[str]]:
+    """The weathers, the transmittance [B, h, w] of the air on the quarter grid, and where the depth comes from."""
+    weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
     rows, columns = grid_size(batch)
     depth, sources = depth_grid(batch, frames)
-    density = wp.empty(
-        (batch.count, -(-batch.height // _CELLS), -(-batch.width // _CELLS)), dtype=float, device=batch.device
-    )
-    poses = np.stack([camera_to_world(f) for f in frames])
-    drift = np.stack([w.wind * age for w, age in zip(weathers, ages, strict=True)])
+    coarse = (batch.count, -(-batch.height // _CELLS), -(-batch.width // _CELLS))
+    density = wp.empty(coarse, dtype=float, device=batch.device)
+    keys = keys_on(batch, [s.key("air", f.scene) for s, f in zip(specs, frames, strict=True)])
+    poses = on(batch, np.stack([camera_to_world(f) for f in frames]), wp.mat44)
     view = lens(batch, frames)
-    wp.launch(
-        veil.patchiness,
-        dim=density.shape,
-        inputs=[
-            keys_on(batch, [s.key("air", f.scene) for s, f in zip(specs, frames, strict=True)]),
-            on(batch, poses.astype(np.float32), wp.mat44),
-            view,
-            depth,
-            on(batch, drift.astype(np.float32), wp.vec3),
-            on(
-                batch, [w.patches if s.name == "fog" else 0.0 for w, s in zip(weathers, specs, strict=True)], wp.float32
-            ),
-            float(_CELLS),
-        ],
-        outputs=[density],
-        device=batch.device,
-    )
+    drift = np.stack([w.wind * age for w, age in zip(weathers, _ages(frames, contexts), strict=True)])
+    patches = on(batch, [w.patches if s.name == "fog" else 0.0 for w, s in zip(weathers, specs, strict=True)])
+    inputs = [keys, poses, view, depth, on(batch, drift, wp.vec3), patches, float(_CELLS)]
+    batch.launch(veil.patchiness, coarse, inputs, density)
     clear = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
-    betas = [extinction(s) for s in specs]
-    wp.launch(
-        veil.transmittance,
-        dim=(batch.count, rows),
-        inputs=[depth, view, density, on(batch, betas, wp.float32), FARTHEST],
-        outputs=[clear],
-        device=batch.device,
-    )
-    return clear, sources
+    inputs = [depth, view, density, on(batch, [extinction(s) for s in specs]), FARTHEST]
+    batch.launch(veil.transmittance, (batch.count, rows), inputs, clear)
+    return weathers, clear, sources
 
 
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
     """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) (Koschmieder 1924)."""
-    weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
-    ages = _ages(frames, contexts)
-    clear, sources = _clear(batch, frames, specs, weathers, ages)
+    weathers, clear, sources = _clear(batch, frames, specs, contexts)
     air = np.stack([w.colour * c.light * 245 for w, c in zip(weathers, contexts, strict=True)])
     out = batch.like()
-    wp.launch(
-        veil.blend_air,
-        dim=(batch.count, batch.height),
-        inputs=[batch.words(), clear, on(batch, air.astype(np.float32), wp.vec3), batch.width, batch.stride // 4],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+    inputs = [batch.words(), clear, on(batch, air, wp.vec3), batch.width, batch.stride // 4]
+    batch.launch(veil.blend_air, (batch.count, batch.height), inputs, out.words())
     done = [
         Applied(True, {"range_m": table.FOG_RANGE[s.severity - 1], "depth": source})
         for s, source in zip(specs, sources, strict=True)
@@ -175,54 +145,33 @@ def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
     """rain or snow: the veil of what is far away, and streaks of what is within a few metres."""
-    weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
-    ages = _ages(frames, contexts)
-    clear, sources = _clear(batch, frames, specs, weathers, ages)
+    weathers, clear, sources = _clear(batch, frames, specs, contexts)
     airs = [_air(s, f, w) for s, f, w in zip(specs, frames, weathers, strict=True)]
     most = max(a[-1] for a in airs)
     poses = np.stack([camera_to_world(f) for f in frames])
     layer = wp.zeros((batch.count, -(-batch.height // 2), -(-batch.width // 2)), dtype=int, device=batch.device)
-    wp.launch(
-        particles.splat,
-        dim=(batch.count, most),
-        inputs=[
-            structs(batch, airs, particles.Air),
-            on(batch, ages, wp.float32),
-            on(batch, np.swapaxes(poses[:, :3, :3], 1, 2).astype(np.float32), wp.mat33),
-            on(batch, (poses[:, :3, 3] % np.array([a[1] for a in airs])).astype(np.float32), wp.vec3),
-            on(batch, np.stack([f.ego_velocity for f in frames]).astype(np.float32), wp.vec3),
-            lens(batch, frames),
-            table.EXPOSURE,
-            table.APERTURE,
-        ],
-        outputs=[layer],
-        device=batch.device,
-    )
+    inputs = [
+        structs(batch, airs, particles.Air),
+        on(batch, _ages(frames, contexts)),
+        on(batch, np.swapaxes(poses[:, :3, :3], 1, 2), wp.mat33),
+        on(batch, poses[:, :3, 3] % np.array([a[1] for a in airs]), wp.vec3),
+        on(batch, np.stack([f.ego_velocity for f in frames]), wp.vec3),
+        lens(batch, frames),
+        table.EXPOSURE,
+        table.APERTURE,
+    ]
+    batch.launch(particles.splat, (batch.count, most), inputs, layer)
     sky = np.stack([w.colour * c.light for w, c in zip(weathers, contexts, strict=True)])
     bright = np.array([255.0 if s.name == "snow" else 235.0 for s in specs])[:, None]
-    out = batch.like()
-    wp.launch(
-        veil.blend_particles,
-        dim=(batch.count, batch.height),
-        inputs=[
-            batch.words(),
-            clear,
-            on(batch, (sky * 235).astype(np.float32), wp.vec3),
-            layer,
-            on(batch, (sky * bright).astype(np.float32), wp.vec3),
-            batch.width,
-            batch.stride // 4,
-        ],
-        outputs=[out.words()],
-        device=batch.device,
-    )
+    out, dim = batch.like(), (batch.count, batch.height)
+    haze, white = on(batch, sky * 235, wp.vec3), on(batch, sky * bright, wp.vec3)
+    inputs = [batch.words(), clear, haze, layer, white, batch.width, batch.stride // 4]
+    batch.launch(veil.blend_particles, dim, inputs, out.words())
     drops = _lens_drops(batch, frames, specs)
     if len(drops):
         rows = structs(batch, drops, particles.LensDrop)
         first = on(batch, np.searchsorted([d[0] for d in drops], np.arange(batch.count + 1)), wp.int32)
-        inputs = [batch.data, rows, first, batch.height, batch.width]
-        dim = (batch.count, batch.height)
-        wp.launch(particles.refract, dim=dim, inputs=inputs, outputs=[out.data], device=batch.device)
+        batch.launch(particles.refract, dim, [batch.data, rows, first, batch.height, batch.width], out.data)
     rates = [(table.SNOW_RATE if s.name == "snow" else table.RAIN_RATE)[s.severity - 1] for s in specs]
     done = [
         Applied(True, {"rate_mm_h": rate, "particles": air[-1], "lens_drops": _count(s), "depth": source})

@@ -2,7 +2,18 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import FIELDS, ONES, TENS, cell, draw, gather, pixel_of, spread, unit
+from ssad.scenarios.static.shifts.kernels.shared import (
+    FIELDS,
+    ONES,
+    TENS,
+    cell,
+    draw,
+    gather,
+    pixel_of,
+    put_four,
+    spread,
+    unit,
+)
 
 OVER = wp.constant(wp.uint64(256 + (256 << 21) + (256 << 42)))
 
@@ -162,11 +173,7 @@ def put(
     out: wp.array(dtype=wp.uint32), i: int, most: int, f0: wp.uint64, f1: wp.uint64, f2: wp.uint64, f3: wp.uint64
 ) -> int:
     """Writes four pixels, given as fields, to three words from i on; the largest value so far."""
-    p1 = gather(f1)
-    p2 = gather(f2)
-    out[i] = gather(f0) | (p1 << wp.uint32(24))
-    out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-    out[i + 2] = (p2 >> wp.uint32(16)) | (gather(f3) << wp.uint32(8))
+    put_four(out, i, gather(f0), gather(f1), gather(f2), gather(f3))
     return most_of(f3, most_of(f2, most_of(f1, most_of(f0, most))))
 
 

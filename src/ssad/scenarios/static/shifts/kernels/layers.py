@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import byte, draw, unit
+from ssad.scenarios.static.shifts.kernels.shared import byte, colour, draw, put_colour, unit
 
 
 @wp.kernel
@@ -117,18 +117,16 @@ def blend_clouds(
             right = grid[b, above, q] * (1.0 - part) + grid[b, below, q] * part
         veil = (left + (right - left) * (fx - float(here))) * add + base
         i = start + x * 3
-        out[i] = byte(float(image[i]) * scale + veil)
-        out[i + 1] = byte(float(image[i + 1]) * scale + veil)
-        out[i + 2] = byte(float(image[i + 2]) * scale + veil)
+        for k in range(3):
+            out[i + k] = byte(float(image[i + k]) * scale + veil)
 
 
 @wp.func
-def brighter(r: float, g: float, w: float, colour: wp.vec3, part: float) -> wp.vec3:
+def brighter(pixel: wp.vec3, shade: wp.vec3, part: float) -> wp.vec3:
     """A colour over a pixel by a share, unless that makes it darker (HLS lightness, whole grey levels)."""
-    over = wp.vec3(r, g, w) * (1.0 - part) + colour * part
-    before = int(wp.max(r, wp.max(g, w))) + int(wp.min(r, wp.min(g, w)))
-    after = int(wp.max(over[0], wp.max(over[1], over[2]))) + int(wp.min(over[0], wp.min(over[1], over[2])))
-    return wp.where(after > before, over, wp.vec3(r, g, w))
+    over = pixel * (1.0 - part) + shade * part
+    lighter = int(wp.max(over)) + int(wp.min(over)) > int(wp.max(pixel)) + int(wp.min(pixel))
+    return wp.where(lighter, over, pixel)
 
 
 @wp.kernel
@@ -136,7 +134,7 @@ def blend_sun(
     image: wp.array(dtype=wp.uint8),
     sun: wp.array(dtype=wp.vec3),
     flare: wp.array(dtype=wp.vec3),
-    colour: wp.array(dtype=wp.vec3),
+    tint: wp.array(dtype=wp.vec3),
     strength: wp.array(dtype=float),
     width: int,
     stride: int,
@@ -144,7 +142,7 @@ def blend_sun(
 ):
     """In place (out holds the image): a faint disc of a colour, then the white sun, both with gaussian edges.
 
-    sun, flare: x, y, deviation in pixels, 0 for none; strength: share of the colour in the disc.
+    sun, flare: x, y, deviation in pixels, 0 for none; tint: colour of the disc; strength: its share there.
     """
     b, y = wp.tid()
     start = b * stride + y * width * 3
@@ -162,16 +160,12 @@ def blend_sun(
             far = (ex * ex + ey * ey) / (flare[b][2] * flare[b][2])
         if near < 16.0 or far < 20.0:
             i = start + x * 3
-            r = float(image[i])
-            g = float(image[i + 1])
-            w = float(image[i + 2])
             part = wp.min(4.0 * wp.exp(-0.5 * far), 1.0) * strength[b]
-            mixed = brighter(r, g, w, colour[b], part)
+            mixed = brighter(wp.vec3(colour(image, i)), tint[b], part)
             part = wp.min(1.5 * wp.exp(-0.5 * near), 1.0)
-            mixed = brighter(mixed[0], mixed[1], mixed[2], wp.vec3(255.0, 255.0, 255.0), part)
-            out[i] = wp.uint8(wp.clamp(int(mixed[0]), 0, 255))
-            out[i + 1] = wp.uint8(wp.clamp(int(mixed[1]), 0, 255))
-            out[i + 2] = wp.uint8(wp.clamp(int(mixed[2]), 0, 255))
+            mixed = brighter(mixed, wp.vec3(255.0, 255.0, 255.0), part)
+            for k in range(3):
+                out[i + k] = wp.uint8(wp.clamp(int(mixed[k]), 0, 255))
 
 
 @wp.kernel
@@ -189,26 +183,16 @@ def smear_rows(
     if half < 1:
         return
     start = b * stride + y * width * 3
-    red = int(0)
-    green = int(0)
-    blue = int(0)
+    total = wp.vec3i(0, 0, 0)
     for k in range(-half, half + 1):
-        i = start + wp.clamp(k, 0, width - 1) * 3
-        red += int(image[i])
-        green += int(image[i + 1])
-        blue += int(image[i + 2])
+        total += colour(image, start + wp.clamp(k, 0, width - 1) * 3)
     taps = 2 * half + 1
     for x in range(width):
         if owner[b, y, x] > wp.int16(0):
-            i = start + x * 3
-            out[i] = wp.uint8(red / taps)
-            out[i + 1] = wp.uint8(green / taps)
-            out[i + 2] = wp.uint8(blue / taps)
+            put_colour(out, start + x * 3, total / taps)
         enter = start + wp.min(x + half + 1, width - 1) * 3
         leave = start + wp.max(x - half, 0) * 3
-        red += int(image[enter]) - int(image[leave])
-        green += int(image[enter + 1]) - int(image[leave + 1])
-        blue += int(image[enter + 2]) - int(image[leave + 2])
+        total += colour(image, enter) - colour(image, leave)
 
 
 @wp.kernel
@@ -230,18 +214,10 @@ def zoom_blur(
     start = b * stride
     for x in range(width):
         if owner[b, y, x] > wp.int16(0):
-            red = int(0)
-            green = int(0)
-            blue = int(0)
+            total = wp.vec3i(0, 0, 0)
             for k in range(12):
                 shrink = 1.0 / (1.0 + zoom[b] * float(k) / 11.0)
                 sx = int((float(x) - cx) * shrink + cx + 0.5)
                 sy = int((float(y) - cy) * shrink + cy + 0.5)
-                i = start + (sy * width + sx) * 3
-                red += int(image[i])
-                green += int(image[i + 1])
-                blue += int(image[i + 2])
-            o = start + (y * width + x) * 3
-            out[o] = wp.uint8(red / 12)
-            out[o + 1] = wp.uint8(green / 12)
-            out[o + 2] = wp.uint8(blue / 12)
+                total += colour(image, start + (sy * width + sx) * 3)
+            put_colour(out, start + (y * width + x) * 3, total / 12)

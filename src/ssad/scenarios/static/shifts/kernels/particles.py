@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.scenarios.static.shifts.kernels.shared import draw, unit
+from ssad.scenarios.static.shifts.kernels.shared import colour, draw, unit
 
 
 @wp.struct
@@ -62,24 +62,19 @@ def refract(
                 u = float(i) / drop.radius
                 r = wp.sqrt(u * u + v * v)
                 if r < 1.0 and x >= 0 and x < width:
-                    red = float(0.0)
-                    green = float(0.0)
-                    blue = float(0.0)
+                    total = wp.vec3i(0, 0, 0)
                     for k in range(9):
                         # a wide view: the rim looks past the picture's border, where it is held
                         sx = drop.x - (u + float(k % 3 - 1) * 0.12) * float(height) * 0.55
                         sy = drop.y - (v + float(k / 3 - 1) * 0.12) * float(height) * 0.55
                         row = wp.clamp(int(sy), 0, height - 1)
-                        at = start + (row * width + wp.clamp(int(sx), 0, width - 1)) * 3
-                        red += float(image[at])
-                        green += float(image[at + 1])
-                        blue += float(image[at + 2])
+                        total += colour(image, start + (row * width + wp.clamp(int(sx), 0, width - 1)) * 3)
                     cover = 0.8 * wp.clamp((1.0 - r) * 3.0, 0.0, 1.0)
                     shade = (1.0 - 0.35 * r * r) * cover / 9.0
                     o = start + (y * width + x) * 3
-                    out[o] = wp.uint8(wp.min(float(out[o]) * (1.0 - cover) + red * shade + 0.5, 255.0))
-                    out[o + 1] = wp.uint8(wp.min(float(out[o + 1]) * (1.0 - cover) + green * shade + 0.5, 255.0))
-                    out[o + 2] = wp.uint8(wp.min(float(out[o + 2]) * (1.0 - cover) + blue * shade + 0.5, 255.0))
+                    for k in range(3):
+                        light = float(out[o + k]) * (1.0 - cover) + float(total[k]) * shade + 0.5
+                        out[o + k] = wp.uint8(wp.min(light, 255.0))
 
 
 @wp.func

@@ -32,6 +32,28 @@ def byte(value: float) -> wp.uint8:
 
 
 @wp.func
+def colour(image: wp.array(dtype=wp.uint8), i: int) -> wp.vec3i:
+    """The three bytes from i on."""
+    return wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
+
+
+@wp.func
+def put_colour(image: wp.array(dtype=wp.uint8), i: int, value: wp.vec3i):
+    """Writes three grey levels in 0..255 to the bytes from i on."""
+    image[i] = wp.uint8(value[0])
+    image[i + 1] = wp.uint8(value[1])
+    image[i + 2] = wp.uint8(value[2])
+
+
+@wp.func
+def put_four(out: wp.array(dtype=wp.uint32), i: int, p0: wp.uint32, p1: wp.uint32, p2: wp.uint32, p3: wp.uint32):
+    """Writes four pixels to three words from i on."""
+    out[i] = p0 | (p1 << wp.uint32(24))
+    out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
+    out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+
+
+@wp.func
 def cell(grid: wp.array3d(dtype=float), b: int, row: int, fraction: float, column: int) -> float:
     """Value of a grid between two of its rows, columns held at the border."""
     x = wp.clamp(column, 0, grid.shape[2] - 1)

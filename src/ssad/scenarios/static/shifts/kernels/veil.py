@@ -12,6 +12,7 @@ from ssad.scenarios.static.shifts.kernels.shared import (
     fields_of,
     gather,
     pixel_of,
+    put_four,
     spread,
     value_noise,
 )
@@ -103,9 +104,7 @@ def blend_air(
         p1 = gather(blend(spread(pixel_of(w0, w1, w2, 1)), haze, int(before + (here - before) * 0.875)))
         p2 = gather(blend(spread(pixel_of(w0, w1, w2, 2)), haze, int(here + (after - here) * 0.125)))
         p3 = gather(blend(spread(pixel_of(w0, w1, w2, 3)), haze, int(here + (after - here) * 0.375)))
-        out[i] = p0 | (p1 << wp.uint32(24))
-        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        put_four(out, i, p0, p1, p2, p3)
         i += 3
         before = here
         here = after
@@ -165,9 +164,7 @@ def blend_particles(
         p1 = behind(pixel_of(w0, w1, w2, 1), haze, before + (here - before) * 0.875, light, 3 * o1 + o2)
         p2 = behind(pixel_of(w0, w1, w2, 2), haze, here + (after - here) * 0.125, light, 3 * o2 + o1)
         p3 = behind(pixel_of(w0, w1, w2, 3), haze, here + (after - here) * 0.375, light, 3 * o2 + o3)
-        out[i] = p0 | (p1 << wp.uint32(24))
-        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        put_four(out, i, p0, p1, p2, p3)
         i += 3
         before = here
         here = after
@@ -267,9 +264,7 @@ def blend_glare(
         p1 = lit(pixel_of(w0, w1, w2, 1), factor, colour, before + (here - before) * 0.875)
         p2 = lit(pixel_of(w0, w1, w2, 2), factor, colour, here + (after - here) * 0.125)
         p3 = lit(pixel_of(w0, w1, w2, 3), factor, colour, here + (after - here) * 0.375)
-        out[i] = p0 | (p1 << wp.uint32(24))
-        out[i + 1] = (p1 >> wp.uint32(8)) | (p2 << wp.uint32(16))
-        out[i + 2] = (p2 >> wp.uint32(16)) | (p3 << wp.uint32(8))
+        put_four(out, i, p0, p1, p2, p3)
         i += 3
         before = here
         here = after

@@ -1,4 +1,4 @@
-"""Makes the shipped scenario sets: `python -m ssad.scenarios.dynamic.make_sets`.
+"""Makes the shipped scenario sets: `python benchmarks/make_scenario_sets.py`.
 
 Routes are searched on the towns' lane graphs: every stretch of road that a class needs (a clear lane, a lane with a
 neighbour, a turn with crossing traffic), then those that lie farthest apart, so that arms, bends and junctions vary.

@@ -1,4 +1,4 @@
-"""The towns that ship with SSAD, as code: `python -m ssad.roads.generate FOLDER` writes their .xodr and .npz."""
+"""The towns that ship with SSAD, as code: `python benchmarks/make_towns.py FOLDER` writes their .xodr and .npz."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from ssad.core.safeio import write_atomic
 from ssad.roads.bake import bake
 from ssad.roads.library import BUILT_IN
 from ssad.roads.writer import Point, RoadSpec, Town, write_town
-
-__all__ = ["TOWNS", "generate_town"]
 
 
 def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], RoadSpec]) -> list[RoadSpec]:

@@ -1,0 +1,382 @@
+"""Kind `driving` without a world behind it: its suites, cells, batches, and what it keeps beside the results."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from ssad.bench.kind import Cell, Job, Plan, Resources
+from ssad.bench.kinds import driving
+from ssad.bench.kinds.driving import (
+    Driving,
+    DrivingSuite,
+    make_pictures,
+    plain,
+    suite_scenarios,
+    system_version,
+    town_version,
+    type_version,
+)
+from ssad.core.errors import ConfigError, RouteError, UnknownNameError
+from ssad.core.types import Pose, Scenario
+
+GOOD: dict[str, Any] = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"]}
+
+
+def suite(**changes: Any) -> DrivingSuite:
+    return DrivingSuite.model_validate(GOOD | changes)
+
+
+def scenario(name: str, **changes: Any) -> Scenario:
+    base = {"name": name, "type": "StraightObstacle", "town": "Nowhere", "route": (Pose(0, 0), Pose(9, 0))}
+    return Scenario(**(base | changes))
+
+
+@pytest.fixture(autouse=True)
+def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Towns of that name, and scenarios that the suite seems to name."""
+    monkeypatch.setattr(driving, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3)))
+
+
+def plan_of(monkeypatch: pytest.MonkeyPatch, *scenarios: Scenario, check: bool = False, **changes: Any) -> Plan:
+    monkeypatch.setattr(driving, "suite_scenarios", lambda suite: scenarios)
+    return Driving().plan(suite(**changes), check=check)
+
+
+def test_what_a_suite_says_by_default() -> None:
+    found = suite()
+    assert (found.repetitions, found.spread, found.timeout_s, found.chunk) == (1, 1.0, 120.0, 16)
+    assert (found.witness, found.pictures) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("key", "good", "bad"),
+    [
+        ("repetitions", [1, 100_000], [0, 100_001]),
+        ("spread", [0.0, 10.0], [-0.01, 10.01, math.inf, math.nan]),
+        ("timeout_s", [0.01], [0.0, math.inf]),
+        ("chunk", [1, 4096], [0, 4097]),
+        ("pictures", [["shifts", "camera"]], [["cats"]]),
+        ("systems", [["a"]], [[], [""]]),
+        ("scenarios", [["a"]], [[], [""]]),
+    ],
+)
+def test_what_a_suite_may_say(key: str, good: list[Any], bad: list[Any]) -> None:
+    for value in good:
+        assert getattr(suite(**{key: value}), key) == value
+    for value in bad:
+        with pytest.raises(ValidationError):
+            suite(**{key: value})
+
+
+def test_scenario_files_lie_in_the_working_folder_or_beside_the_suite(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    for name in ("here/one.yaml", "there/one.yaml", "there/two.yml", "there/three"):
+        (tmp_path / name).write_text("")
+    monkeypatch.chdir(tmp_path / "here")
+    found = suite(scenarios=["one.yaml", "two.yml", "gone.yaml", "three", "set"]).beside(tmp_path / "there" / "s.yaml")
+    assert found.scenarios == ["one.yaml", str(tmp_path / "there" / "two.yml"), "gone.yaml", "three", "set"]
+
+
+def test_a_system_twice_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError, match="suite s: systems: a name appears twice"):
+        plan_of(monkeypatch, scenario("a"), systems=["blind", "blind"])
+
+
+def test_cells_are_named_and_described(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = plan_of(monkeypatch, scenario("a/00", group="A"), scenario("b"), repetitions=2, spread=0.5)
+    assert [cell.name for cell in plan.cells] == [
+        f"{system}/{name}" for system in ("autopilot", "blind") for name in ("a/00", "a/00#1", "b", "b#1")
+    ]
+    one, again = plan.cells[:2]
+    assert one.fields == {"system": "autopilot", "group": "A", "cluster": "a/00"}
+    assert plan.cells[2].fields["group"] == "StraightObstacle"
+    assert (one.spec["repetition"], one.spec["spread"]) == (0, 0.0)
+    assert (again.spec["repetition"], again.spec["spread"]) == (1, 0.5)
+    assert again.spec["system"] == "autopilot"
+    assert one.spec["scenario"]["name"] == "a/00"
+    assert set(plan.inputs) == {"towns", "systems"}
+    assert list(plan.inputs["towns"]) == ["Nowhere"]
+    assert plan.device == "cpu"
+
+
+def test_each_scenario_is_built_once_to_check_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+
+    def build(cell: Cell) -> None:
+        built.append(cell.name)
+        if cell.name.endswith("bad"):
+            raise RouteError("no way")
+        if cell.name.endswith("worse"):
+            raise RouteError("scenario worse: no way")
+
+    monkeypatch.setattr(driving, "episode_of", build)
+    plan_of(monkeypatch, scenario("a"), scenario("b"), repetitions=3, check=True)
+    assert built == ["autopilot/a", "autopilot/b"]
+    for name in ("bad", "worse"):
+        with pytest.raises(RouteError, match=f"^scenario {name}: no way$"):
+            plan_of(monkeypatch, scenario(name), check=True)
+        plan_of(monkeypatch, scenario(name))
+    plan_of(monkeypatch, scenario("a"))
+    built.clear()
+    Driving().plan(suite(scenarios=["x"]))
+    assert built, "unless it is told not to"
+
+
+def test_copies_of_towns_lie_beside_the_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    saved = []
+
+    def save(graph: Any, path: Path) -> None:
+        saved.append((graph.name, path))
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("")
+
+    monkeypatch.setattr(driving, "save_graph", save)
+    plan = plan_of(monkeypatch, scenario("a"), scenario("b", town="dir/own.npz"), scenario("c", town="Old"))
+    (tmp_path / "towns").mkdir()
+    (tmp_path / "towns" / "Old.npz").write_text("")
+    assert plan.kind.prepare(plan, tmp_path, Resources()) == {"witness": True}
+    assert saved == [("Nowhere", tmp_path / "towns" / "Nowhere.npz")]
+    assert (tmp_path / "traces").is_dir()
+    no = plan_of(monkeypatch, scenario("a"), witness=False)
+    assert no.kind.prepare(no, tmp_path, Resources()) == {"witness": False}
+
+
+@pytest.mark.parametrize(
+    ("chunk", "workers", "sizes"),
+    [(16, 1, [5, 5]), (16, 2, [5, 5]), (16, 3, [4, 1, 4, 1]), (2, 1, [2, 2, 1] * 2), (16, 99, [1] * 10)],
+)
+def test_cells_of_a_system_run_together(
+    monkeypatch: pytest.MonkeyPatch, chunk: int, workers: int, sizes: list[int]
+) -> None:
+    plan = plan_of(monkeypatch, *(scenario(name) for name in "abcde"), chunk=chunk)
+    found = plan.kind.batches(plan, plan.cells, workers)
+    assert [len(batch) for batch in found] == sizes
+    assert [cell for batch in found for cell in batch] == list(plan.cells)
+    assert plan.kind.batches(plan, [], workers) == []
+
+
+class Thing:
+    """No system: it cannot act."""
+
+    def reset(self, episodes: Any) -> None:
+        """Nothing."""
+
+
+class Mute:
+    """No system: it cannot be reset."""
+
+    reset = 3
+
+    def act(self, view: Any) -> None:
+        """Nothing."""
+
+
+class Whole(Thing, Mute):
+    """A system; there are others of its class."""
+
+
+WHOLE = Whole()
+
+
+def test_a_system_must_have_its_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driving, "source_version", lambda module: f"version of {module}")
+    for name in ("Thing", "Mute"):
+        with pytest.raises(
+            ConfigError, match=rf"system '{__name__}:{name}' needs the methods reset\(episodes\) and act"
+        ):
+            system_version(f"{__name__}:{name}")
+    for name in ("Whole", "WHOLE"):
+        assert system_version(f"{__name__}:{name}") == f"version of {__name__}"
+    with pytest.raises(UnknownNameError):
+        system_version("nobody")
+
+
+def test_a_scenario_type_of_ones_own_has_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driving, "source_version", lambda module: f"version of {module}")
+    assert type_version("own.module:Type") == "version of own.module"
+    assert type_version("StraightObstacle") == ""
+
+
+def test_the_version_of_a_town_depends_on_every_array() -> None:
+    def version(**changes: Any) -> str:
+        arrays = {"xy": np.zeros((2, 3)), "ids": np.arange(3)}
+        return town_version(SimpleNamespace(name="any", **(arrays | changes)))  # type: ignore[arg-type]
+
+    first = version()
+    assert len(first) == 12
+    assert version(index=[3]) == first, "what is no array does not count"
+    others = [
+        version(xy=np.ones((2, 3))), version(xy=np.zeros((3, 2))), version(xy=np.zeros((2, 3), np.int64)),
+        version(more=np.zeros(1)),
+    ]  # fmt: skip
+    assert len({first, *others}) == 5
+
+
+def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    sets = {
+        "one": (scenario("a"), scenario("b")),
+        "two": (scenario("b"), scenario("c")),
+        "bad": (scenario("b", seed=1),),
+    }
+
+    def load(ref: str) -> Any:
+        if ref not in sets:
+            raise UnknownNameError(f"unknown scenario '{ref}'")
+        return sets[ref]
+
+    monkeypatch.setattr("ssad.scenarios.dynamic.load_scenarios", load)
+    assert [one.name for one in suite_scenarios(suite(scenarios=["one", "two"]))] == ["a", "b", "c"]
+    with pytest.raises(
+        ConfigError, match=r"suite s: two different scenarios are named 'b' \(one from bad\); rename one"
+    ):
+        suite_scenarios(suite(scenarios=["one", "bad"]))
+    with pytest.raises(UnknownNameError, match="suite s: unknown scenario 'three'"):
+        suite_scenarios(suite(scenarios=["one", "three"]))
+
+
+def test_a_witness_is_looked_for_once_for_an_episode_and_speed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    speeds = []
+
+    def find(episode: Any, graph: Any, *, device: str) -> Any:
+        speeds.append((episode.agents[0].target_speed, episode.agents[1:], graph.name, device))
+        return SimpleNamespace(as_dict=lambda: {"found": True, "margin": math.inf, "speed": np.float64(2.5)})
+
+    monkeypatch.setattr("ssad.world.witness.find_witness", find)
+    monkeypatch.setattr(driving, "replace", lambda old, **new: SimpleNamespace(**(vars(old) | new)))
+    monkeypatch.setattr(driving, "scenario_json", lambda scenario: {"name": scenario})
+    ego, other = SimpleNamespace(target_speed=8.0), SimpleNamespace(target_speed=1.0)
+    episode: Any = SimpleNamespace(agents=(ego, other), scenario="s", seed=3, town="Nowhere")
+    expected = {"found": True, "margin": None, "speed": 2.5}
+    for speed in (None, 9.5, 9.5, None):
+        assert driving.witness(tmp_path, episode, speed, "cpu") == expected
+    assert speeds == [(8.0, (other,), "Nowhere", "cpu"), (9.5, (other,), "Nowhere", "cpu")]
+    files = list((tmp_path / "witness").iterdir())
+    assert len(files) == 2
+    assert all(len(path.stem) == 16 and path.read_text().endswith("}\n") for path in files)
+    later: Any = SimpleNamespace(**(vars(episode) | {"seed": 4}))
+    driving.witness(tmp_path, later, None, "cpu")
+    assert len(speeds) == 3
+
+
+def test_plain_data() -> None:
+    given = {
+        "a": (1, [np.float32(0.5), math.nan]),
+        3: {"b": -math.inf},
+        "c": "text",
+        "d": np.int64(4),
+        "e": None,
+        "f": True,
+    }
+    assert plain(given) == {
+        "a": [1, [0.5, None]], "3": {"b": None}, "c": "text", "d": 4, "e": None, "f": True,
+    }  # fmt: skip
+    assert type(plain(np.int64(4))) is int
+
+
+def trace_of(end: str) -> Any:
+    return SimpleNamespace(town="Nowhere", end=end)
+
+
+def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    cells = plan_of(monkeypatch, scenario("a"), scenario("b"), systems=["autopilot"]).cells
+    episodes = [SimpleNamespace(scenario=SimpleNamespace(name=name)) for name in "ab"]
+    asked, clock = [], iter([0.0, 8.0, 10.0, 11.0, 20.0, 22.0] * 2)
+    monkeypatch.setattr(driving, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr(
+        driving, "drive", lambda cells, *, device: (episodes, [trace_of("collision"), trace_of("route")])
+    )
+    monkeypatch.setattr(driving, "save_trace", lambda path, trace: path.write_text(trace.end))
+    monkeypatch.setattr(driving, "trace_hash", lambda trace: f"hash {trace.end}")
+    monkeypatch.setattr(driving, "motion_hash", lambda trace: f"motion {trace.end}")
+    monkeypatch.setattr(driving, "system_of", lambda name: SimpleNamespace(target_speed=7.5))
+    measured = SimpleNamespace(as_dict=lambda: {"speed": math.inf})
+    monkeypatch.setattr(driving, "episode_metrics", lambda trace: measured)
+
+    def witness(*given: Any) -> dict[str, bool]:
+        asked.append(given)
+        return {"avoidable": True}
+
+    monkeypatch.setattr(driving, "witness", witness)
+    (tmp_path / "traces").mkdir()
+    found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": True}))
+    one, two = (found[cell.key] for cell in cells)
+    path = f"traces/{cells[0].key}.npz"
+    assert one == {
+        "metrics": {"speed": None}, "artefacts": {"trace": path}, "case": "motion collision", "wall_s": 4.0 + 1.0,
+        "episode": {
+            "scenario": "a", "repetition": 0, "town": "Nowhere", "end": "collision", "trace_hash": "hash collision",
+            "trace": path, "metrics": {"speed": None},
+        },
+        "witness": {"avoidable": True},
+    }  # fmt: skip
+    assert two["wall_s"] == 4.0 + 2.0
+    assert "witness" not in two, "nothing was hit"
+    assert asked == [(tmp_path, episodes[0], 7.5, "cpu")]
+    assert (tmp_path / path).read_text() == "collision"
+    found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": False}))
+    assert "witness" not in found[cells[0].key]
+
+
+def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made = []
+
+    def sheets(street: Path, path: Path) -> None:
+        made.append(street.name)
+        path.write_text("")
+        path.with_name("shifts-severities.jpg").write_text("")
+
+    def tiny(path: Path, *, scenes: int, samples: int, sweeps: int, size: tuple[int, int]) -> Path:
+        assert scenes >= 1
+        assert samples * (1 + sweeps) >= 2, "shifts of motion need more than one frame"
+        assert size[0] * 9 == size[1] * 16
+        return path
+
+    def save(path: Path, picture: str) -> None:
+        made.append(picture)
+        path.write_text("")
+
+    def told() -> Any:
+        return json.loads((tmp_path / "pictures" / "pictures.json").read_text())
+
+    trace = tmp_path / "traces" / "ab12.npz"
+    fakes: dict[str, dict[str, Any]] = {
+        "ssad.datasets.nuscenes.tiny": {"make_tiny": tiny},
+        "ssad.toolbox.contact_sheet": {"write_sheets": sheets},
+        "ssad.recording.camera_sheets": {"write_gallery": lambda folder: {"camera-rig.jpg": f"In {folder.name}."}},
+        "ssad.recording.onboard": {
+            "pick_trace": lambda folder: trace, "onboard_sheet": lambda trace, graph: f"{trace.town} {graph}",
+        },
+    }  # fmt: skip
+    for name, contents in fakes.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**contents))  # type: ignore[arg-type]
+    monkeypatch.setattr(driving, "save_picture", save)
+    monkeypatch.setattr(driving, "load_trace", lambda path: {trace: trace_of("route")}[path])
+    monkeypatch.setattr(driving, "load_graph", lambda path: path.relative_to(tmp_path).as_posix())
+    make_pictures([], tmp_path)
+    assert not list(tmp_path.iterdir()), "none are asked for"
+    for _ in range(2):
+        make_pictures(["shifts", "camera"], tmp_path)
+    assert made == ["street", "Nowhere towns/Nowhere.npz"]
+    captions = told()
+    assert set(captions) == {"shifts.jpg", "shifts-severities.jpg", "camera-rig.jpg", "camera.jpg"}
+    assert captions["camera-rig.jpg"] == "In pictures."
+    assert "(ab12)" in captions["camera.jpg"]
+    (tmp_path / "pictures" / "shifts-severities.jpg").unlink()
+    make_pictures(["shifts"], tmp_path)
+    assert made[2:] == ["street"], "what is gone is made again"
+    assert set(told()) == {"shifts.jpg", "shifts-severities.jpg"}
+    trace = None  # type: ignore[assignment]
+    make_pictures(["camera"], tmp_path)
+    assert set(told()) == {"camera-rig.jpg"}

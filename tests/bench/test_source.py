@@ -1,0 +1,134 @@
+"""The source that a result depends on is found, all of it and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+
+from ssad.bench.source import source_files, source_version
+
+Write = Callable[[Mapping[str, str]], None]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Write:
+    """Writes modules into a folder that is imported from."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def inner(files: Mapping[str, str]) -> None:
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+
+    return inner
+
+
+def led_to(module: str) -> set[str]:
+    return set(source_files(module))
+
+
+def test_a_module_without_source_leads_to_nothing() -> None:
+    for name in ("no_such_module_anywhere", "sys", "math", "no_such_package.anywhere"):
+        assert source_files(name) == {}
+
+
+def test_a_version_has_12_digits(write: Write) -> None:
+    write({"own_a.py": ""})
+    assert len(source_version("own_a")) == 12
+    assert int(source_version("own_a"), 16) >= 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import own_b", "import os, own_b", "import own_b as b, sys", "from own_b import x",
+        "if True:\n\timport own_b",
+        "  from own_b import (\n  x as y,\n  z)", "from  own_b  import *", "X = 'own_b.thing:name'",
+        'X = "own_b.thing"',
+    ],
+)  # fmt: skip
+def test_imports_are_followed_wherever_they_stand(write: Write, text: str) -> None:
+    write({"own_a.py": f"VALUE = 1\n{text}\n", "own_b/__init__.py": "", "own_b/thing.py": ""})
+    found = led_to("own_a")
+    assert found in ({"own_a", "own_b"}, {"own_a", "own_b.thing"})
+    assert ("own_b.thing" in found) == ("thing" in text)
+
+
+@pytest.mark.parametrize("text", ["import_own_b = 1", "x = 'own_b'", "# no import own_b", "import own_bb", "x.own_b.y"])
+def test_what_only_looks_like_an_import_is_none(write: Write, text: str) -> None:
+    write({"own_a.py": f"{text}\n", "own_b.py": ""})
+    assert led_to("own_a") == {"own_a"}
+
+
+PACKAGE = {
+    "own_p/__init__.py": "from own_p.unseen import x\n", "own_p/unseen.py": "", "own_p/top.py": "",
+    "own_p/sub/__init__.py": "from .near import x\n", "own_p/sub/near.py": "", "own_p/sub/other.py": "",
+    "own_p/sub/deep/__init__.py": "", "own_p/sub/deep/far.py": "", "own_p/sub/deep/_own.py": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("", set()),
+        ("from . import other", {"sub.other"}),
+        ("from .other import x", {"sub.other"}),
+        ("from .. import top", {"top"}),
+        ("from ..top import x", {"top"}),
+        ("from .deep import far", {"sub.deep", "sub.deep.far"}),
+        ("from .deep.far import x", {"sub.deep", "sub.deep.far"}),
+        ("from own_p import top", {"top"}),
+        ("from own_p.sub import other", {"sub.other"}),
+        ("import own_p.top", {"top"}),
+        ("import own_p", set()),
+        ("X = {'own_p.sub.deep'}", {"sub.deep", "sub.deep.far"}),
+    ],
+)
+def test_names_in_a_package_are_followed(write: Write, text: str, found: set[str]) -> None:
+    """With the packages they are in, but for the top-level one, whose own names are loaded on demand."""
+    write(PACKAGE | {"own_p/sub/begin.py": text})
+    always = {"own_p.sub.begin", "own_p.sub", "own_p.sub.near"}
+    assert led_to("own_p.sub.begin") - {"own_p"} == always | {f"own_p.{name}" for name in found}
+
+
+def test_a_package_is_followed_from_its_own_place(write: Write) -> None:
+    """The dots of a relative import count from the package, in its __init__ as well."""
+    write(PACKAGE | {"own_p/sub/__init__.py": "from .deep import far\nfrom .. import top\n"})
+    assert led_to("own_p.sub") == {"own_p.sub", "own_p.sub.deep", "own_p.sub.deep.far", "own_p.top"}
+
+
+def test_the_source_of_a_cell_is_found() -> None:
+    """What a drive depends on is in its key, and a report or a detector is not."""
+    found = set(source_files("ssad.bench.kinds.driving"))
+    for name in ("core.safeio", "core.registry", "core.traces", "core.geometry", "metrics.driving",
+                 "metrics.criticality", "world.kernels.traffic", "world.witness", "drivers.builtin", "roads.router",
+                 "scenarios.dynamic.knowledge.lane_changing", "scenarios.dynamic.knowledge._placing"):  # fmt: skip
+        assert f"ssad.{name}" in found, name
+    assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
+    seen = set(source_files("ssad.bench.kinds.detection"))
+    for name in ("detectors.mono3d.nms", "detectors.yolo.decode", "scenarios.static.shifts.kernels.falling",
+                 "metrics.detection_match", "evaluation.scene_boxes", "recording.drives", "camera.kernels.shade",
+                 "assets.street.palette", "datasets.nuscenes.truth"):  # fmt: skip
+        assert f"ssad.{name}" in seen, name
+
+
+def test_any_changed_file_that_is_led_to_changes_the_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    files = {
+        "one.py": "import two\nfrom pack import inner\nNAMES = {'x': 'pack.named:X'}\nimport numpy\n",
+        "two.py": "def f():\n    from three import (\n        g,\n    )\n", "three.py": "g = 1\n", "four.py": "h = 1\n",
+        "pack/__init__.py": "", "pack/inner.py": "from . import beside\n", "pack/beside.py": "", "pack/named.py": "",
+    }  # fmt: skip
+    (tmp_path / "pack").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert set(source_files("one")) == {"one", "two", "three", "pack", "pack.inner", "pack.beside", "pack.named"}
+    before = source_version("one")
+    for name, text in files.items():
+        (tmp_path / name).write_text(text + "# changed\n")
+        assert (source_version("one") != before) == (name != "four.py"), name
+        (tmp_path / name).write_text(text)
+        assert source_version("one") == before

@@ -1,0 +1,163 @@
+"""What a machine has: devices, cores, GPUs, versions; and Warp started without a word."""
+
+from __future__ import annotations
+
+import os
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from ssad.core.errors import ConfigError
+from ssad.jobs import machine
+from ssad.jobs.machine import (
+    cuda_driver,
+    default_workers,
+    gpu_workers,
+    pick_device,
+    quiet_warp,
+    versions,
+    visible_gpus,
+)
+
+GIB = 1 << 30
+
+
+class FakeWarp:
+    """The part of Warp that is asked for; `init` warns on the descriptor of standard error, as its native part does."""
+
+    LOG_ERROR = 40
+
+    def __init__(self, cuda: bool = False) -> None:
+        self.config = SimpleNamespace(log_level=0)
+        self.started = 0
+        self.cuda = cuda
+
+    def init(self) -> None:
+        assert self.config.log_level == self.LOG_ERROR
+        self.started += 1
+        os.write(2, b"no driver\n")
+
+    def is_cuda_available(self) -> bool:
+        assert self.started
+        return self.cuda
+
+
+@pytest.fixture
+def warp(monkeypatch: pytest.MonkeyPatch) -> FakeWarp:
+    fake = FakeWarp()
+    monkeypatch.setitem(sys.modules, "warp", fake)
+    return fake
+
+
+def has_driver(monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
+    monkeypatch.setattr(machine, "cuda_driver", lambda: there)
+
+
+def test_the_driver_is_asked_for_by_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr("ctypes.CDLL", asked.append)
+    assert cuda_driver() is True
+    assert asked == ["libcuda.so.1"]
+
+    def absent(name: str) -> None:
+        raise OSError(name)
+
+    monkeypatch.setattr("ctypes.CDLL", absent)
+    assert cuda_driver() is False
+
+
+def test_without_a_driver_warp_starts_without_a_word(
+    warp: FakeWarp, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    has_driver(monkeypatch, False)
+    before = sorted(os.listdir("/proc/self/fd"))
+    quiet_warp()
+    assert warp.started == 1
+    assert sorted(os.listdir("/proc/self/fd")) == before, "nothing is left open"
+    os.write(2, b"afterwards\n")
+    assert capfd.readouterr().err == "afterwards\n"
+
+
+def test_with_a_driver_what_warp_says_is_shown(
+    warp: FakeWarp, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    has_driver(monkeypatch, True)
+    quiet_warp()
+    assert warp.started == 1
+    assert capfd.readouterr().err == "no driver\n"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "driver", "cuda", "found"),
+    [
+        ("cpu", True, True, "cpu"),
+        ("auto", True, True, "cuda"),
+        ("cuda", True, True, "cuda"),
+        ("auto", False, True, "cpu"),
+        ("auto", True, False, "cpu"),
+    ],
+)
+def test_the_device_that_is_there_is_picked(
+    warp: FakeWarp, monkeypatch: pytest.MonkeyPatch, wanted: str, driver: bool, cuda: bool, found: str
+) -> None:
+    has_driver(monkeypatch, driver)
+    warp.cuda = cuda
+    assert pick_device(wanted) == found
+    assert warp.started == (wanted != "cpu" and driver), "Warp is not loaded for nothing"
+
+
+def test_a_device_that_cannot_be_had_is_one_line(warp: FakeWarp, monkeypatch: pytest.MonkeyPatch) -> None:
+    for driver in (False, True):
+        has_driver(monkeypatch, driver)
+        with pytest.raises(ConfigError, match="--device cuda: no CUDA device is usable"):
+            pick_device("cuda")
+    with pytest.raises(ConfigError, match="--device tpu: expected auto, cpu or cuda"):
+        pick_device("tpu")
+
+
+def test_one_worker_a_core_that_may_be_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0: {0, 2, 5}}[process], raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert default_workers() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert default_workers() == 8
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert default_workers() == 1
+
+
+def test_versions_of_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name == "torch":
+            raise machine.PackageNotFoundError
+        return f"{name} 1"
+
+    monkeypatch.setattr(machine, "version", version)
+    found = versions("cuda")
+    assert set(found) == {"ssad", "python", "device", "numpy", "warp-lang"}
+    assert (found["device"], found["warp-lang"]) == ("cuda", "warp-lang 1")
+    assert found["python"] == ".".join(map(str, sys.version_info[:3]))
+
+
+def test_visible_gpus_follow_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, GPU-ab12")
+    assert visible_gpus() == ["2", "GPU-ab12"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert visible_gpus() == []
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=SimpleNamespace(device_count=lambda: 3)))
+    assert visible_gpus() == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("memory", "workers"),
+    [((), 0), ((80,), 14), ((60,), 14), ((55,), 13), ((9,), 2), ((2,), 1), ((24, 80), 6 + 14), ((24, 80, 9), 22)],
+)
+def test_gpus_are_shared_by_as_many_as_their_memory_takes(
+    monkeypatch: pytest.MonkeyPatch, memory: tuple[int, ...], workers: int
+) -> None:
+    def properties(k: int) -> SimpleNamespace:
+        return SimpleNamespace(total_memory=memory[k] * GIB)
+
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=SimpleNamespace(get_device_properties=properties)))
+    assert gpu_workers(len(memory)) == workers
