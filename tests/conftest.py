@@ -108,7 +108,7 @@ def recorded(shared: Shared) -> Path:
 @pytest.fixture(scope="session")
 def tiny_set(shared: Shared) -> Path:
     """A data set in the nuScenes schema: two scenes of two samples, pictures of 320 x 180, one sweep between them."""
-    from ssad.datasets.nuscenes.tiny import make_tiny
+    from helpers.tiny import make_tiny
 
     return shared("tiny", lambda out: make_tiny(out, size=(320, 180), scenes=2, samples=2, sweeps=1))
 

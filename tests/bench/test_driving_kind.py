@@ -337,11 +337,15 @@ def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_pa
         path.write_text("")
         path.with_name("shifts-severities.jpg").write_text("")
 
-    def tiny(path: Path, *, scenes: int, samples: int, sweeps: int, size: tuple[int, int]) -> Path:
-        assert scenes >= 1
-        assert samples * (1 + sweeps) >= 2, "shifts of motion need more than one frame"
-        assert size[0] * 9 == size[1] * 16
-        return path
+    def recording(out: Path, towns: tuple[str, ...], *, scenes: int, seconds: float, width: int) -> Path:
+        assert len(towns) == scenes == 1
+        assert seconds >= 0.5, "shifts of motion need more than one frame"
+        assert width % 16 == 0
+        return out
+
+    def record(street: Path, *, workers: int) -> Path:
+        assert workers == 0, "in this process: a run has its own already"
+        return street
 
     def save(path: Path, picture: str) -> None:
         made.append(picture)
@@ -352,7 +356,7 @@ def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
     trace = tmp_path / "traces" / "ab12.npz"
     fakes: dict[str, dict[str, Any]] = {
-        "ssad.datasets.nuscenes.tiny": {"make_tiny": tiny},
+        "ssad.recording.nuscenes_recorder": {"Recording": recording, "record_nuscenes": record},
         "ssad.toolbox.contact_sheet": {"write_sheets": sheets},
         "ssad.recording.camera_sheets": {"write_gallery": lambda folder: {"camera-rig.jpg": f"In {folder.name}."}},
         "ssad.recording.onboard": {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ssad.assets.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
 from ssad.assets.bodies import BODIES
 from ssad.bench.kinds.driving import make_pictures
 from ssad.camera.rig import RIG, rig_camera
+from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import SHOWN, class_sheet
 from ssad.recording.onboard import above, body_of, moments, onboard_sheet, pick_trace, things_at
@@ -69,3 +71,18 @@ def test_a_run_without_recordings_has_no_such_picture(tmp_path: Path) -> None:
     assert pick_trace(tmp_path) is None
     make_pictures([], tmp_path)
     assert not (tmp_path / "pictures").exists()
+
+
+@pytest.mark.slow
+def test_the_shifts_are_shown_on_a_recorded_street(tmp_path: Path) -> None:
+    make_pictures(["shifts"], tmp_path)
+    sheet = read_image(tmp_path / "pictures" / "shifts.jpg")
+    tall, wide = sheet.shape[0] // 4, sheet.shape[1] // 3
+    clean, *shifted = (
+        sheet[r * tall : (r + 1) * tall - 40, c * wide : (c + 1) * wide].astype(int) for r in range(4) for c in range(3)
+    )
+    assert clean.std() > 20
+    assert min(np.abs(one - clean).mean() for one in shifted) > 1.0
+    captions = json.loads((tmp_path / "pictures" / "pictures.json").read_text())
+    assert captions.keys() == {"shifts.jpg", "shifts-severities.jpg"}
+    assert all((tmp_path / "pictures" / name).is_file() for name in captions)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.tiny import make_tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,6 @@ from ssad.core.rotations import quaternion_to_matrix, slerp
 from ssad.datasets.nuscenes import index
 from ssad.datasets.nuscenes.reader import Annotations, NuScenes, SceneData, points_bytes, read_points
 from ssad.datasets.nuscenes.schema import TABLES
-from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
 VERSION = "v1.0-mini"
@@ -125,7 +125,7 @@ def test_frames_are_joined_with_calibration_and_pose(tiny: Path) -> None:
             assert frame.intrinsic.tolist() == calibration["camera_intrinsic"]
             assert (frame.width, frame.height) == (160, 90)
             forward = (frame.sensor_to_ego @ [0, 0, 1, 0])[:3]
-            yaw = {"CAM_FRONT": 0, "CAM_FRONT_LEFT": 55, "CAM_FRONT_RIGHT": -55, "CAM_BACK_LEFT": 110,
+            yaw = {"CAM_FRONT": 0, "CAM_FRONT_LEFT": 55, "CAM_FRONT_RIGHT": -55.5, "CAM_BACK_LEFT": 110,
                    "CAM_BACK_RIGHT": -110, "CAM_BACK": 180}[frame.channel]  # fmt: skip
             expected = [math.cos(math.radians(yaw)), math.sin(math.radians(yaw)), 0]
             np.testing.assert_allclose(forward, expected, atol=1e-12)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.boxes import cars
+from helpers.tiny import make_tiny
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import page_trend_test
@@ -21,7 +22,6 @@ from ssad.core.frames import FORWARD, Camera, Frame, SceneContext, camera_to_wor
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.scenarios.static.shifts import (
     SHIFTS,

@@ -19,13 +19,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.tiny import make_tiny
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, FormatError, SSADError, StoreError
 from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, transformed_boxes
 from ssad.toolbox import Options, SceneShifter, check_manifest, materialise, read_manifest, verify
 from ssad.toolbox import scene_writer as work

@@ -10,9 +10,9 @@ import time
 from pathlib import Path
 
 import pytest
+from helpers.tiny import make_tiny
 
 from ssad.core.errors import StoreError
-from ssad.datasets.nuscenes.tiny import make_tiny
 from ssad.toolbox import Options, check_manifest, materialise, verify
 from ssad.toolbox.manifest import read_lines
 

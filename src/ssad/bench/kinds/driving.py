@@ -304,15 +304,15 @@ def make_pictures(names: Sequence[str], folder: Path) -> None:
     """Makes what is missing of DIR/pictures; pictures.json says what each shows. StoreError."""
     target, captions = folder / "pictures", {}
     if "shifts" in names:
-        captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a drawn street."
+        captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a street of Larkhill."
         captions["shifts-severities.jpg"] = "Each shift at severities 1 to 5."
         if not all((target / name).is_file() for name in captions):
-            from ssad.datasets.nuscenes.tiny import make_tiny
+            from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
             from ssad.toolbox.contact_sheet import write_sheets
 
             with tempfile.TemporaryDirectory() as temporary:
-                street = make_tiny(Path(temporary) / "street", scenes=1, samples=2, sweeps=1, size=(960, 540))
-                write_sheets(street, safeio.make_folder(target) / "shifts.jpg")
+                street = Recording(Path(temporary) / "street", ("Larkhill",), scenes=1, seconds=0.5, width=960)
+                write_sheets(record_nuscenes(street, workers=0), safeio.make_folder(target) / "shifts.jpg")
     if "camera" in names:
         from ssad.recording.camera_sheets import write_gallery
         from ssad.recording.onboard import onboard_sheet, pick_trace
