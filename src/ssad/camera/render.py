@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.camera.kernels import raster, shade
+from ssad.camera.kernels import layers as layer_kernels
+from ssad.camera.kernels import raster, shade, sky
 from ssad.camera.kernels import sensor as sensing
 from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of, struct_array
 from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
@@ -22,7 +23,7 @@ from ssad.core.types import F32, F64, I32, U8
 NEAR = 0.15  # m
 FAR = 500.0
 LARGE, LANES = 4096, 32  # large triangles that a view may list, threads for each
-SHADOW_SIZE, SHADOW_REACH = 1024, 60.0  # texels, m from the middle to the border
+SHADOW_SIZE, SHADOW_REACH = 768, 60.0  # texels, m from the middle to the border
 FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
 
@@ -236,7 +237,7 @@ def render(
     out.tag = wp.empty(shape, dtype=int, device=device)
     out.depth = wp.empty(shape, dtype=float, device=device)
     room = out.radiance.size * 2 if layers.any or projecting else 1
-    out.fragments = wp.empty(room, dtype=shade.Fragment, device=device)
+    out.fragments = wp.empty(room, dtype=layer_kernels.Fragment, device=device)
     out.found = wp.zeros(1, dtype=int, device=device)
     out.surface = int(surface)
     for name in SURFACE:
@@ -244,11 +245,11 @@ def render(
     inputs = [
         stage.geometry, seen.drawn, layers, seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(struct_array(shade.Light, lights), dtype=shade.Light, device=device), shadows, near,
+        wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device), shadows, near,
         int(projecting), scale, out,
     ]  # fmt: skip
     wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
-    fragments: Any = np.zeros(0, shade.Fragment.numpy_dtype())  # type: ignore[attr-defined]
+    fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layers.any or projecting:
         count = int(out.found.numpy()[0])
         if count > room:
@@ -318,7 +319,7 @@ def _sun_map(  # noqa: PLR0917
     # as far as what casts a shadow into the map can be away; small things of the street near its middle alone
     far = 1.4 * reach + 11.0
     casting = stage.gather(
-        to_light, [v.things for v in views], eyes=middles, axes=None, reach=(0.75 * reach, far),
+        to_light, [v.things for v in views], eyes=middles, axes=None, reach=(0.4 * reach, far),
         far=np.full(len(views), far), horizon=False, casting=True,
     )  # fmt: skip
     return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
@@ -343,8 +344,8 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
             (decal.texture, tuple(decal.pose[:3, 3]), tuple(turn[:, 0] * 2 / width), tuple(turn[:, 1] * 2 / height),
              tuple(turn[:, 2]), decal.depth, width * height, decal.tag, decal.opacity, *mask_of(decal))
         )  # fmt: skip
-    table = shade.Layers()
-    tables: Any = (("layers", shade.Layer, layers), ("decals", shade.Decal, decals))
+    table = layer_kernels.Layers()
+    tables: Any = (("layers", layer_kernels.Layer, layers), ("decals", layer_kernels.Decal, decals))
     for name, struct, rows in tables:
         setattr(table, name, wp.array(struct_array(struct, rows), dtype=struct, device=device))
     for name, counts in (("start", [len(r) for r in draws.layers]), ("decal_start", [len(v.decals) for v in views])):

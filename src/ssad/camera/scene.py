@@ -11,19 +11,20 @@ import warp as wp
 
 from ssad.assets.mesh import Material, Mesh
 from ssad.assets.street.model import Street
+from ssad.camera.kernels import matter
 from ssad.camera.kernels import shade as kernels
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, F64, I32
 
 # pattern of a material by its name; others are plain
 PATTERNS = {
-    "asphalt": kernels.GRAIN, "asphalt_patch": kernels.GRAIN, "asphalt_worn": kernels.GRAIN, "driveway": kernels.GRAIN,
-    "kerb": kernels.GRAIN, "stone": kernels.GRAIN, "plaster": kernels.GRAIN, "soil": kernels.GRAIN,
-    "roofing_felt": kernels.GRAIN, "cobbles": kernels.SLAB, "paving": kernels.SLAB, "brick": kernels.BRICK,
-    "grass": kernels.LEAF, "dry_grass": kernels.LEAF, "lawn": kernels.LEAF, "meadow": kernels.LEAF,
-    "hedge": kernels.LEAF, "forest": kernels.LEAF, "hills": kernels.LEAF, "leaves_round": kernels.LEAF,
-    "leaves_tall": kernels.LEAF, "leaves_birch": kernels.LEAF, "leaves_conifer": kernels.LEAF, "bark": kernels.GRAIN,
-    "roof_tiles": kernels.TILE, "boards": kernels.TILE, "window": kernels.GLASS, "shop_window": kernels.GLASS,
+    "asphalt": matter.GRAIN, "asphalt_patch": matter.GRAIN, "asphalt_worn": matter.GRAIN, "driveway": matter.GRAIN,
+    "kerb": matter.GRAIN, "stone": matter.GRAIN, "plaster": matter.GRAIN, "soil": matter.GRAIN,
+    "roofing_felt": matter.GRAIN, "cobbles": matter.SLAB, "paving": matter.SLAB, "brick": matter.BRICK,
+    "grass": matter.LEAF, "dry_grass": matter.LEAF, "lawn": matter.LEAF, "meadow": matter.LEAF,
+    "hedge": matter.LEAF, "forest": matter.LEAF, "hills": matter.LEAF, "leaves_round": matter.LEAF,
+    "leaves_tall": matter.LEAF, "leaves_birch": matter.LEAF, "leaves_conifer": matter.LEAF, "bark": matter.GRAIN,
+    "roof_tiles": matter.TILE, "boards": matter.TILE, "window": matter.GLASS, "shop_window": matter.GLASS,
 }  # fmt: skip
 
 
@@ -172,8 +173,8 @@ class Scene:
         self.meshes = tuple(meshes)
         self._lights: dict[int, dict[str, tuple[F64, float]]] = {}
         self._standing: dict[int, tuple[F64, F64, float, float]] = {}
-        rows: Any = np.array(surfaces, dtype=kernels.Surface.numpy_dtype())  # type: ignore[attr-defined]
-        self.surfaces = on(rows, kernels.Surface)
+        rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
+        self.surfaces = on(rows, matter.Surface)
         self.listed = on(np.concatenate(listed), wp.int32)
         self.geometry = kernels.Geometry()
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
@@ -297,7 +298,7 @@ class Scene:
 
 def surface(material: Material) -> tuple[Any, ...]:
     """A material as the kernels want it."""
-    pattern = PATTERNS.get(material.name, kernels.PLAIN)
+    pattern = PATTERNS.get(material.name, matter.PLAIN)
     night, lamp = NIGHT.get(material.name, 0.0), int(material.name in LAMPS)
     return (
         material.colour, material.specular, material.gloss, material.emission, night, int(material.paint), lamp,

@@ -7,33 +7,13 @@ term for glass, paint and wet roads, fog by distance.
 
 import warp as wp
 
+from ssad.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
 from ssad.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness
+from ssad.camera.kernels.matter import Surface, textured
 from ssad.camera.kernels.raster import LAST
+from ssad.camera.kernels.sky import Light, cloudy, sky, surroundings
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
-PLAIN = wp.constant(0)
-GRAIN = wp.constant(1)  # asphalt, concrete: fine noise and large patches
-LEAF = wp.constant(2)  # leaves, grass: strong noise
-BRICK = wp.constant(3)  # courses of bricks, in metres
-SLAB = wp.constant(4)  # paving slabs
-TILE = wp.constant(5)  # roof tiles, boards
-GLASS = wp.constant(6)
-
-
-@wp.struct
-class Surface:
-    """A material: linear albedo, mirror share, gloss, emission by day and what the night adds to it, 1 where it takes
-    the paint, 1 where it shines only while the lamps of its body are on, pattern."""
-
-    colour: wp.vec3
-    specular: float
-    gloss: float
-    emission: float
-    night: float
-    paint: int
-    lamp: int
-    pattern: int
 
 
 @wp.struct
@@ -47,51 +27,6 @@ class Geometry:
     material: wp.array(dtype=int)
     surfaces: wp.array(dtype=Surface)
     wearable: wp.array(dtype=int)
-
-
-@wp.struct
-class Layer:
-    """A texture on a body: which, the rectangle of the atlas that it covers (u0, v0, u1, v1), how opaque it is, and
-    where in `Layers.masks` its opacities begin (-1: even), so many columns and rows."""
-
-    texture: int
-    box: wp.vec4
-    opacity: float
-    mask: int
-    columns: int
-    rows: int
-
-
-@wp.struct
-class Decal:
-    """A texture on whatever lies in a box in the world: its middle, across and down (each divided by half the side),
-    ahead (unit) and half its depth, m; tag: of the only body that wears it, -1 for any; else as a layer."""
-
-    texture: int
-    place: wp.vec3
-    across: wp.vec3
-    down: wp.vec3
-    ahead: wp.vec3
-    depth: float
-    area: float
-    tag: int
-    opacity: float
-    mask: int
-    columns: int
-    rows: int
-
-
-@wp.struct
-class Layers:
-    """Layers of all draws, bottom first: those of draw d begin at start[d] and end at start[d + 1]; decals of all
-    views, above the layers, likewise; opacities; any: 0 where there are none of both."""
-
-    layers: wp.array(dtype=Layer)
-    start: wp.array(dtype=int)
-    decals: wp.array(dtype=Decal)
-    decal_start: wp.array(dtype=int)
-    masks: wp.array(dtype=float)
-    any: int
 
 
 @wp.struct
@@ -117,24 +52,6 @@ class SunShadows:
     to_fine: wp.array(dtype=wp.mat44)
     wide_texel: float
     fine_texel: float
-
-
-@wp.struct
-class Fragment:
-    """A piece of a textured or lit surface in a pixel: its light is what the pixel gains per unit of the texture's
-    colour, which the surface wears or a lamp projects.
-
-    place: view, row and column in one number; slot: the triangle's; u, v in the texture's rectangle, 0 to 1; area:
-    share of the texture that the pixel spans; light: RGB.
-    """
-
-    place: int
-    slot: int
-    texture: int
-    u: float
-    v: float
-    area: float
-    light: wp.vec3
 
 
 @wp.struct
@@ -186,93 +103,6 @@ class Seen:
     gain: wp.vec3
 
 
-@wp.struct
-class Light:
-    """Light of a view: unit vector to the sun, its colour (irradiance / pi), sky overhead and at the horizon, light
-    from the ground; extinction of fog, 1/m; clouds in 0..1; wet in 0..1; lamps: how far lamps are on, 0..1;
-    turn: offset of the clouds."""
-
-    sun: wp.vec3
-    sun_colour: wp.vec3
-    zenith: wp.vec3
-    horizon: wp.vec3
-    ground: wp.vec3
-    fog: float
-    clouds: float
-    wet: float
-    lamps: float
-    turn: float
-
-
-@wp.func
-def speck(x: int, y: int) -> float:
-    """A fixed random number in [0, 1) for a cell."""
-    h = wp.uint32(x) * wp.uint32(374761393) + wp.uint32(y) * wp.uint32(668265263)
-    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(1274126177)
-    h = h ^ (h >> wp.uint32(16))
-    return float(h & wp.uint32(65535)) / 65536.0
-
-
-@wp.func
-def cloudy(x: float, y: float) -> float:
-    """Smooth noise in [0, 1] with unit cells."""
-    i = wp.floor(x)
-    j = wp.floor(y)
-    u = x - i
-    v = y - j
-    u = u * u * (3.0 - 2.0 * u)
-    v = v * v * (3.0 - 2.0 * v)
-    a = int(i)
-    b = int(j)
-    low = speck(a, b) * (1.0 - u) + speck(a + 1, b) * u
-    high = speck(a, b + 1) * (1.0 - u) + speck(a + 1, b + 1) * u
-    return low * (1.0 - v) + high * v
-
-
-@wp.func
-def sky(light: Light, ray: wp.vec3, fine: int) -> wp.vec3:
-    """Light from a direction of the sky (unit vector, world)."""
-    up = wp.max(ray[2], 0.0)
-    mix = wp.sqrt(up)
-    colour = light.horizon * (1.0 - mix) + light.zenith * mix
-    if fine == 1 and ray[2] > 0.0:
-        # a layer of clouds high above
-        reach = 3.0 / (ray[2] + 0.12)
-        x = ray[0] * reach + light.turn
-        y = ray[1] * reach
-        form = cloudy(x, y) * 0.55 + cloudy(x * 2.3, y * 2.3) * 0.3 + cloudy(x * 5.1, y * 5.1) * 0.15
-        amount = wp.clamp((form - 1.0 + light.clouds * 1.05) * 3.0, 0.0, 1.0) * wp.min(up * 8.0, 1.0)
-        white = light.horizon * 0.9 + light.sun_colour * 0.25
-        colour = colour * (1.0 - amount) + white * amount
-        toward = wp.dot(ray, light.sun)
-        if toward > 0.9:
-            glow = wp.pow(toward, 64.0) * 0.35 + wp.pow(toward, 2000.0) * 40.0
-            colour = colour + light.sun_colour * glow * (1.0 - 0.9 * light.clouds)
-    return colour
-
-
-@wp.func
-def surroundings(light: Light, ray: wp.vec3, p: wp.vec3, sharp: float) -> wp.vec3:
-    """What a mirror at a point sees in a direction (unit vector, world): sky, houses up to a roof line, the road;
-    sharp: 1 for glass, less for what blurs its image."""
-    level = wp.max(wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]), 1.0e-4)
-    rise = ray[2] / level
-    if sharp * (rise - 0.5) > 0.25:
-        return sky(light, ray, 0)
-    x = ray[0] / level
-    y = ray[1] / level
-    form = cloudy(x * 4.0 + p[0] * 0.04, y * 4.0 + p[1] * 0.04)
-    roofs = 0.10 + 0.38 * form
-    houses = (light.horizon * 0.5 + light.zenith * 0.3 + light.sun_colour * 0.25) * (0.10 + 0.16 * form)
-    road = light.ground * 0.6
-    above = wp.clamp((rise - roofs) * 16.0 * sharp + 0.5, 0.0, 1.0)
-    below = wp.clamp(0.5 - rise * 7.0, 0.0, 1.0)
-    image = houses * (1.0 - below) + road * below
-    if above > 0.0:
-        image = image * (1.0 - above) + sky(light, ray, 0) * above
-    return image
-
-
 @wp.func
 def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
     """1 where the texel holds nothing nearer to the light."""
@@ -313,54 +143,6 @@ def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
     if share < 0.0:
         share = 1.0
     return share
-
-
-@wp.func
-def octave(uv: wp.vec2, rate: float, depth: float, fine: float) -> float:
-    """1 with smooth noise of `depth` about it, `rate` cells a metre; it fades out where a pixel (`fine` m) has a third
-    of a cell and more."""
-    keep = wp.clamp(2.0 - 3.0 * fine * rate, 0.0, 1.0)
-    if keep <= 0.0:
-        return 1.0
-    return 1.0 + keep * depth * (cloudy(uv[0] * rate, uv[1] * rate) - 0.5)
-
-
-@wp.func
-def textured(surface: Surface, albedo: wp.vec3, uv: wp.vec2, fine: float) -> wp.vec3:
-    """Albedo with the pattern of the material; `fine` is metres a pixel, so that what is too small fades out."""
-    if surface.pattern == PLAIN or surface.pattern == GLASS:
-        return albedo
-    factor = float(1.0)
-    if surface.pattern == GRAIN:
-        factor = octave(uv, 0.21, 0.28, fine) * octave(uv, 1.7, 0.10, fine)
-        factor = factor * octave(uv, 9.0, 0.22, fine) * octave(uv, 37.0, 0.36, fine)
-    elif surface.pattern == LEAF:
-        factor = octave(uv, 0.31, 0.3, fine) * octave(uv, 1.3, 0.5, fine)
-        factor = factor * octave(uv, 9.0, 0.6, fine) * octave(uv, 31.0, 0.4, fine)
-    else:
-        wide = float(0.25)
-        tall = float(0.08)
-        joint = float(0.012)
-        if surface.pattern == SLAB:
-            wide = 0.6
-            tall = 0.6
-            joint = 0.015
-        if surface.pattern == TILE:
-            wide = 0.3
-            tall = 0.22
-            joint = 0.02
-        row = wp.floor(uv[1] / tall)
-        x = uv[0] / wide
-        if surface.pattern != SLAB:
-            x = x + 0.5 * (row - 2.0 * wp.floor(row * 0.5))
-        column = wp.floor(x)
-        keep = wp.clamp(1.5 - fine / tall * 2.0, 0.0, 1.0)
-        factor = 1.0 + (speck(int(column), int(row)) - 0.5) * 0.35 * keep
-        edge = wp.min((x - column) * wide, (uv[1] / tall - row) * tall)
-        if edge < joint:
-            factor = factor * (1.0 - 0.35 * keep)
-        factor = factor * octave(uv, 0.27, 0.22, fine) * octave(uv, 11.0, 0.14, fine)
-    return albedo * factor
 
 
 @wp.func
@@ -526,52 +308,6 @@ def project(
                 piece.area = given[3] * span
                 piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given[0] * open_)
                 keep(out, piece)
-
-
-@wp.func
-def opacity(masks: wp.array(dtype=float), start: int, columns: int, rows: int, u: float, v: float) -> float:
-    """The opacity of a mask at (u, v) in 0..1, between its texels."""
-    x = wp.clamp(u * float(columns) - 0.5, 0.0, float(columns - 1))
-    y = wp.clamp(v * float(rows) - 0.5, 0.0, float(rows - 1))
-    i = wp.min(int(x), wp.max(columns - 2, 0))
-    j = wp.min(int(y), wp.max(rows - 2, 0))
-    right = wp.min(i + 1, columns - 1)
-    below = wp.min(j + 1, rows - 1)
-    x = x - float(i)
-    y = y - float(j)
-    upper = masks[start + j * columns + i] * (1.0 - x) + masks[start + j * columns + right] * x
-    lower = masks[start + below * columns + i] * (1.0 - x) + masks[start + below * columns + right] * x
-    return upper * (1.0 - y) + lower * y
-
-
-@wp.func
-def on_layer(all: Layers, layer: Layer, uv: wp.vec2) -> wp.vec3:
-    """u, v in a layer's texture and its opacity there, 0 beside it."""
-    box = layer.box
-    u = (uv[0] - box[0]) / (box[2] - box[0])
-    v = (uv[1] - box[1]) / (box[3] - box[1])
-    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0:
-        return wp.vec3(u, v, 0.0)
-    share = layer.opacity
-    if layer.mask >= 0:
-        share = share * opacity(all.masks, layer.mask, layer.columns, layer.rows, u, v)
-    return wp.vec3(u, v, share)
-
-
-@wp.func
-def on_decal(all: Layers, decal: Decal, p: wp.vec3, n: wp.vec3, tag: int) -> wp.vec3:
-    """u, v in a decal's texture and its opacity there, 0 beside it and on what is turned away."""
-    to = p - decal.place
-    u = 0.5 + 0.5 * wp.dot(to, decal.across)
-    v = 0.5 + 0.5 * wp.dot(to, decal.down)
-    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or wp.abs(wp.dot(to, decal.ahead)) > decal.depth:
-        return wp.vec3(u, v, 0.0)
-    if wp.dot(n, decal.ahead) >= 0.0 or (decal.tag >= 0 and decal.tag != tag):
-        return wp.vec3(u, v, 0.0)
-    share = decal.opacity
-    if decal.mask >= 0:
-        share = share * opacity(all.masks, decal.mask, decal.columns, decal.rows, u, v)
-    return wp.vec3(u, v, share)
 
 
 @wp.func

@@ -1,0 +1,114 @@
+"""Textures on bodies and decals in the world: where they are, and how opaque."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class Fragment:
+    """A piece of a textured or lit surface in a pixel: its light is what the pixel gains per unit of the texture's
+    colour, which the surface wears or a lamp projects.
+
+    place: view, row and column in one number; slot: the triangle's; u, v in the texture's rectangle, 0 to 1; area:
+    share of the texture that the pixel spans; light: RGB.
+    """
+
+    place: int
+    slot: int
+    texture: int
+    u: float
+    v: float
+    area: float
+    light: wp.vec3
+
+
+@wp.struct
+class Layer:
+    """A texture on a body: which, the rectangle of the atlas that it covers (u0, v0, u1, v1), how opaque it is, and
+    where in `Layers.masks` its opacities begin (-1: even), so many columns and rows."""
+
+    texture: int
+    box: wp.vec4
+    opacity: float
+    mask: int
+    columns: int
+    rows: int
+
+
+@wp.struct
+class Decal:
+    """A texture on whatever lies in a box in the world: its middle, across and down (each divided by half the side),
+    ahead (unit) and half its depth, m; tag: of the only body that wears it, -1 for any; else as a layer."""
+
+    texture: int
+    place: wp.vec3
+    across: wp.vec3
+    down: wp.vec3
+    ahead: wp.vec3
+    depth: float
+    area: float
+    tag: int
+    opacity: float
+    mask: int
+    columns: int
+    rows: int
+
+
+@wp.struct
+class Layers:
+    """Layers of all draws, bottom first: those of draw d begin at start[d] and end at start[d + 1]; decals of all
+    views, above the layers, likewise; opacities; any: 0 where there are none of both."""
+
+    layers: wp.array(dtype=Layer)
+    start: wp.array(dtype=int)
+    decals: wp.array(dtype=Decal)
+    decal_start: wp.array(dtype=int)
+    masks: wp.array(dtype=float)
+    any: int
+
+
+@wp.func
+def opacity(masks: wp.array(dtype=float), start: int, columns: int, rows: int, u: float, v: float) -> float:
+    """The opacity of a mask at (u, v) in 0..1, between its texels."""
+    x = wp.clamp(u * float(columns) - 0.5, 0.0, float(columns - 1))
+    y = wp.clamp(v * float(rows) - 0.5, 0.0, float(rows - 1))
+    i = wp.min(int(x), wp.max(columns - 2, 0))
+    j = wp.min(int(y), wp.max(rows - 2, 0))
+    right = wp.min(i + 1, columns - 1)
+    below = wp.min(j + 1, rows - 1)
+    x = x - float(i)
+    y = y - float(j)
+    upper = masks[start + j * columns + i] * (1.0 - x) + masks[start + j * columns + right] * x
+    lower = masks[start + below * columns + i] * (1.0 - x) + masks[start + below * columns + right] * x
+    return upper * (1.0 - y) + lower * y
+
+
+@wp.func
+def on_layer(all: Layers, layer: Layer, uv: wp.vec2) -> wp.vec3:
+    """u, v in a layer's texture and its opacity there, 0 beside it."""
+    box = layer.box
+    u = (uv[0] - box[0]) / (box[2] - box[0])
+    v = (uv[1] - box[1]) / (box[3] - box[1])
+    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0:
+        return wp.vec3(u, v, 0.0)
+    share = layer.opacity
+    if layer.mask >= 0:
+        share = share * opacity(all.masks, layer.mask, layer.columns, layer.rows, u, v)
+    return wp.vec3(u, v, share)
+
+
+@wp.func
+def on_decal(all: Layers, decal: Decal, p: wp.vec3, n: wp.vec3, tag: int) -> wp.vec3:
+    """u, v in a decal's texture and its opacity there, 0 beside it and on what is turned away."""
+    to = p - decal.place
+    u = 0.5 + 0.5 * wp.dot(to, decal.across)
+    v = 0.5 + 0.5 * wp.dot(to, decal.down)
+    if u < 0.0 or u > 1.0 or v < 0.0 or v > 1.0 or wp.abs(wp.dot(to, decal.ahead)) > decal.depth:
+        return wp.vec3(u, v, 0.0)
+    if wp.dot(n, decal.ahead) >= 0.0 or (decal.tag >= 0 and decal.tag != tag):
+        return wp.vec3(u, v, 0.0)
+    share = decal.opacity
+    if decal.mask >= 0:
+        share = share * opacity(all.masks, decal.mask, decal.columns, decal.rows, u, v)
+    return wp.vec3(u, v, share)
