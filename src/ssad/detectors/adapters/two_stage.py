@@ -24,8 +24,8 @@ from torchvision.ops import box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, suppress
-from ssad.detectors.adapters.torchvision import full, scale_of
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, scale_of, suppress
+from ssad.detectors.adapters.torchvision import full
 from ssad.detectors.yolo.assign import Targets
 
 NONE = -30.0  # the logit of a place that is not filled
