@@ -51,6 +51,23 @@ class Adapter(nn.Module, ABC):
         """Detections of each image above a score of `least`."""
 
 
+def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
+    """What places are that a matcher gave to objects.
+
+    Args:
+        owner: [P] Index of the object of each place; -1 none, -2 in between.
+        label: [Q] Classes of the objects.
+        crowd: [Q] Which of them are crowd: their places are ignored.
+
+    Returns:
+        Label (-1 background, -2 ignored) and owner (-1 none) [P] as an `Assignment` has them.
+    """
+    index = owner.clamp(min=0)
+    kind = torch.where(owner >= 0, label[index], owner)
+    kind = torch.where((owner >= 0) & crowd[index], -2, kind)
+    return kind, torch.where(kind >= 0, owner, -1)
+
+
 def check_images(name: str, images: Tensor, *, least: int = 1) -> tuple[int, int]:
     """Height and width of images [B, 3, H, W].
 

@@ -30,7 +30,15 @@ from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError, install_extra
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, resize_and_pad, size_inside, sums
+from ssad.detectors.adapters.common import (
+    Adapter,
+    check_images,
+    check_truth,
+    label_owned,
+    resize_and_pad,
+    size_inside,
+    sums,
+)
 from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
@@ -200,9 +208,7 @@ class Ultralytics(Adapter):
         strength = torch.where(mine, aligned, 0.0)
         norm = torch.where(mine, overlap, 0.0).amax(0) / (strength.amax(0) + 1e-9)
         weight = (strength * norm).amax(1)
-        label = torch.where(owner >= 0, kind[index], -1)
-        label = torch.where((owner >= 0) & crowd[index], -2, label)
-        owner = torch.where(label >= 0, owner, -1)
+        label, owner = label_owned(owner, kind, crowd)
         found = label >= 0
         return label, owner, torch.where(found[:, None], box[index], 0.0), torch.where(found, weight, 0.0)
 
