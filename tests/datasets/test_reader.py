@@ -23,7 +23,9 @@ from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.rotations import quaternion_to_matrix, slerp
 from ssad.datasets.nuscenes import index
-from ssad.datasets.nuscenes.reader import Annotations, NuScenes, SceneData, points_bytes, read_points
+from ssad.datasets.nuscenes.files import points_bytes, read_points
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import Annotations, SceneData
 from ssad.datasets.nuscenes.schema import TABLES
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 

@@ -17,7 +17,7 @@ from ssad.core.errors import FormatError, StoreError
 from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORIES, CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.schema import TABLES
-from ssad.datasets.nuscenes.tables import read_table
+from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 
 VERSION = "v1.0-mini"
@@ -65,7 +65,7 @@ def fill(root: Path, *, name: str | None = None, order: tuple[int, ...] = (0, 1,
 
 
 def table(root: Path, name: str) -> list[Any]:
-    return read_table(root, VERSION, name)
+    return [record for block in stream(table_path(root, VERSION, name), TABLES[name]) for record in block]
 
 
 def test_tables_are_complete(tmp_path: Path) -> None:

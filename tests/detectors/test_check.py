@@ -445,19 +445,16 @@ class ThatWantsWholeCells(Base):
 
 @breaks("greyscale images: refused with ConfigError")
 class ThatTakesGreyscale(Base):
-    def _check(self, images: Tensor) -> tuple[int, int]:
-        return super()._check(images.expand(-1, 3, -1, -1) if images.ndim == 4 else images)
-
-    def _prepare(self, images: Tensor) -> Tensor:
-        return super()._prepare(images.expand(-1, 3, -1, -1))
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        return super().dense(images.expand(-1, 3, -1, -1) if images.ndim == 4 else images)
 
 
 @breaks("uint8 images: refused with ConfigError, not TypeError")
 class ThatRefusesInAnotherWay(Base):
-    def _check(self, images: Tensor) -> tuple[int, int]:
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         if images.dtype is torch.uint8:
             raise TypeError("no")
-        return super()._check(images)
+        return super().dense(images)
 
 
 @breaks("labels that are none of the classes: refused with ConfigError")

@@ -1,5 +1,6 @@
 """YOLO networks and their weights: published sizes, darknet files against an interpreter of its layer table, names."""
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.errors import ConfigError, FormatError
-from ssad.detectors.yolo.darknet import convolutions, read_darknet, write_darknet
+from ssad.detectors.yolo.darknet import convolutions, read_darknet
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.models import YoloSpec
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY, YOLOV3_TINY_OFFICIAL, yolov3, yolov3_tiny
@@ -113,6 +114,13 @@ def test_official_darknet_files_have_the_size_that_is_expected(spec: YoloSpec, s
     assert 20 + 4 * floats == size
 
 
+def write_darknet(detector: Yolo, path: Path, *, seen: int = 0) -> None:
+    """The detector's weights as darknet 0.2.5 would write them."""
+    parts = [struct.pack("<3iq", 0, 2, 5, seen)]
+    parts += [v.detach().numpy().astype("<f4").tobytes() for layer in convolutions(detector) for v in layer]
+    path.write_bytes(b"".join(parts))
+
+
 @pytest.mark.parametrize(("spec", "table"), [(NARROW_V3, V3_TABLE), (NARROW_TINY, TINY_TABLE)])
 def test_darknet_weights_run_as_the_layer_table_says(spec: YoloSpec, table: str, tmp_path: Path) -> None:
     detector = shake(Yolo(spec, ("a", "b")))
@@ -174,7 +182,7 @@ def test_a_foreign_or_broken_darknet_file_is_one_line(tmp_path: Path) -> None:
         yolov3_tiny(weights=tmp_path / "none.weights")
     assert all(torch.equal(before[name], value) for name, value in detector.state_dict().items())
     with pytest.raises(ConfigError, match="no darknet network"):
-        write_darknet(Yolo(YOLOV5N, ("car",)), path)
+        read_darknet(Yolo(YOLOV5N, ("car",)), path)
 
 
 def test_an_old_header_counts_images_in_four_bytes(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from torchvision.ops import complete_box_iou_loss
 
 from ssad.core.detections import Assignment, Dense, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.yolo.decode import Grid, decode, encode, make_grid
+from ssad.detectors.yolo.decode import Grid, decode, make_grid
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.loss import BALANCE, ciou
 from ssad.detectors.yolov3 import YOLOV3, YOLOV3_TINY
@@ -65,6 +65,15 @@ def answering(detector: Yolo, values: Tensor, grid: Grid) -> Yolo:
     copy = Yolo(detector.spec, detector.classes)
     copy.network = Fixed(maps)  # type: ignore[assignment]
     return copy
+
+
+def encode(rule: str, box: Tensor, grid: Grid) -> Tensor:
+    """The raw numbers [..., P, 4] that `decode` turns into the boxes [..., P, 4]; infinite or NaN where none do."""
+    cell = (box[..., :2] + box[..., 2:]) / 2 / grid.stride[:, None] - grid.cell
+    ratio = (box[..., 2:] - box[..., :2]) / grid.anchor
+    if rule == "v3":
+        return torch.cat((cell.logit(), ratio.log()), -1)
+    return torch.cat((((cell + 0.5) / 2).logit(), (ratio.sqrt() / 2).logit()), -1)
 
 
 def random_truth(source: torch.Generator, count: int, height: int, width: int) -> Truth:

@@ -26,7 +26,8 @@ from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, CLASSES
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
-from ssad.datasets.nuscenes.reader import NuScenes, read_points
+from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned

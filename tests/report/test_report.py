@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import html.parser
 import io
 import json
 import re
+import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +24,7 @@ from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
 from ssad.report import write_report, write_video
 from ssad.report.driving_tables import precrash_table
-from ssad.report.embed import SCALE, episode_data, origin, pack, unpack
+from ssad.report.embed import SCALE, episode_data, origin, pack
 from ssad.report.episodes import load_episodes
 from ssad.report.lanes import thin
 from ssad.report.load import load_run
@@ -32,6 +35,12 @@ from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.rollout import rollout
 
 HOSTILE = "<script>alert(1)</script>"
+
+
+def unpack(text: str, rows: int) -> Any:
+    """The inverse of `pack`: int16 [rows, T], as the page does it in JavaScript."""
+    flat = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i2").reshape(rows, -1)
+    return np.cumsum(flat, axis=1, dtype=np.int64).astype(np.int16)
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from ssad.training.batches import (
     OnDisk,
     change_colours,
     change_pictures,
-    change_truth,
+    change_truths,
     draw_change,
     fill,
     make_batch,
@@ -36,6 +36,11 @@ from ssad.training.batches import (
 )
 from ssad.training.loop import LAST, LOG, train
 from ssad.training.recipe import RECIPES, Recipe, find_recipe
+
+
+def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
+    """Truth of one changed picture."""
+    return change_truths([truth], [change], size, keep=keep)[0]
 
 
 def same(a: Any, b: Any) -> bool:

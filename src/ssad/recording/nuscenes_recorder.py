@@ -7,10 +7,9 @@ at any moment and gone on with, and the bytes do not depend on the number of pro
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,7 +35,7 @@ from ssad.core.rotations import matrix_to_quaternion, upright_pose, wrap_angle
 from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, Episode, EpisodeTrace
 from ssad.datasets.nuscenes.files import points_bytes
-from ssad.datasets.nuscenes.writer import NuScenesWriter
+from ssad.datasets.nuscenes.writer import NuScenesWriter, place_file
 from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import Pool, open_pool, run_all
 from ssad.jobs.store import locked
@@ -92,11 +91,7 @@ class Recording:
 
     def identity(self) -> dict[str, Any]:
         """What decides the bytes."""
-        return {
-            "towns": list(self.towns), "held_out": list(self.held_out), "scenes": self.scenes, "seconds": self.seconds,
-            "width": self.width, "sweeps": self.sweeps, "seed": self.seed, "quality": self.quality,
-            "version": self.version, "device": self.device, "streets": self.streets,
-        }  # fmt: skip
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items() if k != "out"}
 
 
 def draw_weather(key: tuple[object, ...]) -> Weather:
@@ -281,20 +276,22 @@ class _Files:
     ) -> None:
         """One picture and its depth map."""
         name = f"{camera.channel}_{moment}"
-        safeio.write_atomic(self.folder / f"{name}.jpg", encode_jpeg(image, self.quality, "420"))
         safeio.write_atomic(self.folder / f"{name}.depth.png", depth_bytes(depth))
-        size = [camera.width, camera.height]
-        row = {"channel": camera.channel, "time": moment, "key": on_key, "file": f"{name}.jpg", "size": size,
-               "sweep": sweep}  # fmt: skip
-        self.rows.append(row | {"ego": ego.tolist()})
+        self._write(
+            f"{name}.jpg", encode_jpeg(image, self.quality, "420"), channel=camera.channel, time=moment, key=on_key,
+            size=[camera.width, camera.height], sweep=sweep, ego=ego.tolist(),
+        )  # fmt: skip
 
     def cloud(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
         """One sweep."""
-        name = f"LIDAR_TOP_{moment}.pcd.bin"
-        safeio.write_atomic(self.folder / name, points_bytes(points))
-        row = {"channel": "LIDAR_TOP", "time": moment, "key": on_key, "file": name, "size": [0, 0],
-               "sweep": sweep}  # fmt: skip
-        self.rows.append(row | {"ego": ego.tolist()})
+        self._write(
+            f"LIDAR_TOP_{moment}.pcd.bin", points_bytes(points), channel="LIDAR_TOP", time=moment, key=on_key,
+            size=[0, 0], sweep=sweep, ego=ego.tolist(),
+        )  # fmt: skip
+
+    def _write(self, name: str, data: bytes, **row: Any) -> None:
+        safeio.write_atomic(self.folder / name, data)
+        self.rows.append({"file": name} | row)
 
 
 def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
@@ -409,7 +406,7 @@ def _merge(recording: Recording, names: list[str]) -> None:
                 )  # fmt: skip
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"
                 if depth.is_file():
-                    link(depth, out / "depth" / frame["channel"] / f"{token}.png")
+                    place_file(out / "depth" / frame["channel"] / f"{token}.png", depth)
             known: dict[int, str] = {}
             for sample in part["samples"]:
                 for box in sample["boxes"]:
@@ -422,17 +419,3 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     )  # fmt: skip
         for split, members in splits.items():
             writer.set_split(split, members)
-
-
-def link(source: Path, target: Path) -> None:
-    """A hard link, or a copy where that cannot be. StoreError."""
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if not target.exists():
-            try:
-                os.link(source, target)
-            except OSError:
-                with safeio.atomic_path(target) as temporary:
-                    shutil.copyfile(source, temporary)
-    except OSError as error:
-        raise StoreError(f"{target}: cannot be written: {error.strerror or error}") from None

@@ -31,12 +31,6 @@ def pack(columns: npt.NDArray[np.int16]) -> str:
     return base64.b64encode(zlib.compress(wide.astype("<i2").tobytes(), 9)).decode()
 
 
-def unpack(text: str, rows: int) -> npt.NDArray[np.int16]:
-    """The inverse of `pack`: [rows, T]. The page does the same in JavaScript."""
-    flat = np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i2").reshape(rows, -1)
-    return np.cumsum(flat, axis=1, dtype=np.int64).astype(np.int16)
-
-
 def _i16(values: npt.NDArray[Any]) -> npt.NDArray[np.int16]:
     return np.clip(np.round(values), -32767, 32767).astype(np.int16)
 

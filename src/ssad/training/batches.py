@@ -181,11 +181,6 @@ def draw_change(
     return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1]))
 
 
-def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
-    """Truth of a changed picture; see `change_truths`."""
-    return change_truths([truth], [change], size, keep=keep)[0]
-
-
 def change_truths(
     truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
 ) -> list[Truth]:

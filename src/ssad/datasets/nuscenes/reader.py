@@ -16,10 +16,8 @@ import numpy as np
 
 from ssad.core.boxes import size_columns
 from ssad.core.errors import ConfigError, FormatError
-from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.core.rotations import pose_matrix
 from ssad.core.types import F64, I32
-from ssad.datasets.nuscenes.files import points_bytes, read_points
 from ssad.datasets.nuscenes.index import Index, open_index
 from ssad.datasets.nuscenes.scene import (
     Annotations,
@@ -44,18 +42,6 @@ from ssad.datasets.nuscenes.schema import (
     TableRecord,
 )
 from ssad.datasets.nuscenes.tables import table_path
-
-__all__ = [
-    "Annotations",
-    "NuScenes",
-    "SceneData",
-    "SensorFrame",
-    "decode_image",
-    "encode_jpeg",
-    "points_bytes",
-    "read_image",
-    "read_points",
-]
 
 R = TypeVar("R", bound=TableRecord)
 

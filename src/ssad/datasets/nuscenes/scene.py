@@ -126,8 +126,8 @@ def velocities(centre: F64, time: npt.NDArray[np.int64], before: I32, after: I32
     seconds = 1e-6 * time[last] - 1e-6 * time[first]
     limit = np.where((before >= 0) & (after >= 0), 2.0 * MAX_TIME_DIFF, MAX_TIME_DIFF)
     known = (first != last) & (seconds <= limit)
-    safe = np.where(known, seconds, 1.0)
-    return np.where(known[:, None], (centre[last] - centre[first]) / safe[:, None], np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):  # broken tables may have two boxes at one time
+        return np.where(known[:, None], (centre[last] - centre[first]) / seconds[:, None], np.nan)
 
 
 def frozen(array: F64) -> F64:

@@ -9,7 +9,6 @@ from typing import TypeVar
 import msgspec
 
 from ssad.core.errors import FormatError
-from ssad.datasets.nuscenes.schema import TABLES, TableRecord
 
 BLOCK = 4 << 20
 LIMIT = 16 * BLOCK  # no record is longer
@@ -110,8 +109,3 @@ def _error(path: Path, decoder: msgspec.json.Decoder[list[T]], text: bytes, line
 def table_path(root: Path, version: str, name: str) -> Path:
     """File of a table, such as ROOT/v1.0-mini/sample.json."""
     return root / version / f"{name}.json"
-
-
-def read_table(root: Path, version: str, name: str) -> list[TableRecord]:
-    """A whole table; for the small ones."""
-    return [record for block in stream(table_path(root, version, name), TABLES[name]) for record in block]

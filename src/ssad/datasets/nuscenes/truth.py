@@ -20,6 +20,7 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, BICYCLE_RACK, CATEGORY_TO_CLASS, CLASSES, LIDAR, VISIBILITY
 from ssad.core.types import F64, I32
 from ssad.datasets.nuscenes.results import uncollected, with_ego
+from ssad.datasets.nuscenes.scene import velocities
 from ssad.datasets.nuscenes.schema import (
     Attribute,
     Category,
@@ -32,7 +33,6 @@ from ssad.datasets.nuscenes.schema import (
 from ssad.datasets.nuscenes.tables import stream, table_path
 from ssad.metrics.detection_boxes import I8, I64, BikeRacks, BoxTable
 
-MAX_TIME: Final = 1.5  # s between frames that give a velocity; twice that for a central difference
 _RACK_LABEL: Final = len(CLASSES)
 
 T = TypeVar("T")
@@ -255,7 +255,6 @@ def _velocity(
     path: Path, tokens: Sequence[str], links: tuple[Sequence[str], Sequence[str]], centre: F64, time: I64
 ) -> F64:
     """Velocity [N, 2] from the frames before and after; NaN for a single frame or frames too far apart in time."""
-    own = np.arange(len(tokens))
     row = dict(zip(tokens, range(len(tokens)), strict=True))
     row[""] = -1
     ends = []
@@ -264,11 +263,5 @@ def _velocity(
         if (end == -2).any():
             bad = int((end == -2).argmax())
             raise FormatError(f"{path}: annotation {tokens[bad]}: its {side} is not in its scene")
-        ends.append(np.where(end < 0, own, end))
-    first, last = ends
-    elapsed = 1e-6 * time[last] - 1e-6 * time[first]
-    limit = np.where((first != own) & (last != own), 2.0 * MAX_TIME, MAX_TIME)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        velocity = (centre[last, :2] - centre[first, :2]) / elapsed[:, None]
-    velocity[(elapsed > limit) | ((first == own) & (last == own))] = np.nan
-    return np.asarray(velocity)
+        ends.append(end.astype(np.int32))
+    return velocities(centre, time, *ends)[:, :2]

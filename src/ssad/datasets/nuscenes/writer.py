@@ -95,16 +95,7 @@ class NuScenesWriter:
         if kind is None:
             self.close()
 
-    def add_log(
-        self, logfile: str, *, vehicle: str = "ssad", date_captured: str = "2020-01-01", location: str = "drawn"
-    ) -> str:
-        """A drive; the token of the one there is when the name was given before."""
-        token = _token("log", logfile)
-        if token not in self._rows[Log]:
-            self._add(Log(token, logfile, vehicle, date_captured, location))
-        return token
-
-    def add_scene(self, name: str | None = None, *, description: str = "", log_token: str | None = None) -> str:
+    def add_scene(self, name: str | None = None, *, description: str = "") -> str:
         """A scene. Without a name it gets the next one of mini_val, mini_train, then scene-9001 and so on."""
         taken = {scene.name for scene in self._rows[Scene].values()}
         if name is None:
@@ -112,8 +103,8 @@ class NuScenesWriter:
             name = next(free for free in known if free not in taken)
         if name in taken:
             raise ValueError(f"scene '{name}' was added before")
-        log = self.add_log(f"log-{name}") if log_token is None else log_token
-        self._known(Log, log)
+        logfile = f"log-{name}"
+        log = self._add(Log(_token("log", logfile), logfile, "ssad", "2020-01-01", "drawn"))
         return self._add(Scene(_token("scene", name), name, log, description))
 
     def add_sensor(
@@ -154,12 +145,11 @@ class NuScenesWriter:
         ego_rotation: Quaternion = IDENTITY,
         sample: str | None = None,
         size: tuple[int, int] = (0, 0),
-        suffix: str | None = None,
     ) -> str:
         """A file of a sensor: its bytes, or a file to link to (copied where it cannot be linked).
 
         sample: the key frame it belongs to, None for a sweep, which gets the sample that follows it; size: width and
-        height of an image in pixels; suffix: of the file, such as .png (default: .jpg, .pcd.bin, .pcd).
+        height of an image in pixels.
         """
         record = self._known(Scene, scene)
         if (scene, channel) not in self._mounted:
@@ -168,8 +158,6 @@ class NuScenesWriter:
         if sample is not None and self._known(Sample, sample).scene_token != scene:
             raise ValueError(f"sample '{sample}' is of another scene")
         ending, kind = _FORMATS[modality]
-        if suffix is not None:
-            ending, kind = suffix, suffix.lstrip(".").split(".")[0]
         folder = "sweeps" if sample is None else "samples"
         filename = f"{folder}/{channel}/{record.name}__{channel}__{timestamp_us}{ending}"
         token = _token("sample_data", record.name, channel, timestamp_us)
@@ -189,7 +177,7 @@ class NuScenesWriter:
             raise ValueError(f"'{channel}' has two files at {timestamp_us} in scene '{record.name}'")
         self._add(EgoPose(token, _floats(ego_translation), _floats(ego_rotation), timestamp_us))
         self._frames[token] = _Frame(row, scene, channel)
-        _place(self.root / filename, data)
+        place_file(self.root / filename, data)
         return token
 
     def add_instance(self, scene: str, key: str, *, category: str) -> str:
@@ -209,7 +197,6 @@ class NuScenesWriter:
         visibility: str = "4",
         attributes: Iterable[str] = (),
         lidar_points: int = 0,
-        radar_points: int = 0,
     ) -> str:
         """The box of an object in a key frame: centre and rotation in the global frame, size width, length, height."""
         self._known(Instance, instance)
@@ -227,7 +214,7 @@ class NuScenesWriter:
                 size=_floats(size),
                 rotation=_floats(rotation),
                 num_lidar_pts=int(lidar_points),
-                num_radar_pts=int(radar_points),
+                num_radar_pts=0,
             )
         )
 
@@ -350,8 +337,13 @@ def _floats(values: Sequence[float]) -> Any:
     return plain
 
 
-def _place(path: Path, data: bytes | Path) -> None:
-    """Write the bytes, or link (else copy) the file."""
+def place_file(path: Path, data: bytes | Path) -> None:
+    """Writes bytes, or links to a file, or copies it where it cannot be linked; what was there is replaced.
+
+    Raises:
+        FormatError: There is no such file.
+        StoreError: The place cannot be written.
+    """
     if isinstance(data, bytes):
         write_atomic(path, data)
         return

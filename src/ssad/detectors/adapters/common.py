@@ -1,4 +1,4 @@
-"""What the adapters share: the frame of a detector, input, truth, choice of detections, sums."""
+"""What 2D detectors share: the frame of a detector, input, truth, choice of detections, sums."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torchvision.ops import batched_nms
 
 from ssad.core.detections import Dense, Detections, Truth
@@ -17,7 +18,7 @@ from ssad.detectors.yolo.assign import Targets, pad_truth
 
 
 class Adapter(nn.Module, ABC):
-    """What every adapted 2D detector has. threshold: default of `predict`. ConfigError: not in [0, 1)."""
+    """What every 2D detector has. threshold: default of `predict`. ConfigError: not in [0, 1)."""
 
     task: Literal["2d", "3d"] = "2d"
 
@@ -50,14 +51,61 @@ class Adapter(nn.Module, ABC):
         """Detections of each image above a score of `least`."""
 
 
-def check_images(name: str, images: Tensor) -> tuple[int, int]:
-    """Height and width of images [B, 3, H, W]. ConfigError: another shape or type."""
-    if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
+def label_owned(owner: Tensor, label: Tensor, crowd: Tensor) -> tuple[Tensor, Tensor]:
+    """What places are that a matcher gave to objects.
+
+    Args:
+        owner: [P] Index of the object of each place; -1 none, -2 in between.
+        label: [Q] Classes of the objects.
+        crowd: [Q] Which of them are crowd: their places are ignored.
+
+    Returns:
+        Label (-1 background, -2 ignored) and owner (-1 none) [P] as an `Assignment` has them.
+    """
+    index = owner.clamp(min=0)
+    kind = torch.where(owner >= 0, label[index], owner)
+    kind = torch.where((owner >= 0) & crowd[index], -2, kind)
+    return kind, torch.where(kind >= 0, owner, -1)
+
+
+def check_images(name: str, images: Tensor, *, least: int = 1) -> tuple[int, int]:
+    """Height and width of images [B, 3, H, W].
+
+    Args:
+        name: Of the detector, for the message.
+        images: What it was given.
+        least: How many images there must be.
+
+    Raises:
+        ConfigError: Another shape or type.
+    """
+    shape = images.shape
+    if len(shape) != 4 or shape[1] != 3 or not images.is_floating_point() or 0 in shape[2:] or shape[0] < least:
         kind = str(images.dtype).removeprefix("torch.")
         raise ConfigError(
             f"{name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); got {list(images.shape)} of {kind}"
         )
     return images.shape[2], images.shape[3]
+
+
+def size_inside(size: tuple[int, int], input_width: int | None) -> tuple[int, int]:
+    """Height and width that a picture of `size` is resized to, before padding (None: as it is)."""
+    if input_width is None:
+        return size
+    return max(1, round(size[0] * input_width / size[1])), input_width
+
+
+def scale_of(inside: tuple[int, int], size: tuple[int, int], like: Tensor) -> Tensor:
+    """[4]: what a box of a picture of `size` is multiplied by to stand in the network's input of size `inside`."""
+    x, y = inside[1] / size[1], inside[0] / size[0]
+    return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
+
+
+def resize_and_pad(images: Tensor, inside: tuple[int, int], *, multiple: int, grey: float) -> Tensor:
+    """Images [B, 3, H, W] at the size `inside`, padded at the right and bottom to multiples of so many pixels."""
+    if inside != tuple(images.shape[2:]):
+        images = functional.interpolate(images, inside, mode="bilinear", align_corners=False)
+    return functional.pad(images, (0, -inside[1] % multiple, 0, -inside[0] % multiple), value=grey)
 
 
 def check_threshold(name: str, threshold: float) -> float:

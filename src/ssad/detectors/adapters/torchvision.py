@@ -17,7 +17,7 @@ from torchvision.ops import box_iou, generalized_box_iou_loss, sigmoid_focal_los
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, sums, suppress
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, scale_of, sums, suppress
 from ssad.detectors.yolo.assign import Targets
 
 
@@ -222,12 +222,6 @@ class OneStage(Adapter):
 def full(value: Tensor) -> Tensor:
     """In float32 at least."""
     return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
-
-
-def scale_of(inside: tuple[int, int], size: tuple[int, int], like: Tensor) -> Tensor:
-    """[4]: what a box of a picture of `size` is multiplied by to stand in the network's input of size `inside`."""
-    x, y = inside[1] / size[1], inside[0] / size[0]
-    return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
 
 
 def _runs(level: Tensor) -> list[tuple[int, int]]:

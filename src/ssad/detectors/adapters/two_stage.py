@@ -24,8 +24,8 @@ from torchvision.ops import box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, log_odds, suppress
-from ssad.detectors.adapters.torchvision import full, scale_of
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, label_owned, log_odds, scale_of, suppress
+from ssad.detectors.adapters.torchvision import full
 from ssad.detectors.yolo.assign import Targets
 
 NONE = -30.0  # the logit of a place that is not filled
@@ -158,8 +158,7 @@ class TwoStage(Adapter):
                 rows.append((zero, torch.zeros_like(anchors)))
                 continue
             first = self.model.rpn.proposal_matcher(box_iou(targets.box[k, :real], anchors))
-            everywhere = torch.ones_like(first, dtype=torch.bool)
-            near, _ = _labels(first, torch.ones_like(targets.label[k]), targets.crowd[k], everywhere)
+            near, _ = label_owned(first, torch.ones_like(targets.label[k]), targets.crowd[k])
             rows.append((torch.where(near == -1, 0, near), targets.box[k, first.clamp(min=0)] / scale))
         near, far = (torch.stack(column) for column in zip(*rows, strict=True))
         extra = {
@@ -184,7 +183,7 @@ class TwoStage(Adapter):
             owner = self.model.roi_heads.proposal_matcher(overlap)
             most, best = overlap.max(1)
             owner[best[most > 0]] = torch.arange(real, device=owner.device)[most > 0]
-            label, owner = _labels(owner, kinds[k], targets.crowd[k], filled)
+            label, owner = label_owned(owner.masked_fill(~filled, -2), kinds[k], targets.crowd[k])
             rows.append((label, owner, torch.where((owner >= 0)[:, None], box[owner.clamp(min=0)], 0.0)))
         label, owner, target = (torch.stack(column) for column in zip(*rows, strict=True))
         return label, owner, target
@@ -235,14 +234,6 @@ class TwoStage(Adapter):
         kinds[image, assignment.owner[image, place]] = assignment.label[image, place]
         label, _, target = self._second(dense, targets, kinds)
         return label, target
-
-
-def _labels(owner: Tensor, label: Tensor, crowd: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
-    """Label and owner [K] of places that a matcher gave to objects (-1 none, -2 in between)."""
-    index = owner.clamp(min=0)
-    kind = torch.where(owner >= 0, label[index], owner)
-    kind = torch.where((owner >= 0) & crowd[index], -2, kind).masked_fill(~usable, -2)
-    return kind, torch.where(kind >= 0, owner, -1)
 
 
 def _smooth(coder: Any, regression: Tensor, target: Tensor, boxes: Tensor, found: Tensor) -> Tensor:

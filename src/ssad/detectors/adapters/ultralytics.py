@@ -30,7 +30,15 @@ from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError, install_extra
-from ssad.detectors.adapters.common import Adapter, check_images, check_truth, sums
+from ssad.detectors.adapters.common import (
+    Adapter,
+    check_images,
+    check_truth,
+    label_owned,
+    resize_and_pad,
+    size_inside,
+    sums,
+)
 from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
@@ -135,8 +143,10 @@ class Ultralytics(Adapter):
         """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type,
         or a head that answers in another way than those of YOLOv8 and YOLO11 do."""
         size = check_images(self.name, images)
-        inside, scale = self._inside(size), self._scale(size, images.device)
-        scores, boxes, features = self._heads(self._prepare(images, inside))
+        inside, scale = size_inside(size, self.input_width), self._scale(size, images.device)
+        images = images.to(next(self.network.parameters()).dtype)
+        step = max(32, *self.strides)
+        scores, boxes, features = self._heads(resize_and_pad(images, inside, multiple=step, grey=GREY))
         place, stride, level = self._places(features)
         distance = _expectation(boxes) * stride
         middle = place.T
@@ -198,9 +208,7 @@ class Ultralytics(Adapter):
         strength = torch.where(mine, aligned, 0.0)
         norm = torch.where(mine, overlap, 0.0).amax(0) / (strength.amax(0) + 1e-9)
         weight = (strength * norm).amax(1)
-        label = torch.where(owner >= 0, kind[index], -1)
-        label = torch.where((owner >= 0) & crowd[index], -2, label)
-        owner = torch.where(label >= 0, owner, -1)
+        label, owner = label_owned(owner, kind, crowd)
         found = label >= 0
         return label, owner, torch.where(found[:, None], box[index], 0.0), torch.where(found, weight, 0.0)
 
@@ -266,23 +274,10 @@ class Ultralytics(Adapter):
             level.append(torch.full((rows * columns,), k, device=part.device))
         return torch.cat(place), torch.cat(stride), torch.cat(level)
 
-    def _inside(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the picture inside, before padding."""
-        if self.input_width is None:
-            return size
-        return max(1, round(size[0] * self.input_width / size[1])), self.input_width
-
     def _scale(self, size: tuple[int, int], device: torch.device) -> Tensor:
-        height, width = self._inside(size)
+        height, width = size_inside(size, self.input_width)
         x, y = width / size[1], height / size[0]
         return torch.tensor([x, y, x, y], device=device)
-
-    def _prepare(self, images: Tensor, inside: tuple[int, int]) -> Tensor:
-        images = images.to(next(self.network.parameters()).dtype)
-        if inside != tuple(images.shape[2:]):
-            images = functional.interpolate(images, inside, mode="bilinear", align_corners=False)
-        step = max(32, *self.strides)
-        return functional.pad(images, (0, -inside[1] % step, 0, -inside[0] % step), value=GREY)
 
 
 def _expectation(boxes: Tensor) -> Tensor:

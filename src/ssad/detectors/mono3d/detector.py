@@ -13,6 +13,7 @@ from torch.nn import functional
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.detectors.adapters.common import check_images, check_threshold, scale_of, size_inside
 from ssad.detectors.eval_mode import evaluating
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
@@ -93,9 +94,7 @@ class Mono3D(nn.Module):
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
         """Detections of each image, best first: score class times centreness (times PGD's confidence of depth)."""
-        least = self.config.threshold if threshold is None else threshold
-        if not 0 <= least < 1:
-            raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
+        least = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
         with evaluating(self):
             dense = self.dense(images, intrinsic)
         return self._chosen(dense, least, best_first=True)
@@ -211,30 +210,20 @@ class Mono3D(nn.Module):
         return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)
 
     def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
-        if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
-            kind = str(images.dtype).removeprefix("torch.")
-            wanted = "[B, 3, H, W] of floats in [0, 1] (RGB)"
-            raise ConfigError(f"{self.name}: images must be {wanted}; got {list(images.shape)} of {kind}")
+        size = check_images(self.name, images)
         if intrinsic is None or intrinsic.shape != (len(images), 3, 3):
             got = "none" if intrinsic is None else str(list(intrinsic.shape))
             raise ConfigError(f"{self.name}: a 3D detector needs the cameras' intrinsic [B, 3, 3]; got {got}")
         focal = intrinsic[:, [0, 1], [0, 1]]
         if intrinsic.device.type == "cpu" and not bool(intrinsic.isfinite().all() & (focal > 0).all()):
             raise ConfigError(f"{self.name}: an intrinsic has no focal length above 0, or holds NaN")
-        return (images.shape[2], images.shape[3]), intrinsic.to(images.device, self._dtype())
+        return size, intrinsic.to(images.device, self._dtype())
 
     def _dtype(self) -> torch.dtype:
         return next(self.parameters()).dtype
 
-    def _resized(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width inside the network, before padding."""
-        if self.config.input_width is None:
-            return size
-        return max(1, round(size[0] * self.config.input_width / size[1])), self.config.input_width
-
     def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
-        height, width = self._resized(size)
-        return torch.tensor([width / size[1], height / size[0]], device=like.device, dtype=like.dtype)
+        return scale_of(size_inside(size, self.config.input_width), size, like)[:2]
 
     def _scaled(self, lens: Tensor, scale: Tensor) -> Tensor:
         """Intrinsics of the resized picture; pixel edges are what is scaled."""
@@ -267,7 +256,7 @@ class Mono3D(nn.Module):
         """BGR in 0..255, less the mean, padded with 0 at the right and bottom."""
         images = images.to(self._dtype())
         size = (images.shape[2], images.shape[3])
-        resized = self._resized(size)
+        resized = size_inside(size, self.config.input_width)
         if resized != size:
             small = resized[0] < size[0]
             images = functional.interpolate(images, resized, mode="bilinear", align_corners=False, antialias=small)

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from ssad.core.errors import ConfigError, FormatError
-from ssad.core.safeio import MIB, read_bytes, write_atomic
+from ssad.core.safeio import MIB, read_bytes
 from ssad.detectors.yolo.detector import Yolo
 from ssad.detectors.yolo.layers import ConvUnit
 from ssad.detectors.yolo.models import CSPNetwork
 
-VERSION = (0, 2, 5)
 MAX_BYTES = 1024 * MIB
 
 
@@ -83,14 +82,3 @@ def read_darknet(detector: Yolo, path: str | Path, *, layers: int | None = None)
         for tensor, part in zip(tensors, parts, strict=True):
             tensor.copy_(part)
     return int(seen)
-
-
-def write_darknet(detector: Yolo, path: str | Path, *, seen: int = 0) -> None:
-    """Write the detector's weights as darknet would. ConfigError, StoreError."""
-    parts = [struct.pack("<3iq", *VERSION, seen)]
-    parts += [
-        tensor.detach().to("cpu", torch.float32).numpy().astype("<f4").tobytes()
-        for layer in convolutions(detector)
-        for tensor in layer
-    ]
-    write_atomic(path, b"".join(parts))

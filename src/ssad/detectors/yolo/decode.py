@@ -85,15 +85,6 @@ def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
     return to_corners((share[..., :2] - 0.5 + grid.cell) * stride, grid.anchor * share[..., 2:] ** 2)
 
 
-def encode(rule: str, box: Tensor, grid: Grid) -> Tensor:
-    """The raw numbers [..., P, 4] that `decode` turns into the boxes [..., P, 4]; infinite or NaN where none do."""
-    cell = (box[..., :2] + box[..., 2:]) / 2 / grid.stride[:, None] - grid.cell
-    ratio = (box[..., 2:] - box[..., :2]) / grid.anchor
-    if rule == "v3":
-        return torch.cat((cell.logit(), ratio.log()), -1)
-    return torch.cat((((cell + 0.5) / 2).logit(), (ratio.sqrt() / 2).logit()), -1)
-
-
 def select(
     score: Tensor, box: Tensor, *, threshold: float, iou: float, limit: int, size: tuple[int, int]
 ) -> Detections:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.eval_mode import evaluating
-from ssad.detectors.yolo.assign import label_places, match_best, match_near, pad_truth
+from ssad.detectors.adapters.common import Adapter, check_images, check_truth, resize_and_pad, scale_of, size_inside
+from ssad.detectors.yolo.assign import label_places, match_best, match_near
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import Grid, decode, flatten, make_grid, select
 from ssad.detectors.yolo.loss import Answers, Reduction, losses_v3, losses_v5
@@ -21,7 +20,7 @@ from ssad.detectors.yolo.models import YoloSpec, build_network
 MULTIPLE = 32
 
 
-class Yolo(nn.Module):
+class Yolo(Adapter):
     """An anchor-based detector with objectness.
 
     classes: names in the order of the class logits; input_width: pictures are resized to so many pixels (bilinear,
@@ -33,7 +32,6 @@ class Yolo(nn.Module):
     rows, columns; `place` and `stride` are in pixels of the picture handed in; features: what the heads read.
     """
 
-    task: Literal["2d", "3d"] = "2d"
     anchors: Tensor
 
     def __init__(
@@ -47,30 +45,25 @@ class Yolo(nn.Module):
         limit: int = 300,
         seed: int = 0,
     ) -> None:
-        super().__init__()
         if not classes or len(set(classes)) != len(classes):
             raise ConfigError(f"{spec.name}: classes must be distinct names, at least one; got {list(classes)[:5]}")
         if input_width is not None and input_width < MULTIPLE:
             raise ConfigError(f"{spec.name}: input_width {input_width} is too small; it takes {MULTIPLE} or more")
+        super().__init__(spec.name, classes, threshold)
         self.spec = spec
-        self.name = spec.name
-        self.classes = tuple(classes)
         self.input_width = input_width
-        self.threshold = threshold
         self.nms_iou = spec.nms_iou if nms_iou is None else nms_iou
         self.limit = limit
         self.network = build_network(spec, len(self.classes), seed=seed)
         self.register_buffer("anchors", torch.tensor(spec.anchors, dtype=torch.float32))
         self.requires_grad_(False).eval()
 
-    def forward(self, images: Tensor) -> Dense:
-        """As `dense`."""
-        return self.dense(images)
-
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
-        size = self._check(images)
-        raw, neck = self.network(self._prepare(images))
+        size = check_images(self.name, images, least=0)
+        inside = size_inside(size, self.input_width)
+        images = images.to(next(self.network.parameters()).dtype)
+        raw, neck = self.network(resize_and_pad(images, inside, multiple=MULTIPLE, grey=self.spec.grey))
         grid = self._grid([(part.shape[2], part.shape[3]) for part in raw])
         values = flatten(raw, self.anchors.shape[1])
         scale = self._scale(size, values)
@@ -87,16 +80,8 @@ class Yolo(nn.Module):
             size=size,
         )
 
-    @torch.no_grad()
-    def predict(
-        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
-    ) -> list[Detections]:
-        """Detections of each image, best first: score sigmoid(objectness) * sigmoid(class), suppressed by class."""
-        least = self.threshold if threshold is None else threshold
-        if not 0 <= least < 1:
-            raise ConfigError(f"{self.name}: threshold {least} is not in [0, 1)")
-        with evaluating(self):
-            dense = self.dense(images)
+    def choose(self, dense: Dense, least: float) -> list[Detections]:
+        """Score sigmoid(objectness) * sigmoid(class), suppressed by class."""
         assert dense.quality is not None
         score = dense.logit.sigmoid() * dense.quality.sigmoid()[..., None]
         return [
@@ -110,13 +95,9 @@ class Yolo(nn.Module):
 
         ConfigError: truth that does not belong to the images, or is none (labels out of range, empty boxes).
         """
-        if not truth or len(truth) != len(dense.box):
-            raise ConfigError(
-                f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.box)}; it takes one each"
-            )
-        grid = self._grid_of(dense)
         scale = self._scale(dense.size, dense.box)
-        targets = pad_truth(truth, scale, classes=len(self.classes))
+        targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
+        grid = self._grid_of(dense)
         match = match_best if self.spec.rule == "v3" else match_near
         owner = match(targets, grid, dense.box.shape[1])
         label, owner, box = label_places(targets, owner, dense.box * scale, ignore_objects=self.spec.rule == "v3")
@@ -140,38 +121,13 @@ class Yolo(nn.Module):
             return losses_v3(answers, grid, box_loss=self.spec.box_loss, reduction=kind)
         return losses_v5(answers, grid, reduction=kind)
 
-    def _check(self, images: Tensor) -> tuple[int, int]:
-        if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape[2:]:
-            raise ConfigError(
-                f"{self.name}: images must be [B, 3, H, W] of floats in [0, 1] (RGB); "
-                f"got {list(images.shape)} of {str(images.dtype).removeprefix('torch.')}"
-            )
-        return images.shape[2], images.shape[3]
-
-    def _resized(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the picture inside the network, before padding."""
-        if self.input_width is None:
-            return size
-        return max(1, round(size[0] * self.input_width / size[1])), self.input_width
-
     def _padded(self, size: tuple[int, int]) -> tuple[int, int]:
-        height, width = self._resized(size)
+        """Height and width of the network's input."""
+        height, width = size_inside(size, self.input_width)
         return -(-height // MULTIPLE) * MULTIPLE, -(-width // MULTIPLE) * MULTIPLE
 
     def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
-        """[4]: what a box of the picture is multiplied by to stand in the network's input."""
-        height, width = self._resized(size)
-        x, y = width / size[1], height / size[0]
-        return torch.tensor([x, y, x, y], device=like.device, dtype=like.dtype)
-
-    def _prepare(self, images: Tensor) -> Tensor:
-        size = (images.shape[2], images.shape[3])
-        resized, padded = self._resized(size), self._padded(size)
-        images = images.to(next(self.network.parameters()).dtype)
-        if resized != size:
-            images = functional.interpolate(images, resized, mode="bilinear", align_corners=False)
-        pad = (0, padded[1] - resized[1], 0, padded[0] - resized[0])
-        return functional.pad(images, pad, value=self.spec.grey)
+        return scale_of(size_inside(size, self.input_width), size, like)
 
     def _grid(self, shapes: list[tuple[int, int]]) -> Grid:
         anchors = self.anchors

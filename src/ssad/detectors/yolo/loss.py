@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits as cross_entropy
 
+from ssad.detectors.adapters.common import sums
 from ssad.detectors.yolo.decode import Grid
 
 Reduction = Literal["batch", "image"]
@@ -72,9 +73,9 @@ def losses_v3(answers: Answers, grid: Grid, *, box_loss: str, reduction: Reducti
     counted = answers.label != -2
     every = cross_entropy(answers.objectness, found, reduction="none")
     parts = {
-        "box": _sum(box * (2 - share), image, len(found)),
+        "box": sums(box * (2 - share), image, len(found)),
         "obj": torch.where(counted, every, 0.0).sum(1),
-        "cls": _sum(_class_loss(answers, image, place).sum(-1), image, len(found)),
+        "cls": sums(_class_loss(answers, image, place).sum(-1), image, len(found)),
     }
     return parts if reduction == "image" else {name: part.mean() for name, part in parts.items()}
 
@@ -91,9 +92,9 @@ def losses_v5(answers: Answers, grid: Grid, *, reduction: Reduction) -> dict[str
     # the means at a level run over the batch's objects, or over the image's
     group = image * levels + grid.level[place]
     kind = _class_loss(answers, image, place).mean(-1)
-    count = _sum(torch.ones_like(overlap), group, batch * levels).view(batch, levels)
-    box = _sum(1 - overlap, group, batch * levels).view(batch, levels)
-    cls = _sum(kind, group, batch * levels).view(batch, levels)
+    count = sums(torch.ones_like(overlap), group, batch * levels).view(batch, levels)
+    box = sums(1 - overlap, group, batch * levels).view(batch, levels)
+    cls = sums(kind, group, batch * levels).view(batch, levels)
     wanted = torch.zeros_like(answers.objectness)
     wanted[image, place] = overlap.detach().clamp(min=0)
     every = cross_entropy(answers.objectness, wanted, reduction="none")
@@ -116,12 +117,6 @@ def _class_loss(answers: Answers, image: Tensor, place: Tensor) -> Tensor:
     classes = torch.arange(logit.shape[-1], device=logit.device)
     wanted = (answers.label[image, place][:, None] == classes).to(logit.dtype)
     return cross_entropy(logit, wanted, reduction="none")
-
-
-def _sum(value: Tensor, group: Tensor, groups: int) -> Tensor:
-    """Sums [groups] of value [N] by group [N]; no atomic additions, hence the same bits in every run."""
-    member = torch.arange(groups, device=group.device)[:, None] == group
-    return torch.where(member, value, 0.0).sum(1)
 
 
 def _levels(grid: Grid) -> list[slice]:
