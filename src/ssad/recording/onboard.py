@@ -10,7 +10,7 @@ import numpy as np
 from ssad.assets.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.assets.bodies import draw_paint, make_body
 from ssad.assets.mesh import Mesh
-from ssad.assets.street import build_street
+from ssad.assets.street import cached_street
 from ssad.camera.render import View, Weather, render
 from ssad.camera.scene import Scene, Thing
 from ssad.core.frames import FORWARD, Camera
@@ -68,7 +68,7 @@ def moments(trace: EpisodeTrace) -> list[int]:
 
 def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) -> U8:
     """Three moments, camera left, view from above right."""
-    stage = Scene(build_street(graph), cast(trace))
+    stage = Scene(cached_street(graph), cast(trace))
     front = Camera.typical(width, width * 9 // 16)
     rows = []
     for step in moments(trace):
