@@ -35,12 +35,14 @@ from ssad.recording.clip_recorder import (
     SMALL,
     TARGET,
     Clips,
+    _named,
     _prepare,
     _Set,
     clip_views,
     pair_images,
     record_clips,
 )
+from ssad.recording.scene_objects import SceneObjects
 from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.viewpoints import AIM, EYE, follow, look_at, polar, turn_of, weather_name
 
@@ -242,8 +244,8 @@ def projected(row: dict[str, Any]) -> F64:
 def test_a_recording_is_drawn_again(drives: Path, orbits: Path) -> None:
     """Each row gives scene, view, target and labels; what is rendered is what was stored."""
     for folder in (drives, orbits):
-        rows = read(folder, "all")["images"]
-        again = list(clip_views(folder))
+        rows = read(folder, "test")["images"]
+        again = list(clip_views(folder, split="test"))
         assert [v.file for v in again] == [row["file_name"] for row in rows]
         assert len({id(v.scene) for v in again}) < len(again), "pictures of a part share a scene"
         for seen in again:
@@ -259,14 +261,13 @@ def test_a_recording_is_drawn_again(drives: Path, orbits: Path) -> None:
             assert worn[1:] == seen.view.things[1:]
 
 
-def test_the_named_target_is_the_same_metal_everywhere(tmp_path: Path) -> None:
+def test_the_named_target_is_the_same_metal_everywhere() -> None:
     target = TargetCar("suv", "red", seed=2)
     found = []
-    for town in ("Twinford", "Oldmarket"):
-        clips = todo(tmp_path, "drive", target=target)
-        made = _prepare(clips, town, (0, "drive", town, 0, 0))
-        (body,) = made.targets
-        found.append(made.stage.meshes[body.meshes[0]])
+    for key in ("one", "another"):
+        objects = SceneObjects(0.1, (key,))
+        body = _named(objects, target)
+        found.append(objects.meshes[body.meshes[0]])
         assert body.paint == target.colour
         assert body.size == target.full_size
     assert np.array_equal(found[0].vertices, found[1].vertices)
