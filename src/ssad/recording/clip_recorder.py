@@ -395,7 +395,7 @@ class ClipView:
 def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
 
-    Rendering a view gives the recorded picture (before JPEG) again. Pictures of one part of a recording share a scene.
+    Rendering a view gives the recorded picture (before JPEG) again. Pictures of one drive share a scene.
 
     Args:
         folder: What `record_clips` wrote.
@@ -413,11 +413,14 @@ def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iter
         for one in data["annotations"]:
             own[one["image_id"]].append(one)
         clips = _clips_of(about, folder, device)
-        made, last = None, None
+        sets: dict[tuple[object, ...], _Set] = {}
         for row in data["images"]:
             key = (clips.seed, clips.mode, row["town"], row["part"], row["attempt"])
-            if made is None or key != last:
-                made, last = _prepare(clips, row["town"], key), key
+            if key not in sets:
+                # one part at a time: its pictures may come from several drives
+                sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
+                sets[key] = _prepare(clips, row["town"], key)
+            made = sets[key]
             weather = Weather(**row["light"])
             shot = Viewpoint(row["time"], np.array(row["pose"]), np.array(row["target_pose"]), weather, {})
             around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
