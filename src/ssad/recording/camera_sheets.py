@@ -11,6 +11,7 @@ from ssad.assets.actor_bodies import BODY_CATEGORIES, class_of
 from ssad.assets.bodies import BODIES, draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, build
 from ssad.assets.street import cached_street
+from ssad.camera.lamps import own_lamps
 from ssad.camera.render import View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene, Thing
@@ -99,7 +100,10 @@ def weather_sheet(width: int = 480) -> U8:
     """One street in six weathers and hours."""
     stage, ego, things = street_scene()
     camera = rig_camera("CAM_FRONT", 960)
-    views = [View(camera, ego @ camera.to_ego, things, weather) for weather in WEATHERS.values()]
+    views = [
+        View(camera, ego @ camera.to_ego, things, weather, lamps=own_lamps(ego, weather))
+        for weather in WEATHERS.values()
+    ]  # fmt: skip
     images = [render(stage, [view]).image[0] for view in views]
     panels = [captioned(image, name, width) for image, name in zip(images, WEATHERS, strict=True)]
     return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])

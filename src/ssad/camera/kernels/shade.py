@@ -89,10 +89,12 @@ class Hit:
 
 @wp.struct
 class Lit:
-    """Light on a point: irradiance / pi of all, and what of it comes straight from the sun (0..1 of the sun's)."""
+    """Light on a point: irradiance / pi of all, what of it comes straight from the sun (0..1 of the sun's), and which
+    share of the sky it sees."""
 
     light: wp.vec3
     sun: float
+    open_: float
 
 
 @wp.struct
@@ -189,6 +191,7 @@ def lit_at(
 ) -> Lit:
     """All light on a point with a normal, but for lamps that project a texture."""
     lit = Lit()
+    lit.open_ = open_
     facing = wp.dot(n, light.sun)
     if facing > 0.0:
         lit.sun = facing * sun_at(shadows, view, p, n)
@@ -244,7 +247,7 @@ def seen_from(
     # no step where the mirror begins to count: the first hundredths are given away
     share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
     if share > 0.0:
-        colour = colour * (1.0 - share) + surroundings(light, back, p, sharp) * share
+        colour = colour * (1.0 - share) + surroundings(light, back, p, sharp) * (share * lit.open_)
         gain = gain * (1.0 - share)
     if gloss > 0.2:
         power = 8.0 + 400.0 * gloss * gloss
