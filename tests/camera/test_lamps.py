@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ssad.assets import mesh as meshes
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, build
-from ssad.camera.lamps import Lamp, lamp_strength, lamps_of, own_lamps
+from ssad.camera.lamps import Lamp, lamp_strength, near_of, own_lamps
 from ssad.camera.render import PLAIN, Quality, View, Weather, light_of, render
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import retexture, taps_of
@@ -160,18 +160,26 @@ def test_the_surface_explains_the_picture(scene: Scene) -> None:
     assert render(scene, [view]).surface is None
 
 
+def lit_lamps(scene: Scene, view: View) -> Any:
+    """The lamps of a view as the kernels get them."""
+    near = near_of(scene, [view])
+    return near.lamps.numpy()[: len(set(near.lamp_list.numpy()))] if near.lamp_start.numpy()[-1] else []
+
+
 def test_by_night_lamps_are_on(scene: Scene) -> None:
     car = Thing(2, at(10.0, 0.0, 0.0), tag=1)
     view = View(CAMERA, FORWARD, (Thing(0, np.eye(4)), car), NIGHT)
     assert lamp_strength(1.0) == 0.0
     assert lamp_strength(-1.0) == 1.0
-    assert not lamps_of(scene, replace(view, weather=Weather()))
-    head, tail = lamps_of(scene, view)
-    assert head.pose[0, 2] > 0.9, "forward"
-    assert tail.pose[0, 2] < -0.9
-    assert head.pose[0, 3] > 11.5
-    assert tail.pose[0, 3] < 8.5
-    assert not lamps_of(scene, replace(view, things=(replace(car, lit=False),)))
+    assert not len(lit_lamps(scene, replace(view, weather=Weather())))
+    head, tail = lit_lamps(scene, view)
+    assert head["ahead"][0] > 0.9, "forward"
+    assert tail["ahead"][0] < -0.9
+    assert head["place"][0] > 11.5
+    assert tail["place"][0] < 8.5
+    dusk = lit_lamps(scene, replace(view, weather=Weather(sun_height=0.02)))
+    assert dusk["light"] == pytest.approx(lit_lamps(scene, view)["light"] * lamp_strength(0.02), rel=1e-5)
+    assert not len(lit_lamps(scene, replace(view, things=(replace(car, lit=False),))))
     lit, off = (render(scene, [replace(view, things=(view.things[0], c))]) for c in (car, replace(car, lit=False)))
     assert lit.radiance[0, 50:].sum() > 1.05 * off.radiance[0, 50:].sum()
     assert not own_lamps(np.eye(4), Weather())

@@ -89,70 +89,133 @@ def own_lamps(vehicle: F64, weather: Weather) -> tuple[Lamp, ...]:
     return (_beam(vehicle @ _moved(np.array([NOSE, 0.0, 0.65])), HEAD_LAMPS, strength),) if strength > 0.0 else ()
 
 
-def lamps_of(scene: Scene, view: View) -> list[Lamp]:
-    """The lamps of a view: its own, and by dusk and night those of the street and of bodies that have them lit."""
-    found = list(view.lamps)
-    strength = lamp_strength(view.weather.sun_height)
-    if strength <= 0.0:
-        return found
-    eye = view.pose[:3, 3]
-    if scene.street is not None:
-        down = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])
-        power, spread, colour, reach = STREET_LAMP
-        for x, y, z, heading in scene.street.lamps.astype(np.float64).tolist():
-            if np.hypot(x - eye[0], y - eye[1]) < LIT_UP_TO:
-                pose = np.eye(4)
-                pose[:3, :3] = _turn(heading) @ down
-                pose[:3, 3] = x, y, z - 0.05
-                found.append(Lamp(pose, power * strength, spread, colour, 0.5, False, reach, False))
-    for thing in view.things:
-        if thing.lit and np.hypot(*(thing.pose[:2, 3] - eye[:2])) < LIT_UP_TO:
-            for place, kind, back in _own(scene, thing.mesh):
-                turned = np.diag([-1.0, -1.0, 1.0, 1.0]) if back else np.eye(4)
-                found.append(_beam(thing.pose @ _moved(place) @ turned, kind, strength))
-    return found
-
-
 def lamp_strength(sun_height: float) -> float:
     """How far lamps are on: 0 by day, 1 by night."""
     return float(np.clip((0.08 - sun_height) / 0.15, 0, 1))
 
 
-def near_of(scene: Scene, views: Sequence[View], lamps: Sequence[Sequence[Lamp]], *, contact: bool) -> Any:
+def near_of(scene: Scene, views: Sequence[View], *, lamps: bool = True, contact: bool = True) -> Any:
     """Lamps and occluders of B views with their grids, as the kernels read them, without shadow maps.
 
-    lamps: of each view, in the order in which their shadow maps are numbered; contact: whether bodies keep light from
-    the ground.
+    Args:
+        scene: Street and bodies.
+        views: What is seen; their own lamps come first, in the order in which their shadow maps are numbered.
+        lamps: Whether by dusk and night those of the street and of bodies are lit, too.
+        contact: Whether bodies keep light from the ground.
     """
-    lamp_rows, lamp_places, occluder_rows, occluder_places = [], [], [], []
-    layer = 0
-    for number, (view, own) in enumerate(zip(views, lamps, strict=True)):
-        eye = view.pose[:3, 3]
-        for lamp in own:
-            lamp_rows.append(_lamp_row(lamp, layer if lamp.shadows else -1))
-            layer += lamp.shadows
-            middle, around = _lit_circle(lamp)
-            lamp_places.append((number, *(middle - eye[:2]), around))
-        if contact:
-            for thing in view.things:
-                away = float(np.hypot(*(thing.pose[:2, 3] - eye[:2])))
-                if away < SHADED_UP_TO and thing.pose[2, 2] > 0.9 and scene.standing(thing.mesh)[3] > FLAT:
-                    row, middle, around = _occluder_row(scene, thing.mesh, thing.pose)
-                    occluder_rows.append(row)
-                    occluder_places.append((number, *(middle - eye[:2]), around))
     near = kernels.Near()
-    device = scene.device
-    tables: Any = (
-        ("lamp", kernels.Lamp, lamp_rows, lamp_places),
-        ("occluder", kernels.Occluder, occluder_rows, occluder_places),
-    )
-    for name, struct, rows, places in tables:
-        table: Any = struct_array(struct, rows)
-        start, listed = _grid(np.array(places, np.float64).reshape(-1, 4), len(views))
-        setattr(near, f"{name}s", wp.array(table, dtype=struct, device=device))
-        setattr(near, f"{name}_start", wp.array(start, dtype=int, device=device))
-        setattr(near, f"{name}_list", wp.array(listed, dtype=int, device=device))
+    tables = {
+        "lamp": (kernels.Lamp, _lamps(scene, views) if lamps else _own_lamps(views)),
+        "occluder": (kernels.Occluder, _occluders(scene, views) if contact else _nothing(kernels.Occluder)),
+    }
+    for name, (struct, (rows, places)) in tables.items():
+        start, listed = _grid(places, len(views))
+        table = rows if len(rows) else np.zeros(1, rows.dtype)
+        setattr(near, f"{name}s", wp.array(table, dtype=struct, device=scene.device))
+        setattr(near, f"{name}_start", wp.array(start, dtype=int, device=scene.device))
+        setattr(near, f"{name}_list", wp.array(listed, dtype=int, device=scene.device))
     return near
+
+
+Rows = tuple[Any, F64]
+"""Rows of a kernel's struct, and where on the map they matter [N, 4]: view, x and y from its eye, radius, m."""
+
+
+def _nothing(struct: Any) -> Rows:
+    return np.zeros(0, struct.numpy_dtype()), np.zeros((0, 4))
+
+
+def _own_lamps(views: Sequence[View]) -> Rows:
+    """The lamps that views bring with them."""
+    rows: list[tuple[Any, ...]] = []
+    places = []
+    for number, view in enumerate(views):
+        for lamp in view.lamps:
+            rows.append(_lamp_row(lamp, sum(row[8] >= 0 for row in rows) if lamp.shadows else -1))
+            middle, radius = _lit_circle(lamp)
+            places.append((number, *(middle - view.pose[:2, 3]), radius))
+    return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
+
+
+def _lamps(scene: Scene, views: Sequence[View]) -> Rows:
+    """The lamps of views, and by dusk and night those of the street and of bodies that have them lit."""
+    found = [_own_lamps(views)]
+    strength = np.array([lamp_strength(view.weather.sun_height) for view in views])
+    eyes = np.array([view.pose[:2, 3] for view in views])
+    dark = np.flatnonzero(strength > 0.0)
+    if len(dark):
+        street, circles = scene.kept("street lamps", lambda: _fixed(_street_lamps(scene)))
+        away = circles[None, :, :2] - eyes[dark, None]
+        view, lamp = np.nonzero(np.hypot(*np.moveaxis(away, -1, 0)) < LIT_UP_TO)
+        rows = street[lamp]
+        rows["light"] *= strength[dark[view], None]
+        found.append((rows, np.column_stack([dark[view], away[view, lamp], circles[lamp, 2]])))
+    who = [(v, t) for v in dark.tolist() for t in views[v].things if t.lit]
+    beams = [scene.kept(("lamps", t.mesh), lambda t=t: _fixed(_beams(scene, t.mesh))) for _, t in who]  # type: ignore[misc]
+    count = [len(rows) for rows, _ in beams]
+    if sum(count):
+        rows, circles = (np.concatenate([beam[k] for beam in beams]) for k in (0, 1))
+        view = np.repeat([v for v, _ in who], count)
+        pose = np.repeat(np.array([t.pose for _, t in who]), count, axis=0)
+        for name in ("across", "down", "ahead", "place"):
+            rows[name] = np.einsum("nij,nj->ni", pose[:, :3, :3], rows[name])
+        rows["place"] += pose[:, :3, 3]
+        rows["light"] *= strength[view, None]
+        middle = np.einsum("nij,nj->ni", pose[:, :2, :2], circles[:, :2]) + pose[:, :2, 3] - eyes[view]
+        near = np.hypot(*(pose[:, :2, 3] - eyes[view]).T) < LIT_UP_TO
+        found.append((rows[near], np.column_stack([view, middle, circles[:, 2]])[near]))
+    return np.concatenate([rows for rows, _ in found]), np.concatenate([places for _, places in found])
+
+
+def _fixed(lamps: Sequence[Lamp]) -> Rows:
+    """Rows of lamps without shadow maps, and the circles [N, 3] (x, y, radius) that hold what they light."""
+    circles = [(*middle, radius) for middle, radius in map(_lit_circle, lamps)]
+    rows = np.array([_lamp_row(lamp, -1) for lamp in lamps], kernels.Lamp.numpy_dtype())  # type: ignore[attr-defined]
+    return rows, np.array(circles, np.float64).reshape(-1, 3)
+
+
+def _street_lamps(scene: Scene) -> list[Lamp]:
+    """The lamps of the street."""
+    power, spread, colour, reach = STREET_LAMP
+    found = []
+    for x, y, z, heading in [] if scene.street is None else scene.street.lamps.astype(np.float64).tolist():
+        pose = _moved(np.array([x, y, z - 0.05]))
+        pose[:3, :3] = _turn(heading) @ np.diag([1.0, -1.0, -1.0])
+        found.append(Lamp(pose, power, spread, colour, 0.5, False, reach, False))
+    return found
+
+
+def _beams(scene: Scene, mesh: int) -> list[Lamp]:
+    """The head and tail lamps of a body, in its own frame."""
+    found = []
+    for name, (place, area) in scene.lights(mesh).items():
+        if area > 0.0:
+            head = name == "head_lamp"
+            turned = np.eye(4) if head else np.diag([-1.0, -1.0, 1.0, 1.0])
+            found.append(_beam(_moved(place) @ turned, HEAD_LAMPS if head else TAIL_LAMPS, 1.0))
+    return found
+
+
+def _occluders(scene: Scene, views: Sequence[View]) -> Rows:
+    """The bodies of views that keep light from the ground."""
+    who = [(v, t) for v, view in enumerate(views) for t in view.things]
+    rows, places = _nothing(kernels.Occluder)
+    if not who:
+        return rows, places
+    view = np.array([v for v, _ in who])
+    pose = np.array([t.pose for _, t in who])
+    middle, half, under, height = (
+        np.array(column) for column in zip(*(scene.standing(t.mesh) for _, t in who), strict=True)
+    )
+    eyes = np.array([v.pose[:2, 3] for v in views])[view]
+    keep = (np.hypot(*(pose[:, :2, 3] - eyes).T) < SHADED_UP_TO) & (pose[:, 2, 2] > 0.9) & (height > FLAT)
+    view, pose, middle, half, under, height, eyes = (a[keep] for a in (view, pose, middle, half, under, height, eyes))
+    rows = np.zeros(len(view), rows.dtype)
+    rows["place"] = np.einsum("nij,nj->ni", pose[:, :3, :2], middle) + pose[:, :3, 3]
+    rows["heading"] = pose[:, :2, 0] / np.maximum(np.hypot(*pose[:, :2, 0].T), 1e-9)[:, None]
+    rows["half"], rows["under"], rows["middle"] = half, under, 0.5 * height
+    rows["reach"] = np.hypot(*half.T) + 2.0 * height
+    return rows, np.column_stack([view, rows["place"][:, :2] - eyes, rows["reach"]])
 
 
 def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
@@ -164,17 +227,16 @@ def struct_array(struct: Any, rows: Sequence[tuple[Any, ...]]) -> Any:
 def _grid(places: F64, views: int) -> tuple[I32, I32]:
     """Which squares of the grid of each view circles (view, x, y, radius; m from the eye) touch."""
     cells, cell = int(kernels.CELLS), float(kernels.CELL)
-    pairs = []
-    for number, (view, x, y, radius) in enumerate(places.tolist()):
-        low = [max(int(np.floor((v - radius) / cell)) + cells // 2, 0) for v in (x, y)]
-        high = [min(int(np.floor((v + radius) / cell)) + cells // 2, cells - 1) for v in (x, y)]
-        columns, rows = np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
-        squares = (int(view) * cells * cells + rows[:, None] * cells + columns[None]).ravel()
-        pairs.append(np.stack([squares, np.full(len(squares), number)], 1))
-    pair = np.concatenate(pairs) if pairs else np.zeros((0, 2), int)
-    pair = pair[np.argsort(pair[:, 0], kind="stable")]
-    start = np.searchsorted(pair[:, 0], np.arange(views * cells * cells + 1))
-    return start.astype(np.int32), pair[:, 1].astype(np.int32) if len(pair) else np.zeros(1, np.int32)
+    low = np.clip(np.floor((places[:, 1:3] - places[:, 3:]) / cell) + cells // 2, 0, cells).astype(int)
+    high = np.clip(np.floor((places[:, 1:3] + places[:, 3:]) / cell) + cells // 2, -1, cells - 1).astype(int)
+    wide, tall = np.maximum(high - low + 1, 0).T
+    number = np.repeat(np.arange(len(places)), wide * tall)
+    order = np.arange(len(number)) - np.repeat(np.cumsum(wide * tall) - wide * tall, wide * tall)
+    column, row = low[number, 0] + order % wide[number], low[number, 1] + order // wide[number]
+    square = places[number, 0].astype(int) * cells * cells + row * cells + column
+    sort = np.argsort(square, kind="stable")
+    start = np.searchsorted(square[sort], np.arange(views * cells * cells + 1))
+    return start.astype(np.int32), number[sort].astype(np.int32) if len(number) else np.zeros(1, np.int32)
 
 
 def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
@@ -198,25 +260,6 @@ def _lit_circle(lamp: Lamp) -> tuple[F64, float]:
         return lamp.pose[:2, 3], lamp.reach
     half = 0.5 * lamp.reach * float(np.sqrt(1.0 + wide * wide))
     return lamp.pose[:2, 3] + 0.5 * ahead[:2], half * (1.0 + wide)
-
-
-def _occluder_row(scene: Scene, mesh: int, pose: F64) -> tuple[tuple[Any, ...], F64, float]:
-    """A body as an occluder for the kernels, where it stands, and how far it works, m."""
-    middle, half, under, height = scene.standing(mesh)
-    place = pose[:3, :3] @ [middle[0], middle[1], 0.0] + pose[:3, 3]
-    forward = pose[:2, 0] / max(float(np.hypot(*pose[:2, 0])), 1e-9)
-    reach = float(np.hypot(*half)) + 2.0 * height
-    return (tuple(place), tuple(forward), tuple(half), under, 0.5 * height, reach), place[:2], reach
-
-
-def _own(scene: Scene, mesh: int) -> list[tuple[F64, tuple[Any, ...], bool]]:
-    """Where a body has its head and tail lamps (object frame), what they are, and whether they look back."""
-    found = []
-    for name, (place, area) in scene.lights(mesh).items():
-        kind, back = (HEAD_LAMPS, False) if name == "head_lamp" else (TAIL_LAMPS, True)
-        if area > 0.0:
-            found.append((place, kind, back))
-    return found
 
 
 def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> Lamp:

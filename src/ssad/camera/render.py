@@ -13,7 +13,7 @@ import warp as wp
 from ssad.camera.kernels import layers as layer_kernels
 from ssad.camera.kernels import raster, shade, sky
 from ssad.camera.kernels import sensor as sensing
-from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, lamps_of, near_of, struct_array
+from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, near_of, struct_array
 from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
 from ssad.camera.sensor import BRIGHTEST, DEFAULT_SENSOR, KNEE, SHOULDER, Sensor, noise_levels, point_spread
 from ssad.core.errors import ConfigError
@@ -358,9 +358,8 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
 
 def _near(stage: Scene, views: Sequence[View], quality: Quality) -> Any:
     """Lamps with their shadow maps, and bodies that keep light from the ground."""
-    lamps = [lamps_of(stage, view) if quality.lamps else list(view.lamps) for view in views]
-    near = near_of(stage, views, lamps, contact=quality.contact)
-    casting = [(view, lamp) for view, row in zip(views, lamps, strict=True) for lamp in row if lamp.shadows]
+    near = near_of(stage, views, lamps=quality.lamps, contact=quality.contact)
+    casting = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not casting:
         near.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
         return near

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -171,8 +171,7 @@ class Scene:
         worn = [p.panel >= 0 if isinstance(p, Mesh) else np.zeros(len(p.faces), bool) for p in parts]
         self.wearable = on(np.concatenate(worn).astype(np.int32), wp.int32)
         self.meshes = tuple(meshes)
-        self._lights: dict[int, dict[str, tuple[F64, float]]] = {}
-        self._standing: dict[int, tuple[F64, F64, float, float]] = {}
+        self._kept: dict[Any, Any] = {}
         rows: Any = np.array(surfaces, dtype=matter.Surface.numpy_dtype())  # type: ignore[attr-defined]
         self.surfaces = on(rows, matter.Surface)
         self.listed = on(np.concatenate(listed), wp.int32)
@@ -180,19 +179,22 @@ class Scene:
         for name in ("vertices", "faces", "normals", "uvs", "material", "surfaces", "wearable"):
             setattr(self.geometry, name, getattr(self, name))
 
+    def kept(self, key: Any, make: Callable[[], Any]) -> Any:
+        """What was made once for this scene."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
+
     def lights(self, mesh: int) -> dict[str, tuple[F64, float]]:
         """Middle [3] (object frame, m) and area (m^2) of the head lamps and of the tail lamps of a mesh."""
-        if mesh not in self._lights:
-            body = self.meshes[mesh]
-            names, areas, middles = [m.name for m in body.materials], body.areas(), body.corners().mean(1)
-            found = {}
-            for name in LAMPS:
-                index = [k for k, other in enumerate(names) if other == name]
-                weight = areas * np.isin(body.material, index)
-                total = float(weight.sum())
-                found[name] = (weight @ middles / max(total, 1e-12), total)
-            self._lights[mesh] = found
-        return self._lights[mesh]
+        body = self.meshes[mesh]
+        names, areas, middles = [m.name for m in body.materials], body.areas(), body.corners().mean(1)
+        found = {}
+        for name in LAMPS:
+            weight = areas * np.isin(body.material, [k for k, other in enumerate(names) if other == name])
+            total = float(weight.sum())
+            found[name] = (weight @ middles / max(total, 1e-12), total)
+        return found
 
     def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
         """What a mesh covers of the ground: middle [2], half length and width [2], height of its underside and of its
@@ -200,19 +202,7 @@ class Scene:
 
         What looks down from at most half its height says how much of the rectangle about it is covered, and from where.
         """
-        if mesh not in self._standing:
-            body = self.meshes[mesh]
-            low, high = body.bounds()
-            corners = body.corners()
-            cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            flat, heights = np.maximum(-0.5 * cross[:, 2], 0.0), corners[..., 2].mean(1)
-            flat = flat * (heights <= 0.5 * high[2])
-            sides = np.maximum(high[:2] - low[:2], 1e-3)
-            fill = float(np.clip(flat.sum() / sides.prod(), 0.1, 1.0))
-            under = float((flat * heights).sum() / max(float(flat.sum()), 1e-9)) if flat.any() else 0.0
-            half = 0.5 * sides * np.sqrt(fill)
-            self._standing[mesh] = (low[:2] + 0.5 * sides, half, max(under, 0.03), float(high[2]))
-        return self._standing[mesh]
+        return self.kept(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
 
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
@@ -304,3 +294,16 @@ def surface(material: Material) -> tuple[Any, ...]:
         material.colour, material.specular, material.gloss, material.emission, night, int(material.paint), lamp,
         int(pattern),
     )  # fmt: skip
+
+
+def _standing(body: Mesh) -> tuple[F64, F64, float, float]:
+    """See `Scene.standing`."""
+    low, high = body.bounds()
+    corners = body.corners()
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat, heights = np.maximum(-0.5 * cross[:, 2], 0.0), corners[..., 2].mean(1)
+    flat = flat * (heights <= 0.5 * high[2])
+    sides = np.maximum(high[:2] - low[:2], 1e-3)
+    fill = float(np.clip(flat.sum() / sides.prod(), 0.1, 1.0))
+    under = float((flat * heights).sum() / max(float(flat.sum()), 1e-9)) if flat.any() else 0.0
+    return low[:2] + 0.5 * sides, 0.5 * sides * np.sqrt(fill), max(under, 0.03), float(high[2])
