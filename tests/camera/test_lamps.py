@@ -58,7 +58,7 @@ def lamp_light(scene: Scene, view: View, **options: Any) -> Any:
     return lit.irradiance[0].astype(float) - dark.irradiance[0]
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     height=st.floats(6.0, 14.0), across=st.floats(0.2, 0.7), down=st.floats(0.2, 0.7), soft=st.floats(0.0, 1.0),
     square=st.booleans(), tilt=st.floats(-0.2, 0.2),

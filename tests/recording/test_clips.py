@@ -241,25 +241,26 @@ def projected(row: dict[str, Any]) -> F64:
     return np.concatenate([xy.min(0), xy.max(0)])
 
 
-def test_a_recording_is_drawn_again(drives: Path, orbits: Path) -> None:
+@pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=pytest.mark.slow)])
+def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -> None:
     """Each row gives scene, view, target and labels; what is rendered is what was stored."""
-    for folder in (drives, orbits):
-        rows = read(folder, "test")["images"]
-        again = list(clip_views(folder, split="test"))
-        assert [v.file for v in again] == [row["file_name"] for row in rows]
-        scenes = {(v.row["town"], v.row["part"], v.row["attempt"], id(v.scene)) for v in again}
-        assert len(scenes) == len({key[:3] for key in scenes}), "pictures of a drive share a scene"
-        for seen in again:
-            picture = render(seen.scene, [seen.view])
-            assert encode_jpeg(picture.image[0], 92, "420") == (folder / "images" / seen.file).read_bytes()
-            labels = label_picture(seen.scene, seen.view, picture)
-            target = next(o for o in seen.objects if o["target"])
-            x, y, w, h = target["bbox"]
-            assert labels.box[labels.tag == TARGET][0].tolist() == [x, y, x + w, y + h]
-            assert seen.view.things[0].tag == TARGET
-            worn = seen.wearing(Layer(4)).things
-            assert worn[0].layers == (Layer(4),)
-            assert worn[1:] == seen.view.things[1:]
+    folder = request.getfixturevalue(mode)
+    rows = read(folder, "test")["images"]
+    again = list(clip_views(folder, split="test"))
+    assert [v.file for v in again] == [row["file_name"] for row in rows]
+    scenes = {(v.row["town"], v.row["part"], v.row["attempt"], id(v.scene)) for v in again}
+    assert len(scenes) == len({key[:3] for key in scenes}), "pictures of a drive share a scene"
+    for seen in again:
+        picture = render(seen.scene, [seen.view])
+        assert encode_jpeg(picture.image[0], 92, "420") == (folder / "images" / seen.file).read_bytes()
+        labels = label_picture(seen.scene, seen.view, picture)
+        target = next(o for o in seen.objects if o["target"])
+        x, y, w, h = target["bbox"]
+        assert labels.box[labels.tag == TARGET][0].tolist() == [x, y, x + w, y + h]
+        assert seen.view.things[0].tag == TARGET
+        worn = seen.wearing(Layer(4)).things
+        assert worn[0].layers == (Layer(4),)
+        assert worn[1:] == seen.view.things[1:]
 
 
 def test_the_named_target_is_the_same_metal_everywhere() -> None:
