@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.clock import Clock, stopped
 
 from ssad.core.errors import ConfigError, SSADError
 from ssad.jobs import local
@@ -22,21 +23,9 @@ from ssad.jobs.task import Outcome, Task
 GIB = 1 << 30
 
 
-class Clock:
-    """Seconds, as the test sets them."""
-
-    def __init__(self) -> None:
-        self.now = 5000.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    fake = Clock()
-    monkeypatch.setattr(local, "time", SimpleNamespace(monotonic=fake.monotonic))
-    return fake
+    return stopped(monkeypatch, local)
 
 
 def open_files() -> list[str]:

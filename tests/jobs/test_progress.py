@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import io
-from types import SimpleNamespace
 
 import pytest
+from helpers.clock import Clock, stopped
 from rich.console import Console
 
 from ssad.jobs import progress
 from ssad.jobs.progress import Live
 
 
-class Clock:
-    """Seconds, as the test sets them."""
-
-    def __init__(self) -> None:
-        self.now = 5000.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    fake = Clock()
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=fake.monotonic))
-    return fake
+    return stopped(monkeypatch, progress)
 
 
 def plain() -> Console:

@@ -2,7 +2,7 @@
 
 A lamp lights a plane across its axis evenly: an ellipse, or the rectangle of what it projects. So its power spreads
 over the plane that it lights whatever the distance, and head lamps, street lamps, projectors, flashlights and lasers
-are one thing.
+are one thing. Irradiance over pi of one lux is about 1/60, on the scale on which the sun at noon is 2.6.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import warp as wp
 
 from ssad.camera.kernels import light as kernels
 from ssad.core.errors import ConfigError
+from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, I32
 
 if TYPE_CHECKING:
     from ssad.camera.render import View, Weather
     from ssad.camera.scene import Scene
 
-LUX = 1 / 60  # irradiance / pi of one lux, on the scale on which the sun at noon is about 2.6
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
 LAMP_NEAR = 0.05  # m: what is nearer to a lamp casts no shadow (its own housing)
 HEAD_LAMPS = (7.0, (0.60, 0.06), (1.0, 0.97, 0.90), 60.0, 0.055)  # power, spread, colour, reach (m), tilt (rad)
@@ -86,7 +86,7 @@ def own_lamps(vehicle: F64, weather: Weather) -> tuple[Lamp, ...]:
         weather: Says how far lamps are on.
     """
     strength = lamp_strength(weather.sun_height)
-    return (_beam(vehicle @ _moved(np.array([NOSE, 0.0, 0.65])), HEAD_LAMPS, strength),) if strength > 0.0 else ()
+    return (_beam(vehicle @ upright_pose(NOSE, 0.0, 0.0, 0.65), HEAD_LAMPS, strength),) if strength > 0.0 else ()
 
 
 def lamp_strength(sun_height: float) -> float:
@@ -129,9 +129,11 @@ def _own_lamps(views: Sequence[View]) -> Rows:
     """The lamps that views bring with them."""
     rows: list[tuple[Any, ...]] = []
     places = []
+    layers = 0
     for number, view in enumerate(views):
         for lamp in view.lamps:
-            rows.append(_lamp_row(lamp, sum(row[8] >= 0 for row in rows) if lamp.shadows else -1))
+            rows.append(_lamp_row(lamp, layers if lamp.shadows else -1))
+            layers += lamp.shadows
             middle, radius = _lit_circle(lamp)
             places.append((number, *(middle - view.pose[:2, 3]), radius))
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
@@ -179,8 +181,7 @@ def _street_lamps(scene: Scene) -> list[Lamp]:
     power, spread, colour, reach = STREET_LAMP
     found = []
     for x, y, z, heading in [] if scene.street is None else scene.street.lamps.astype(np.float64).tolist():
-        pose = _moved(np.array([x, y, z - 0.05]))
-        pose[:3, :3] = _turn(heading) @ np.diag([1.0, -1.0, -1.0])
+        pose = upright_pose(x, y, heading, z - 0.05) @ np.diag([1.0, -1.0, -1.0, 1.0])
         found.append(Lamp(pose, power, spread, colour, 0.5, False, reach, False))
     return found
 
@@ -191,8 +192,8 @@ def _beams(scene: Scene, mesh: int) -> list[Lamp]:
     for name, (place, area) in scene.lights(mesh).items():
         if area > 0.0:
             head = name == "head_lamp"
-            turned = np.eye(4) if head else np.diag([-1.0, -1.0, 1.0, 1.0])
-            found.append(_beam(_moved(place) @ turned, HEAD_LAMPS if head else TAIL_LAMPS, 1.0))
+            pose = upright_pose(float(place[0]), float(place[1]), 0.0 if head else np.pi, float(place[2]))
+            found.append(_beam(pose, HEAD_LAMPS if head else TAIL_LAMPS, 1.0))
     return found
 
 
@@ -274,17 +275,6 @@ def lamp_lens(lamp: Lamp) -> tuple[float, float, float, float]:
     """Focal lengths and middle of the camera that a lamp's shadow map is taken with, texels."""
     half = LAMP_SHADOWS / 2
     return half / lamp.spread[0], half / lamp.spread[1], half - 0.5, half - 0.5
-
-
-def _turn(heading: float) -> F64:
-    cos, sin = np.cos(heading), np.sin(heading)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _moved(place: F64) -> F64:
-    matrix = np.eye(4)
-    matrix[:3, 3] = place
-    return matrix
 
 
 def _tilted(angle: float) -> F64:
