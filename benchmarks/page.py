@@ -115,6 +115,26 @@ def camera() -> list[str]:
     ]
 
 
+def sensor() -> list[str]:
+    """Time of the sensor, in the renderer and in torch."""
+    found = read("sensor-cpu")
+    return [
+        "## Speed of the sensor",
+        "",
+        "Measured by `benchmarks/sensor_speed.py` on one core, 640 x 640 pixels. In torch: forward and backward from a",
+        "texture on a car 20 m ahead to the image, of the whole image and of a `Window` of what the texture touches.",
+        "",
+        "| renderer | ms |",
+        "|---|---:|",
+        *(f"| {name} | {ms:.1f} |" for name, ms in found["rendered_ms"].items()),
+        "",
+        "| torch | whole image, ms | window, ms |",
+        "|---|---:|---:|",
+        *(f"| {name} | {ms['whole']:.1f} | {ms['touched']:.1f} |" for name, ms in found["torch_ms"].items()),
+        "",
+    ]
+
+
 def recorder() -> list[str]:
     """Samples of the recorder."""
     cpu = read("record-cpu")
@@ -197,7 +217,7 @@ def page() -> str:
     ]
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
-    lines += shifts() + scores() + camera() + recorder() + detectors()
+    lines += shifts() + scores() + camera() + sensor() + recorder() + detectors()
     return "\n".join(lines)
 
 
