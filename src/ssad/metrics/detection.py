@@ -72,16 +72,15 @@ class DetectionScores:
     @property
     def label_aps(self) -> dict[str, dict[str, float]]:
         """class -> threshold as text -> AP."""
-        rows = self.ap.tolist()
+        names = [str(t) for t in self.config.dist_ths]
         return {
-            c: {str(t): rows[i][j] for j, t in enumerate(self.config.dist_ths)}
-            for i, c in enumerate(self.config.classes)
+            c: dict(zip(names, row, strict=True)) for c, row in zip(self.config.classes, self.ap.tolist(), strict=True)
         }
 
     @property
     def mean_dist_aps(self) -> dict[str, float]:
         """class -> mean AP over the thresholds."""
-        return {c: float(np.mean(self.ap[i])) for i, c in enumerate(self.config.classes)}
+        return {c: float(np.mean(row)) for c, row in zip(self.config.classes, self.ap, strict=True)}
 
     @property
     def mean_ap(self) -> float:
@@ -92,12 +91,12 @@ class DetectionScores:
     def label_tp_errors(self) -> dict[str, dict[str, float]]:
         """class -> error -> value, NaN where it has no meaning."""
         rows = self.errors.tolist()
-        return {c: {name: rows[i][j] for j, name in enumerate(TP_METRICS)} for i, c in enumerate(self.config.classes)}
+        return {c: dict(zip(TP_METRICS, row, strict=True)) for c, row in zip(self.config.classes, rows, strict=True)}
 
     @property
     def tp_errors(self) -> dict[str, float]:
         """error -> mean over the classes for which it has a meaning."""
-        return {name: float(np.nanmean(self.errors[:, j])) for j, name in enumerate(TP_METRICS)}
+        return {name: float(np.nanmean(column)) for name, column in zip(TP_METRICS, self.errors.T, strict=True)}
 
     @property
     def tp_scores(self) -> dict[str, float]:

@@ -62,7 +62,7 @@ def match_2d(
     if detections.score is None:
         raise ValueError("detections need scores")
     crowd = np.zeros(len(truth.image), np.bool_) if truth.ignore is None else truth.ignore
-    images = len(np.bincount(np.concatenate([truth.image, detections.image])))  # as many as the greatest index needs
+    images = int(max(truth.image.max(initial=-1), detections.image.max(initial=-1))) + 1
     real_group = truth.label.astype(np.int64) * images + truth.image
     real = np.argsort(real_group, kind="stable")
     group = detections.label.astype(np.int64) * images + detections.image
