@@ -8,6 +8,7 @@ import pytest
 import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, some_truth, truth_of
 from torch import Tensor
+from torchvision.ops import box_iou
 
 from ssad.core.detections import Detections, Truth
 from ssad.core.errors import ConfigError
@@ -18,6 +19,7 @@ from ssad.detectors.fcos3d import fcos3d
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
 from ssad.detectors.mono3d.detector import Mono3D
+from ssad.detectors.mono3d.head import group_norm_relu
 from ssad.detectors.pgd_det import pgd_det
 
 BOTH = pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
@@ -408,3 +410,35 @@ def test_it_learns_a_few_pictures(config: Mono3DConfig, steps: int, least: int) 
         history.append(float(loss.detach()))
     assert history[-1] < 0.5 * history[0]
     assert near() >= least
+
+
+def test_fused_norm_equals_the_library() -> None:
+    draws = torch.Generator().manual_seed(3)
+    x = (2 * torch.randn((3, 64, 7, 5), generator=draws) + 0.5).requires_grad_()
+    weight, bias = (torch.randn(64, generator=draws).requires_grad_() for _ in range(2))
+    cotangent = torch.randn((3, 64, 7, 5), generator=draws)
+    wanted = torch.group_norm(x, 32, weight, bias, 1e-5).relu()
+    found = group_norm_relu(x.contiguous(memory_format=torch.channels_last), weight, bias, 32, 1e-5)
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    for a, b in zip(*(torch.autograd.grad(y, (x, weight, bias), cotangent) for y in (found, wanted)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+
+
+@BOTH
+def test_boxes_of_one_object_in_the_image_are_suppressed(config: Mono3DConfig) -> None:
+    """Of two of a class that overlap in the image the better stays, wherever they are on the ground; nothing else."""
+    config = replace(config, nms=0.9, most=100000)
+    free = lively(config)
+    strict = lively(replace(config, image_nms=0.3))
+    images, cameras = pictures(2, 3, *SIZE), K.expand(2, 3, 3)
+    for before, after in zip(
+        free.predict(images, cameras, threshold=0.001), strict.predict(images, cameras, threshold=0.001), strict=True
+    ):
+        keep: list[int] = []
+        for k in before.score.argsort(descending=True, stable=True).tolist():
+            rivals = [j for j in keep if before.label[j] == before.label[k]]
+            overlap = box_iou(before.box[k : k + 1], before.box[rivals])
+            if not (overlap > 0.3).any():
+                keep.append(k)
+        assert 1 < len(keep) < len(before.score)
+        torch.testing.assert_close(after.box, before.box[keep])

@@ -76,6 +76,9 @@ def train(
     layout = torch.channels_last if where.type == "cuda" else torch.contiguous_format
     detector.to(memory_format=layout)
     _unfreeze(detector, recipe)
+    for part in detector.modules():
+        if hasattr(part, "compiled"):
+            part.compiled = recipe.compile
     step_of = Step(detector, amp=recipe.amp)
     shared: Any = step_of
     if share.world > 1:

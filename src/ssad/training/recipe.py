@@ -26,7 +26,8 @@ class Recipe:
     optimizer, lr, momentum (of SGD, or beta 1 of AdamW), weight_decay (not on norms and biases), clip: norm of the
     gradient, 0 none; schedule: "cosine" or "linear" from lr to lr * last, or "step": a tenth after each of `steps`
     (epochs); warmup: iterations from a third of lr; average: decay of the weights' moving average, 0 none; amp:
-    bfloat16 on a GPU; freeze: prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
+    bfloat16 on a GPU; compile: layers that can be fused are compiled on a GPU (needs Triton and a C compiler); freeze:
+    prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
     flip: chance of a mirror image; zoom: range of the scale of a random crop; jitter: of brightness, contrast,
     saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop, 2D
     only (a 3D box stays while its middle is in sight). rare: pictures with a class that fewer than this share of them
@@ -47,6 +48,7 @@ class Recipe:
     clip: Least = 10.0
     average: Decay = 0.998
     amp: bool = True
+    compile: bool = False
     freeze: tuple[str, ...] = ()
     norm_eval: bool = False
     flip: Part = 0.5

@@ -29,7 +29,9 @@ class Mono3DConfig:
     pgd: 2D boxes, depth bins and their fusion with the regressed depth.
 
     code_weights: of offset, depth, size, yaw, velocity (and 2D box) in the loss; threshold, nms, before, most: least
-    score, IoU, places kept of each level, detections kept of an image. input_width: pictures are resized to it inside;
+    score, IoU on the ground, places kept of each level, detections kept of an image; image_nms: IoU in the image above
+    which the worse of two of a class goes as well (None: none do, as in the source): two guesses of one object's depth
+    do not overlap on the ground. input_width: pictures are resized to it inside;
     virtual_focal: depth is predicted as for a camera of this focal length (pixels, after resizing) and scaled.
     mean, std: of B, G, R in 0..255; start: depth, length, height, width that fresh weights predict (None: 1, as the
     source); rays: the regression also sees where each place looks (tangents to the right of and below the axis),
@@ -47,6 +49,7 @@ class Mono3DConfig:
     code_weights: tuple[float, ...] = (1, 1, 0.2, 1, 1, 1, 1, 0.05, 0.05)
     threshold: float = 0.05
     nms: float = 0.8
+    image_nms: float | None = None
     before: int = 1000
     most: int = 200
     input_width: int | None = None
@@ -84,7 +87,7 @@ PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights
 FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
     deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395), start=(20.0, 4.0, 1.7, 1.8),
-    rays=True, code_weights=_LIGHT_WEIGHTS,
+    rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.6,
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
     FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None,

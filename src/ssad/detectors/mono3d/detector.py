@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torchvision.ops import batched_nms
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
@@ -117,7 +118,12 @@ class Mono3D(nn.Module):
             centre, size, yaw = self._solids(pick(flat, image, rows), places.xy[rows], lens, image)
             ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1).cpu()
             ends = torch.searchsorted(image, torch.arange(len(lens) + 1, device=image.device)).tolist()
-            stay = self._suppressed(ground, score.cpu(), label.cpu(), ends, best_first=best_first)
+            shown = None
+            if self.config.image_nms is not None:
+                solids = centre, size, yaw
+                picked = pick(flat, image, rows)
+                shown = self._boxes(picked, places.xy[rows], solids, lens=lens[image], size=dense.size).cpu()
+            stay = self._suppressed(ground, shown, score.cpu(), label.cpu(), ends, best_first=best_first)
             of = torch.cat(stay).to(image.device)
             image, rows, score, label = image[of], rows[of], score[of], label[of]
             centre, size, yaw = centre[of], size[of], yaw[of]
@@ -149,13 +155,18 @@ class Mono3D(nn.Module):
         return torch.cat(rows, 1)
 
     def _suppressed(
-        self, ground: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], *, best_first: bool
-    ) -> list[Tensor]:
-        """Rows that stay of each image's candidates, which lie between `ends`; all on the host."""
+        self, ground: Tensor, shown: Tensor | None, score: Tensor, label: Tensor, ends: Sequence[int], *,
+        best_first: bool,
+    ) -> list[Tensor]:  # fmt: skip
+        """Rows that stay of each image's candidates, which lie between `ends`; all on the host. ground, shown: their
+        rectangles on the ground and, if these count too, boxes in the image."""
         stay = []
         for start, end in pairwise(ends):
             own = score[start:end]
             rows = rotated_nms(ground[start:end], own, label[start:end], threshold=self.config.nms)
+            if shown is not None and self.config.image_nms is not None:
+                columns = shown[start:end][rows], own[rows], label[start:end][rows]
+                rows = rows[batched_nms(*columns, self.config.image_nms).sort()[0]]
             if len(rows) > self.config.most or best_first:
                 rows = rows[own[rows].argsort(descending=True, stable=True)[: self.config.most]]
             stay.append(rows + start)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +19,9 @@ BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
 
 
 class Unit(nn.Module):
-    """Convolution, group norm, ReLU."""
+    """Convolution, group norm, ReLU. compiled: the last two are one compiled function while it trains on a GPU."""
+
+    compiled = False
 
     def __init__(self, inside: int, outside: int, *, deformable: bool = False) -> None:
         super().__init__()
@@ -33,8 +38,37 @@ class Unit(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[B, C, H, W] -> [B, O, H, W]."""
         norm = self.gn  # called by its function: the module refuses a map of one place
+        if self.compiled and self.training and x.is_cuda:
+            fused: Tensor = _compiled_norm()(self.conv(x), norm.weight, norm.bias, norm.num_groups, norm.eps)
+            return fused
         x = torch.group_norm(self.conv(x), norm.num_groups, norm.weight, norm.bias, norm.eps)
         return functional.relu(x)
+
+
+def group_norm_relu(x: Tensor, weight: Tensor, bias: Tensor, groups: int, eps: float) -> Tensor:
+    """Group norm and ReLU of a map [B, C, H, W] in channels-last memory, written so that a compiler can fuse them.
+
+    PyTorch's own group norm copies such a map to another layout and, in mixed precision, to 32 bits: a third of the
+    time of a training step. Statistics are taken in 32 bits.
+    """
+    values = x.permute(0, 2, 3, 1).float()
+    share = x.shape[1] // groups
+
+    def of_groups(each: Tensor) -> Tensor:
+        return each.view(len(x), groups, share).mean(2)
+
+    mean = of_groups(values.mean((1, 2)))
+    variance = (of_groups((values * values).mean((1, 2))) - mean * mean).clamp_min(0.0)
+    scale = torch.rsqrt(variance + eps).repeat_interleave(share, 1) * weight
+    shift = bias - mean.repeat_interleave(share, 1) * scale
+    values = functional.relu(values * scale[:, None, None] + shift[:, None, None])
+    return values.to(x.dtype).permute(0, 3, 1, 2)
+
+
+@cache
+def _compiled_norm() -> Callable[..., Any]:
+    """`group_norm_relu`, compiled when it is first used, for maps of any size."""
+    return torch.compile(group_norm_relu, dynamic=True)
 
 
 class Scale(nn.Module):

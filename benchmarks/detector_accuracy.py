@@ -1,0 +1,327 @@
+"""How well the shipped detectors see, by class, size, distance and light, in towns that they never saw.
+
+    python benchmarks/detector_accuracy.py --clips CLIPS [CLIPS ...] --drives DRIVES [--device cuda] [--out FILE]
+    python benchmarks/detector_accuracy.py --page      # docs/accuracy.md from benchmarks/results/accuracy.json
+
+CLIPS: folders that `ssad record --clips` wrote; DRIVES: a folder that `ssad record` wrote. Only pictures of held-out
+towns count (splits test and val).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ssad.camera.render import Weather
+from ssad.core import safeio
+from ssad.core.images import read_image
+from ssad.core.nuscenes_names import CLASSES
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.truth import read_truth
+from ssad.detectors import make_detector
+from ssad.evaluation.camera_truth import scenes_of
+from ssad.evaluation.detection import FLOOR, box_table, detect, numbers
+from ssad.metrics.detection import BoxTable, filter_boxes, match
+from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
+from ssad.recording.viewpoints import weather_name
+from ssad.training.detector import describe_data
+
+ROOT = Path(__file__).parents[1]
+RESULT, PAGE = ROOT / "benchmarks" / "results" / "accuracy.json", ROOT / "docs" / "accuracy.md"
+FLAT, SOLID = ("yolov3-tiny", "yolov5n"), ("fcos3d-light", "pgd-det-light")
+CLEAR = 0.25  # least score of a detection that counts for recall
+SIZES, DISTANCES = (8.0, 16.0, 24.0, 32.0, 64.0, 1e9), (0.0, 10.0, 20.0, 30.0, 50.0, 1e9)
+RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
+FEW = 20  # objects: groups with fewer are left out
+
+
+def weather_of(description: str) -> str:
+    """Day, night, wet ... of a scene, from the text that the recorder wrote."""
+    fields = dict(re.findall(r"(\w+)=([-\d.e]+)", description))
+    return weather_name(Weather(**{name: float(value) for name, value in fields.items()}))
+
+
+class Clips:
+    """The test pictures of some folders and what is in them, one row an object."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self.files: list[Path] = []
+        self.weather: list[str] = []
+        self.classes: tuple[str, ...] = ()
+        rows: list[tuple[Any, ...]] = []
+        for folder in folders:
+            data = safeio.read_json(folder / "annotations" / "test.json", limit=1 << 30)
+            place = {row["id"]: len(self.files) + k for k, row in enumerate(data["images"])}
+            self.files += [folder / "images" / row["file_name"] for row in data["images"]]
+            self.weather += [row["weather"] for row in data["images"]]
+            self.classes = tuple(c["name"] for c in sorted(data["categories"], key=lambda c: c["id"]))
+            rows += [
+                (place[one["image_id"]], one["category_id"] - 1, *one["bbox"], one["iscrowd"], one["target"],
+                 one["distance"])
+                for one in data["annotations"]
+            ]  # fmt: skip
+        table = np.array(rows, np.float64)
+        self.image, self.label = table[:, 0].astype(np.int32), table[:, 1].astype(np.int32)
+        self.box = np.concatenate([table[:, 2:4], table[:, 2:4] + table[:, 4:6]], 1)
+        self.side = np.sqrt(table[:, 4] * table[:, 5])
+        self.crowd, self.target, self.distance = table[:, 6] > 0, table[:, 7] > 0, table[:, 8]
+
+    def truth(self, counts: np.ndarray[Any, Any]) -> Boxes2D:
+        """Objects of which only some count; the others take detections as crowds do."""
+        return Boxes2D(self.image, self.label, self.box, ignore=self.crowd | ~counts)
+
+
+def found_in(name: str, clips: Clips, device: str) -> Boxes2D:
+    """All detections of a detector, with the labels of the clips."""
+    detector = make_detector(name, device=device)
+    label = np.array([clips.classes.index(c) if c in clips.classes else -1 for c in detector.classes])
+    parts: list[list[np.ndarray[Any, Any]]] = []
+    for start in range(0, len(clips.files), 16):
+        stacked = np.stack([read_image(file) for file in clips.files[start : start + 16]])
+        images = torch.from_numpy(stacked).to(device).permute(0, 3, 1, 2).float() / 255
+        for k, one in enumerate(detector.predict(images, threshold=FLOOR)):
+            own = label[one.label.cpu().numpy()]
+            place = np.full(len(own), start + k)
+            parts.append([v[own >= 0] for v in (place, own, one.box.cpu().double().numpy(), one.score.cpu().numpy())])
+    image, kind, box, score = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Boxes2D(image.astype(np.int32), kind.astype(np.int32), box, score.astype(np.float64))
+
+
+def recall(clips: Clips, found: Boxes2D, counts: np.ndarray[Any, Any], labels: int) -> float:
+    """Share of the objects that count which a clear detection (score 0.25, IoU 0.5) finds."""
+    assert found.score is not None
+    clear = found.score >= CLEAR
+    sure = Boxes2D(found.image[clear], found.label[clear], found.box[clear], found.score[clear])
+    matched = match_2d(clips.truth(counts), sure, labels=labels)
+    return float((matched.hit & ~matched.ignored).sum() / matched.truth.sum())
+
+
+def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
+    """One 2D detector: AP50 by class and light, recall by size and distance."""
+    found, labels = found_in(name, clips, device), len(clips.classes)
+    every = ~clips.crowd
+    ap = average_precision(clips.truth(every), found, labels=labels)
+    followed = average_precision(clips.truth(clips.target), found, labels=labels)
+    car = clips.classes.index("car")
+    result: dict[str, Any] = {
+        "AP50": {c: float(v) for c, v in zip(clips.classes, ap, strict=True) if np.isfinite(v)},
+        "followed car": float(followed[car]),
+        "objects": {c: int((every & (clips.label == k)).sum()) for k, c in enumerate(clips.classes)},
+    }
+    weather = np.array(clips.weather)
+    for light in sorted(set(clips.weather)):
+        own, seen = weather[clips.image] == light, weather[found.image] == light
+        assert found.score is not None
+        part = Boxes2D(found.image[seen], found.label[seen], found.box[seen], found.score[seen])
+        truth = Boxes2D(clips.image[own], clips.label[own], clips.box[own], ignore=clips.crowd[own])
+        enough = [k for k in range(labels) if (every & own & (clips.label == k)).sum() >= FEW]
+        values = average_precision(truth, part, labels=labels)
+        result.setdefault("by light", {})[light] = {
+            "mean": float(np.mean(values[enough])),
+            "car": float(values[car]),
+            "pictures": int((weather == light).sum()),
+        }
+    for what, values, edges in (("size", clips.side, SIZES), ("distance", clips.distance, DISTANCES)):
+        for kind in ("car", "pedestrian", "stop_sign"):
+            if kind not in clips.classes:
+                continue
+            for low, high in pairwise(edges):
+                counts = every & (clips.label == clips.classes.index(kind)) & (values >= low) & (values < high)
+                if counts.sum() >= FEW:
+                    row = {"recall": recall(clips, found, counts, labels), "objects": int(counts.sum())}
+                    result.setdefault(f"by {what}", {}).setdefault(kind, {})[f"{low:g}-{high:g}"] = row
+    below = every & (clips.side < 24.0)
+    result["recall below 24 px"] = {
+        kind: recall(clips, found, below & (clips.label == clips.classes.index(kind)), labels)
+        for kind in ("car", "pedestrian")
+    }
+    return result
+
+
+def between(boxes: BoxTable, low: float, high: float) -> BoxTable:
+    """Boxes in a ring around the ego, m."""
+    return boxes.take(np.flatnonzero((boxes.ego_distance >= low) & (boxes.ego_distance < high)))
+
+
+def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
+    """One 3D detector: scores by class, light and distance, errors by class, duplicates."""
+    detector = make_detector(name, device=device)
+    with NuScenes(root) as data:
+        version, scenes = data.version, scenes_of(data, "val")
+        light = {scene.name: weather_of(scene.description) for scene in data.scenes() if scene.name in scenes}
+    result: dict[str, Any] = {}
+    kinds = sorted(set(light.values()))
+    groups = {"all": scenes} | {kind: tuple(s for s in scenes if light[s] == kind) for kind in kinds}
+    boxes = detect(detector, root, version, scenes, device=device)
+    for group, members in groups.items():
+        truth = read_truth(root, version, scenes=frozenset(members))
+        real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
+        seen = filter_boxes(box_table(boxes, truth), racks=truth.racks)
+        scores = match(real, seen, samples=len(truth.samples)).scores()
+        result.setdefault("by light", {})[group] = numbers(scores, few=True) | {"scenes": len(members)}
+        if group != "all":
+            continue
+        result |= numbers(scores) | {"errors": scores.label_tp_errors, "truth": dict(Counter(
+            CLASSES[int(k)] for k in real.label))}  # fmt: skip
+        result["pairs"] = pairs(real, seen)
+        for low, high in pairwise(RINGS):
+            near, close = between(real, low, high), between(seen, low, high)
+            own = match(near, close, samples=len(truth.samples)).scores()
+            kept = [k for k, count in enumerate(own.truth) if count >= FEW]
+            values = list(own.mean_dist_aps.values())
+            result.setdefault("by distance", {})[f"{low:g}-{high:g}"] = {
+                "mAP": float(np.mean([values[k] for k in kept])), "AP_car": own.mean_dist_aps["car"],
+                "objects": len(near.label),
+            }  # fmt: skip
+    return result
+
+
+def pairs(real: BoxTable, seen: BoxTable) -> dict[str, Any]:
+    """Of the boxes within 2 m of a true one of their class: how many more than one there are for it, by sample."""
+    assert seen.score is not None
+    seen = seen.take(np.flatnonzero(seen.score >= 0.15))
+    more = 0
+    for sample in np.unique(real.sample):
+        a, b = np.flatnonzero(real.sample == sample), np.flatnonzero(seen.sample == sample)
+        apart = np.linalg.norm(real.centre[a][:, None, :2] - seen.centre[b][None, :, :2], axis=-1)
+        near = (apart < 2.0) & (real.label[a][:, None] == seen.label[b][None])
+        more += int(np.maximum(near.sum(1) - 1, 0).sum())
+    return {"duplicates a sample": more / max(len(np.unique(real.sample)), 1)}
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table."""
+    line = "|---|" + "---:|" * (len(head) - 1)
+    return ["| " + " | ".join(head) + " |", line, *("| " + " | ".join(row) + " |" for row in rows), ""]
+
+
+def page(data: Mapping[str, Any]) -> str:
+    """docs/accuracy.md."""
+    flat, solid = data["flat"], data["solid"]
+    lines = [
+        "# Accuracy of the shipped detectors",
+        "",
+        "`benchmarks/detector_accuracy.py` measures it and makes this page. All pictures show towns that were not used",
+        "for training (Oldmarket and Larkhill):",
+        "```",
+        *data["data"],
+        "```",
+        "",
+        "## 2D detectors",
+        "AP50 in percent. *Followed car*: only the target of each picture counts. *Objects*: how many there are (8 px",
+        "and more on each side, a quarter visible).",
+        "",
+    ]
+    names = list(flat)
+    first = flat[names[0]]
+    rows = [["followed car", *(f"{100 * flat[n]['followed car']:.1f}" for n in names), ""]]
+    rows += [
+        [c.replace("_", " "), *(f"{100 * flat[n]['AP50'].get(c, float('nan')):.1f}" for n in names), f"{count:,}"]
+        for c, count in first["objects"].items()
+        if c in first["AP50"]
+    ]
+    mean = [f"**{100 * np.mean(list(flat[n]['AP50'].values())):.1f}**" for n in names]
+    lines += table(["class", *names, "objects"], [*rows, ["**mean of the classes**", *mean, ""]])
+    lines += table(
+        ["light", *(f"{n}, {what}" for n in names for what in ("mean", "car")), "pictures"],
+        [
+            [light, *(f"{100 * flat[n]['by light'][light][w]:.1f}" for n in names for w in ("mean", "car")),
+             str(row["pictures"])]
+            for light, row in first["by light"].items()
+        ],
+    )  # fmt: skip
+    lines += [
+        "Recall in percent: share of the objects that a detection with a score of 0.25 and an IoU of 0.5 finds. Size:",
+        "the root of the box's area.",
+        "",
+    ]
+    for what, unit in (("size", "px"), ("distance", "m")):
+        kinds = [k for k in ("car", "pedestrian", "stop_sign") if k in first[f"by {what}"]]
+        bins = list(dict.fromkeys(b for k in kinds for b in first[f"by {what}"][k]))
+        rows = []
+        for part in sorted(bins, key=lambda text: float(text.split("-")[0])):
+            low, high = part.split("-")
+            cells = [
+                f"{100 * flat[n][f'by {what}'][k][part]['recall']:.0f}" if part in flat[n][f"by {what}"][k] else ""
+                for k in kinds for n in names
+            ]  # fmt: skip
+            rows.append([f"{low} to {high} {unit}" if float(high) < 1e8 else f"{low} {unit} and more", *cells])
+        lines += table([what, *(f"{k.replace('_', ' ')}, {n}" for k in kinds for n in names)], rows)
+    lines += [
+        "## 3D detectors",
+        "AP in percent, errors as nuScenes defines them (`-`: not defined for the class). *Duplicates*: boxes (score",
+        "0.15 and more) beyond the first within 2 m of a true box of their class, a sample of six images, after the",
+        "merge of the cameras.",
+        "",
+    ]
+    names = list(solid)
+    keys = ("mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE")
+    rows = [[k, *(f"{100 * solid[n][k]:.1f}" if k in keys[:2] else f"{solid[n][k]:.2f}" for n in names)] for k in keys]
+    rows.append(["duplicates a sample", *(f"{solid[n]['pairs']['duplicates a sample']:.2f}" for n in names)])
+    lines += table(["", *names], rows)
+    shown = ("trans_err", "orient_err", "vel_err")
+    lines += table(
+        ["class", *(f"{n}: {what}" for n in names for what in ("AP", "m", "rad", "m/s")), "objects"],
+        [
+            [c.replace("_", " "),
+             *(text for n in names for text in
+               (f"{100 * solid[n][f'AP_{c}']:.1f}", *(number(solid[n]["errors"][c][e]) for e in shown))),
+             f"{solid[names[0]]['truth'].get(c, 0):,}"]
+            for c in CLASSES
+        ],
+    )  # fmt: skip
+    for what in ("light", "distance"):
+        size = "scenes" if what == "light" else "objects"
+        scores = ("mAP", "NDS") if what == "light" else ("mAP", "AP_car")
+        lines += table(
+            [what, *(f"{n}: {s.replace('AP_car', 'AP of cars')}" for n in names for s in scores), size],
+            [
+                [f"{group} m" if what == "distance" else group,
+                 *(f"{100 * solid[n][f'by {what}'][group][s]:.1f}" for n in names for s in scores), f"{row[size]:,}"]
+                for group, row in solid[names[0]][f"by {what}"].items()
+            ],
+        )  # fmt: skip
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def number(value: float | None) -> str:
+    """An error with two digits, or a dash."""
+    return "-" if value is None or not np.isfinite(value) else f"{value:.2f}"
+
+
+def main() -> None:
+    """Measure, or write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--clips", type=Path, nargs="*", default=[])
+    parser.add_argument("--drives", type=Path)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--page", action="store_true", help="write docs/accuracy.md from what was measured")
+    given = parser.parse_args()
+    if given.page:
+        PAGE.write_text(page(json.loads(RESULT.read_text())))
+        return
+    if not given.clips or given.drives is None:
+        parser.error("name --clips and --drives, or give --page")
+    clips = Clips(given.clips)
+    result = {
+        "device": torch.cuda.get_device_name() if given.device != "cpu" else "cpu",
+        "data": [describe_data(folder) for folder in (*given.clips, given.drives)],
+        "flat": {name: flat_tables(name, clips, given.device) for name in FLAT},
+        "solid": {name: solid_tables(name, given.drives, given.device) for name in SOLID},
+    }
+    given.out.write_text(json.dumps(result, indent=1, sort_keys=False, default=float) + "\n")
+    print(page(result))
+
+
+if __name__ == "__main__":
+    main()
