@@ -75,7 +75,7 @@ def scenery() -> tuple[U8, Frame]:
     boxes = cars((10.0, 1.5, 0.8), (14.0, -2.0, 0.8))
     image = drawn(boxes, [(200, 40, 40), (40, 60, 200)])
     noise = np.random.default_rng(0).normal(0, 6, image.shape)
-    v = np.arange(45)[:, None] * 4 + 1.5 - CAMERA.intrinsic[1, 2]
+    v = np.arange(45)[:, None] * 4 + 2.0 - CAMERA.intrinsic[1, 2]
     depth = np.where(v > 1, 1.5 * CAMERA.intrinsic[1, 1] / np.maximum(v, 1), 1000.0) + np.zeros((1, 80))
     frame = Frame(CAMERA, "scene", "file", 3.0, ego_velocity=np.array([6.0, 0, 0]), boxes=boxes)
     return np.clip(image + noise, 0, 255).astype(np.uint8), replace(frame, depth=depth.astype(np.float32))
@@ -242,7 +242,7 @@ def test_fog_is_koschmieders_law() -> None:
     beta = extinction(ShiftSpec("fog", 3))
     far = cv2.resize(depth, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
     k = CAMERA.intrinsic
-    u, v = (np.arange(WIDTH) - k[0, 2]) / k[0, 0], (np.arange(HEIGHT) - k[1, 2]) / k[1, 1]
+    u, v = (np.arange(WIDTH) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(HEIGHT) + 0.5 - k[1, 2]) / k[1, 1]
     away = far * np.sqrt(1 + u[None] ** 2 + v[:, None] ** 2)
     inside = (away > 20) & (away < 150)
     density = -np.log(clear[..., 1][inside]) / (beta * away[inside])
@@ -323,7 +323,7 @@ def test_glare_is_the_eyes_at_most_and_none_behind_a_wall() -> None:
         seen, done = sunlit(np.inf, severity)
         assert done.applied
         toward = camera_to_world(Frame(CAMERA, "s"))[:3, :3].T @ np.array(done.details["direction"])
-        v, u = np.mgrid[:HEIGHT, :WIDTH]
+        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         k = CAMERA.intrinsic
         rays = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -353,7 +353,7 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
 
 def test_the_sun_rises_until_it_is_seen() -> None:
     frame = Frame(CAMERA, "s")
-    elevation = np.degrees(np.arctan((CAMERA.intrinsic[1, 2] - np.arange(HEIGHT)) / CAMERA.intrinsic[1, 1]))
+    elevation = np.degrees(np.arctan((CAMERA.intrinsic[1, 2] - np.arange(HEIGHT) - 0.5) / CAMERA.intrinsic[1, 1]))
     depth = np.where(elevation > 12, np.inf, 30.0)[:, None] * np.ones((1, WIDTH))
     context = SceneContext("s", heading=float(np.arctan2(*camera_to_world(frame)[[1, 0], 2])))
     walled, spec = replace(frame, depth=depth.astype(np.float32)), ShiftSpec("sunlight", 3)

@@ -36,8 +36,8 @@ def patchiness(
     """
     b, y, x = wp.tid()
     focal = lens[b]
-    u = (float(x) + 0.5) * cells - 0.5
-    v = (float(y) + 0.5) * cells - 0.5
+    u = (float(x) + 0.5) * cells
+    v = (float(y) + 0.5) * cells
     row = wp.min(int(v * 0.25), depth.shape[1] - 1)
     column = wp.min(int(u * 0.25), depth.shape[2] - 1)
     far = wp.clamp(depth[b, row, column], 2.0, 120.0)
@@ -63,11 +63,11 @@ def transmittance(
     """Koschmieder: exp(-beta * range) at each node; range is depth times the slant of the ray."""
     b, y = wp.tid()
     focal = slant[b]
-    v = ((float(y) + 0.5) * 4.0 - 0.5 - focal[3]) / focal[1]
+    v = ((float(y) + 0.5) * 4.0 - focal[3]) / focal[1]
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     for x in range(depth.shape[2]):
-        u = ((float(x) + 0.5) * 4.0 - 0.5 - focal[2]) / focal[0]
+        u = ((float(x) + 0.5) * 4.0 - focal[2]) / focal[0]
         fx = (float(x) + 0.5) * 0.25 - 0.5
         column = int(wp.floor(fx))
         left = cell(density, b, row, fy - float(row), column)
@@ -195,11 +195,11 @@ def glare(
     b, y = wp.tid()
     focal = lens[b]
     sun = toward[b]
-    v = ((float(y) + 0.5) * 4.0 - 0.5 - focal[3]) / focal[1]
+    v = ((float(y) + 0.5) * 4.0 - focal[3]) / focal[1]
     spot = place[b]
     lens_light = wp.min(strength[b], STAR)
     for x in range(out.shape[2]):
-        u = ((float(x) + 0.5) * 4.0 - 0.5 - focal[2]) / focal[0]
+        u = ((float(x) + 0.5) * 4.0 - focal[2]) / focal[0]
         ray = wp.normalize(wp.vec3(u, v, 1.0))
         chord = wp.length(ray - sun)
         degrees = chord * 57.29578
