@@ -19,6 +19,7 @@ from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
 from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import particles, veil
+from ssad.scenarios.static.shifts.light import tables, to_linear
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 # period of the particle fields, metres; drops per m^3 follow from the size distributions
@@ -91,11 +92,11 @@ def _clear(
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) (Koschmieder 1924)."""
+    """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) in linear light (Koschmieder 1924)."""
     weathers, clear, sources = _clear(batch, frames, specs, contexts)
-    air = np.stack([w.colour * c.light * 245 for w, c in zip(weathers, contexts, strict=True)])
+    air = np.stack([to_linear(w.colour * c.light * 245) for w, c in zip(weathers, contexts, strict=True)])
     out = batch.like()
-    inputs = [batch.words(), clear, on(batch, air, wp.vec3), batch.width, batch.stride // 4]
+    inputs = [batch.words(), clear, on(batch, air, wp.vec3), *tables(batch.device), batch.width, batch.stride // 4]
     batch.launch(veil.blend_air, (batch.count, batch.height), inputs, out.words())
     done = [
         Applied(True, {"range_m": table.FOG_RANGE[s.severity - 1], "depth": source})
@@ -164,8 +165,8 @@ def add_precipitation(
     sky = np.stack([w.colour * c.light for w, c in zip(weathers, contexts, strict=True)])
     bright = np.array([255.0 if s.name == "snow" else 235.0 for s in specs])[:, None]
     out, dim = batch.like(), (batch.count, batch.height)
-    haze, white = on(batch, sky * 235, wp.vec3), on(batch, sky * bright, wp.vec3)
-    inputs = [batch.words(), clear, haze, layer, white, batch.width, batch.stride // 4]
+    haze, white = on(batch, to_linear(sky * 235), wp.vec3), on(batch, to_linear(sky * bright), wp.vec3)
+    inputs = [batch.words(), clear, haze, layer, white, *tables(batch.device), batch.width, batch.stride // 4]
     batch.launch(veil.blend_particles, dim, inputs, out.words())
     drops = _lens_drops(batch, frames, specs)
     if len(drops):
