@@ -21,6 +21,7 @@ from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, 
 from ssad.scenarios.static.shifts.kernels import particles, veil
 from ssad.scenarios.static.shifts.light import tables, to_linear
 from ssad.scenarios.static.shifts.spec import ShiftSpec
+from ssad.scenarios.static.shifts.wet import wet_ground
 
 # period of the particle fields, metres; drops per m^3 follow from the size distributions
 RAIN_TILE, SNOW_TILE = (6.0, 6.0, 5.0), (8.0, 8.0, 6.0)
@@ -69,8 +70,8 @@ def extinction(spec: ShiftSpec) -> float:
 
 def _clear(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[list[Weather], Any, list[str]]:
-    """The weathers, the transmittance [B, h, w] of the air on the quarter grid, and where the depth comes from."""
+) -> tuple[list[Weather], Any, Any, list[str]]:
+    """Weathers, transmittance of the air and depth [B, h, w] on the quarter grid, and where the depth comes from."""
     weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
     rows, columns = grid_size(batch)
     depth, sources = depth_grid(batch, frames)
@@ -86,14 +87,14 @@ def _clear(
     clear = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
     inputs = [depth, view, density, on(batch, [extinction(s) for s in specs]), FARTHEST]
     batch.launch(veil.transmittance, (batch.count, rows), inputs, clear)
-    return weathers, clear, sources
+    return weathers, clear, depth, sources
 
 
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
     """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) in linear light (Koschmieder 1924)."""
-    weathers, clear, sources = _clear(batch, frames, specs, contexts)
+    weathers, clear, _, sources = _clear(batch, frames, specs, contexts)
     air = np.stack([to_linear(w.colour * c.light * 245) for w, c in zip(weathers, contexts, strict=True)])
     out = batch.like()
     inputs = [batch.words(), clear, on(batch, air, wp.vec3), *tables(batch.device), batch.width, batch.stride // 4]
@@ -145,8 +146,10 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
 def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """rain or snow: the veil of what is far away, and streaks of what is within a few metres."""
-    weathers, clear, sources = _clear(batch, frames, specs, contexts)
+    """rain or snow: the veil of what is far away, and streaks of what is within a few metres; rain wets the ground."""
+    weathers, clear, depth, sources = _clear(batch, frames, specs, contexts)
+    if specs[0].name == "rain":
+        batch = wet_ground(batch, frames, specs, (depth, sources))
     airs = [_air(s, f, w) for s, f, w in zip(specs, frames, weathers, strict=True)]
     most = max(a[-1] for a in airs)
     poses = np.stack([camera_to_world(f) for f in frames])
