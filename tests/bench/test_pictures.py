@@ -39,7 +39,7 @@ def test_the_rig_is_that_of_nuscenes() -> None:
     for channel, (at, heading, focal) in RIG.items():
         camera = rig_camera(channel, 1600)
         assert camera.intrinsic[0, 0] == pytest.approx(focal)
-        assert camera.intrinsic[:2, 2] == pytest.approx([816.3, 491.5])
+        assert camera.intrinsic[:2, 2] == pytest.approx([816.8, 492.0])
         axis = camera.to_ego[:3, 2]
         turned = np.degrees(np.arctan2(axis[1], axis[0])) - heading
         assert (turned + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)

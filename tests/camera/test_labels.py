@@ -22,7 +22,7 @@ from ssad.core.nuscenes_names import visibility_token
 from ssad.core.seeding import generator
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0
-CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 319.5], [0, FOCAL, 179.5], [0, 0, 1]]))
+CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 320.0], [0, FOCAL, 180.0], [0, 0, 1]]))
 EYE = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])  # along +x, 1.5 m up
 BODIES = ("car", "bus", "motorcycle", "bicycle", "pedestrian", "traffic_cone", "barrier")
 GREY = Material("grey", (0.5, 0.5, 0.5))
@@ -82,6 +82,30 @@ def test_the_box_is_the_projection(x: float, y: float) -> None:
     assert labels.pixels[0] == len(rows)
     assert labels.share[0] > 0.99
     assert labels.inside[0] == 1.0
+
+
+@pytest.mark.parametrize(("x", "y"), [(5.0, 0.0), (11.0, 1.1)])
+def test_projected_corners_enclose_what_is_drawn(x: float, y: float) -> None:
+    """The drawn extent, found to a part of a pixel from pictures moved by such parts, is that of the corners through
+    the recorded intrinsic: boxes and intrinsics count from the same corner of the picture."""
+    parts = 32
+    intrinsic = np.array([[40.0, 0, 31.3], [0, 40.0, 23.7], [0, 0, 1]])
+    move = np.arange(parts) / parts
+    views = []
+    for part in move:
+        moved = intrinsic.copy()
+        moved[:2, 2] += part
+        views.append(View(Camera(64, 48, moved), EYE, (at(x, y),)))
+    tags = render(stage(), views, scale=1, quality=PLAIN).tag
+    edges = np.array([extents(tag)[1][0] for tag in tags]) - move[:, None]
+    # one sample a pixel: a pixel is drawn where its middle lies inside
+    drawn = np.concatenate([edges[:, :2].min(0) + 0.5, edges[:, 2:].max(0) - 0.5])
+    corners = np.array([(x + a, y + b, c) for a in (0.0, 0.5) for b in (-1.0, 1.0) for c in (0.5, 2.5)])
+    pixels = (corners - EYE[:3, 3]) @ EYE[:3, :3] @ intrinsic.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    inwards = (drawn - np.concatenate([pixels.min(0), pixels.max(0)])) * [1, 1, -1, -1]
+    assert inwards.min() > -1e-3, "the corners enclose it"
+    assert inwards.max() < 0.05, "and closely"
 
 
 @pytest.mark.parametrize("x", [6.0, 15.0, 45.0])

@@ -23,7 +23,7 @@ from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
-CAMERA = Camera(96, 96, np.array([[96.0, 0, 47.5], [0, 96.0, 47.5], [0, 0, 1]]))
+CAMERA = Camera(96, 96, np.array([[96.0, 0, 48.0], [0, 96.0, 48.0], [0, 0, 1]]))
 NIGHT = Weather(sun_height=-0.5, clouds=0.0)
 DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -70,7 +70,7 @@ def test_the_power_of_a_lamp_is_what_arrives(
     cos, sin = np.cos(tilt), np.sin(tilt)
     turned = DOWN @ np.array([[1, 0, 0, 0], [0, cos, -sin, 0], [0, sin, cos, 0], [0, 0, 0, 1.0]])
     lamp = Lamp(at(1.0, 0.5, height, turned), 7.0, (across, down), (1.0, 0.5, 0.25), soft, square, 1e3, shadows=False)
-    camera = Camera(480, 480, np.array([[480.0, 0, 239.5], [0, 480.0, 239.5], [0, 0, 1]]))
+    camera = Camera(480, 480, np.array([[480.0, 0, 240.0], [0, 480.0, 240.0], [0, 0, 1]]))
     light = lamp_light(scene, replace(above(40.0, lamps=(lamp,)), camera=camera), quality=PLAIN)
     pixel = (40.0 / 480.0) ** 2
     assert light.sum((0, 1)) * pixel == pytest.approx(7.0 * np.array([1.0, 0.5, 0.25]), rel=0.04)
@@ -193,7 +193,7 @@ def test_by_night_lamps_are_on(scene: Scene) -> None:
 def test_fine_shadows_are_finer(scene: Scene) -> None:
     """The edge of the shadow of a block, against the geometry: within a few centimetres."""
     weather = Weather(sun_height=0.8, sun_heading=0.0, clouds=0.0)
-    camera = Camera(256, 256, np.array([[512.0, 0, 127.5], [0, 512.0, 127.5], [0, 0, 1]]))
+    camera = Camera(256, 256, np.array([[512.0, 0, 128.0], [0, 512.0, 128.0], [0, 0, 1]]))
     things = (Thing(0, np.eye(4)), Thing(1, np.eye(4), tag=1, hidden=True))
     view = View(camera, at(-3.0, 0.0, 10.0, DOWN), things, weather, focus=(-2.0, 0.0))
     sun = np.array(light_of(weather)[0][0])
@@ -202,7 +202,7 @@ def test_fine_shadows_are_finer(scene: Scene) -> None:
     for fine in (True, False):
         picture = render(scene, [view], quality=Quality(fine=fine, contact=False))
         row = picture.radiance[0][127].sum(-1)
-        where = -3.0 + (np.arange(256) - 127.5) * 10.0 / 512.0
+        where = -3.0 + (np.arange(256) + 0.5 - 128.0) * 10.0 / 512.0
         half = 0.5 * (row.max() + row.min())
         errors.append(abs(float(where[np.flatnonzero(row < half)[0]]) - edge))
     assert errors[0] < 0.06

@@ -21,7 +21,7 @@ from ssad.core.frames import FORWARD, Camera
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
-CAMERA = Camera(64, 48, np.array([[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]))
+CAMERA = Camera(64, 48, np.array([[50.0, 0, 32.0], [0, 50.0, 24.0], [0, 0, 1]]))
 NOON = Weather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
 
 
@@ -128,15 +128,15 @@ def test_depth_tags_and_the_nuscenes_camera_model(stage: Scene) -> None:
     assert (tag[:10] == -1).all()
     assert np.isinf(depth[:10]).all()
     rows = np.arange(36, 48)
-    expected = 1.5 * 50.0 / (rows - 23.5)  # the ground under a level camera 1.5 m up
+    expected = 1.5 * 50.0 / (rows + 0.5 - 24.0)  # the ground under a level camera 1.5 m up
     assert depth[rows, 2] == pytest.approx(expected, rel=1e-4)
     assert (tag[rows, 2] == 0).all()
     # the near face of the box: depth and extent by the pinhole model of nuScenes (u = fx X / Z + cx)
     z = 10.0 - FORWARD[0, 3]
-    left, right = 31.5 - 50 * 1.5 / z, 31.5 + 50 * 0.5 / z
+    left, right = 32.0 - 50 * 1.5 / z, 32.0 + 50 * 0.5 / z
     columns = np.flatnonzero((tag == 7).any(0))
     assert columns[0] == pytest.approx(left, abs=1.0)
-    assert columns[-1] == pytest.approx(right, abs=1.0)
+    assert columns[-1] + 1 == pytest.approx(right, abs=1.0)
     assert np.median(depth[tag == 7]) == pytest.approx(z, rel=1e-4)
 
 

@@ -23,7 +23,7 @@ from ssad.core.seeding import generator
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)
-CAMERA = Camera(64, 48, np.array([[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]))
+CAMERA = Camera(64, 48, np.array([[50.0, 0, 32.0], [0, 50.0, 24.0], [0, 0, 1]]))
 NOON = Weather(sun_height=1.2, sun_heading=2.0, clouds=0.0)
 CAR = make_body("car", style="sedan", generator=generator("texture"))
 
@@ -103,10 +103,10 @@ def test_a_decal_lies_on_what_faces_it(scene: Scene) -> None:
     bare, marked = (render(scene, [v], quality=PLAIN) for v in (view(), view(decals=(decal,))))
     white = retexture(taps(marked, 16), flat((1.0, 1.0, 1.0), (16, 16)), base(marked))
     changed = (np.abs(white.numpy() - bare.radiance).max(-1) > 1e-3)[0]
-    rows, columns = np.mgrid[0:48, 0:64]
+    rows, columns = np.mgrid[0:48, 0:64] + 0.5
     with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = 1.5 * 50.0 / (rows - 23.5)
-    x, y = ahead + FORWARD[0, 3], -(columns - 31.5) / 50.0 * ahead
+        ahead = 1.5 * 50.0 / (rows - 24.0)
+    x, y = ahead + FORWARD[0, 3], -(columns - 32.0) / 50.0 * ahead
     inside = (np.abs(x - 9.0) < 1.4) & (np.abs(y - 0.5) < 0.9) & (rows > 24)
     outside = (np.abs(x - 9.0) > 1.8) | (np.abs(y - 0.5) > 1.2) | (rows < 24)
     assert inside.sum() > 20

@@ -52,9 +52,9 @@ def test_a_pose_turns_and_then_moves() -> None:
 def test_a_typical_camera_looks_forward_from_above_the_road() -> None:
     camera = Camera.typical(1600, 900, channel="CAM_FRONT")
     assert camera.channel == "CAM_FRONT"
-    assert camera.intrinsic.tolist() == [[1264.0, 0, 799.5], [0, 1264.0, 449.5], [0, 0, 1]]
+    assert camera.intrinsic.tolist() == [[1264.0, 0, 800.0], [0, 1264.0, 450.0], [0, 0, 1]]
     # 10 m ahead of the lens, on its axis; 2 m to the right of that; 1 m up
-    for point, pixel in (((0, 0, 10), (799.5, 449.5)), ((2, 0, 10), (1052.3, 449.5)), ((0, -1, 10), (799.5, 323.1))):
+    for point, pixel in (((0, 0, 10), (800.0, 450.0)), ((2, 0, 10), (1052.8, 450.0)), ((0, -1, 10), (800.0, 323.6))):
         u, v, w = camera.intrinsic @ point
         assert (u / w, v / w) == pytest.approx(pixel)
     assert camera.to_ego @ [0, 0, 10, 1] == pytest.approx([11.7, 0, 1.5, 1]), "z is forward, from the lens"

@@ -263,8 +263,7 @@ def test_resizing_moves_no_box() -> None:
     detector = lively(config)
     k = lens(90.0, (64, 96)).float()
     wide = k.clone()
-    wide[:2, :2] *= 2
-    wide[:2, 2] = (wide[:2, 2] + 0.5) * 2 - 0.5
+    wide[:2] *= 2
     small, large = torch.full((1, 3, 64, 96), 0.5), torch.full((1, 3, 128, 192), 0.5)
     one, two = detector.dense(small, k[None]), detector.dense(large, wide[None])
     torch.testing.assert_close(two.maps["intrinsic"][0], one.maps["intrinsic"][0])
@@ -281,9 +280,8 @@ def test_rays_are_tangents_to_the_right_and_down(width: int | None) -> None:
     first = detector.bbox_head.get_submodule("reg_convs.0.conv")
     first.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     k = torch.tensor([[40.0, 0, 100], [0, 80, 20], [0, 0, 1]])
-    if width is not None:  # twice as wide: the same ray stands at the same part of the picture, counted from its edge
-        k[:2, :2] /= 2
-        k[:2, 2] = (k[:2, 2] + 0.5) / 2 - 0.5
+    if width is not None:  # twice as wide: the same ray stands at the same part of the picture
+        k[:2] /= 2
     detector.dense(torch.zeros(1, 3, 96, 160) if width is None else torch.zeros(1, 3, 80, 160), k[None])
     right, down = seen[0][0, -2:]  # of stride 8: places at 4, 12, 20, ... of the network's input
     assert right[5, 17].item() == pytest.approx(4.0)  # (140 - 100) / 40
@@ -302,7 +300,7 @@ def test_a_resized_picture_has_a_scale_of_its_own_in_each_direction() -> None:
         dense.place[:9], torch.tensor([[(8 * c + 4) / 0.4, 4 * 3] for c in range(8)] + [[10.0, 36]])
     )
     torch.testing.assert_close(dense.stride[:8], torch.full((8,), 20.0))
-    wanted = torch.tensor([[90 * 0.4, 0, 70.5 * 0.4 - 0.5], [0, 30, 2.5 / 3 - 0.5], [0, 0, 1]])
+    wanted = torch.tensor([[90 * 0.4, 0, 70 * 0.4], [0, 30, 2 / 3], [0, 0, 1]])
     torch.testing.assert_close(dense.maps["intrinsic"][0][0], wanted)
 
 

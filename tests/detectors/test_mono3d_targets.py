@@ -161,9 +161,7 @@ def test_maps_that_say_the_truth_decode_to_it(config: Mono3DConfig, seed: int) -
         turned = float(found.solid.yaw[near] - truth.solid.yaw[k])
         assert math.remainder(turned, 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
         assert found.solid.attribute[near] == truth.solid.attribute[k]
-        inside = truth.box[k].clone()
-        if not config.pgd:  # hulls stand at pixel edges
-            inside += 0.5
+        inside = truth.box[k]
         limit = torch.tensor([400.0, 225, 400, 225], dtype=torch.float64)
         assert found.box[near].tolist() == pytest.approx(inside.clamp_min(0).minimum(limit).tolist(), abs=1e-6)
     assert len(found.label) == len(owners)  # neighbouring places say the same, and one stays

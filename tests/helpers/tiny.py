@@ -141,8 +141,8 @@ def draw(boxes: WorldBoxes, camera: Camera, to_street: F64, grain: F64) -> U8:
     image = np.empty((camera.height, camera.width, 3))
     horizon = round(camera.intrinsic[1, 2])
     image[:horizon] = np.linspace((110, 150, 210), (215, 222, 230), horizon)[:, None]
-    rows = np.arange(horizon, camera.height)[:, None]
-    across = np.arange(camera.width) - camera.intrinsic[0, 2]
+    rows = np.arange(horizon, camera.height)[:, None] + 0.5
+    across = np.arange(camera.width) + 0.5 - camera.intrinsic[0, 2]
     depth = to_street[2, 3] * camera.intrinsic[1, 1] / np.maximum(rows - camera.intrinsic[1, 2], 0.5)
     ray = np.stack([across * depth / camera.intrinsic[0, 0], to_street[2, 3] + 0 * across * depth, depth + 0 * across])
     ground = np.einsum("ij,jvu->ivu", to_street[:2, :3], ray) + to_street[:2, 3, None, None]
@@ -156,7 +156,7 @@ def draw(boxes: WorldBoxes, camera: Camera, to_street: F64, grain: F64) -> U8:
             continue
         pixels = (corners[n] @ camera.intrinsic.T)[:, :2] / corners[n][:, 2:]
         hull = cv2.convexHull(np.clip(pixels, -30000, 30000).astype(np.float32))
-        cv2.fillConvexPoly(picture, np.rint(hull).astype(np.int32), THINGS[n].colour, cv2.LINE_AA)
+        cv2.fillConvexPoly(picture, np.floor(hull).astype(np.int32), THINGS[n].colour, cv2.LINE_AA)
     return picture
 
 

@@ -236,8 +236,7 @@ def projected(row: dict[str, Any]) -> F64:
     target, pose = np.array(row["target_pose"]), np.linalg.inv(np.array(row["pose"]))
     seen = (corners @ target[:3, :3].T + target[:3, 3]) @ pose[:3, :3].T + pose[:3, 3]
     pixels = seen @ np.array(row["intrinsic"]).T
-    # pixel x spans x..x+1 in a box, its middle is x in the matrix
-    xy = (pixels[:, :2] / pixels[:, 2:] + 0.5).clip(0, [row["width"], row["height"]])
+    xy = (pixels[:, :2] / pixels[:, 2:]).clip(0, [row["width"], row["height"]])
     return np.concatenate([xy.min(0), xy.max(0)])
 
 

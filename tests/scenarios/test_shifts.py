@@ -33,9 +33,10 @@ from ssad.scenarios.static.shifts import (
     transformed_boxes,
 )
 from ssad.scenarios.static.shifts import parameters as table
+from ssad.scenarios.static.shifts.light import tables, to_codes, to_linear
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
-from ssad.scenarios.static.shifts.weather import extinction
+from ssad.scenarios.static.shifts.weather import extinction, scene_weather
 
 WIDTH, HEIGHT = 320, 180
 CAMERA = Camera.typical(WIDTH, HEIGHT)
@@ -75,7 +76,7 @@ def scenery() -> tuple[U8, Frame]:
     boxes = cars((10.0, 1.5, 0.8), (14.0, -2.0, 0.8))
     image = drawn(boxes, [(200, 40, 40), (40, 60, 200)])
     noise = np.random.default_rng(0).normal(0, 6, image.shape)
-    v = np.arange(45)[:, None] * 4 + 1.5 - CAMERA.intrinsic[1, 2]
+    v = np.arange(45)[:, None] * 4 + 2.0 - CAMERA.intrinsic[1, 2]
     depth = np.where(v > 1, 1.5 * CAMERA.intrinsic[1, 1] / np.maximum(v, 1), 1000.0) + np.zeros((1, 80))
     frame = Frame(CAMERA, "scene", "file", 3.0, ego_velocity=np.array([6.0, 0, 0]), boxes=boxes)
     return np.clip(image + noise, 0, 255).astype(np.uint8), replace(frame, depth=depth.astype(np.float32))
@@ -227,7 +228,7 @@ def test_noise_keeps_its_bits() -> None:
     assert found == GOLDEN
 
 
-GOLDEN = {"uniform": "6350018bf537faf5", "gaussian": "e4d5d556c0e09fc5", "impulse": "60ad67ae506d72a7"}
+GOLDEN = {"uniform": "0cb517e62c746a92", "gaussian": "9ccdf1812e7a7882", "impulse": "8116979592fd9b09"}
 
 
 # ---------------------------------------------------------------- weather
@@ -236,13 +237,15 @@ GOLDEN = {"uniform": "6350018bf537faf5", "gaussian": "e4d5d556c0e09fc5", "impuls
 def test_fog_is_koschmieders_law() -> None:
     depth = np.tile(np.geomspace(3, 800, 80, dtype=np.float32), (45, 1))
     frame = Frame(CAMERA, "s", depth=depth)
-    black, white, middle = (one(np.full_like(GREY, v), frame, ShiftSpec("fog", 3)).astype(float) for v in (0, 255, 128))
-    clear = (white - black) / 255
-    assert np.abs(middle - (black + 128 * clear)).max() <= 1.5, "not linear in the picture"
+    shown = [one(np.full_like(GREY, v), frame, ShiftSpec("fog", 3)) for v in (0, 255, 128)]
+    black, white = (to_linear(picture) for picture in shown[:2])
+    clear = white - black
+    expected = to_codes(black + float(to_linear(128)) * clear)
+    assert np.abs(shown[2] - expected).max() <= 1.5, "not linear in the picture's light"
     beta = extinction(ShiftSpec("fog", 3))
     far = cv2.resize(depth, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
     k = CAMERA.intrinsic
-    u, v = (np.arange(WIDTH) - k[0, 2]) / k[0, 0], (np.arange(HEIGHT) - k[1, 2]) / k[1, 1]
+    u, v = (np.arange(WIDTH) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(HEIGHT) + 0.5 - k[1, 2]) / k[1, 1]
     away = far * np.sqrt(1 + u[None] ** 2 + v[:, None] ** 2)
     inside = (away > 20) & (away < 150)
     density = -np.log(clear[..., 1][inside]) / (beta * away[inside])
@@ -250,7 +253,31 @@ def test_fog_is_koschmieders_law() -> None:
     assert density.min() > 0.4
     assert density.max() < 1.6
     air = black[:, -8:] / np.maximum(1 - clear[:, -8:], 1e-6)
-    assert np.ptp(air.reshape(-1, 3), axis=0).max() < 4, "one colour of the air"
+    assert np.ptp(air.reshape(-1, 3), axis=0).max() < 0.02, "one colour of the air"
+
+
+@pytest.mark.parametrize("severity", [2, 4, 5])
+def test_fog_keeps_as_much_contrast_as_koschmieder_says(severity: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the light of a dark and a bright thing at 10, 20 and 60 m, within what codes of 8 bits can say."""
+    even = replace(scene_weather(ShiftSpec("fog"), "s"), patches=0.0)
+    monkeypatch.setattr("ssad.scenarios.static.shifts.weather.scene_weather", lambda *_: even)
+    dark, bright = np.full_like(GREY, 30), np.full_like(GREY, 180)
+    y, x = HEIGHT // 2, WIDTH // 2
+    for distance in (10.0, 20.0, 60.0):
+        frame = Frame(CAMERA, "s", depth=np.full((45, 80), distance, np.float32))
+        codes = [one(picture, frame, ShiftSpec("fog", severity))[y, x].astype(float) for picture in (dark, bright)]
+        least, most = (to_linear(np.clip(codes[1] + e, 0, 255)) - to_linear(codes[0] - e) for e in (-0.8, 0.8))
+        there = to_linear(180) - to_linear(30)
+        kept = np.exp(-3.0 * distance / table.FOG_RANGE[severity - 1])
+        assert (least / there <= kept).all(), distance
+        assert (most / there >= kept).all(), distance
+        assert (most - least).max() < 0.04, "sharp enough to tell"
+
+
+def test_light_through_clear_air_keeps_its_code() -> None:
+    linear, codes = (array.numpy() for array in tables("cpu"))
+    assert codes[linear * 1024 >> 14].tolist() == list(range(256))
+    assert np.abs(to_codes(to_linear(np.arange(256))) - np.arange(256)).max() < 1e-9
 
 
 def test_weather_agrees_between_cameras_and_changes_with_the_scene(street: NuScenes) -> None:
@@ -323,7 +350,7 @@ def test_glare_is_the_eyes_at_most_and_none_behind_a_wall() -> None:
         seen, done = sunlit(np.inf, severity)
         assert done.applied
         toward = camera_to_world(Frame(CAMERA, "s"))[:3, :3].T @ np.array(done.details["direction"])
-        v, u = np.mgrid[:HEIGHT, :WIDTH]
+        v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         k = CAMERA.intrinsic
         rays = np.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones_like(u)], -1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -353,7 +380,7 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
 
 def test_the_sun_rises_until_it_is_seen() -> None:
     frame = Frame(CAMERA, "s")
-    elevation = np.degrees(np.arctan((CAMERA.intrinsic[1, 2] - np.arange(HEIGHT)) / CAMERA.intrinsic[1, 1]))
+    elevation = np.degrees(np.arctan((CAMERA.intrinsic[1, 2] - np.arange(HEIGHT) - 0.5) / CAMERA.intrinsic[1, 1]))
     depth = np.where(elevation > 12, np.inf, 30.0)[:, None] * np.ones((1, WIDTH))
     context = SceneContext("s", heading=float(np.arctan2(*camera_to_world(frame)[[1, 0], 2])))
     walled, spec = replace(frame, depth=depth.astype(np.float32)), ShiftSpec("sunlight", 3)

@@ -1,8 +1,8 @@
 """Labels of a picture from its tags: tight boxes, visible pixels, and which share of each thing is visible.
 
-Pixel (x, y) spans x..x+1, y..y+1 here, so that boxes are made of pixel edges. What a thing would cover alone is
-rasterised in a crop of its own, on the samples of the picture where it is small and on a coarser grid where it is
-large.
+Pixel (x, y) spans x..x+1, y..y+1, as in an intrinsic, so that boxes are made of pixel edges. What a thing would cover
+alone is rasterised in a crop of its own, on the samples of the picture where it is small and on a coarser grid where it
+is large.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def _projected(stage: Scene, view: View, things: Sequence[Thing], inverse: F64) 
     points = np.where(points[..., 2:] >= NEAR, points, np.nan)
     points = np.concatenate([points, cuts], 1)
     k = view.camera.intrinsic
-    xy = points[..., :2] / points[..., 2:] * [k[0, 0], k[1, 1]] + [k[0, 2] + 0.5, k[1, 2] + 0.5]
+    xy = points[..., :2] / points[..., 2:] * [k[0, 0], k[1, 1]] + [k[0, 2], k[1, 2]]
     low = np.where(np.isnan(xy), np.inf, xy).min(1)
     high = np.where(np.isnan(xy), -np.inf, xy).max(1)
     return np.concatenate([low, high], 1)
@@ -169,7 +169,7 @@ def _alone(
     step = np.maximum(size / CROP, 1.0)  # pixels of the picture for one of the crop
     k = view.camera.intrinsic
     focal = np.array([k[0, 0], k[1, 1]]) / step
-    centre = (np.array([k[0, 2], k[1, 2]]) + 0.5 - crops[:, :2]) / step - 0.5
+    centre = (np.array([k[0, 2], k[1, 2]]) - crops[:, :2]) / step - 0.5  # as `kernel_lens` has it
     lens = np.concatenate([focal, centre], 1).astype(np.float32)
     order = np.concatenate(list(members))
     firsts = np.array([stage.first[things[n].mesh] for n in order], np.int32)

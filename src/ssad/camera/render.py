@@ -138,6 +138,13 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
     return light, 0.40 / max(bright, 0.004) * 2.0**weather.exposure
 
 
+def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point in px as the kernels have them: they count from the middle of the first pixel,
+    whose place in an intrinsic is (0.5, 0.5)."""
+    k = intrinsic
+    return float(k[0, 0]), float(k[1, 1]), float(k[0, 2] - 0.5), float(k[1, 2] - 0.5)
+
+
 @lru_cache(maxsize=1)
 def response() -> U8:
     """The camera's curve [4096] over sqrt(light / 4): linear to 0.8, a soft shoulder above, then sRGB."""
@@ -215,7 +222,7 @@ def render(
         k = view.camera.intrinsic
         if not np.isfinite(view.pose).all() or not np.isfinite(k).all() or min(k[0, 0], k[1, 1]) <= 0:
             raise ConfigError(f"view {number}: a camera needs a finite pose and a positive focal length")
-        lens.append([k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
+        lens.append(kernel_lens(k))
         light, exposure = light_of(view.weather)
         lights.append(light)
         exposures.append(exposure)

@@ -25,7 +25,5 @@ def rig_camera(channel: str, width: int) -> Camera:
     to_ego[:3, :3] = to_ego[:3, :3] @ FORWARD[:3, :3]
     f = focal * width / 1600
     height = width * 9 // 16
-    matrix = np.array(
-        [[f, 0, (816.3 + 0.5) * width / 1600 - 0.5], [0, f, (491.5 + 0.5) * width / 1600 - 0.5], [0, 0, 1]]
-    )
+    matrix = np.array([[f, 0, 816.8 * width / 1600], [0, f, 492.0 * width / 1600], [0, 0, 1]])
     return Camera(width, height, matrix, to_ego, channel)

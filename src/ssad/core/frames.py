@@ -1,8 +1,8 @@
 """What a camera or LiDAR delivers at one moment, and what is known about that moment.
 
 Frames of reference: world (x east, y north, z up), ego (x forward, y left, z up), camera (x right, y down, z forward).
-A pose `a_to_b` is a 4 x 4 matrix that takes homogeneous points of a into b. Pixel (0, 0) is the centre of the first
-pixel. N boxes, P points.
+A pose `a_to_b` is a 4 x 4 matrix that takes homogeneous points of a into b. Places in a picture count from its corner,
+in intrinsics as in 2D boxes: the first pixel spans 0 to 1, its middle lies at (0.5, 0.5). N boxes, P points.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Camera:
     def typical(width: int, height: int, *, channel: str = "CAM") -> Camera:
         """What is assumed of an unknown camera: that of nuScenes, focal length 0.79 of the width, level, 1.5 m up."""
         focal = 0.79 * width
-        matrix = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+        matrix = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return Camera(width, height, matrix, channel=channel)
 
 

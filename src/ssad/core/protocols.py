@@ -213,10 +213,10 @@ class Detector(Protocol):
     """Finds objects in camera images; what is attacked, trained and scored.
 
     images are [B, 3, H, W] float32 (or float64), RGB in [0, 1], of any H and W; intrinsic is [B, 3, 3], in pixels of
-    these images, and needed where `task` is "3d". All that the detector's source does to a picture (order of channels,
-    mean, padding, size) happens inside and is differentiable. No call changes the detector's state or mode; its
-    parameters are frozen (`requires_grad` is False) unless it is being trained. `ssad.detectors.check.check_detector`
-    holds an implementation to this.
+    these images from their corner, and needed where `task` is "3d". All that the detector's source does to a picture
+    (order of channels, mean, padding, size) happens inside and is differentiable. No call changes the detector's state
+    or mode; its parameters are frozen (`requires_grad` is False) unless it is being trained.
+    `ssad.detectors.check.check_detector` holds an implementation to this.
 
     An attack calls `dense` on the clean image and `assign` once, then `dense` and `losses` at every step: the
     assignment stays fixed, so that the loss is smooth.

@@ -44,8 +44,8 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     flat = centre @ frame.intrinsic.T
     with np.errstate(all="ignore"):
         middle = flat[:, :2] / flat[:, 2:]
-    wanted &= (flat[:, 2] > NEAR) & (middle >= -0.5).all(1)
-    wanted &= (middle[:, 0] < frame.width - 0.5) & (middle[:, 1] < frame.height - 0.5)
+    wanted &= (flat[:, 2] > NEAR) & (middle >= 0).all(1)
+    wanted &= (middle[:, 0] < frame.width) & (middle[:, 1] < frame.height)
     box, seen = _hulls(frame, found, turn)
     rows = np.flatnonzero(wanted & seen)
     own = found.take(rows)
@@ -74,7 +74,7 @@ def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool
     local[..., 2] = np.maximum(local[..., 2], NEAR)
     assert frame.intrinsic is not None
     flat = local @ frame.intrinsic.T
-    place = flat[..., :2] / flat[..., 2:] + 0.5
+    place = flat[..., :2] / flat[..., 2:]
     limit = np.array([frame.width, frame.height])
     box = np.concatenate([np.clip(place.min(1), 0, limit), np.clip(place.max(1), 0, limit)], 1)
     return box, ((box[:, 2:] - box[:, :2]) > 1.0).all(1)

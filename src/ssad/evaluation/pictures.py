@@ -103,7 +103,7 @@ def _draw(
     points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
     for box in points[(points[..., 2] > 0.5).all(1)]:
         flat = box @ intrinsic.T
-        place = np.rint((flat[:, :2] / flat[:, 2:] + 0.5) * scale * 8).clip(-1e6, 1e6).astype(int)
+        place = np.rint(flat[:, :2] / flat[:, 2:] * scale * 8).clip(-1e6, 1e6).astype(int)
         for a, b in EDGES:
             first, last = (int(v) for v in place[a]), (int(v) for v in place[b])
             cv2.line(canvas, tuple(first), tuple(last), colour, width, cv2.LINE_AA, 3)

@@ -272,7 +272,7 @@ def _take(
 
 
 def _camera(size: int) -> Camera:
-    middle, focal = (size - 1) / 2, FOCAL * size
+    middle, focal = size / 2, FOCAL * size
     return Camera(size, size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
 
 

@@ -143,7 +143,7 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int) -> Boo
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
     """
-    camera = Camera(PROBE, PROBE, np.array([[200.0, 0, PROBE // 2], [0, 200.0, PROBE // 2], [0, 0, 1]]))
+    camera = Camera(PROBE, PROBE, np.array([[200.0, 0, PROBE / 2], [0, 200.0, PROBE / 2], [0, 0, 1]]))
     free = []
     for k in range(0, len(shots), at_once):
         views, away = [], []
@@ -165,8 +165,8 @@ def near_share(view: View, depth: F32, tag: I32, *, within: float) -> float:
     if not near.any():
         return 0.0
     k = view.camera.intrinsic
-    y, x = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
-    ray = np.stack([(x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1], np.ones_like(x, float)], -1)[rows, columns]
+    y, x = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]] + 0.5
+    ray = np.stack([(x - k[0, 2]) / k[0, 0], (y - k[1, 2]) / k[1, 1], np.ones_like(x)], -1)[rows, columns]
     away = np.where(near, depth[rows, columns], 0.0)
     height = (ray @ view.pose[2, :3]) * away + view.pose[2, 3]
     return float((near & (height > 0.5)).mean())

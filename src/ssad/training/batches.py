@@ -176,7 +176,7 @@ def draw_change(
     mirror = bool(rng.random() < recipe.flip)
     share = [rng.random(), rng.random()]
     if lens is not None:
-        share = [(float(lens[0, 2]) + 0.5) / size[1], (float(lens[1, 2]) + 0.5) / size[0]]
+        share = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
         share[0] = 1.0 - share[0] if mirror else share[0]
     return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1]))
 
@@ -239,9 +239,9 @@ def _changed_lens(
     if len(given) < len(lenses):
         return None
     lens = torch.stack(given)
-    lens[:, 0, 2] = torch.where(mirror, width - 1 - lens[:, 0, 2], lens[:, 0, 2])
+    lens[:, 0, 2] = torch.where(mirror, width - lens[:, 0, 2], lens[:, 0, 2])
     lens[:, :2, :2] *= zoom.to(lens)[:, None, None]
-    lens[:, :2, 2] = zoom.to(lens)[:, None] * (lens[:, :2, 2] + 0.5) + shift.to(lens) - 0.5
+    lens[:, :2, 2] = zoom.to(lens)[:, None] * lens[:, :2, 2] + shift.to(lens)
     return lens
 
 

@@ -41,7 +41,8 @@ class Mono3D(nn.Module):
     """A monocular 3D detector; parts and weights carry mmdetection3d's names (backbone, neck, bbox_head).
 
     Starts frozen and in eval mode with fresh weights from `seed`. Truth and detections are in the camera frame of the
-    intrinsic that is handed in; it is used as given (a place is column and row times stride plus half the stride).
+    intrinsic that is handed in; it is used as given (a place is column and row times stride plus half the stride: the
+    middle of what its cell covers, counted from the picture's corner as in an intrinsic).
     `Dense`: maps are mmdetection3d's in eval mode, in pixels of the network's input; quality: centreness; box: hull of
     the projected corners, or PGD's own 2D box, cut at the border; while training there are none ([B, 0, 4]).
     """
@@ -215,8 +216,8 @@ class Mono3D(nn.Module):
         """2D boxes [..., P, 4] at the picture's pixel edges: PGD's own, else of the solids' corners."""
         if self.config.pgd:
             box = torch.cat([xy - flat.reg[..., 9:11], xy + flat.reg[..., 11:13]], -1)
-        else:  # an intrinsic counts from the middle of the first pixel
-            box = hull(project(corners(*solids), lens[..., None, :, :])) + 0.5
+        else:
+            box = hull(project(corners(*solids), lens[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
         return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)
 
@@ -237,11 +238,10 @@ class Mono3D(nn.Module):
         return scale_of(size_inside(size, self.config.input_width), size, like)[:2]
 
     def _scaled(self, lens: Tensor, scale: Tensor) -> Tensor:
-        """Intrinsics of the resized picture; pixel edges are what is scaled."""
+        """Intrinsics of the resized picture."""
         if self.config.input_width is None:
             return lens
-        moved = (lens[:, :2, 2:] + 0.5) * scale[:, None] - 0.5
-        return torch.cat([torch.cat([lens[:, :2, :2] * scale[:, None], moved], 2), lens[:, 2:]], 1)
+        return torch.cat([lens[:, :2] * scale[:, None], lens[:, 2:]], 1)
 
     def _factor(self, lens: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:

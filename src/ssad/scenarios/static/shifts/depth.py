@@ -68,14 +68,14 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
     k = frame.camera.intrinsic
     scale_x, scale_y = columns / width, rows / height
     fx, fy = k[0, 0] * scale_x, k[1, 1] * scale_y
-    cx, cy = (k[0, 2] + 0.5) * scale_x - 0.5, (k[1, 2] + 0.5) * scale_y - 0.5
+    cx, cy = k[0, 2] * scale_x, k[1, 2] * scale_y
     small = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
 
     # the road: where a ray meets the plane z = 0 of the ego; the height of a ray over the ground is linear in u and v
     rotation, place = frame.camera.to_ego[:3, :3], frame.camera.to_ego[:3, 3]
-    u = ((np.arange(columns, dtype=np.float32) - cx) / fx)[None]
-    v = ((np.arange(rows, dtype=np.float32) - cy) / fy)[:, None]
+    u = ((np.arange(columns, dtype=np.float32) + 0.5 - cx) / fx)[None]
+    v = ((np.arange(rows, dtype=np.float32) + 0.5 - cy) / fy)[:, None]
     down = (rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]).astype(np.float32)
     inverse = np.maximum(-down / max(float(place[2]), 0.3), 0).astype(np.float32)
     weight = np.where(inverse > 1 / 80, np.float32(_ROAD_WEIGHT), np.float32(0))
@@ -101,8 +101,8 @@ def fill_depth(frame: Frame, image: Any, rows: int, columns: int) -> F32:
     if points is not None and len(points):
         p = np.asarray(points, np.float32)[:, :3]
         p = p[p[:, 2] > 1.0]
-        x = np.rint(p[:, 0] / p[:, 2] * fx + cx).astype(np.int64)
-        y = np.rint(p[:, 1] / p[:, 2] * fy + cy).astype(np.int64)
+        x = np.floor(p[:, 0] / p[:, 2] * fx + cx).astype(np.int64)
+        y = np.floor(p[:, 1] / p[:, 2] * fy + cy).astype(np.int64)
         inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
         far_first = np.argsort(-p[inside, 2], kind="stable")
         y, x, z = y[inside][far_first], x[inside][far_first], p[inside, 2][far_first]
@@ -126,7 +126,7 @@ def _boxes(frame: Frame, inverse: F32, weight: F32, lens: tuple[float, float, fl
         if nearest[n] < 1.0 or nearest[n] > 80:
             continue
         pixels = local[n, :, :2] / local[n, :, 2:] * [fx, fy] + [cx, cy]
-        hull = np.rint(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32)
+        hull = np.floor(cv2.convexHull(pixels.astype(np.float32))).astype(np.int32)  # cells that hold the corners
         cv2.fillConvexPoly(inverse, hull, 1 / (0.5 * (nearest[n] + float(local[n, :, 2].mean()))))
         cv2.fillConvexPoly(weight, hull, 0.2)
 

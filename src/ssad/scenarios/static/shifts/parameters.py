@@ -25,6 +25,11 @@ FOG_RANGE: Final[Five] = (600.0, 300.0, 150.0, 100.0, 50.0)
 RAIN_RATE: Final[Five] = (2.5, 10.0, 25.0, 50.0, 100.0)
 # snow: mm/h of water; visual range about 1 km / rate
 SNOW_RATE: Final[Five] = (0.5, 1.5, 3.5, 7.0, 14.0)
+# wet ground: share of its light that asphalt loses (albedo .75 to .5 of the dry one), and share under a film of water
+WET_DARK: Final[Five] = (0.25, 0.32, 0.38, 0.44, 0.5)
+WET_FILM: Final[Five] = (0.25, 0.4, 0.55, 0.7, 0.85)
+# waves of the falling drops: tangent of the angle over which they blur what the water mirrors
+WET_ROUGH: Final[Five] = (0.03, 0.045, 0.06, 0.075, 0.09)
 # drops on the lens, from as many as a wiped lens has between two wipes
 LENS_DROPS: Final = (4, 9, 16, 26, 40)
 # sun: glare one degree from the sun, grey levels at full scale 255. In the eye a sun of 40,000 lx adds 400,000 cd/m2

@@ -33,7 +33,7 @@ SHIFTS: Final[dict[str, tuple[Family, str]]] = {
 }
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
-VERSIONS: Final[dict[Calibration, int]] = {"physical": 2, "paper": 3}
+VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,9 @@ from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, keys_on, on, structs
 from ssad.scenarios.static.shifts.depth import FARTHEST, depth_grid, grid_size, lens
 from ssad.scenarios.static.shifts.kernels import particles, veil
+from ssad.scenarios.static.shifts.light import tables, to_linear
 from ssad.scenarios.static.shifts.spec import ShiftSpec
+from ssad.scenarios.static.shifts.wet import wet_ground
 
 # period of the particle fields, metres; drops per m^3 follow from the size distributions
 RAIN_TILE, SNOW_TILE = (6.0, 6.0, 5.0), (8.0, 8.0, 6.0)
@@ -68,8 +70,8 @@ def extinction(spec: ShiftSpec) -> float:
 
 def _clear(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
-) -> tuple[list[Weather], Any, list[str]]:
-    """The weathers, the transmittance [B, h, w] of the air on the quarter grid, and where the depth comes from."""
+) -> tuple[list[Weather], Any, Any, list[str]]:
+    """Weathers, transmittance of the air and depth [B, h, w] on the quarter grid, and where the depth comes from."""
     weathers = [scene_weather(s, f.scene) for s, f in zip(specs, frames, strict=True)]
     rows, columns = grid_size(batch)
     depth, sources = depth_grid(batch, frames)
@@ -85,17 +87,17 @@ def _clear(
     clear = wp.empty((batch.count, rows, columns), dtype=float, device=batch.device)
     inputs = [depth, view, density, on(batch, [extinction(s) for s in specs]), FARTHEST]
     batch.launch(veil.transmittance, (batch.count, rows), inputs, clear)
-    return weathers, clear, sources
+    return weathers, clear, depth, sources
 
 
 def add_fog(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) (Koschmieder 1924)."""
-    weathers, clear, sources = _clear(batch, frames, specs, contexts)
-    air = np.stack([w.colour * c.light * 245 for w, c in zip(weathers, contexts, strict=True)])
+    """fog: image * exp(-beta * range) + airlight * (1 - exp(-beta * range)) in linear light (Koschmieder 1924)."""
+    weathers, clear, _, sources = _clear(batch, frames, specs, contexts)
+    air = np.stack([to_linear(w.colour * c.light * 245) for w, c in zip(weathers, contexts, strict=True)])
     out = batch.like()
-    inputs = [batch.words(), clear, on(batch, air, wp.vec3), batch.width, batch.stride // 4]
+    inputs = [batch.words(), clear, on(batch, air, wp.vec3), *tables(batch.device), batch.width, batch.stride // 4]
     batch.launch(veil.blend_air, (batch.count, batch.height), inputs, out.words())
     done = [
         Applied(True, {"range_m": table.FOG_RANGE[s.severity - 1], "depth": source})
@@ -144,8 +146,10 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
 def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """rain or snow: the veil of what is far away, and streaks of what is within a few metres."""
-    weathers, clear, sources = _clear(batch, frames, specs, contexts)
+    """rain or snow: the veil of what is far away, and streaks of what is within a few metres; rain wets the ground."""
+    weathers, clear, depth, sources = _clear(batch, frames, specs, contexts)
+    if specs[0].name == "rain":
+        batch = wet_ground(batch, frames, specs, (depth, sources))
     airs = [_air(s, f, w) for s, f, w in zip(specs, frames, weathers, strict=True)]
     most = max(a[-1] for a in airs)
     poses = np.stack([camera_to_world(f) for f in frames])
@@ -164,8 +168,8 @@ def add_precipitation(
     sky = np.stack([w.colour * c.light for w, c in zip(weathers, contexts, strict=True)])
     bright = np.array([255.0 if s.name == "snow" else 235.0 for s in specs])[:, None]
     out, dim = batch.like(), (batch.count, batch.height)
-    haze, white = on(batch, sky * 235, wp.vec3), on(batch, sky * bright, wp.vec3)
-    inputs = [batch.words(), clear, haze, layer, white, batch.width, batch.stride // 4]
+    haze, white = on(batch, to_linear(sky * 235), wp.vec3), on(batch, to_linear(sky * bright), wp.vec3)
+    inputs = [batch.words(), clear, haze, layer, white, *tables(batch.device), batch.width, batch.stride // 4]
     batch.launch(veil.blend_particles, dim, inputs, out.words())
     drops = _lens_drops(batch, frames, specs)
     if len(drops):

@@ -89,14 +89,14 @@ def stamp(
     points: wp.array(dtype=wp.vec2),
     owner: wp.array3d(dtype=wp.int16),
 ):
-    """owner[b, y, x]: rank of the nearest box whose old outline covers the pixel; 0, as it came, for none."""
+    """owner[b, y, x]: rank of the nearest box whose old outline covers the pixel's middle; 0, as it came, for none."""
     b, y = wp.tid()
     width = owner.shape[2]
     for k in range(item_first[b], item_first[b + 1]):
-        span = row_span(points, items[k].old_first, items[k].old_count, float(y))
+        span = row_span(points, items[k].old_first, items[k].old_count, float(y) + 0.5)
         if span[0] <= span[1]:
-            low = wp.clamp(int(wp.ceil(span[0])), 0, width)
-            high = wp.clamp(int(wp.floor(span[1])) + 1, 0, width)
+            low = wp.clamp(int(wp.ceil(span[0] - 0.5)), 0, width)
+            high = wp.clamp(int(wp.floor(span[1] - 0.5)) + 1, 0, width)
             for x in range(low, high):
                 owner[b, y, x] = wp.int16(items[k].rank)
 
@@ -108,7 +108,7 @@ def displace(
     lens: wp.array(dtype=wp.vec4),
     nodes: wp.array(dtype=wp.vec4),
 ):
-    """Where each node of an item's grid takes its colour from.
+    """Where each node of an item's grid, the middle of a pixel, takes its colour from.
 
     (dx, dy, pixels inside the new outline, 1 where the surroundings must stretch). Inside, the viewing ray meets the
     surface of the new box, and the same point of the old box is looked up. Where the new outline lies inside the old
@@ -120,7 +120,7 @@ def displace(
         return
     focal = lens[item.image]
     for column in range(item.node_wide):
-        p = wp.vec2(float(item.low_x + column * STEP), float(item.low_y + row * STEP))
+        p = wp.vec2(float(item.low_x + column * STEP) + 0.5, float(item.low_y + row * STEP) + 0.5)
         ray = wp.vec3((p[0] - focal[2]) / focal[0], (p[1] - focal[3]) / focal[1], 1.0)
         d = item.into * ray
         o = item.into_origin

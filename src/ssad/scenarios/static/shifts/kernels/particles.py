@@ -149,11 +149,11 @@ def splat(
     z = 0.5 * (a[2] + c[2])
     if a[2] < 0.25 or c[2] < 0.25:
         return
-    # half-resolution cells: pixel u lies in cell (u + 0.5) / 2 - 0.5
-    ax = (focal[0] * a[0] / a[2] + focal[2] + 0.5) * 0.5 - 0.5
-    ay = (focal[1] * a[1] / a[2] + focal[3] + 0.5) * 0.5 - 0.5
-    cx = (focal[0] * c[0] / c[2] + focal[2] + 0.5) * 0.5 - 0.5
-    cy = (focal[1] * c[1] / c[2] + focal[3] + 0.5) * 0.5 - 0.5
+    # in half-resolution cells, counted from the middle of the first one
+    ax = (focal[0] * a[0] / a[2] + focal[2]) * 0.5 - 0.5
+    ay = (focal[1] * a[1] / a[2] + focal[3]) * 0.5 - 0.5
+    cx = (focal[0] * c[0] / c[2] + focal[2]) * 0.5 - 0.5
+    cy = (focal[1] * c[1] / c[2] + focal[3]) * 0.5 - 0.5
     size = melted * air.growth * 0.001 * focal[0] / z * 0.5
     blur = aperture * focal[0] / z * 0.5
     wide = wp.sqrt(size * size + blur * blur + 0.36)

@@ -130,13 +130,6 @@ def fields_of(colour: wp.vec3) -> wp.uint64:
 
 
 @wp.func
-def blend(a: wp.uint64, b: wp.uint64, share: int) -> wp.uint64:
-    """a * share / 1024 + b * (1 - share / 1024), rounded, field by field (values up to 255)."""
-    total = a * wp.uint64(share) + b * wp.uint64(1024 - share) + HALF
-    return (total >> wp.uint64(10)) & FIELDS
-
-
-@wp.func
 def pixel_of(first: wp.uint32, second: wp.uint32, third: wp.uint32, k: int) -> wp.uint32:
     """Pixel k of the four in three words."""
     if k == 0:

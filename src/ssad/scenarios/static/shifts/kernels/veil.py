@@ -2,12 +2,12 @@
 
 import warp as wp
 
+from ssad.scenarios.static.shifts.kernels.light import PARTS, coded_pixel, light_of, linear_pixel
 from ssad.scenarios.static.shifts.kernels.shared import (
     FIELDS,
     HALF,
     ONES,
     TENS,
-    blend,
     cell,
     fields_of,
     gather,
@@ -36,8 +36,8 @@ def patchiness(
     """
     b, y, x = wp.tid()
     focal = lens[b]
-    u = (float(x) + 0.5) * cells - 0.5
-    v = (float(y) + 0.5) * cells - 0.5
+    u = (float(x) + 0.5) * cells
+    v = (float(y) + 0.5) * cells
     row = wp.min(int(v * 0.25), depth.shape[1] - 1)
     column = wp.min(int(u * 0.25), depth.shape[2] - 1)
     far = wp.clamp(depth[b, row, column], 2.0, 120.0)
@@ -63,11 +63,11 @@ def transmittance(
     """Koschmieder: exp(-beta * range) at each node; range is depth times the slant of the ray."""
     b, y = wp.tid()
     focal = slant[b]
-    v = ((float(y) + 0.5) * 4.0 - 0.5 - focal[3]) / focal[1]
+    v = ((float(y) + 0.5) * 4.0 - focal[3]) / focal[1]
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     for x in range(depth.shape[2]):
-        u = ((float(x) + 0.5) * 4.0 - 0.5 - focal[2]) / focal[0]
+        u = ((float(x) + 0.5) * 4.0 - focal[2]) / focal[0]
         fx = (float(x) + 0.5) * 0.25 - 0.5
         column = int(wp.floor(fx))
         left = cell(density, b, row, fy - float(row), column)
@@ -77,22 +77,31 @@ def transmittance(
         out[b, y, x] = wp.exp(-beta[b] * thick * away)
 
 
+@wp.func
+def through(pixel: wp.uint32, haze: wp.vec3i, clear: int, linear: wp.array(dtype=int)) -> wp.vec3i:
+    """Light of a pixel behind the veil that lets `clear` of 1024 parts through, in as many parts."""
+    return linear_pixel(linear, pixel) * clear + haze * (PARTS - clear)
+
+
 @wp.kernel
 def blend_air(
     image: wp.array(dtype=wp.uint32),
     grid: wp.array3d(dtype=float),
     air: wp.array(dtype=wp.vec3),
+    linear: wp.array(dtype=int),
+    codes: wp.array(dtype=wp.uint8),
     width: int,
     words: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """image * t + air * (1 - t), with t from a quarter grid; `air` in grey levels. Four pixels are three words."""
+    """image * t + air * (1 - t) in linear light, with t from a quarter grid; `air`: 1 is white. Four pixels are three
+    words; linear, codes: of `light.tables`."""
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
     fraction = fy - float(row)
     i = b * words + y * width * 3 / 4
-    haze = fields_of(air[b])
+    haze = light_of(air[b])
     before = cell(grid, b, row, fraction, -1) * 1024.0
     here = cell(grid, b, row, fraction, 0) * 1024.0
     for q in range(width / 4):
@@ -100,10 +109,10 @@ def blend_air(
         w0 = image[i]
         w1 = image[i + 1]
         w2 = image[i + 2]
-        p0 = gather(blend(spread(pixel_of(w0, w1, w2, 0)), haze, int(before + (here - before) * 0.625)))
-        p1 = gather(blend(spread(pixel_of(w0, w1, w2, 1)), haze, int(before + (here - before) * 0.875)))
-        p2 = gather(blend(spread(pixel_of(w0, w1, w2, 2)), haze, int(here + (after - here) * 0.125)))
-        p3 = gather(blend(spread(pixel_of(w0, w1, w2, 3)), haze, int(here + (after - here) * 0.375)))
+        p0 = coded_pixel(codes, through(pixel_of(w0, w1, w2, 0), haze, int(before + (here - before) * 0.625), linear))
+        p1 = coded_pixel(codes, through(pixel_of(w0, w1, w2, 1), haze, int(before + (here - before) * 0.875), linear))
+        p2 = coded_pixel(codes, through(pixel_of(w0, w1, w2, 2), haze, int(here + (after - here) * 0.125), linear))
+        p3 = coded_pixel(codes, through(pixel_of(w0, w1, w2, 3), haze, int(here + (after - here) * 0.375), linear))
         put_four(out, i, p0, p1, p2, p3)
         i += 3
         before = here
@@ -118,12 +127,16 @@ def opacity(layer: wp.array3d(dtype=int), b: int, near: int, other: int, column:
 
 
 @wp.func
-def behind(pixel: wp.uint32, haze: wp.uint64, clear: float, white: wp.uint64, cover: int) -> wp.uint32:
-    """A pixel through the veil, then under particles that hide cover / 1,048,576 of it."""
-    seen = blend(spread(pixel), haze, int(clear))
+def behind(
+    pixel: wp.uint32, haze: wp.vec3i, clear: float, white: wp.vec3i, cover: int, linear: wp.array(dtype=int)
+) -> wp.vec3i:
+    """Light of a pixel through the veil, then under particles that hide cover / 1,048,576 of it, in 1024 parts."""
+    seen = through(pixel, haze, int(clear), linear)
     if cover > 0:
-        seen = blend(white, seen, wp.min(cover >> 10, 1024))
-    return gather(seen)
+        hidden = wp.min(cover >> 10, PARTS)
+        rest = PARTS - hidden
+        seen = wp.vec3i((seen[0] >> 10) * rest, (seen[1] >> 10) * rest, (seen[2] >> 10) * rest) + white * hidden
+    return seen
 
 
 @wp.kernel
@@ -133,6 +146,8 @@ def blend_particles(
     air: wp.array(dtype=wp.vec3),
     layer: wp.array3d(dtype=int),
     white: wp.array(dtype=wp.vec3),
+    linear: wp.array(dtype=int),
+    codes: wp.array(dtype=wp.uint8),
     width: int,
     words: int,
     out: wp.array(dtype=wp.uint32),
@@ -143,8 +158,8 @@ def blend_particles(
     row = int(wp.floor(fy))
     fraction = fy - float(row)
     i = b * words + y * width * 3 / 4
-    haze = fields_of(air[b])
-    light = fields_of(white[b])
+    haze = light_of(air[b])
+    light = light_of(white[b])
     # rows of the half-resolution layer around this row: weights 3/4 and 1/4
     near = y / 2
     other = wp.clamp(near + (y & 1) * 2 - 1, 0, layer.shape[1] - 1)
@@ -160,10 +175,18 @@ def blend_particles(
         w0 = image[i]
         w1 = image[i + 1]
         w2 = image[i + 2]
-        p0 = behind(pixel_of(w0, w1, w2, 0), haze, before + (here - before) * 0.625, light, 3 * o1 + o0)
-        p1 = behind(pixel_of(w0, w1, w2, 1), haze, before + (here - before) * 0.875, light, 3 * o1 + o2)
-        p2 = behind(pixel_of(w0, w1, w2, 2), haze, here + (after - here) * 0.125, light, 3 * o2 + o1)
-        p3 = behind(pixel_of(w0, w1, w2, 3), haze, here + (after - here) * 0.375, light, 3 * o2 + o3)
+        p0 = coded_pixel(
+            codes, behind(pixel_of(w0, w1, w2, 0), haze, before + (here - before) * 0.625, light, 3 * o1 + o0, linear)
+        )
+        p1 = coded_pixel(
+            codes, behind(pixel_of(w0, w1, w2, 1), haze, before + (here - before) * 0.875, light, 3 * o1 + o2, linear)
+        )
+        p2 = coded_pixel(
+            codes, behind(pixel_of(w0, w1, w2, 2), haze, here + (after - here) * 0.125, light, 3 * o2 + o1, linear)
+        )
+        p3 = coded_pixel(
+            codes, behind(pixel_of(w0, w1, w2, 3), haze, here + (after - here) * 0.375, light, 3 * o2 + o3, linear)
+        )
         put_four(out, i, p0, p1, p2, p3)
         i += 3
         before = here
@@ -195,11 +218,11 @@ def glare(
     b, y = wp.tid()
     focal = lens[b]
     sun = toward[b]
-    v = ((float(y) + 0.5) * 4.0 - 0.5 - focal[3]) / focal[1]
+    v = ((float(y) + 0.5) * 4.0 - focal[3]) / focal[1]
     spot = place[b]
     lens_light = wp.min(strength[b], STAR)
     for x in range(out.shape[2]):
-        u = ((float(x) + 0.5) * 4.0 - 0.5 - focal[2]) / focal[0]
+        u = ((float(x) + 0.5) * 4.0 - focal[2]) / focal[0]
         ray = wp.normalize(wp.vec3(u, v, 1.0))
         chord = wp.length(ray - sun)
         degrees = chord * 57.29578
