@@ -242,13 +242,14 @@ def render(
     out.surface = int(surface)
     for name in SURFACE:
         setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+    lanes = 1 if device == "cpu" else shape[2]
     inputs = [
         stage.geometry, seen.drawn, layers, seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
         wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device), shadows, near,
-        int(projecting), scale, out,
+        int(projecting), scale, lanes, out,
     ]  # fmt: skip
-    wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
+    wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layers.any or projecting:
         count = int(out.found.numpy()[0])

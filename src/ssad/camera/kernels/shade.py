@@ -369,29 +369,24 @@ def wear(
                 left = left * (1.0 - at[2])
 
 
-@wp.kernel
-def shade(
+@wp.func
+def shade_pixel(
     geometry: Geometry,
     drawn: Drawn,
     layers: Layers,
-    lens: wp.array(dtype=wp.vec4),
-    to_world: wp.array(dtype=wp.mat44),
-    lights: wp.array(dtype=Light),
+    focal: wp.vec4,
+    pose: wp.mat44,
+    light: Light,
     shadows: SunShadows,
     near: Near,
     projecting: int,
     scale: int,
     out: Output,
+    view: int,
+    y: int,
+    x: int,
 ):
-    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
-
-    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
-    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
-    """
-    view, y, x = wp.tid()
-    focal = lens[view]
-    light = lights[view]
-    pose = to_world[view]
+    """Shades one pixel, see `shade`."""
     total = wp.vec3(0.0, 0.0, 0.0)
     best = int(0)
     most = int(-1)
@@ -497,3 +492,36 @@ def shade(
     out.radiance[view, y, x] = total / float(count)
     out.tag[view, y, x] = most
     out.depth[view, y, x] = far
+
+
+@wp.kernel
+def shade(
+    geometry: Geometry,
+    drawn: Drawn,
+    layers: Layers,
+    lens: wp.array(dtype=wp.vec4),
+    to_world: wp.array(dtype=wp.mat44),
+    lights: wp.array(dtype=Light),
+    shadows: SunShadows,
+    near: Near,
+    projecting: int,
+    scale: int,
+    lanes: int,
+    out: Output,
+):
+    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
+
+    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
+    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
+
+    Each row has `lanes` threads, which take its pixels in turn: as many as pixels on a GPU, one on a CPU, where every
+    thread copies all the arguments anew.
+    """
+    view, y, lane = wp.tid()
+    focal = lens[view]
+    light = lights[view]
+    pose = to_world[view]
+    for x in range(lane, out.radiance.shape[2], lanes):
+        shade_pixel(
+            geometry, drawn, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
+        )  # fmt: skip
