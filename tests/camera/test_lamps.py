@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ssad.assets import mesh as meshes
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, build
-from ssad.camera.lamps import Lamp, lamp_strength, near_of, own_lamps
+from ssad.camera.lamps import Lamp, lamp_strength, lit_circle, near_of, own_lamps
 from ssad.camera.render import PLAIN, Quality, View, Weather, light_of, render
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import retexture, taps_of
@@ -83,6 +83,33 @@ def test_a_lamp_fades_with_its_reach_and_needs_sense() -> None:
     ):  # fmt: skip
         with pytest.raises(ConfigError, match="a lamp"):
             Lamp(**({"pose": pose, "power": 1.0} | wrong))  # type: ignore[arg-type]
+
+
+@given(st.integers(0, 10_000), st.booleans(), st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_what_a_lamp_lights_lies_in_its_circle(seed: int, square: bool, level: bool) -> None:
+    """And touches it where the lamp looks along the map and is widest there."""
+    draw = np.random.default_rng(seed)
+    down, across = np.sort(np.exp(draw.uniform(-2.5, 1.5, 2)))
+    pose = np.eye(4)
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    pose[:3, :3] = turn if level else np.linalg.qr(draw.normal(size=(3, 3)))[0]
+    pose[:3, 3] = draw.uniform(-50, 50, 3)
+    lamp = Lamp(pose, 1.0, (across, down), square=square, reach=draw.uniform(1, 80))
+    angle = np.linspace(0, 2 * np.pi, 721)
+    rim = np.column_stack([np.cos(angle), np.sin(angle)])
+    if square:
+        rim = rim / np.abs(rim).max(1)[:, None]
+    spot = np.concatenate([share * rim for share in (0.0, 0.3, 0.7, 1.0)]) * [across, down]
+    ray = np.column_stack([spot, np.ones(len(spot))]) @ pose[:3, :3].T
+    ray *= lamp.reach / np.linalg.norm(ray, axis=1)[:, None]
+    lit = pose[:2, 3] + np.concatenate([[np.zeros(2)], ray[:, :2]])
+    middle, radius = lit_circle(lamp)
+    away = np.hypot(*(lit - middle).T)
+    assert away.max() <= radius * (1 + 1e-9)
+    assert radius <= lamp.reach
+    if level and not square:
+        assert away.max() == pytest.approx(radius)
 
 
 def test_what_stands_in_its_way_keeps_light_off(scene: Scene) -> None:

@@ -16,7 +16,7 @@ import warp as wp
 
 from ssad.camera.kernels import raster
 from ssad.camera.kernels.labels import cover
-from ssad.camera.render import NEAR, Picture, View
+from ssad.camera.render import FACE_LANES, NEAR, Picture, View
 from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, I32
@@ -180,17 +180,18 @@ def _alone(
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
     side = CROP * scale
     samples = wp.zeros((len(crops), side, side), dtype=wp.uint64, device=device)
-    triangles = wp.empty(2 * total, dtype=raster.Triangle, device=device)
+    lanes = FACE_LANES if device != "cpu" else 1
     inputs = [
         stage.vertices, stage.faces, stage.listed, wp.array(starts, dtype=int, device=device),
         wp.array(firsts, dtype=int, device=device), wp.array(views, dtype=int, device=device),
         wp.array(matrices.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(lens, dtype=wp.vec4, device=device), NEAR, float(scale), 0, float(side), float(side),
+        wp.array(lens, dtype=wp.vec4, device=device), NEAR, float(scale), 0, lanes, 1e30,
     ]  # fmt: skip
     owners = wp.empty(total, dtype=wp.vec2i, device=device)
-    wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles, owners], device=device)
-    none = wp.zeros(1, dtype=int, device=device)
-    wp.launch(raster.fill, dim=2 * total, inputs=[triangles, 1 << 20], outputs=[samples, none, none], device=device)
+    large = wp.empty(1, dtype=raster.Triangle, device=device)
+    many = wp.zeros(1, dtype=int, device=device)
+    outputs = [owners, samples, large, many]
+    wp.launch(raster.fill, dim=(len(firsts), lanes), inputs=inputs, outputs=outputs, device=device)
     shape = np.ceil(np.minimum(size, CROP)).astype(np.int32)[:, ::-1]
     pixels = wp.zeros(len(crops), dtype=int, device=device)
     hits = wp.zeros(len(crops), dtype=int, device=device)

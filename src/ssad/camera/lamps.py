@@ -70,10 +70,15 @@ class Lamp:
         if min(self.power, *self.colour) < 0.0 or min(*self.spread, self.reach) <= 0.0 or not 0.0 <= self.soft <= 1.0:
             raise ConfigError("a lamp: power and colour from 0, spread and reach above 0, soft from 0 to 1")
 
+    @property
+    def is_square(self) -> bool:
+        """Whether it lights a rectangle, as what projects a texture always does."""
+        return self.square or self.texture >= 0
+
     def area(self) -> float:
         """What it lights of a plane 1 m ahead, m^2; where it fades, as much as it is lit."""
         across, down = self.spread
-        if self.square or self.texture >= 0:
+        if self.is_square:
             return 4.0 * across * down
         return float(np.pi * across * down * (1.0 + (1.0 - self.soft) ** 2) / 2.0)
 
@@ -134,7 +139,7 @@ def _own_lamps(views: Sequence[View]) -> Rows:
         for lamp in view.lamps:
             rows.append(_lamp_row(lamp, layers if lamp.shadows else -1))
             layers += lamp.shadows
-            middle, radius = _lit_circle(lamp)
+            middle, radius = lit_circle(lamp)
             places.append((number, *(middle - view.pose[:2, 3]), radius))
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
 
@@ -171,7 +176,7 @@ def _lamps(scene: Scene, views: Sequence[View]) -> Rows:
 
 def _fixed(lamps: Sequence[Lamp]) -> Rows:
     """Rows of lamps without shadow maps, and the circles [N, 3] (x, y, radius) that hold what they light."""
-    circles = [(*middle, radius) for middle, radius in map(_lit_circle, lamps)]
+    circles = [(*middle, radius) for middle, radius in map(lit_circle, lamps)]
     rows = np.array([_lamp_row(lamp, -1) for lamp in lamps], kernels.Lamp.numpy_dtype())  # type: ignore[attr-defined]
     return rows, np.array(circles, np.float64).reshape(-1, 3)
 
@@ -244,23 +249,22 @@ def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
     """A lamp as the kernels want it."""
     across, down = lamp.spread
     turn, place = lamp.pose[:3, :3], lamp.pose[:3, 3]
-    square = lamp.square or lamp.texture >= 0
     light = np.asarray(lamp.colour) * lamp.power / lamp.area()
     inner = (1.0 - lamp.soft) ** 2 - 1e-6  # its fade is as wide as this, also where it has none
     return (
         tuple(place), tuple(turn[:, 0] / across), tuple(turn[:, 1] / down), tuple(turn[:, 2]), tuple(light),
-        inner, int(square), lamp.reach, layer, lamp.texture, 4.0 * across * down,
+        inner, int(lamp.is_square), lamp.reach, layer, lamp.texture, 4.0 * across * down,
     )  # fmt: skip
 
 
-def _lit_circle(lamp: Lamp) -> tuple[F64, float]:
-    """A circle on the map, middle [2] and radius (m), that holds what a lamp lights."""
-    ahead = lamp.pose[:3, 2] * lamp.reach
-    wide = float(np.hypot(*lamp.spread))
-    if wide > 1.0:
-        return lamp.pose[:2, 3], lamp.reach
-    half = 0.5 * lamp.reach * float(np.sqrt(1.0 + wide * wide))
-    return lamp.pose[:2, 3] + 0.5 * ahead[:2], half * (1.0 + wide)
+def lit_circle(lamp: Lamp) -> tuple[F64, float]:
+    """A circle on the map, middle [2] and radius (m), that holds what a lamp lights: that of the smallest ball around
+    the sector of a ball which its spread and its reach bound."""
+    across, down = lamp.spread
+    cosine = 1.0 / float(np.hypot(1.0, np.hypot(across, down) if lamp.is_square else max(across, down)))
+    sine = float(np.sqrt(1.0 - cosine**2))
+    ahead, radius = (cosine, sine) if sine > cosine else (0.5 / cosine, 0.5 / cosine)
+    return lamp.pose[:2, 3] + lamp.pose[:2, 2] * (lamp.reach * ahead), lamp.reach * radius
 
 
 def _beam(pose: F64, kind: tuple[Any, ...], strength: float) -> Lamp:

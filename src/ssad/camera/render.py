@@ -22,7 +22,8 @@ from ssad.core.types import F32, F64, I32, U8
 
 NEAR = 0.15  # m
 FAR = 500.0
-LARGE, LANES = 4096, 32  # large triangles that a view may list, threads for each
+LARGE, ROW_LANES = 4096, 32  # large triangles that a view may list, threads for each
+FACE_LANES = 512  # threads for each draw on a GPU
 SHADOW_SIZE, SHADOW_REACH = 768, 60.0  # texels, m from the middle to the border
 FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before the camera, unless a view has a focus
 
@@ -178,22 +179,21 @@ class _Pass:
         drawn.owners = wp.empty(max(total, 1), dtype=wp.vec2i, device=device)
         if not total:
             return
-        triangles = wp.empty(2 * total, dtype=raster.Triangle, device=device)
+        gpu = device != "cpu"
+        # on a GPU the faces of a draw are shared out over threads, and so are the rows of large triangles
+        room = LARGE * len(lens) if gpu else 1
+        large = wp.empty(room, dtype=raster.Triangle, device=device)
+        many = wp.zeros(1, dtype=int, device=device)
+        lanes = FACE_LANES if gpu else 1
         inputs = [
             stage.vertices, stage.faces, stage.listed, starts, firsts, views, drawn.matrices, self.lens,
-            near, float(scale), int(ortho), float(width), float(height),
+            near, float(scale), int(ortho), lanes, 256.0 if gpu else 1e30,
         ]  # fmt: skip
-        wp.launch(raster.setup, dim=total, inputs=inputs, outputs=[triangles, drawn.owners], device=device)
-        gpu = device != "cpu"
-        # on a GPU large triangles are shared out over threads
-        room = LARGE * len(lens) if gpu else 1
-        large = wp.empty(room, dtype=int, device=device)
-        many = wp.zeros(1, dtype=int, device=device)
-        inputs = [triangles, 256.0 if gpu else 1e30]
-        wp.launch(raster.fill, dim=2 * total, inputs=inputs, outputs=[self.samples, large, many], device=device)
+        outputs = [drawn.owners, self.samples, large, many]
+        wp.launch(raster.fill, dim=(len(draws.counts), lanes), inputs=inputs, outputs=outputs, device=device)
         if gpu:
-            inputs = [triangles, large, many, LANES]
-            wp.launch(raster.fill_large, dim=(room, LANES), inputs=inputs, outputs=[self.samples], device=device)
+            inputs = [large, many, ROW_LANES]
+            wp.launch(raster.fill_large, dim=(room, ROW_LANES), inputs=inputs, outputs=[self.samples], device=device)
 
 
 def render(
@@ -249,13 +249,14 @@ def render(
     out.surface = int(surface)
     for name in SURFACE:
         setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
+    lanes = 1 if device == "cpu" else shape[2]
     inputs = [
         stage.geometry, seen.drawn, layers, seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
         wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device), shadows, near,
-        int(projecting), scale, out,
+        int(projecting), scale, lanes, out,
     ]  # fmt: skip
-    wp.launch(shade.shade, dim=shape, inputs=inputs, device=device)
+    wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layers.any or projecting:
         count = int(out.found.numpy()[0])

@@ -141,33 +141,54 @@ def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: f
 
 
 @wp.func
-def lamp_at(lamp: Lamp, shadows: wp.array3d(dtype=wp.uint64), p: wp.vec3, n: wp.vec3, fog: float) -> wp.vec4:
-    """Irradiance / pi that a lamp of unit light gives a point with a normal, with where in its spread (x, y in -1..1)
-    the point lies and how much of the spread an area of 1 m^2 there takes: (irradiance, x, y, share)."""
-    to = p - lamp.place
+def lamp_at(
+    lamps: wp.array(dtype=Lamp), k: int, shadows: wp.array3d(dtype=wp.uint64), p: wp.vec3, n: wp.vec3, fog: float
+) -> float:
+    """Irradiance / pi that a lamp, were its light 1, gives a point with a normal."""
+    to = p - lamps[k].place
+    turned = wp.dot(n, to)
+    ahead = wp.dot(to, lamps[k].ahead)
+    # most lamps that can reach the square leave the point dark: these tests cost least
+    if turned >= 0.0 or ahead <= 0.02:
+        return 0.0
     square = wp.max(wp.dot(to, to), 1.0e-4)
     distance = wp.sqrt(square)
-    facing = -wp.dot(n, to) / distance
-    ahead = wp.dot(to, lamp.ahead)
-    if facing <= 0.0 or ahead <= 0.02 or distance >= lamp.reach:
-        return wp.vec4(0.0, 0.0, 0.0, 0.0)
-    x = wp.dot(to, lamp.across) / ahead
-    y = wp.dot(to, lamp.down) / ahead
+    reach = lamps[k].reach
+    if distance >= reach:
+        return 0.0
+    x = wp.dot(to, lamps[k].across) / ahead
+    y = wp.dot(to, lamps[k].down) / ahead
     weight = float(1.0)
-    if lamp.square == 1:
+    if lamps[k].square == 1:
         if wp.abs(x) > 1.0 or wp.abs(y) > 1.0:
             weight = 0.0
     else:
         radius = x * x + y * y
-        if radius > lamp.inner:
-            weight = wp.max((1.0 - radius) / (1.0 - lamp.inner), 0.0)
+        inner = lamps[k].inner
+        if radius > inner:
+            weight = wp.max((1.0 - radius) / (1.0 - inner), 0.0)
     if weight <= 0.0:
-        return wp.vec4(0.0, x, y, 0.0)
+        return 0.0
+    layer = lamps[k].layer
+    if layer >= 0:
+        weight = weight * lamp_shadow(shadows, layer, x, y, ahead - 0.02 - 0.004 * ahead)
+    # the last third of the reach fades, so that no edge shows
+    weight = weight * wp.clamp(3.0 * (1.0 - distance / reach), 0.0, 1.0)
+    if fog > 0.0:
+        weight = weight * wp.exp(-fog * distance)
     # a plane across the axis is lit evenly: the intensity grows with the cube of the secant
     secant = distance / ahead
-    bundle = secant * secant * secant * facing / square
-    if lamp.layer >= 0:
-        weight = weight * lamp_shadow(shadows, lamp.layer, x, y, ahead - 0.02 - 0.004 * ahead)
-    # the last third of the reach fades, so that no edge shows
-    weight = weight * wp.clamp(3.0 * (1.0 - distance / lamp.reach), 0.0, 1.0) * wp.exp(-fog * distance)
-    return wp.vec4(weight * bundle, x, y, bundle / lamp.spread)
+    return weight * (secant * secant * secant * (-turned / distance) / square)
+
+
+@wp.func
+def spot_of(lamp: Lamp, p: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """Where in a lamp's spread (x, y in -1..1) a point lies that it lights, and how much of the spread an area of
+    1 m^2 there takes."""
+    to = p - lamp.place
+    square = wp.max(wp.dot(to, to), 1.0e-4)
+    distance = wp.sqrt(square)
+    ahead = wp.dot(to, lamp.ahead)
+    secant = distance / ahead
+    bundle = secant * secant * secant * (-wp.dot(n, to) / distance) / square
+    return wp.vec3(wp.dot(to, lamp.across) / ahead, wp.dot(to, lamp.down) / ahead, bundle / lamp.spread)

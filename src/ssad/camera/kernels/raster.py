@@ -18,40 +18,27 @@ LAST = wp.constant(wp.uint64(4294967295))
 
 @wp.struct
 class Triangle:
-    """Corners as (x, y, inverse depth) in samples; view -1: nothing to draw."""
+    """Corners as (x, y, inverse depth) in samples; its view; its slot, which names it there."""
 
     a: wp.vec3
     b: wp.vec3
     c: wp.vec3
     view: int
-
-
-@wp.func
-def draw_of(starts: wp.array(dtype=int), index: int) -> int:
-    """The draw whose faces begin at or before an index (binary search)."""
-    low = int(0)
-    high = starts.shape[0] - 1
-    while high - low > 1:
-        middle = (low + high) / 2
-        if starts[middle] <= index:
-            low = middle
-        else:
-            high = middle
-    return low
+    slot: int
 
 
 @wp.func
 def shown(p: wp.vec3, lens: wp.vec4, scale: float, ortho: int) -> wp.vec3:
     """A point of the camera frame as (x, y, inverse depth) in samples."""
+    near = 1.0 / p[2]
+    shrink = near
     if ortho == 1:
         # linear in depth, as a parallel projection must interpolate
-        return wp.vec3(
-            (lens[0] * p[0] + lens[2] + 0.5) * scale, (lens[1] * p[1] + lens[3] + 0.5) * scale, (1.0e3 - p[2]) * 1.0e-3
-        )
-    near = 1.0 / p[2]
-    return wp.vec3(
-        (lens[0] * p[0] * near + lens[2] + 0.5) * scale, (lens[1] * p[1] * near + lens[3] + 0.5) * scale, near
-    )
+        near = (1.0e3 - p[2]) * 1.0e-3
+        shrink = 1.0
+    x = (lens[0] * p[0] * shrink + lens[2] + 0.5) * scale
+    y = (lens[1] * p[1] * shrink + lens[3] + 0.5) * scale
+    return wp.vec3(x, y, near)
 
 
 @wp.func
@@ -75,100 +62,6 @@ def outside(t: Triangle, width: float, height: float) -> int:
     return 0
 
 
-@wp.kernel
-def setup(
-    vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array2d(dtype=int),
-    listed: wp.array(dtype=int),
-    starts: wp.array(dtype=int),
-    firsts: wp.array(dtype=int),
-    views: wp.array(dtype=int),
-    matrices: wp.array(dtype=wp.mat44),
-    lens: wp.array(dtype=wp.vec4),
-    near: float,
-    scale: float,
-    ortho: int,
-    width: float,
-    height: float,
-    triangles: wp.array(dtype=Triangle),
-    owners: wp.array(dtype=wp.vec2i),
-):
-    """Moves each listed face into its camera, drops what is turned away or out of the picture, clips, projects.
-
-    owners: the draw and the face of each index. A parallel projection is light: the ground casts no shadow.
-    """
-    index = wp.tid()
-    draw = draw_of(starts, index)
-    face = listed[firsts[draw] + index - starts[draw]]
-    owners[index] = wp.vec2i(draw, face)
-    if ortho == 1 and vertices[faces[face, 0]][2] < LOW:
-        if vertices[faces[face, 1]][2] < LOW and vertices[faces[face, 2]][2] < LOW:
-            triangles[2 * index].view = -1
-            triangles[2 * index + 1].view = -1
-            return
-    m = matrices[draw]
-    view = views[draw]
-    p = wp.transform_point(m, vertices[faces[face, 0]])
-    q = wp.transform_point(m, vertices[faces[face, 1]])
-    r = wp.transform_point(m, vertices[faces[face, 2]])
-    first = Triangle()
-    second = Triangle()
-    first.view = -1
-    second.view = -1
-    focal = lens[view]
-    plane = near
-    if ortho == 1:
-        plane = -900.0
-    # rotate the corners so that the first is in front whenever one is
-    if p[2] < plane:
-        if q[2] >= plane:
-            o = p
-            p = q
-            q = r
-            r = o
-        elif r[2] >= plane:
-            o = p
-            p = r
-            r = q
-            q = o
-    if p[2] >= plane:
-        if q[2] >= plane and r[2] >= plane:
-            first.a = shown(p, focal, scale, ortho)
-            first.b = shown(q, focal, scale, ortho)
-            first.c = shown(r, focal, scale, ortho)
-            first.view = view
-        elif q[2] >= plane:
-            qr = shown(cut(q, r, plane), focal, scale, ortho)
-            first.a = shown(p, focal, scale, ortho)
-            first.b = shown(q, focal, scale, ortho)
-            first.c = qr
-            first.view = view
-            second.a = first.a
-            second.b = qr
-            second.c = shown(cut(p, r, plane), focal, scale, ortho)
-            second.view = view
-        elif r[2] >= plane:
-            first.a = shown(p, focal, scale, ortho)
-            first.b = shown(cut(p, q, plane), focal, scale, ortho)
-            first.c = shown(cut(r, q, plane), focal, scale, ortho)
-            first.view = view
-            second.a = first.a
-            second.b = first.c
-            second.c = shown(r, focal, scale, ortho)
-            second.view = view
-        else:
-            first.a = shown(p, focal, scale, ortho)
-            first.b = shown(cut(p, q, plane), focal, scale, ortho)
-            first.c = shown(cut(p, r, plane), focal, scale, ortho)
-            first.view = view
-    if first.view >= 0 and outside(first, width, height) == 1:
-        first.view = -1
-    if second.view >= 0 and outside(second, width, height) == 1:
-        second.view = -1
-    triangles[2 * index] = first
-    triangles[2 * index + 1] = second
-
-
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
     """x at which the edge crosses a row; the same number for both triangles that share it."""
@@ -178,7 +71,7 @@ def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
 
 
 @wp.func
-def fill_row(t: Triangle, slot: int, y: int, samples: wp.array3d(dtype=wp.uint64), gx: float, gy: float):
+def fill_row(t: Triangle, y: int, samples: wp.array3d(dtype=wp.uint64), gx: float, gy: float):
     """Enters a triangle into one row of samples."""
     yc = float(y) + 0.5
     low = float(1.0e9)
@@ -202,7 +95,7 @@ def fill_row(t: Triangle, slot: int, y: int, samples: wp.array3d(dtype=wp.uint64
     if first >= last:
         return
     start = t.a[2] + gy * (yc - t.a[1]) + gx * (0.5 - t.a[0])
-    tail = LAST - wp.uint64(slot)
+    tail = LAST - wp.uint64(t.slot)
     for x in range(first, last):
         near = wp.max(start + gx * float(x), 1.0e-9)
         key = (wp.uint64(wp.cast(near, wp.uint32)) << wp.uint64(32)) | tail
@@ -231,36 +124,113 @@ def rows_of(t: Triangle, height: int) -> wp.vec2i:
     return wp.vec2i(wp.max(int(wp.ceil(top - 0.5)), 0), wp.min(int(wp.ceil(bottom - 0.5)), height))
 
 
-@wp.kernel
-def fill(
-    triangles: wp.array(dtype=Triangle),
-    largest: float,
-    samples: wp.array3d(dtype=wp.uint64),
-    large: wp.array(dtype=int),
+@wp.func
+def enter(
+    t: Triangle, largest: float, samples: wp.array3d(dtype=wp.uint64), large: wp.array(dtype=Triangle),
     count: wp.array(dtype=int),
-):
-    """Enters each triangle into the samples; those whose extent has more than `largest` samples are listed in `large`
-    as long as there is room."""
-    slot = wp.tid()
-    t = triangles[slot]
-    if t.view < 0:
+):  # fmt: skip
+    """Enters a triangle into the samples, or lists it in `large` if it is large and there is room, see `fill`."""
+    if outside(t, float(samples.shape[2]), float(samples.shape[1])) == 1:
         return
     rows = rows_of(t, samples.shape[1])
     wide = wp.max(t.a[0], wp.max(t.b[0], t.c[0])) - wp.min(t.a[0], wp.min(t.b[0], t.c[0]))
     if float(rows[1] - rows[0]) * wp.min(wide, float(samples.shape[2])) > largest:
         place = wp.atomic_add(count, 0, 1)
         if place < large.shape[0]:
-            large[place] = slot
+            large[place] = t
             return
     slope = slopes(t)
     for y in range(rows[0], rows[1]):
-        fill_row(t, slot, y, samples, slope[0], slope[1])
+        fill_row(t, y, samples, slope[0], slope[1])
+
+
+@wp.kernel
+def fill(
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array2d(dtype=int),
+    listed: wp.array(dtype=int),
+    starts: wp.array(dtype=int),
+    firsts: wp.array(dtype=int),
+    views: wp.array(dtype=int),
+    matrices: wp.array(dtype=wp.mat44),
+    lens: wp.array(dtype=wp.vec4),
+    near: float,
+    scale: float,
+    ortho: int,
+    lanes: int,
+    largest: float,
+    owners: wp.array(dtype=wp.vec2i),
+    samples: wp.array3d(dtype=wp.uint64),
+    large: wp.array(dtype=Triangle),
+    count: wp.array(dtype=int),
+):
+    """Moves each listed face into its camera, clips and projects it, and enters it into the samples unless it is turned
+    away. Triangles whose extent has more than `largest` samples are listed in `large` as long as there is room.
+
+    owners: the draw and the face of each index. A parallel projection is light: the ground casts no shadow. Each draw
+    has `lanes` threads, which take its faces in turn.
+    """
+    draw, lane = wp.tid()
+    m = matrices[draw]
+    view = views[draw]
+    focal = lens[view]
+    plane = near
+    if ortho == 1:
+        plane = -900.0
+    for index in range(starts[draw] + lane, starts[draw + 1], lanes):
+        face = listed[firsts[draw] + index - starts[draw]]
+        owners[index] = wp.vec2i(draw, face)
+        u = vertices[faces[face, 0]]
+        v = vertices[faces[face, 1]]
+        w = vertices[faces[face, 2]]
+        if ortho == 0 or wp.max(u[2], wp.max(v[2], w[2])) >= LOW:
+            p = wp.transform_point(m, u)
+            q = wp.transform_point(m, v)
+            r = wp.transform_point(m, w)
+            # rotate the corners so that the first is in front whenever one is
+            if p[2] < plane:
+                if q[2] >= plane:
+                    o = p
+                    p = q
+                    q = r
+                    r = o
+                elif r[2] >= plane:
+                    o = p
+                    p = r
+                    r = q
+                    q = o
+            if p[2] >= plane:
+                t = Triangle()
+                t.view = view
+                t.slot = 2 * index
+                t.a = shown(p, focal, scale, ortho)
+                if q[2] >= plane:
+                    t.b = shown(q, focal, scale, ortho)
+                    if r[2] >= plane:
+                        t.c = shown(r, focal, scale, ortho)
+                    else:
+                        t.c = shown(cut(q, r, plane), focal, scale, ortho)
+                else:
+                    t.b = shown(cut(p, q, plane), focal, scale, ortho)
+                    if r[2] >= plane:
+                        t.c = shown(cut(r, q, plane), focal, scale, ortho)
+                    else:
+                        t.c = shown(cut(p, r, plane), focal, scale, ortho)
+                enter(t, largest, samples, large, count)
+                # one corner behind the plane: what is left has four
+                if (q[2] >= plane) != (r[2] >= plane):
+                    t.slot += 1
+                    t.b = t.c
+                    if q[2] >= plane:
+                        t.c = shown(cut(p, r, plane), focal, scale, ortho)
+                    else:
+                        t.c = shown(r, focal, scale, ortho)
+                    enter(t, largest, samples, large, count)
 
 
 @wp.kernel
 def fill_large(
-    triangles: wp.array(dtype=Triangle),
-    large: wp.array(dtype=int),
+    large: wp.array(dtype=Triangle),
     count: wp.array(dtype=int),
     lanes: int,
     samples: wp.array3d(dtype=wp.uint64),
@@ -269,11 +239,8 @@ def fill_large(
     n, lane = wp.tid()
     if n >= wp.min(count[0], large.shape[0]):
         return
-    slot = large[n]
-    t = triangles[slot]
+    t = large[n]
     rows = rows_of(t, samples.shape[1])
     slope = slopes(t)
-    y = rows[0] + lane
-    while y < rows[1]:
-        fill_row(t, slot, y, samples, slope[0], slope[1])
-        y += lanes
+    for y in range(rows[0] + lane, rows[1], lanes):
+        fill_row(t, y, samples, slope[0], slope[1])

@@ -8,7 +8,7 @@ term for glass, paint and wet roads, fog by distance.
 import warp as wp
 
 from ssad.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
-from ssad.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness
+from ssad.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness, spot_of
 from ssad.camera.kernels.matter import Surface, textured
 from ssad.camera.kernels.raster import LAST
 from ssad.camera.kernels.sky import Light, cloudy, sky, surroundings
@@ -200,9 +200,11 @@ def lit_at(
     lit.light += (light.zenith * (0.65 * up) + light.horizon * (0.35 * up)) * open_ + light.ground * (1.0 - up)
     if row >= 0:
         for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-            lamp = near.lamps[near.lamp_list[at]]
-            if lamp.texture < 0:
-                lit.light += lamp.light * (lamp_at(lamp, near.shadows, p, n, light.fog)[0] * open_)
+            k = near.lamp_list[at]
+            if near.lamps[k].texture < 0:
+                given = lamp_at(near.lamps, k, near.shadows, p, n, light.fog)
+                if given > 0.0:
+                    lit.light += near.lamps[k].light * (given * open_)
     return lit
 
 
@@ -259,14 +261,18 @@ def seen_from(
             rough = power
             if wet == 1:
                 rough = 60.0
+            # what is turned further away than this shines by less than a thousandth: no power of it is taken
+            least = 0.99 * wp.pow(0.001, 1.0 / rough)
             for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-                lamp = near.lamps[near.lamp_list[at]]
-                if lamp.texture < 0:
-                    toward = wp.normalize(lamp.place - p)
-                    shine = wp.pow(wp.max(wp.dot(back, toward), 0.0), rough)
-                    if shine > 0.001:
-                        given = lamp_at(lamp, near.shadows, p, toward, light.fog)[0]
-                        colour += lamp.light * (given * shine * bright * 0.5)
+                k = near.lamp_list[at]
+                if near.lamps[k].texture < 0:
+                    toward = wp.normalize(near.lamps[k].place - p)
+                    along = wp.dot(back, toward)
+                    if along > least:
+                        shine = wp.pow(along, rough)
+                        if shine > 0.001:
+                            given = lamp_at(near.lamps, k, near.shadows, p, toward, light.fog)
+                            colour += near.lamps[k].light * (given * shine * bright * 0.5)
     if light.fog > 0.0:
         clear = wp.exp(-light.fog * hit.distance)
         colour = colour * clear + light.horizon * (1.0 - clear)
@@ -300,16 +306,18 @@ def project(
     """Lists what lamps that project a texture add to a pixel; through: share of light that the surface sends on;
     span: area of the surface in the pixel, m^2."""
     for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
-        lamp = near.lamps[near.lamp_list[at]]
-        if lamp.texture >= 0:
-            given = lamp_at(lamp, near.shadows, hit.place, hit.normal, fog)
-            if given[0] > 0.0:
+        k = near.lamp_list[at]
+        if near.lamps[k].texture >= 0:
+            given = lamp_at(near.lamps, k, near.shadows, hit.place, hit.normal, fog)
+            if given > 0.0:
+                lamp = near.lamps[k]
+                spot = spot_of(lamp, hit.place, hit.normal)
                 piece = fragment
                 piece.texture = lamp.texture
-                piece.u = 0.5 + 0.5 * given[1]
-                piece.v = 0.5 + 0.5 * given[2]
-                piece.area = given[3] * span
-                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given[0] * open_)
+                piece.u = 0.5 + 0.5 * spot[0]
+                piece.v = 0.5 + 0.5 * spot[1]
+                piece.area = spot[2] * span
+                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given * open_)
                 keep(out, piece)
 
 
@@ -369,29 +377,24 @@ def wear(
                 left = left * (1.0 - at[2])
 
 
-@wp.kernel
-def shade(
+@wp.func
+def shade_pixel(
     geometry: Geometry,
     drawn: Drawn,
     layers: Layers,
-    lens: wp.array(dtype=wp.vec4),
-    to_world: wp.array(dtype=wp.mat44),
-    lights: wp.array(dtype=Light),
+    focal: wp.vec4,
+    pose: wp.mat44,
+    light: Light,
     shadows: SunShadows,
     near: Near,
     projecting: int,
     scale: int,
     out: Output,
+    view: int,
+    y: int,
+    x: int,
 ):
-    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
-
-    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
-    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
-    """
-    view, y, x = wp.tid()
-    focal = lens[view]
-    light = lights[view]
-    pose = to_world[view]
+    """Shades one pixel, see `shade`."""
     total = wp.vec3(0.0, 0.0, 0.0)
     best = int(0)
     most = int(-1)
@@ -497,3 +500,36 @@ def shade(
     out.radiance[view, y, x] = total / float(count)
     out.tag[view, y, x] = most
     out.depth[view, y, x] = far
+
+
+@wp.kernel
+def shade(
+    geometry: Geometry,
+    drawn: Drawn,
+    layers: Layers,
+    lens: wp.array(dtype=wp.vec4),
+    to_world: wp.array(dtype=wp.mat44),
+    lights: wp.array(dtype=Light),
+    shadows: SunShadows,
+    near: Near,
+    projecting: int,
+    scale: int,
+    lanes: int,
+    out: Output,
+):
+    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
+
+    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
+    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
+
+    Each row has `lanes` threads, which take its pixels in turn: as many as pixels on a GPU, one on a CPU, where every
+    thread copies all the arguments anew.
+    """
+    view, y, lane = wp.tid()
+    focal = lens[view]
+    light = lights[view]
+    pose = to_world[view]
+    for x in range(lane, out.radiance.shape[2], lanes):
+        shade_pixel(
+            geometry, drawn, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
+        )  # fmt: skip
