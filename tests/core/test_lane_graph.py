@@ -102,6 +102,22 @@ def test_file_round_trip_is_exact_and_deterministic(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
+def test_a_file_from_before_there_were_signs_has_none(tmp_path: Path) -> None:
+    graph = load_town("Twinford")
+    assert len(graph.sign_kind) > 0
+    save_graph(graph, tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as data:
+        old = {name: data[name] for name in data.files if not name.startswith(("sign_", "rule_"))}
+    np.savez(tmp_path / "old.npz", **old)
+    again = load_graph(tmp_path / "old.npz")
+    assert (len(again.sign_kind), again.sign_xy.shape, len(again.rule_lane)) == (0, (0, 2), 0)
+    assert np.array_equal(again.xy, graph.xy)
+    del old["stop_s"]
+    np.savez(tmp_path / "torn.npz", **old)
+    with pytest.raises(MapError, match="missing or unknown arrays: stop_s"):
+        load_graph(tmp_path / "torn.npz")
+
+
 def test_arrays_are_read_only() -> None:
     graph = load_town("Twinford")
     for part in dataclasses.fields(graph):
@@ -129,6 +145,10 @@ def test_arrays_are_read_only() -> None:
         ({"right": [3, -1, -1]}, "right points outside"),
         ({"stop_signal": [0], "stop_lane": [0], "stop_s": [1.0]}, "stop_signal points outside"),
         ({"kind": [7, 1, 1]}, "kind points outside"),
+        ({"sign_xy": np.zeros(2)}, "sign_xy is not [n, 2]"),
+        ({"sign_kind": [0]}, "sign_kind does not have 0 rows"),
+        ({"sign_xy": [[0, 0]], "sign_yaw": [0], "sign_kind": [2]}, "sign_kind points outside"),
+        ({"rule_sign": [0], "rule_lane": [0], "rule_s": [1.0]}, "rule_sign points outside"),
         ({"kind": [2, 3, 6]}, "it has no drivable lane"),
     ],
 )

@@ -58,8 +58,8 @@ def test_cards_say_where_they_are_from(name: str) -> None:
 def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, PictureSet]) -> None:
     data, bank = clips
     detector = make_detector(name)
-    assert detector.classes == data.classes
-    assert score_2d(detector, bank)["AP50_car"] > 0.5  # 0.87 and more
+    assert set(detector.classes) <= set(data.classes)
+    assert score_2d(detector, bank, classes=data.classes)["AP50_car"] > 0.5  # 0.87 and more
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from roads.towns import IMPORTED, built_in, imported
 
 from benchmarks.make_towns import generate_town
 from ssad.core.errors import MapError
-from ssad.core.lane_graph import LaneGraph, equal
+from ssad.core.lane_graph import LaneGraph, SignKind, equal
 from ssad.core.types import LaneType
 from ssad.roads import bake, import_map, load_graph, load_town, town_names
 from ssad.roads import bake as bake_function
@@ -122,6 +123,45 @@ def test_every_approach_of_a_signalled_junction_has_a_stop_line(carla_home: Path
         stop = graph.at(int(lane), float(graph.length[lane]))
         assert np.hypot(x[k] - stop[0], y[k] - stop[1]) < 45.0
         assert np.cos(yaw[k] - stop[2]) > 0.7
+
+
+def test_signs_of_a_map_are_known_by_what_they_name(tmp_path: Path) -> None:
+    """A stop sign on its own approach, one that the connecting lanes refer to, paint on the road, and a sign that is
+    turned to no lane of its road."""
+    plain = bake(_map(tmp_path, SMALL), "plain")
+    assert set(plain.sign_kind.tolist()) == {SignKind.STOP, SignKind.YIELD}
+    where = dict(zip(plain.rule_sign.tolist(), plain.rule_lane.tolist(), strict=True))
+    root = ElementTree.fromstring(SMALL)
+    posts = [(road, post) for road in root.findall("road") for post in road.findall("signals/signal[@dynamic='no']")]
+    assert len(posts) == len(plain.sign_kind)
+    posts.sort(key=lambda pair: int(pair[1].get("id", "")))
+    posts[0][1].set("name", "Stencil_STOP")
+    posts[1][1].remove(posts[1][1].find("validity"))
+    posts[2][1].set("orientation", "-" if posts[2][1].get("orientation") == "+" else "+")
+    # the post stays where it is, the way behind the approach says whom it rules
+    post = posts[3][1]
+    post.remove(post.find("validity"))
+    post.set("orientation", "-" if post.get("orientation") == "+" else "+")
+    lane = int(plain.rule_lane[plain.rule_sign.tolist().index(3)])
+    after = next(int(k) for k in plain.successors(lane) if plain.kind[k] == LaneType.DRIVING)
+    way = next(r for r in root.findall("road") if r.get("id") == str(plain.road[after]))
+    signals = ElementTree.SubElement(way, "signals")
+    reference = ElementTree.SubElement(signals, "signalReference", s="0", t="0", orientation="+", id=post.get("id", ""))
+    ElementTree.SubElement(reference, "validity", fromLane="-1", toLane="-1")
+    changed = bake(_map(tmp_path, ElementTree.tostring(root, encoding="unicode")), "changed")
+    ruled = set(changed.rule_lane.tolist())
+    assert where[0] not in ruled, "paint is no sign"
+    assert where[1] in ruled, "without a range of lanes, all of its direction"
+    assert where[2] not in ruled, "its range and its direction leave none"
+    assert where[3] in ruled, "the lane before the one that refers to it"
+    for name in ("stop_lane", "stop_s", "signal_xy", "signal_virtual", "xy", "succ"):
+        assert np.array_equal(getattr(changed, name), getattr(plain, name)), "signs change nothing that is driven by"
+
+
+def _map(folder: Path, text: str) -> Path:
+    path = folder / "signs.xodr"
+    path.write_text(text, encoding="utf-8")
+    return path
 
 
 SMALL = generate_town("Twinford")

@@ -12,6 +12,7 @@ from roads.towns import BUILT_IN, built_in
 
 from benchmarks.make_towns import TOWNS, generate_town
 from ssad.core.errors import MapError, UnknownNameError
+from ssad.core.lane_graph import SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, bake, load_town, town_names
@@ -108,6 +109,27 @@ def test_signals_stop_every_approach(name: str) -> None:
         for phase in (0, 1):
             yaw = graph.signal_yaw[mine & (graph.signal_phase == phase)]
             assert np.abs(np.sin(yaw - yaw[0])).max() < 1e-3  # only arms that face each other are green together
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_signs_stand_where_no_lights_are(name: str) -> None:
+    """Beside the stop line on the right of the approach, at every junction of three arms or more without lights."""
+    graph = built_in(name)
+    assert len(graph.sign_kind) >= 4
+    assert (graph.sign_kind == SignKind.STOP).any()
+    signal_of = dict(zip(graph.stop_lane.tolist(), graph.stop_signal.tolist(), strict=True))
+    signed = set()
+    for sign, lane, s in zip(graph.rule_sign.tolist(), graph.rule_lane.tolist(), graph.rule_s.tolist(), strict=True):
+        signal = signal_of[lane]
+        assert graph.signal_virtual[signal]
+        signed.add(int(graph.signal_junction[signal]))
+        x, y, yaw, width = graph.at(lane, s)
+        aside = graph.sign_xy[sign] - [x, y]
+        assert abs(aside @ [np.cos(yaw), np.sin(yaw)]) < 1.0
+        assert 0.5 * width < -aside @ [-np.sin(yaw), np.cos(yaw)] < 2.0 * width + 1.5
+        assert np.cos(graph.sign_yaw[sign] - yaw) > 0.99
+    assert set(graph.rule_sign.tolist()) == set(range(len(graph.sign_kind)))
+    assert signed == set(graph.signal_junction[graph.signal_virtual].tolist())
 
 
 @pytest.mark.parametrize("name", BUILT_IN)

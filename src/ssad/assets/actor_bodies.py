@@ -26,6 +26,10 @@ BODY_CATEGORIES: Final[Mapping[str, str]] = {
 }  # fmt: skip
 
 
+# kinds that 2D detectors learn beside the classes of nuScenes; the others are background to them
+PLAIN_CLASSES: Final = ("stop_sign",)
+
+
 def class_of(kind: str) -> str:
     """The nuScenes class of a kind of body. KeyError: it has none."""
     return CATEGORY_TO_CLASS[BODY_CATEGORIES[kind]]

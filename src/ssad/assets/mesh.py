@@ -190,6 +190,14 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(vertices, triangles, normals, uv, material, panel, tuple(materials), tuple(panels), kept)
 
 
+def part_of(mesh: Mesh, faces: npt.NDArray[np.bool_]) -> Mesh:
+    """The mesh with some of its faces [F] alone, in the place and with the atlas of the whole."""
+    return replace(
+        mesh, faces=mesh.faces[faces], normals=mesh.normals[faces], uv=mesh.uv[faces], material=mesh.material[faces],
+        panel=mesh.panel[faces],
+    )  # fmt: skip
+
+
 def corner_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, smooth: float = SMOOTH) -> F64:
     """Unit normals for each corner [F, 3, 3]: area-weighted over faces at the vertex within `smooth` rad."""
     v, f = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)

@@ -16,6 +16,13 @@ FORMAT = 1  # of the .npz file
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
 
 
+class SignKind(IntEnum):
+    """What a sign at a junction says."""
+
+    STOP = 0
+    YIELD = 1
+
+
 class Marking(IntEnum):
     """What is painted between a lane and its neighbour. Only BROKEN may be crossed."""
 
@@ -31,7 +38,8 @@ class Marking(IntEnum):
 class LaneGraph:
     """Lanes of a town as polylines that run in the direction of traffic. Arrays are read-only.
 
-    L lanes, P points, E links, S signals, K stop lines, C crosswalks; metres, radians, m/s, world frame.
+    L lanes, P points, E links, S signals, K stop lines, C crosswalks, G signs, R rules; metres, radians, m/s, world
+    frame.
     A lane is one lane of one OpenDRIVE lane section; sidewalks and shoulders run as the driving lanes beside
     them.
 
@@ -44,6 +52,9 @@ class LaneGraph:
     signal_phase [S]: signals of a junction with equal phase are green together; signal_virtual [S]: not in
     the map, off unless forced. stop_signal, stop_lane, stop_s [K]: signal that controls a lane at arc length
     stop_s (near the lane's end). crosswalk_offset [C+1], crosswalk_xy [., 2]: corners of the crosswalks.
+    sign_kind [G]: `SignKind`; sign_xy [G, 2], sign_yaw [G] (direction of the traffic it faces); rule_sign, rule_lane,
+    rule_s [R]: sign that rules a lane, whose stop line is at arc length rule_s. Signs are only seen so far: nobody
+    obeys them.
     """
 
     name: str
@@ -75,6 +86,12 @@ class LaneGraph:
     stop_s: F32
     crosswalk_offset: I32
     crosswalk_xy: F32
+    sign_kind: U8 = field(default_factory=lambda: np.zeros(0, np.uint8))
+    sign_xy: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    sign_yaw: F32 = field(default_factory=lambda: np.zeros(0, np.float32))
+    rule_sign: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    rule_lane: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    rule_s: F32 = field(default_factory=lambda: np.zeros(0, np.float32))
     length: F32 = field(init=False)
     pred_offset: I32 = field(init=False)
     pred: I32 = field(init=False)
@@ -140,7 +157,11 @@ _PER = {
     "L": ("road", "section", "lane_id", "junction", "speed_limit", "left", "right", "left_marking", "right_marking"),
     "S": ("signal_yaw", "signal_junction", "signal_phase", "signal_virtual"),
     "K": ("stop_signal", "stop_lane", "stop_s"),
+    "G": ("sign_kind", "sign_yaw"),
+    "R": ("rule_sign", "rule_lane", "rule_s"),
 }
+# older files lack them: such a town has no signs
+_OPTIONAL = frozenset({"sign_kind", "sign_xy", "sign_yaw", "rule_sign", "rule_lane", "rule_s"})
 
 
 def _check(graph: LaneGraph) -> None:
@@ -150,10 +171,13 @@ def _check(graph: LaneGraph) -> None:
         if not ok:
             raise MapError(f"town '{graph.name}': {what}; bake the map again with ssad import map")
 
-    for name in ("xy", "signal_xy", "crosswalk_xy"):
+    for name in ("xy", "signal_xy", "crosswalk_xy", "sign_xy"):
         value = getattr(graph, name)
         require(value.ndim == 2 and value.shape[1] == 2, f"{name} is not [n, 2]")
-    size = {"P": len(graph.xy), "L": len(graph.kind), "S": len(graph.signal_xy), "K": len(graph.stop_signal)}
+    size = {
+        "P": len(graph.xy), "L": len(graph.kind), "S": len(graph.signal_xy), "K": len(graph.stop_signal),
+        "G": len(graph.sign_xy), "R": len(graph.rule_sign),
+    }  # fmt: skip
     for letter, names in _PER.items():
         for name in names:
             require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")
@@ -176,6 +200,9 @@ def _check(graph: LaneGraph) -> None:
         ("stop_lane", 0, size["L"]),
         ("stop_signal", 0, size["S"]),
         ("kind", 0, len(LaneType)),
+        ("sign_kind", 0, len(SignKind)),
+        ("rule_sign", 0, size["G"]),
+        ("rule_lane", 0, size["L"]),
     ):
         value = getattr(graph, name)
         require(bool(((value >= low) & (value < high)).all()), f"{name} points outside the table")
@@ -201,12 +228,12 @@ def load_graph(path: Path | str) -> LaneGraph:
     header = arrays.pop("header", None)
     if header is None or header.shape != (2,) or str(header[0]) != f"ssad-lane-graph {FORMAT}":
         raise MapError(f"{source}: not a baked town of format {FORMAT}; {mend}")
-    if set(arrays) != set(_DTYPES):
-        wrong = ", ".join(sorted(set(arrays) ^ set(_DTYPES)))
+    wrong = ", ".join(sorted((set(_DTYPES) - _OPTIONAL - set(arrays)) | (set(arrays) - set(_DTYPES))))
+    if wrong:
         raise MapError(f"{source}: missing or unknown arrays: {wrong}; {mend}")
-    for name, dtype in _DTYPES.items():
-        if arrays[name].dtype != dtype:
-            raise MapError(f"{source}: array {name} is {arrays[name].dtype}; {mend}")
+    for name, value in arrays.items():
+        if value.dtype != _DTYPES[name]:
+            raise MapError(f"{source}: array {name} is {value.dtype}; {mend}")
     return LaneGraph(name=str(header[1]), **arrays)
 
 

@@ -216,9 +216,24 @@ class Annotated(Protocol):
     def truth(self) -> Sequence[Truth]: ...
 
 
-def score_2d(detector: Detector, data: Annotated, *, device: str = "cpu", batch: int = 32) -> dict[str, float]:
-    """AP50 of each class that there is in annotated pictures, and their mean."""
+def score_2d(
+    detector: Detector, data: Annotated, *, classes: Sequence[str] | None = None, device: str = "cpu", batch: int = 32
+) -> dict[str, float]:
+    """AP50 of each class of the detector that there is in annotated pictures, and their mean.
+
+    Args:
+        detector: What is scored. Objects of classes that it does not know are left out.
+        data: Pictures and their truth.
+        classes: Names of the labels of the truth; those of the detector if None.
+        device: Where the detector is.
+        batch: Pictures at once.
+
+    Returns:
+        AP50 (the mean) and AP50_NAME.
+    """
     names = detector.classes
+    index = {name: k for k, name in enumerate(names)}
+    own = np.array([index.get(name, -1) for name in (names if classes is None else classes)], np.int32)
     found: list[tuple[int, Detections]] = []
     for start in range(0, len(data.truth), batch):
         images = data.pictures[start : start + batch].to(device).permute(0, 3, 1, 2).float() / 255
@@ -234,11 +249,12 @@ def score_2d(detector: Detector, data: Annotated, *, device: str = "cpu", batch:
         rows([one.score for _, one in found]),
     )  # fmt: skip
     crowd = [torch.zeros(len(t.label), dtype=torch.bool) if t.crowd is None else t.crowd for t in data.truth]
+    image = np.repeat(np.arange(len(data.truth)), [len(t.label) for t in data.truth]).astype(np.int32)
+    label = own[rows([t.label for t in data.truth]).astype(np.int32)]
+    known = label >= 0
     real = Boxes2D(
-        np.repeat(np.arange(len(data.truth)), [len(t.label) for t in data.truth]).astype(np.int32),
-        rows([t.label for t in data.truth]).astype(np.int32), rows([t.box for t in data.truth], 4),
-        ignore=rows(crowd).astype(bool),
-    )  # fmt: skip
+        image[known], label[known], rows([t.box for t in data.truth], 4)[known], ignore=rows(crowd).astype(bool)[known]
+    )
     ap = average_precision(real, predicted, labels=len(names))
-    known = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}
-    return {"AP50": float(np.mean(list(known.values()))) if known else 0.0} | known
+    each = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}
+    return {"AP50": float(np.mean(list(each.values()))) if each else 0.0} | each

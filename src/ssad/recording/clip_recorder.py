@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 import cv2
 import numpy as np
 
-from ssad.assets.actor_bodies import class_of
+from ssad.assets.actor_bodies import BODY_CATEGORIES, PLAIN_CLASSES, class_of
 from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.assets.mesh import Point
 from ssad.camera.labels import label_picture
@@ -44,7 +44,8 @@ from ssad.recording.target import TargetCar
 from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
 from ssad.roads import load_town, town_names
 
-CLASSES: Final = MMDET3D_CLASSES  # category ids are 1 and more in this order
+CLASSES: Final = (*MMDET3D_CLASSES, *PLAIN_CLASSES)  # category ids are 1 and more in this order
+BEHIND: Final = 75.0  # degrees from the front of a sign from which its face is hardly seen: it is crowd then
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
 DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
@@ -142,7 +143,7 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     graph = load_town(town)
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
-    cast = place_objects(trace, graph, street, key=key)
+    cast = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
     if clips.target is not None:
         targets: tuple[ObjectBody, ...] = (_named(cast, clips.target),)
     else:
@@ -271,6 +272,19 @@ def _take(
             yield n, row | shot.about, picture.image[index]
 
 
+def label_of(kind: str) -> int | None:
+    """Index into `CLASSES` of a kind of body; None for what is background."""
+    if kind in PLAIN_CLASSES:
+        return CLASSES.index(kind)
+    return CLASSES.index(class_of(kind)) if kind in BODY_CATEGORIES else None
+
+
+def faces(sign: F64, eye: F64) -> bool:
+    """Whether the front of a sign of pose [4, 4] can be read from a place [3]: not from behind or far from aside."""
+    ahead, left, _ = sign[:3, :3].T @ (eye - sign[:3, 3])
+    return bool(abs(np.degrees(np.arctan2(left, ahead))) < BEHIND)
+
+
 def _camera(size: int) -> Camera:
     middle, focal = size / 2, FOCAL * size
     return Camera(size, size, np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1.0]]))
@@ -313,10 +327,13 @@ def _annotate(
     objects = []
     for n, tag in enumerate(labels.tag.tolist()):
         who = at[tag]
-        if who.body.kind:
+        label = label_of(who.body.kind)
+        if label is not None:
+            if who.body.kind in PLAIN_CLASSES:
+                crowd[n] |= not faces(who.pose, view.pose[:3, 3])
             middle = who.pose[:3, 3] + [0.0, 0.0, who.body.size[2] / 2]
             objects.append(
-                {"label": CLASSES.index(class_of(who.body.kind)), "box": labels.box[n].tolist(),
+                {"label": label, "box": labels.box[n].tolist(),
                  "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
                  "visible": round(float(labels.share[n]), 3),
                  "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}

@@ -155,7 +155,7 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     seconds, streets = recording.seconds + 0.2, recording.streets
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive(episode, graph)
-    cast = place_objects(trace, graph, street, key=key, streets=streets)
+    cast = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
     stage = Scene(street, cast.meshes, device=recording.device)
     weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
@@ -295,8 +295,8 @@ class _Files:
 
 
 def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[int, float]) -> list[dict[str, Any]]:
-    """Boxes within reach that are seen by a camera or hit by the LiDAR."""
-    near = [s for s in around if np.hypot(*(s.pose[:2, 3] - ego[:2, 3])) < REACH]
+    """Boxes of what nuScenes has a category for, within reach and seen by a camera or hit by the LiDAR."""
+    near = [s for s in around if s.body.kind in BODY_CATEGORIES and np.hypot(*(s.pose[:2, 3] - ego[:2, 3])) < REACH]
     if not near:
         return []
     centre = np.array([s.pose[:3, 3] + [0, 0, s.body.size[2] / 2] for s in near])

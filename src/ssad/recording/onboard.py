@@ -9,7 +9,7 @@ import numpy as np
 
 from ssad.assets.actor_bodies import ACTOR_BODIES, plain_body
 from ssad.assets.bodies import draw_paint, make_body
-from ssad.assets.mesh import Mesh
+from ssad.assets.mesh import Mesh, merge
 from ssad.assets.street import cached_street
 from ssad.camera.render import View, Weather, render
 from ssad.camera.scene import Scene, Thing
@@ -19,6 +19,8 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, U8, EpisodeTrace
+from ssad.recording.scene_objects import Clear
+from ssad.recording.street_signs import street_signs
 from ssad.world.models import MODELS
 
 
@@ -68,15 +70,21 @@ def moments(trace: EpisodeTrace) -> list[int]:
 
 def onboard_sheet(trace: EpisodeTrace, graph: LaneGraph, *, width: int = 640) -> U8:
     """Three moments, camera left, view from above right."""
-    stage = Scene(cached_street(graph), cast(trace))
+    street, bodies = cached_street(graph), cast(trace)
+    way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1).astype(np.float64)
+    found = street_signs(graph, way, Clear(street), key=(trace.key,), many=False, detail=1)
+    signs = [(merge([one.plate, one.post]), one.pose) for one in found]
+    standing = tuple(Thing(len(bodies) + n, upright_pose(*pose)) for n, (_, pose) in enumerate(signs))
+    stage = Scene(street, [*bodies, *(mesh for mesh, _ in signs)])
     front = Camera.typical(width, width * 9 // 16)
     rows = []
     for step in moments(trace):
         pose = upright_pose(float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
         over, over_pose = above(pose, 42.0, front.width, front.height)
         weather = Weather(0.9, 2.2, 0.3)
-        seen = render(stage, [View(front, pose @ FORWARD, things_at(trace, step, ego=False), weather)]).image[0]
-        top = render(stage, [View(over, over_pose, things_at(trace, step, ego=True), weather)]).image[0]
+        ahead = View(front, pose @ FORWARD, (*things_at(trace, step, ego=False), *standing), weather)
+        seen = render(stage, [ahead]).image[0]
+        top = render(stage, [View(over, over_pose, (*things_at(trace, step, ego=True), *standing), weather)]).image[0]
         text = f"{step * trace.dt:.1f} s, {trace.speed[step, 0]:.1f} m/s"
         rows.append(np.hstack([captioned(seen, text, width), captioned(top, "from above", width)]))
     return np.vstack(rows)

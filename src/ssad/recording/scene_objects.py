@@ -18,6 +18,7 @@ from ssad.core.rotations import upright_pose, wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import F64, Bool, EpisodeTrace, LaneType
 from ssad.recording.drives import thinned
+from ssad.recording.street_signs import street_signs
 from ssad.world.models import MODELS
 
 Size = tuple[float, float, float]  # length, width, height
@@ -153,16 +154,17 @@ class Clear:
 
 def place_objects(
     trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1,
-    streets: str = "town",
+    streets: str = "town", many_signs: bool = False,
 ) -> SceneObjects:  # fmt: skip
     """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way; streets:
-    see `ssad.recording.drives.thinned`."""
+    see `ssad.recording.drives.thinned`; many_signs: see `ssad.recording.street_signs.street_signs`."""
     cast = SceneObjects(trace.dt, key, detail)
     _agents(cast, trace)
     way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
     clear = Clear(street)
     _kerb(cast, graph, street, way, clear, thinned({kind: PARKED[kind][0] for kind in PARKED}, streets))
     _sidewalks(cast, graph, way, clear, len(trace.x))
+    _signs(cast, graph, way, clear, many=many_signs)
     return cast
 
 
@@ -322,6 +324,17 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                     if clear.footprint(qx, qy, 0.0, 0.5, 0.5):
                         turn += (np.pi / 2 if kind == "barrier" and along else 0.0) + float(draws.normal(0.0, ASKEW))
                         cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
+
+
+def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many: bool) -> None:
+    """Stop and yield signs: the plate is the body with a kind, the post one without."""
+    for body in cast.bodies:
+        if len(body.track) == 1:
+            x, y, yaw, _ = body.track[0].tolist()
+            clear.take(x, y, yaw, *body.size[:2])
+    for one in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
+        for kind, mesh in ((one.kind, one.plate), ("", one.post)):
+            cast.add((kind, one.style, one.size, (cast.mesh(mesh),)), _still(*one.pose))
 
 
 def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:

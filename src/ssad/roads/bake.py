@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ssad.core.errors import MapError, install_extra
 from ssad.core.lane_graph import LaneGraph, Marking, save_graph
 from ssad.core.types import F64, I32, LaneType
-from ssad.roads.signals import Approaches, place_signals
+from ssad.roads.signals import Approaches, place_signals, place_signs
 from ssad.roads.xodr import Connection, Lane, Link, Network, Road, read_network
 
 TIMEOUT = 120.0  # s; Town05 takes about 3
@@ -197,6 +197,7 @@ def _assemble(name: str, network: Network, shapes: dict[Key, _Shape], answer: An
         crosswalk_offset=np.concatenate([[0], np.cumsum(corner_count)]),
         crosswalk_xy=walk[:, 1:],
         **place_signals(approaches),
+        **place_signs(approaches),
     )
 
 

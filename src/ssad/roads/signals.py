@@ -1,4 +1,4 @@
-"""Where signals stand, which lanes they stop, and which are green together."""
+"""Where signals and signs stand, which lanes they stop, and which signals are green together."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Approaches:
     width: F64
     line: list[tuple[F64, F64]]  # xy [., 2], s [.]
     crosswalks: list[F64]
-    lights: dict[str, list[float]]  # x, y, yaw
+    lights: dict[str, list[float]]  # x, y, yaw of signals of any kind
 
 
 @dataclass
@@ -83,6 +83,64 @@ def place_signals(data: Approaches) -> dict[str, Any]:
         "stop_lane": line[:, 1].astype(np.int32),
         "stop_s": line[:, 2],
     }
+
+
+def place_signs(data: Approaches) -> dict[str, Any]:
+    """The sign and rule arrays of a LaneGraph: the stop and yield signs of the map that stand at junctions.
+
+    A sign rules the lanes of one approach: those that the map names, by road and direction or by the connecting lanes
+    behind them; where it names several approaches, the one that ends nearest to the sign.
+    """
+    before: dict[int, list[int]] = {}
+    for i, found in enumerate(data.links):
+        for j in found:
+            before.setdefault(j, []).append(i)
+    named: dict[str, set[int]] = {}
+    for i, (road, _, lane) in enumerate(data.keys):
+        for place in data.network.roads[road].signs:
+            ahead = place.way == 0 or place.way * lane < 0
+            if place.sign not in data.network.signs or not ahead:
+                continue
+            if place.low == 0 == place.high or place.low <= lane <= place.high:
+                named.setdefault(place.sign, set()).update([i] if data.junction[i] < 0 else before.get(i, []))
+    signs: list[tuple[float, float, float, int]] = []
+    rules: list[tuple[int, int, float]] = []
+    for sign in sorted(named, key=lambda name: (len(name), name)):
+        lanes = _approach(data, sign, named[sign])
+        if not lanes:
+            continue
+        outer = min(lanes, key=lambda i: -abs(data.keys[i][2]))
+        x, y, yaw = data.end[outer]
+        if sign in data.lights:
+            x, y = data.lights[sign][:2]
+        else:
+            aside = 0.5 * data.width[outer] + 1.0
+            x, y = x + aside * np.sin(yaw), y - aside * np.cos(yaw)
+        rules += [(len(signs), lane, _stop(data, lane)) for lane in lanes]
+        signs.append((x, y, yaw, int(data.network.signs[sign])))
+    table = np.array(signs, np.float64).reshape(-1, 4)
+    ruled = np.array(rules, np.float64).reshape(-1, 3)
+    return {
+        "sign_kind": table[:, 3].astype(np.uint8),
+        "sign_xy": table[:, :2],
+        "sign_yaw": table[:, 2],
+        "rule_sign": ruled[:, 0].astype(np.int32),
+        "rule_lane": ruled[:, 1].astype(np.int32),
+        "rule_s": ruled[:, 2],
+    }
+
+
+def _approach(data: Approaches, sign: str, named: set[int]) -> list[int]:
+    """Of the lanes that a sign is for, those of one approach to a junction."""
+    ways: dict[tuple[int, bool], list[int]] = {}
+    for i in sorted(named):
+        leads_in = any(data.junction[j] >= 0 and data.kind[j] == LaneType.DRIVING for j in data.links[i])
+        if data.kind[i] == LaneType.DRIVING and data.junction[i] < 0 and leads_in:
+            ways.setdefault((data.keys[i][0], data.keys[i][2] < 0), []).append(i)
+    if len(ways) < 2 or sign not in data.lights:
+        return next(iter(ways.values()), [])
+    x, y = data.lights[sign][:2]
+    return min(ways.values(), key=lambda lanes: min(np.hypot(*(data.end[i, :2] - [x, y])) for i in lanes))
 
 
 def _arms(data: Approaches) -> dict[int, list[_Approach]]:

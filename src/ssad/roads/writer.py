@@ -11,6 +11,9 @@ Point = tuple[float, float]
 CLEARANCE = 8.0  # m from the outer edge of the widest arm to the stop lines: sets the radius of right turns
 CROSSWALK = 3.0  # m, width
 CROSSWALK_END = 1.0  # m between a crosswalk and the end of its street
+STOP_LINE = CROSSWALK_END + CROSSWALK + 1.0  # m from the end of a street with a crosswalk to where it is waited
+SIGN_ASIDE = 0.75  # m from the kerb to the post of a sign
+YIELDS = 3  # at every so manieth T-junction without lights the stem yields, elsewhere it stops
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,8 @@ class RoadSpec:
 
 @dataclass(frozen=True)
 class Town:
-    """Streets whose ends meet at junctions; arms leave a junction along the axes. signalled: junction places."""
+    """Streets whose ends meet at junctions; arms leave a junction along the axes. signalled: junction places; all other
+    junctions of three arms or more get signs."""
 
     name: str
     streets: tuple[RoadSpec, ...]
@@ -97,9 +101,14 @@ def write_town(town: Town) -> str:
     for junction in junctions:
         _connect(roads, root, junction)
     places = set(town.signalled)
+    stems = 0
     for junction in junctions:
         if junction.place in places:
             _signals(root, roads, junction, lengths)
+            continue
+        ruled = _ruled(junction)
+        stems += len(ruled) == 1
+        _signs(roads, junction, ruled, lengths, stop=len(ruled) > 1 or stems % YIELDS > 0)
     root[1:1] = roads
     indent(root, " ")
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
@@ -302,6 +311,31 @@ def _signals(root: Element, roads: list[Element], junction: _Junction, lengths: 
         for name in numbers:
             SubElement(controller, "control", signalId=name, type="0")
         root.insert(list(root).index(element), controller)
+
+
+def _ruled(junction: _Junction) -> list[_Arm]:
+    """Arms of a junction without lights that get a sign: all of a crossroads, the stem of a T-junction."""
+    if len(junction.arms) < 3:
+        return []
+    facing = [any(math.cos(a.heading - b.heading) < -0.9 for b in junction.arms) for a in junction.arms]
+    return [arm for arm, faced in zip(junction.arms, facing, strict=True) if all(facing) or not faced]
+
+
+def _signs(
+    roads: list[Element], junction: _Junction, ruled: list[_Arm], lengths: dict[int, float], *, stop: bool
+) -> None:
+    """A stop or yield sign for each of the arms, beside the line where it is waited."""
+    name, kind = ("Sign_Stop", "206") if stop else ("Sign_Yield", "205")
+    for k, arm in enumerate(ruled):
+        aside = arm.street.lanes * arm.street.width + arm.street.shoulder + SIGN_ASIDE
+        back = STOP_LINE if arm.street.sidewalk else 0.1
+        post = SubElement(roads[arm.road - 1][-1], "signal", name=name, id=str(junction.id + 700 + k),
+                          s=_f(lengths[arm.road] - back if arm.at_end else back), t=_f(-aside if arm.at_end else aside),
+                          zOffset="0", hOffset="0", roll="0", pitch="0", orientation="+" if arm.at_end else "-",
+                          dynamic="no", country="OpenDRIVE", type=kind, subtype="-1", value="-1", text="",
+                          height="0.76", width="0.76")  # fmt: skip
+        low, high = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
+        SubElement(post, "validity", fromLane=str(low), toLane=str(high))
 
 
 def _edge(junction: _Junction, arm: _Arm, offset: float, *, inward: bool) -> Point:

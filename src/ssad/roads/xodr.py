@@ -6,12 +6,12 @@ Geometry is not evaluated here; that is `carla.Map`'s work (see `bake`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from ssad.core.errors import FormatError, MapError
-from ssad.core.lane_graph import Marking
+from ssad.core.lane_graph import Marking, SignKind
 from ssad.core.safeio import MIB, read_xml
 from ssad.core.types import LaneType
 
@@ -25,6 +25,8 @@ MAX_TOTAL = 1.0e6  # m, of all roads: bounds the work of the reader
 MAX_CURVATURE = 10.0  # 1/m
 PLANS = ("line", "arc", "spiral", "poly3", "paramPoly3")
 TRAFFIC_LIGHT = "1000001"
+SIGNS = {"206": SignKind.STOP, "205": SignKind.YIELD}  # types of signals that stand still
+STENCIL = "Stencil"  # names of paint on the road, to which CARLA's maps give the type of a sign, begin with it
 
 _KINDS = {
     name: kind
@@ -96,8 +98,19 @@ class SignalPlace:
 
 
 @dataclass(frozen=True)
+class SignPlace:
+    """A stop or yield sign, or a reference to one, on a road: for traffic along the road (way 1), against it (-1) or
+    both (0), on the lanes from low to high (0, 0: all)."""
+
+    sign: str
+    way: int
+    low: int
+    high: int
+
+
+@dataclass(frozen=True)
 class Road:
-    """A road: its sections, where its ends lead, and the lights on it."""
+    """A road: its sections, where its ends lead, and the lights and signs on it."""
 
     id: int
     junction: int
@@ -106,6 +119,7 @@ class Road:
     predecessor: Link | None
     successor: Link | None
     lights: tuple[SignalPlace, ...]
+    signs: tuple[SignPlace, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -121,12 +135,13 @@ class Connection:
 @dataclass(frozen=True)
 class Network:
     """What an OpenDRIVE file says besides geometry. phase: light id -> place of its controller in the
-    cycle."""
+    cycle; signs: id -> what the sign says."""
 
     roads: dict[int, Road]
     junctions: dict[int, tuple[Connection, ...]]
     lights: tuple[str, ...]
     phase: dict[str, int]
+    signs: dict[str, SignKind] = field(default_factory=dict)
 
 
 class _Reader:
@@ -201,7 +216,9 @@ class _Reader:
             for control in element.findall("control"):
                 sequence = element.get("sequence", "0")
                 phase.setdefault(control.get("signalId", ""), int(sequence) if sequence.isdigit() else 0)
-        return Network(roads, junctions, tuple(dict.fromkeys(lights)), phase)
+        signs = {s.get("id", ""): SIGNS[s.get("type", "")] for r in root.findall("road")
+                 for s in r.findall("signals/signal") if _sign(s)}  # fmt: skip
+        return Network(roads, junctions, tuple(dict.fromkeys(lights)), phase, signs)
 
     def road(self, element: Element) -> Road:
         where = f"road {element.get('id')}"
@@ -238,6 +255,7 @@ class _Reader:
             predecessor=self.link(element, "predecessor", where),
             successor=self.link(element, "successor", where),
             lights=tuple(_places(element)),
+            signs=tuple(_sign_places(element)),
         )
 
     def link(self, road: Element, name: str, where: str) -> Link | None:
@@ -342,13 +360,31 @@ def _light(signal: Element) -> bool:
     return signal.get("type") == TRAFFIC_LIGHT and signal.get("dynamic") == "yes"
 
 
+def _sign(signal: Element) -> bool:
+    return signal.get("type") in SIGNS and not signal.get("name", "").startswith(STENCIL)
+
+
+def _sign_places(road: Element) -> list[SignPlace]:
+    """Signs on a road, and references, which may be to signals of any kind."""
+    found = []
+    for element in [*road.findall("signals/signal"), *road.findall("signals/signalReference")]:
+        if element.tag == "signal" and not _sign(element):
+            continue
+        way = {"+": 1, "-": -1}.get(element.get("orientation", "none"), 0)
+        found += [SignPlace(element.get("id", ""), way, low, high) for low, high in _spans(element)]
+    return found
+
+
+def _spans(signal: Element) -> list[tuple[int, int]]:
+    """Lanes that a signal is for, lowest and highest of each range; 0, 0 for all."""
+    spans = [(int(v.get("fromLane", "0")), int(v.get("toLane", "0"))) for v in signal.findall("validity")]
+    return [(min(span), max(span)) for span in spans] or [(0, 0)]
+
+
 def _places(road: Element) -> list[SignalPlace]:
     found = []
     for element in [*road.findall("signals/signal"), *road.findall("signals/signalReference")]:
         if element.tag == "signal" and not _light(element):
             continue
-        spans = [(int(v.get("fromLane", "0")), int(v.get("toLane", "0"))) for v in element.findall("validity")] or [
-            (0, 0)
-        ]
-        found += [SignalPlace(element.get("id", ""), min(span), max(span)) for span in spans]
+        found += [SignalPlace(element.get("id", ""), low, high) for low, high in _spans(element)]
     return found

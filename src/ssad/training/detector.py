@@ -305,11 +305,11 @@ def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[s
             if folder.name not in banks:
                 banks[folder.name] = fill(coco_items(folder, split)[1], device=device)
             bank = banks[folder.name]
-            scores = score_2d(detector, bank, device=device)
-            found |= {f"{folder.name}_{name}": value for name, value in scores.items()}
             data = read_coco(folder / "annotations" / f"{split}.json")
+            scores = score_2d(detector, bank, classes=data.classes, device=device)
+            found |= {f"{folder.name}_{name}": value for name, value in scores.items()}
             aimed = PictureSet(bank.pictures, tuple(coco_truth(data, target=True)))
-            found[f"{folder.name}_target_AP50"] = score_2d(detector, aimed, device=device)["AP50"]
+            found[f"{folder.name}_target_AP50"] = score_2d(detector, aimed, classes=data.classes, device=device)["AP50"]
         return found
 
     return check_2d

@@ -86,9 +86,15 @@ BODIES: dict[str, Body] = {
         "curved": BodyStyle((2.20, 0.34, 8.50), 0.06), "straight": BodyStyle((1.80, 0.34, 7.50), 0.06),
     }),
     "sign": Body(furniture.sign, {
-        "stop": BodyStyle((0.10, 0.76, 2.85), 0.02), "yield": BodyStyle((0.10, 0.85, 2.75), 0.02),
         "limit": BodyStyle((0.10, 0.66, 2.80), 0.02), "warning": BodyStyle((0.10, 0.85, 2.75), 0.02),
         "direction": BodyStyle((0.10, 1.80, 3.60), 0.02),
+    }),
+    "stop_sign": Body(furniture.stop_sign, {
+        "standard": BodyStyle((0.08, 0.76, 2.86), 0.03, 4.0), "large": BodyStyle((0.10, 0.89, 3.02), 0.02, 1.0),
+        "all_way": BodyStyle((0.08, 0.76, 2.92), 0.03, 1.5), "worn": BodyStyle((0.08, 0.70, 2.78), 0.06, 1.5),
+    }),
+    "yield_sign": Body(furniture.yield_sign, {
+        "standard": BodyStyle((0.08, 0.90, 2.90), 0.03, 3.0), "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
     }),
 }  # fmt: skip
 

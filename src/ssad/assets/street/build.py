@@ -23,7 +23,7 @@ from ssad.core.safeio import home
 from ssad.core.seeding import generator
 from ssad.roads.library import load_town
 
-REVISION = 1  # of what is built: a cached street of another revision is not used
+REVISION = 2  # of what is built: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
@@ -80,7 +80,8 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
     name = style_of(graph.name, style)
     what = hashlib.sha256(f"{FORMAT} {REVISION} {graph.name} {seed} {name}".encode())
     for key in ("xy", "width", "offset", "kind", "junction", "left", "right", "left_marking", "right_marking",
-                "signal_xy", "signal_yaw", "signal_virtual", "stop_s", "stop_lane", "crosswalk_xy"):  # fmt: skip
+                "signal_xy", "signal_yaw", "signal_virtual", "stop_s", "stop_lane", "crosswalk_xy", "sign_xy",
+                "sign_kind", "rule_sign", "rule_lane"):  # fmt: skip
         what.update(getattr(graph, key).tobytes())
     path = home() / "cache" / "streets" / f"{what.hexdigest()[:24]}.npz"
     if path.exists():

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ssad.assets.street.free_ground import FreeGround, Side
+from ssad.assets.street.free_ground import CELL, FreeGround, Side
 from ssad.assets.street.furniture import bench, bollard, lamp, litter_bin, planter, shelter, sign, signal_mast
 from ssad.assets.street.model import NEAR
 from ssad.assets.street.palette import Look
@@ -52,10 +52,17 @@ def _kerb(side: Side) -> float:
 
 
 def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Look, masts: Masts) -> None:
-    """Masts at the signals of the map, turned to their approach; signs where a junction has none."""
+    """Masts at the signals of the map, turned to their approach; give-way signs where a junction has none.
+
+    The stop and yield signs of the map are bodies of their own: only their ground is taken here.
+    """
+    for x, y in graph.sign_xy.astype(float).tolist():
+        site.take([(x + u, y + v) for u in (-CELL, 0.0, CELL) for v in (-CELL, 0.0, CELL)])
+    ruled = np.isin(graph.stop_lane, graph.rule_lane)
+    signed = set(graph.signal_junction[graph.stop_signal[ruled]].tolist())
     posts = {reach: signal_mast(look, reach) for reach in (0.0, 4.2)}
     lanes = np.bincount(graph.stop_signal, minlength=len(graph.signal_xy))
-    give_way, stop = sign("give_way", look), sign("stop", look)
+    give_way = sign("give_way", look)
     for k, (x, y) in enumerate(graph.signal_xy.astype(float).tolist()):
         yaw = float(graph.signal_yaw[k]) + np.pi
         # a little further from the road where the map is too close to it
@@ -64,8 +71,8 @@ def signals(soup: TriangleBuilder, graph: LaneGraph, site: FreeGround, look: Loo
             continue
         if graph.signal_virtual[k]:
             # lower phases are the main road
-            if graph.signal_phase[k] > 0:
-                soup.place(stop if look.generator.random() < 0.3 else give_way, [(*spot, KERB, yaw)])
+            if graph.signal_phase[k] > 0 and graph.signal_junction[k] not in signed:
+                soup.place(give_way, [(*spot, KERB, yaw)])
                 site.take([spot])
             continue
         post = posts[4.2 if lanes[k] > 1 else 0.0]

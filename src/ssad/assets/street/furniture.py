@@ -96,13 +96,12 @@ def signal_mast(look: Look, reach: float) -> SignalMast:
 
 
 def sign(kind: str, look: Look) -> Piece:
-    """A traffic sign on a post, facing along x: give_way, stop, limit, crossing, parking."""
+    """A traffic sign on a post, facing along x: give_way, limit, crossing, parking."""
     s = look.sign
     parts = [cylinder((0.035, 0.035), (0.0, 2.75), look.metal, sides=5, levels=VISIBLE)]
     z, turn = 2.35, np.pi / 2
     shapes: dict[str, list[tuple[float, int, float, int]]] = {  # radius, sides, turn, material
         "give_way": [(0.48, 3, -turn, s["red"]), (0.30, 3, -turn, s["white"])],
-        "stop": [(0.42, 8, np.pi / 8, s["white"]), (0.385, 8, np.pi / 8, s["red"])],
         "limit": [(0.36, 16, 0.0, s["red"]), (0.275, 16, 0.0, s["white"])],
         "crossing": [(0.46, 4, np.pi / 4, s["blue"]), (0.34, 3, turn, s["white"])],
         "parking": [(0.44, 4, np.pi / 4, s["blue"])],
@@ -115,12 +114,6 @@ def sign(kind: str, look: Look) -> Piece:
     faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
     parts.append(Piece(away, faces, -back.normals, uv, back.material, back.levels))
     bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
-        "stop": [
-            (-0.26, -0.07, -0.16, 0.07),
-            (-0.12, -0.07, -0.04, 0.07),
-            (0.02, -0.07, 0.12, 0.07),
-            (0.16, -0.07, 0.26, 0.07),
-        ],
         "limit": [(-0.14, -0.11, -0.03, 0.11), (0.03, -0.11, 0.14, 0.11)],
         "parking": [(-0.1, -0.18, -0.03, 0.18), (-0.03, 0.0, 0.12, 0.18)],
     }

@@ -10,7 +10,7 @@ from ssad.assets.street.model import MID, NEAR
 from ssad.assets.street.palette import Look
 from ssad.assets.street.paving import Edge, lane_edge, ribbon
 from ssad.assets.street.triangles import TriangleBuilder, flat
-from ssad.core.lane_graph import LaneGraph, Marking
+from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import LaneType
 
 PAINT = 0.008  # m above the road
@@ -36,11 +36,13 @@ def paint(soup: TriangleBuilder, graph: LaneGraph, look: Look) -> None:
     for lane in driving:
         _lines(soup, graph, lane, look)
         _worn(soup, graph, lane, look)
+    stopped = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
     for signal, lane, s in zip(
         graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s.tolist(), strict=True
     ):
         if graph.kind[lane] == LaneType.DRIVING:
-            _stop(soup, graph, lane, s, give_way=bool(graph.signal_virtual[signal]), look=look)
+            give_way = bool(graph.signal_virtual[signal]) and lane not in stopped
+            _stop(soup, graph, lane, s, give_way=give_way, look=look)
     for k in range(len(graph.crosswalk_offset) - 1):
         _crosswalk(soup, graph.crosswalk(k).astype(np.float64), look)
 
@@ -122,7 +124,8 @@ def _paint(soup: TriangleBuilder, corners: F64, material: int, *, z: float = PAI
 
 
 def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_way: bool, look: Look) -> None:
-    """A stop line across a lane; where no signal stands, the teeth of a give-way line; arrows on multi-lane arms."""
+    """A stop line across a lane; where no signal or stop sign stands, the teeth of a give-way line; arrows on
+    multi-lane arms."""
     x, y, yaw, width = graph.at(lane, s)
     half = 0.5 * width - 0.12
     if give_way:
