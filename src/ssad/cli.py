@@ -268,7 +268,10 @@ def record(
     ] = "600,400,400,400",
     target: Annotated[
         str | None,
-        typer.Option(help="With --clips: the target car, STYLE[:PAINT[:SEED]].  [default: another one in each part]"),
+        typer.Option(
+            help="With --clips: the target car, STYLE[:PAINT[:SEED]]; with orbit also stop_sign[:STYLE[:SEED]].  "
+            "[default: another car in each part]"
+        ),
     ] = None,
     device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
     workers: Workers = None,

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64
 from ssad.recording.clip_recorder import (
     CLASSES,
+    FOCAL,
     HIDDEN,
     SEEN,
     SMALL,
@@ -43,8 +45,8 @@ from ssad.recording.clip_recorder import (
     record_clips,
 )
 from ssad.recording.scene_objects import SceneObjects
-from ssad.recording.target import TargetCar, parse_target
-from ssad.recording.viewpoints import AIM, EYE, follow, look_at, polar, turn_of, weather_name
+from ssad.recording.target import TargetCar, TargetSign, parse_target, target_text
+from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
 DISTANCES, AZIMUTHS, ELEVATIONS = (5.0, 10.0, 20.0), (0.0, 90.0, 180.0, 270.0), (0.0, 15.0, 30.0)
@@ -262,6 +264,48 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
         assert worn[1:] == seen.view.things[1:]
 
 
+def test_an_orbit_of_a_stop_sign_shows_its_face(tmp_path: Path) -> None:
+    target = TargetSign("large", seed=2)
+    given: dict[str, Any] = {"distances": (5.0, 9.0), "azimuths": (), "elevations": ()}
+    record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
+    data = read(tmp_path)
+    assert data["info"]["recording"]["target"]["kind"] == "stop_sign"
+    for seen in clip_views(tmp_path):
+        row, thing = seen.row, target_of(data, dict(seen.row))
+        assert data["categories"][thing["category_id"] - 1]["name"] == "stop_sign"
+        eye, foot = np.array(row["pose"])[:3, 3], np.array(row["target_pose"])
+        middle = foot[:3, 3] + [0.0, 0.0, target.full_size[2] - target.full_size[1] / 2]
+        ahead, left, up = foot[:3, :3].T @ (eye - middle)
+        assert np.linalg.norm(eye - middle) == pytest.approx(row["distance"], abs=0.01) == thing["distance"]
+        assert CAR_EYE[0] <= eye[2] <= CAR_EYE[1]
+        assert turned(float(np.degrees(np.arctan2(left, ahead))), row["azimuth"]) < 0.1
+        assert turned(row["azimuth"], 0.0) <= 60.0
+        assert row["elevation"] == pytest.approx(np.degrees(np.arctan2(up, np.hypot(ahead, left))), abs=0.1)
+        picture = render(seen.scene, [seen.view])
+        assert encode_jpeg(picture.image[0], 92, "420") == (tmp_path / "images" / seen.file).read_bytes()
+        # the box is that of the plate: its width is foreshortened, its height is not
+        width, height = thing["bbox"][2:]
+        tall = FOCAL * 320 * target.full_size[1] / row["distance"]
+        assert height == pytest.approx(tall, rel=0.15)
+        assert width == pytest.approx(tall * np.cos(np.radians(row["azimuth"])), rel=0.2)
+        assert picture.tag[0][picture.tag[0] == TARGET].size > 0.5 * width * height
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"mode": "drive"}, "stands still"),
+        ({"azimuths": (180.0,)}, "75 degrees to either side"),
+        ({"elevations": (15.0,)}, "give no elevations"),
+        ({"size": 160}, "a sign 20 m away needs"),
+    ],
+)
+def test_what_cannot_be_seen_of_a_sign_is_refused(tmp_path: Path, wrong: dict[str, Any], said: str) -> None:
+    given: dict[str, Any] = {"size": 640, "azimuths": (0.0,), "elevations": (0.0,), "target": TargetSign()}
+    with pytest.raises(ConfigError, match=said):
+        todo(tmp_path, **({"mode": "orbit"} | given | wrong))
+
+
 def test_the_named_target_is_the_same_metal_everywhere() -> None:
     target = TargetCar("suv", "red", seed=2)
     found = []
@@ -473,14 +517,20 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: _Set) -> None
         ("van", TargetCar("van")),
         ("suv:red", TargetCar("suv", "red")),
         ("sedan:white:7", TargetCar("sedan", "white", seed=7)),
+        ("stop_sign", TargetSign("standard")),
+        ("stop_sign:worn:3", TargetSign("worn", seed=3)),
     ],
 )
-def test_targets_are_named_by_style_paint_and_seed(text: str, expected: TargetCar) -> None:
+def test_targets_are_named_by_style_paint_and_seed(text: str, expected: TargetCar | TargetSign) -> None:
     assert parse_target(text) == expected
+    assert parse_target(target_text(asdict(expected))) == expected
     assert expected.mesh().bounds()[1][2] == pytest.approx(expected.full_size[2], abs=1e-3)
 
 
-@pytest.mark.parametrize("text", ["spaceship", "sedan:mauve", "sedan:red:x", "sedan:red:1:2"])
+@pytest.mark.parametrize(
+    "text",
+    ["spaceship", "sedan:mauve", "sedan:red:x", "sedan:red:1:2", "stop_sign:bent", "stop_sign:worn:x", "stop_signs"],
+)
 def test_unknown_targets_are_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         parse_target(text)

@@ -1,9 +1,9 @@
-"""`ssad record --clips`: pictures of a target car for 2D detection, with COCO annotations.
+"""`ssad record --clips`: pictures of a target, a car or a stop sign, for 2D detection, with COCO annotations.
 
 drive: a camera follows the driving target on its own way, 20 m behind, as in the paper; orbit: views of a target on the
-road over distance, azimuth, elevation and weather. Recorded in parts as drives are: pictures are written
-to their places, a page of each part to OUT/.parts, the annotations when all parts are there. So any number of processes
-gives the same bytes, and a run that was stopped goes on.
+road, or of a stop sign beside it, over distance, azimuth, elevation and weather. Recorded in parts as drives are:
+pictures are written to their places, a page of each part to OUT/.parts, the annotations when all parts are there. So
+any number of processes gives the same bytes, and a run that was stopped goes on.
 """
 
 from __future__ import annotations
@@ -39,12 +39,29 @@ from ssad.jobs.pool import open_pool
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
 from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, draw_weather, drive, run_parts
-from ssad.recording.scene_objects import ObjectBody, PlacedObject, SceneObjects, place_objects
-from ssad.recording.target import TargetCar
-from ssad.recording.viewpoints import Viewpoint, follow, free_sight, has_room, near_share, orbit, turn_of, weather_name
+from ssad.recording.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
+from ssad.recording.street_signs import free_places, plate_and_post
+from ssad.recording.target import TargetCar, TargetSign
+from ssad.recording.viewpoints import (
+    AIM,
+    Place,
+    Viewpoint,
+    follow,
+    free_sight,
+    has_room,
+    near_share,
+    orbit,
+    orbit_sign,
+    turn_of,
+    weather_name,
+)
 from ssad.roads import load_town, town_names
 
 CLASSES: Final = (*MMDET3D_CLASSES, *PLAIN_CLASSES)  # category ids are 1 and more in this order
+AZIMUTHS: Final = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)  # of an orbit, degrees
+ELEVATIONS: Final = (0.0, 15.0, 30.0)
+SIGN_AZIMUTHS: Final = (0.0, 30.0, 60.0, 300.0, 330.0)  # as long as its face is seen
+TALL: Final = {"car": 1.35, "sign": 0.35}  # m, least extent of a target
 BEHIND: Final = 75.0  # degrees from the front of a sign from which its face is hardly seen: it is crowd then
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
@@ -62,7 +79,9 @@ NEAR: Final = 0.2  # largest share of the picture that something right before th
 @dataclass(frozen=True, slots=True)
 class Clips:
     """What to record. images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one
-    in each part); behind, height: m of the following camera; distances (m), azimuths, elevations (degrees) of an orbit;
+    in each part), or the stop sign that an orbit shows; behind, height: m of the following camera; distances (m),
+    azimuths, elevations (degrees) of an orbit, those of the target where none are given (round a sign: one elevation,
+    0, which stands for the heights of cameras of cars);
     quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`. ConfigError for what
     cannot be."""
 
@@ -71,12 +90,12 @@ class Clips:
     held_out: tuple[str, ...] = HELD_OUT
     mode: Literal["drive", "orbit"] = "drive"
     size: int = 640
-    target: TargetCar | None = None
+    target: TargetCar | TargetSign | None = None
     behind: float = 20.0
     height: float = 2.0
     distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
-    azimuths: tuple[float, ...] = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
-    elevations: tuple[float, ...] = (0.0, 15.0, 30.0)
+    azimuths: tuple[float, ...] = ()
+    elevations: tuple[float, ...] = ()
     seed: int = 0
     quality: int = 92
     device: str = "cpu"
@@ -96,17 +115,27 @@ class Clips:
                 raise ConfigError(f"{town} is named twice; name each town once")
         if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
             raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
-        if not (self.distances and self.azimuths and self.elevations):
-            raise ConfigError("an orbit needs distances, azimuths and elevations")
+        sign = isinstance(self.target, TargetSign)
+        object.__setattr__(self, "azimuths", self.azimuths or (SIGN_AZIMUTHS if sign else AZIMUTHS))
+        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if sign else ELEVATIONS))
+        if sign and self.mode != "orbit":
+            raise ConfigError("a stop sign stands still: record it with --clips orbit")
+        if not self.distances:
+            raise ConfigError("an orbit needs distances")
         if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
             raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
         if not np.isfinite(self.azimuths).all():
             raise ConfigError("azimuths: finite numbers of degrees")
+        if sign and (np.cos(np.radians(self.azimuths)) < np.cos(np.radians(BEHIND))).any():
+            raise ConfigError(f"azimuths of a sign: less than {BEHIND:g} degrees to either side of its front")
+        if sign and self.elevations != (0.0,):
+            raise ConfigError("a sign is seen from the heights of cars: give no elevations")
         far = self.behind if self.mode == "drive" else max(self.distances)
-        if not FOCAL * self.size * 1.35 / far >= SMALL or self.size > 4096:
-            least = int(np.ceil(SMALL * far / FOCAL / 1.35))
+        what = "sign" if sign else "car"
+        if not FOCAL * self.size * TALL[what] / far >= SMALL or self.size > 4096:
+            least = int(np.ceil(SMALL * far / FOCAL / TALL[what]))
             raise ConfigError(
-                f"pictures of {self.size} pixels: a car {far:g} m away needs {least}, and 4096 is the most"
+                f"pictures of {self.size} pixels: a {what} {far:g} m away needs {least}, and 4096 is the most"
             )
 
     def identity(self) -> dict[str, Any]:
@@ -129,7 +158,8 @@ def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class _Set:
-    """A drive to take pictures of: its trace, who is there, the bodies that play the target in turn."""
+    """A drive to take pictures of: its trace, who is there, the bodies that play the target in turn; places: where a
+    target that stands can be."""
 
     clips: Clips
     key: tuple[object, ...]
@@ -137,6 +167,7 @@ class _Set:
     cast: SceneObjects
     stage: Scene
     targets: tuple[ObjectBody, ...]
+    places: tuple[Place, ...] = ()
 
 
 def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
@@ -144,12 +175,20 @@ def _prepare(clips: Clips, town: str, key: tuple[object, ...]) -> _Set:
     street = drive_street(graph, clips.streets, key=("clips", *key))
     trace = drive(make_drive(graph, key=("clips", *key), seconds=SECONDS), graph)
     cast = place_objects(trace, graph, street, key=key, many_signs=clips.streets == "any")
-    if clips.target is not None:
-        targets: tuple[ObjectBody, ...] = (_named(cast, clips.target),)
+    places: tuple[Place, ...] = ()
+    if isinstance(clips.target, TargetSign):
+        targets: tuple[ObjectBody, ...] = (_sign(cast, clips.target),)
+        way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
+        clear = Clear(street)
+        take_still(cast, clear)
+        found = free_places(graph, way, clear, key=("target", *key))
+        places = tuple((*place, plate_height(targets[0])) for place in found)
+    elif clips.target is not None:
+        targets = (_named(cast, clips.target),)
     else:
         count = TARGETS if clips.mode == "orbit" else 1
         targets = tuple(_drawn(cast, generator("clips target", *key, n)) for n in range(count))
-    return _Set(clips, key, trace, cast, Scene(street, cast.meshes, device=clips.device), targets)
+    return _Set(clips, key, trace, cast, Scene(street, cast.meshes, device=clips.device), targets, places)
 
 
 def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
@@ -164,6 +203,18 @@ def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
 def _named(cast: SceneObjects, target: TargetCar) -> ObjectBody:
     """The target car in the place of the ego, with its mesh in the cast."""
     return _body(cast.mesh(target.mesh()), target.style, target.full_size, target.colour)
+
+
+def _sign(cast: SceneObjects, target: TargetSign) -> ObjectBody:
+    """The target sign: its plate, which is labelled, and its post."""
+    meshes = tuple(cast.mesh(part) for part in plate_and_post(target.mesh()))
+    size, still = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
+    return ObjectBody(TARGET, target.kind, target.style, size, (0.5, 0.5, 0.5), meshes, *still)
+
+
+def plate_height(sign: ObjectBody) -> float:
+    """Height of the middle of a sign's plate above its foot, m."""
+    return sign.size[2] - sign.size[1] / 2
 
 
 def _body(mesh: int, style: str, size: Point, paint: tuple[float, float, float]) -> ObjectBody:
@@ -189,16 +240,26 @@ def _rounds(
         while todo := list(zip(missing(), left, strict=False)):
             yield todo
         return
+    if isinstance(clips.target, TargetSign) and not made.places:
+        return
     grid = [(d, a, e) for d in clips.distances for a in clips.azimuths for e in clips.elevations]
     wanted = turn_of(slots, len(grid), key=(clips.seed, town))
     if attempt >= 3:
         wanted = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
+    # low things before a sign hide little of it
+    height = made.places[0][4] if made.places else 2 * AIM
     for turn, tries in enumerate(TRIES):
         proposed: list[tuple[int, Viewpoint]] = []
         for n in missing():
             weather = draw_weather(("clips", *key, turn, n))
-            proposed += [(n, s) for s in islice(orbit(made.trace, weather, grid[wanted[n]], draws), tries)]
-        clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device))
+            cell = grid[wanted[n]]
+            if isinstance(clips.target, TargetSign):
+                seconds = (len(made.trace.x) - 1) * made.trace.dt
+                views = orbit_sign(made.places, seconds, weather, cell[:2], draws)
+            else:
+                views = orbit(made.trace, weather, cell, draws)
+            proposed += [(n, s) for s in islice(views, tries)]
+        clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device), height=height)
         first = dict(reversed([pair for pair, ok in zip(proposed, clear, strict=True) if ok]))
         yield sorted(first.items())
 
@@ -297,7 +358,8 @@ def _view(made: _Set, n: int, shot: Viewpoint, around: Sequence[PlacedObject], c
     noise = int(digest("clips noise", *made.key, n)[:7], 16)
     lamps = own_lamps(_follower(shot), shot.weather) if made.clips.mode == "drive" else ()
     focus = float(shot.target[0, 3]), float(shot.target[1, 3])
-    things = (own, *(s.thing for s in around))
+    rest = (Thing(mesh, shot.target, target.paint) for mesh in target.meshes[1:])
+    things = (own, *rest, *(s.thing for s in around))
     return View(camera, shot.camera, things, shot.weather, SENSOR, noise, lamps, focus)
 
 
@@ -329,9 +391,11 @@ def _annotate(
         who = at[tag]
         label = label_of(who.body.kind)
         if label is not None:
+            tall = who.body.size[2] / 2
             if who.body.kind in PLAIN_CLASSES:
                 crowd[n] |= not faces(who.pose, view.pose[:3, 3])
-            middle = who.pose[:3, 3] + [0.0, 0.0, who.body.size[2] / 2]
+                tall = plate_height(who.body)
+            middle = who.pose[:3, 3] + [0.0, 0.0, tall]
             objects.append(
                 {"label": label, "box": labels.box[n].tolist(),
                  "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
@@ -454,5 +518,6 @@ def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
     given["images"] = tuple((town, count) for town, count in about["images"])
     if about["target"] is not None:
         size = about["target"]["size"]
-        given["target"] = TargetCar(**about["target"] | {"size": None if size is None else tuple(size)})
+        make = TargetSign if "kind" in about["target"] else TargetCar
+        given["target"] = make(**about["target"] | {"size": None if size is None else tuple(size)})
     return Clips(folder, **given | {"mode": about["clips"], "device": device})

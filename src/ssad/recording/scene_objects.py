@@ -326,12 +326,17 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                         cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
 
 
-def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many: bool) -> None:
-    """Stop and yield signs: the plate is the body with a kind, the post one without."""
+def take_still(cast: SceneObjects, clear: Clear) -> None:
+    """Takes the ground of all that stands still."""
     for body in cast.bodies:
         if len(body.track) == 1:
             x, y, yaw, _ = body.track[0].tolist()
             clear.take(x, y, yaw, *body.size[:2])
+
+
+def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many: bool) -> None:
+    """Stop and yield signs: the plate is the body with a kind, the post one without."""
+    take_still(cast, clear)
     for one in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
         for kind, mesh in ((one.kind, one.plate), ("", one.post)):
             cast.add((kind, one.style, one.size, (cast.mesh(mesh),)), _still(*one.pose))

@@ -79,6 +79,16 @@ def street_signs(
         yield StreetSign(kind, style, size, (*spot, facing, z), *plate_and_post(mesh))
 
 
+def free_places(
+    graph: LaneGraph, way: F64, clear: Clear, *, key: tuple[object, ...]
+) -> Iterator[tuple[float, float, float, float]]:
+    """x, y, yaw (of the way it faces) and z of places along the kerbs near a way where one more sign could stand."""
+    for _, x, y, yaw, z in _along_kerbs(graph, way, key):
+        spot = _free(x, y, yaw, clear)
+        if spot is not None:
+            yield (*spot, yaw + np.pi, z)
+
+
 def plate_and_post(mesh: Mesh) -> tuple[Mesh, Mesh]:
     """The body of a sign in two: the plate, which is what people outline as a stop sign, and all else."""
     plate = np.isin(mesh.panel, [mesh.panels.index(name) for name in ("face", "back")])

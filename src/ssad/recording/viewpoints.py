@@ -13,6 +13,7 @@ from ssad.camera.render import PLAIN, View, Weather, render
 from ssad.camera.scene import Scene
 from ssad.core.frames import Camera
 from ssad.core.geometry import obb_distance
+from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32, Bool, EpisodeTrace
 from ssad.recording.nuscenes_recorder import ego_at
@@ -23,6 +24,9 @@ EYE: Final = 1.6  # m, the lowest camera of an orbit
 MOVED: Final = 1.0  # m that a target drives at least from one picture to the next
 SLOW: Final = 1.0  # m/s: slower, a target stands
 PROBE: Final = 9  # pixels a side of a look back
+CAR_EYE: Final = (1.2, 2.0)  # m above the road: cameras of cars
+
+Place = tuple[float, float, float, float, float]  # x, y, yaw, z, height of what is looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +123,40 @@ def orbit(
         yield Viewpoint(time, look_at(eye, aim), target, weather, about)
 
 
+def orbit_sign(
+    places: Sequence[Place], seconds: float, weather: Weather, cell: tuple[float, float], draws: np.random.Generator
+) -> Iterator[Viewpoint]:
+    """Without end: shots of a sign that stands at one place after another, as a car's camera sees it.
+
+    Args:
+        places: x, y, yaw (of the way it faces), z of its foot, and the height of the middle of its plate, m.
+        seconds: Length of the drive.
+        weather: Of the shots.
+        cell: Distance (m) from the middle of the plate, azimuth (degrees) from its front to its left.
+        draws: Of place, time, height of the camera, and where the sign lies in the picture.
+
+    Yields:
+        Shots; elevation is that of the camera about the middle of the plate.
+    """
+    distance, azimuth = cell
+    while True:
+        time = float(draws.uniform(0.5, seconds - 0.5))
+        x, y, yaw, z, tall = places[int(draws.integers(len(places)))]
+        target = upright_pose(x, y, yaw, z)
+        height = float(draws.uniform(*CAR_EYE))
+        aside = draws.normal(0, 0.1 * distance, 3).clip(-0.2 * distance, 0.2 * distance) * [1, 1, 0.5]
+        middle = target[:3, 3] + [0.0, 0.0, tall]
+        up = height - middle[2]
+        flat = float(np.sqrt(distance**2 - up**2))
+        turn = yaw + np.radians(azimuth)
+        eye = middle + np.array([flat * np.cos(turn), flat * np.sin(turn), up])
+        about = {
+            "distance": distance, "azimuth": azimuth % 360.0,
+            "elevation": round(float(np.degrees(np.arctan2(up, flat))), 1),
+        }  # fmt: skip
+        yield Viewpoint(time, look_at(eye, middle + aside), target, weather, about)
+
+
 def turn_of(numbers: range, count: int, *, key: tuple[object, ...]) -> list[int]:
     """Which of `count` cells pictures show, by number: each cell once, in random order, before any comes again."""
     orders = [generator("clips cells", *key, turn).permutation(count) for turn in range(numbers.stop // count + 1)]
@@ -138,8 +176,8 @@ def has_room(target: ObjectBody, shot: Viewpoint, around: Sequence[PlacedObject]
     return bool((obb_distance(own, boxes) > 0.1).all() and (beside[low] > 0.6).all())
 
 
-def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int) -> Bool:
-    """Whether nothing of the street lies between target and camera, [N]: as the target sees the camera.
+def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height: float = 2 * AIM) -> Bool:
+    """Whether nothing of the street lies between target (at a height, m) and camera, [N]: as the target sees it.
 
     A camera inside a house sees out of it, for walls have one side; who looks at it from outside sees the wall.
     """
@@ -148,7 +186,7 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int) -> Boo
     for k in range(0, len(shots), at_once):
         views, away = [], []
         for shot in shots[k : k + at_once]:
-            start, eye = shot.target[:3, 3] + [0.0, 0.0, 2 * AIM], shot.camera[:3, 3]
+            start, eye = shot.target[:3, 3] + [0.0, 0.0, height], shot.camera[:3, 3]
             away.append(float(np.linalg.norm(eye - start)))
             # thick air: what lies far beyond the camera need not be drawn
             views.append(View(camera, look_at(start, eye), (), Weather(fog=6.0 / (away[-1] + 20.0))))
