@@ -16,7 +16,7 @@ from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, build
 from ssad.camera.lamps import Lamp, lamp_strength, lit_circle, near_of, own_lamps
 from ssad.camera.render import PLAIN, Quality, View, Weather, light_of, render
-from ssad.camera.scene import Scene, Thing
+from ssad.camera.scene import Scene, Thing, collect
 from ssad.camera.texture import retexture, taps_of
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
@@ -189,7 +189,7 @@ def test_the_surface_explains_the_picture(scene: Scene) -> None:
 
 def lit_lamps(scene: Scene, view: View) -> Any:
     """The lamps of a view as the kernels get them."""
-    near = near_of(scene, [view])
+    near = near_of(scene, [view], collect([view.things]))
     return near.lamps.numpy()[: len(set(near.lamp_list.numpy()))] if near.lamp_start.numpy()[-1] else []
 
 

@@ -7,7 +7,7 @@ are one thing. Irradiance over pi of one lux is about 1/60, on the scale on whic
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from ssad.core.types import F64, I32
 
 if TYPE_CHECKING:
     from ssad.camera.render import View, Weather
-    from ssad.camera.scene import Scene
+    from ssad.camera.scene import Bodies, Scene
 
 LAMP_SHADOWS = 512  # texels a side of a lamp's shadow map
 LAMP_NEAR = 0.05  # m: what is nearer to a lamp casts no shadow (its own housing)
@@ -99,19 +99,22 @@ def lamp_strength(sun_height: float) -> float:
     return float(np.clip((0.08 - sun_height) / 0.15, 0, 1))
 
 
-def near_of(scene: Scene, views: Sequence[View], *, lamps: bool = True, contact: bool = True) -> Any:
+def near_of(
+    scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool = True, contact: bool = True
+) -> Any:  # fmt: skip
     """Lamps and occluders of B views with their grids, as the kernels read them, without shadow maps.
 
     Args:
         scene: Street and bodies.
         views: What is seen; their own lamps come first, in the order in which their shadow maps are numbered.
+        bodies: The things of the views.
         lamps: Whether by dusk and night those of the street and of bodies are lit, too.
         contact: Whether bodies keep light from the ground.
     """
     near = kernels.Near()
     tables = {
-        "lamp": (kernels.Lamp, _lamps(scene, views) if lamps else _own_lamps(views)),
-        "occluder": (kernels.Occluder, _occluders(scene, views) if contact else _nothing(kernels.Occluder)),
+        "lamp": (kernels.Lamp, _lamps(scene, views, bodies) if lamps else _own_lamps(views)),
+        "occluder": (kernels.Occluder, _occluders(scene, views, bodies) if contact else _nothing(kernels.Occluder)),
     }
     for name, (struct, (rows, places)) in tables.items():
         start, listed = _grid(places, len(views))
@@ -144,7 +147,7 @@ def _own_lamps(views: Sequence[View]) -> Rows:
     return np.array(rows, kernels.Lamp.numpy_dtype()), np.array(places, np.float64).reshape(-1, 4)  # type: ignore[attr-defined]
 
 
-def _lamps(scene: Scene, views: Sequence[View]) -> Rows:
+def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
     """The lamps of views, and by dusk and night those of the street and of bodies that have them lit."""
     found = [_own_lamps(views)]
     strength = np.array([lamp_strength(view.weather.sun_height) for view in views])
@@ -153,25 +156,41 @@ def _lamps(scene: Scene, views: Sequence[View]) -> Rows:
     if len(dark):
         street, circles = scene.kept("street lamps", lambda: _fixed(_street_lamps(scene)))
         away = circles[None, :, :2] - eyes[dark, None]
-        view, lamp = np.nonzero(np.hypot(*np.moveaxis(away, -1, 0)) < LIT_UP_TO)
+        at, lamp = np.nonzero(np.hypot(*np.moveaxis(away, -1, 0)) < LIT_UP_TO)
         rows = street[lamp]
-        rows["light"] *= strength[dark[view], None]
-        found.append((rows, np.column_stack([dark[view], away[view, lamp], circles[lamp, 2]])))
-    who = [(v, t) for v in dark.tolist() for t in views[v].things if t.lit]
-    beams = [scene.kept(("lamps", t.mesh), lambda t=t: _fixed(_beams(scene, t.mesh))) for _, t in who]  # type: ignore[misc]
-    count = [len(rows) for rows, _ in beams]
-    if sum(count):
-        rows, circles = (np.concatenate([beam[k] for beam in beams]) for k in (0, 1))
-        view = np.repeat([v for v, _ in who], count)
-        pose = np.repeat(np.array([t.pose for _, t in who]), count, axis=0)
+        rows["light"] *= strength[dark[at], None]
+        found.append((rows, np.column_stack([dark[at], away[at, lamp], circles[lamp, 2]])))
+    shining = bodies.lit & (strength[bodies.view] > 0.0)
+    shining &= np.hypot(*(bodies.pose[:, :2, 3] - eyes[bodies.view]).T) < LIT_UP_TO
+    view, pose = bodies.view[shining], bodies.pose[shining]
+    beams, beam, owner = _of_meshes(bodies.mesh[shining], lambda mesh: _kept_beams(scene, mesh))
+    if len(beam):
+        rows, circles = (np.concatenate([part[k] for part in beams])[beam] for k in (0, 1))
+        view, pose = view[owner], pose[owner]
         for name in ("across", "down", "ahead", "place"):
             rows[name] = np.einsum("nij,nj->ni", pose[:, :3, :3], rows[name])
         rows["place"] += pose[:, :3, 3]
         rows["light"] *= strength[view, None]
         middle = np.einsum("nij,nj->ni", pose[:, :2, :2], circles[:, :2]) + pose[:, :2, 3] - eyes[view]
-        near = np.hypot(*(pose[:, :2, 3] - eyes[view]).T) < LIT_UP_TO
-        found.append((rows[near], np.column_stack([view, middle, circles[:, 2]])[near]))
+        found.append((rows, np.column_stack([view, middle, circles[:, 2]])))
     return np.concatenate([rows for rows, _ in found]), np.concatenate([places for _, places in found])
+
+
+def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any, Any]:
+    """What belongs to bodies of meshes [N]: rows of each mesh that occurs, one after the other; for each row of each
+    body its place among them, and whose it is."""
+    kinds, kind = np.unique(mesh, return_inverse=True)
+    found = [find(int(number)) for number in kinds]
+    counts = np.array([len(rows) for rows, _ in found], np.int64)
+    count = counts[kind] if len(kinds) else counts
+    owner = np.repeat(np.arange(len(mesh)), count)
+    first = (np.cumsum(counts) - counts)[kind[owner]]
+    return found, first + np.arange(len(owner)) - (np.cumsum(count) - count)[owner], owner
+
+
+def _kept_beams(scene: Scene, mesh: int) -> Rows:
+    """The lamps of a body in its own frame, with their circles."""
+    return scene.kept(("lamps", mesh), lambda: _fixed(_beams(scene, mesh)))  # type: ignore[no-any-return]
 
 
 def _fixed(lamps: Sequence[Lamp]) -> Rows:
@@ -202,20 +221,19 @@ def _beams(scene: Scene, mesh: int) -> list[Lamp]:
     return found
 
 
-def _occluders(scene: Scene, views: Sequence[View]) -> Rows:
+def _occluders(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
     """The bodies of views that keep light from the ground."""
-    who = [(v, t) for v, view in enumerate(views) for t in view.things]
     rows, places = _nothing(kernels.Occluder)
-    if not who:
+    eyes = np.array([v.pose[:2, 3] for v in views])[bodies.view]
+    keep = (np.hypot(*(bodies.pose[:, :2, 3] - eyes).T) < SHADED_UP_TO) & (bodies.pose[:, 2, 2] > 0.9)
+    kinds, kind = np.unique(bodies.mesh[keep], return_inverse=True)
+    if not len(kinds):
         return rows, places
-    view = np.array([v for v, _ in who])
-    pose = np.array([t.pose for _, t in who])
-    middle, half, under, height = (
-        np.array(column) for column in zip(*(scene.standing(t.mesh) for _, t in who), strict=True)
-    )
-    eyes = np.array([v.pose[:2, 3] for v in views])[view]
-    keep = (np.hypot(*(pose[:, :2, 3] - eyes).T) < SHADED_UP_TO) & (pose[:, 2, 2] > 0.9) & (height > FLAT)
-    view, pose, middle, half, under, height, eyes = (a[keep] for a in (view, pose, middle, half, under, height, eyes))
+    standing = zip(*(scene.standing(int(mesh)) for mesh in kinds), strict=True)
+    middle, half, under, height = (np.array(column)[kind] for column in standing)
+    high = height > FLAT
+    middle, half, under, height = (a[high] for a in (middle, half, under, height))
+    view, pose, eyes = (a[keep][high] for a in (bodies.view, bodies.pose, eyes))
     rows = np.zeros(len(view), rows.dtype)
     rows["place"] = np.einsum("nij,nj->ni", pose[:, :3, :2], middle) + pose[:, :3, 3]
     rows["heading"] = pose[:, :2, 0] / np.maximum(np.hypot(*pose[:, :2, 0].T), 1e-9)[:, None]
@@ -241,7 +259,7 @@ def _grid(places: F64, views: int) -> tuple[I32, I32]:
     column, row = low[number, 0] + order % wide[number], low[number, 1] + order // wide[number]
     square = places[number, 0].astype(int) * cells * cells + row * cells + column
     sort = np.argsort(square, kind="stable")
-    start = np.searchsorted(square[sort], np.arange(views * cells * cells + 1))
+    start = np.concatenate([[0], np.cumsum(np.bincount(square, minlength=views * cells * cells))])
     return start.astype(np.int32), number[sort].astype(np.int32) if len(number) else np.zeros(1, np.int32)
 
 

@@ -14,7 +14,7 @@ from ssad.camera.kernels import layers as layer_kernels
 from ssad.camera.kernels import raster, shade, sky
 from ssad.camera.kernels import sensor as sensing
 from ssad.camera.lamps import LAMP_NEAR, LAMP_SHADOWS, Lamp, lamp_lens, lamp_strength, near_of, struct_array
-from ssad.camera.scene import Decal, Draws, Layer, Scene, Thing
+from ssad.camera.scene import Bodies, Decal, Draws, Layer, Scene, Thing, collect
 from ssad.camera.sensor import BRIGHTEST, DEFAULT_SENSOR, KNEE, SHOULDER, Sensor, noise_levels, point_spread
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
@@ -107,6 +107,7 @@ class Picture:
     surface: Surface | None = None
 
 
+@lru_cache(maxsize=256)
 def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
     """The kernels' light, and the exposure that suits it. Day, dusk and night follow from the height of the sun."""
     height = weather.sun_height
@@ -227,15 +228,15 @@ def render(
         lights.append(light)
         exposures.append(exposure)
     poses = np.array([v.pose for v in views], np.float64)
-    things = [v.things for v in views]
+    bodies = collect([v.things for v in views])
     far = np.array([min(FAR, 6.0 / v.weather.fog) if v.weather.fog > 0 else FAR for v in views])
     draws = stage.gather(
-        np.asarray(np.linalg.inv(poses), np.float64), things, eyes=poses[:, :3, 3], axes=poses[:, :3, 2],
+        np.asarray(np.linalg.inv(poses), np.float64), bodies, eyes=poses[:, :3, 3], axes=poses[:, :3, 2],
         reach=(70.0, 180.0), far=far,
     )  # fmt: skip
     seen = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
-    shadows = _sun_shadows(stage, views, [light[0] for light in lights], quality)
-    near = _near(stage, views, quality)
+    shadows = _sun_shadows(stage, views, bodies, [light[0] for light in lights], quality)
+    near = _near(stage, views, bodies, quality)
     device, shape = stage.device, (len(views), *size)
     layers = _layers(draws, views, stage.device)
     projecting = any(lamp.texture >= 0 for v in views for lamp in v.lamps)
@@ -290,7 +291,9 @@ def _surface(out: Any, lens: F64, poses: F64) -> Surface:
     return Surface(position=(position * solid[..., None]).astype(np.float32), **found)
 
 
-def _sun_shadows(stage: Scene, views: Sequence[View], suns: Sequence[tuple[float, ...]], quality: Quality) -> Any:
+def _sun_shadows(
+    stage: Scene, views: Sequence[View], bodies: Bodies, suns: Sequence[tuple[float, ...]], quality: Quality
+) -> Any:
     """The shadow maps of the sun: a wide one, and a fine one around each view's focus."""
     poses = np.array([v.pose for v in views], np.float64)
     flat = poses[:, :3, 2] * [1.0, 1.0, 0.0]
@@ -302,33 +305,33 @@ def _sun_shadows(stage: Scene, views: Sequence[View], suns: Sequence[tuple[float
     high = any(sun[2] > 0.02 for sun in suns)
     shadows = shade.SunShadows()
     shadows.wide, shadows.to_wide, shadows.wide_texel = _sun_map(
-        stage, views, suns, wide, SHADOW_REACH, SHADOW_SIZE if quality.shadows and high else 0
+        stage, bodies, suns, wide, SHADOW_REACH, SHADOW_SIZE if quality.shadows and high else 0
     )
     shadows.fine, shadows.to_fine, shadows.fine_texel = _sun_map(
-        stage, views, suns, fine, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and high else 0
+        stage, bodies, suns, fine, FINE_REACH, FINE_SIZE if quality.shadows and quality.fine and high else 0
     )
     return shadows
 
 
 def _sun_map(  # noqa: PLR0917
-    stage: Scene, views: Sequence[View], suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
+    stage: Scene, bodies: Bodies, suns: Sequence[tuple[float, ...]], middles: F64, reach: float, size: int
 ) -> tuple[Any, Any, float]:
     """A shadow map [B, size, size] around each middle, the matrices from the world to its texels, m a texel."""
     middles = middles * [1.0, 1.0, 0.0]
     texel = 2 * reach / max(size, 1)
-    to_light = np.array([_light_camera(np.array(sun), m) for sun, m in zip(suns, middles, strict=True)])
+    to_light = _light_cameras(np.array(suns), middles)
     texels = np.diag([1 / texel, 1 / texel, 1.0, 1.0])
     texels[:2, 3] = size / 2
     matrices = wp.array((texels @ to_light).astype(np.float32), dtype=wp.mat44, device=stage.device)
     if not size:
-        return wp.zeros((len(views), 1, 1), dtype=wp.uint64, device=stage.device), matrices, texel
+        return wp.zeros((len(middles), 1, 1), dtype=wp.uint64, device=stage.device), matrices, texel
     half = size / 2 - 0.5
-    around = np.tile(np.array([1 / texel, 1 / texel, half, half], np.float32), (len(views), 1))
+    around = np.tile(np.array([1 / texel, 1 / texel, half, half], np.float32), (len(middles), 1))
     # as far as what casts a shadow into the map can be away; small things of the street near its middle alone
     far = 1.4 * reach + 11.0
     casting = stage.gather(
-        to_light, [v.things for v in views], eyes=middles, axes=None, reach=(0.4 * reach, far),
-        far=np.full(len(views), far), horizon=False, casting=True,
+        to_light, bodies, eyes=middles, axes=None, reach=(0.4 * reach, far),
+        far=np.full(len(middles), far), horizon=False, casting=True,
     )  # fmt: skip
     return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
@@ -364,16 +367,17 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
     return table
 
 
-def _near(stage: Scene, views: Sequence[View], quality: Quality) -> Any:
+def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality) -> Any:
     """Lamps with their shadow maps, and bodies that keep light from the ground."""
-    near = near_of(stage, views, lamps=quality.lamps, contact=quality.contact)
+    near = near_of(stage, views, bodies, lamps=quality.lamps, contact=quality.contact)
     casting = [(view, lamp) for view in views for lamp in view.lamps if lamp.shadows]
     if not casting:
         near.shadows = wp.zeros((1, 2, 2), dtype=wp.uint64, device=stage.device)
         return near
     poses = np.array([lamp.pose for _, lamp in casting], np.float64)
+    around = collect([view.things for view, _ in casting])
     draws = stage.gather(
-        np.asarray(np.linalg.inv(poses), np.float64), [view.things for view, _ in casting], eyes=poses[:, :3, 3],
+        np.asarray(np.linalg.inv(poses), np.float64), around, eyes=poses[:, :3, 3],
         axes=poses[:, :3, 2], reach=(70.0, 180.0), far=np.array([lamp.reach for _, lamp in casting]), horizon=False,
         casting=True,
     )  # fmt: skip
@@ -408,13 +412,17 @@ def _develop(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -
     return image
 
 
-def _light_camera(sun: F64, middle: F64) -> F64:
-    """World to light [4, 4]: z runs with the light, x and y across it; `middle` is the origin, to half a metre."""
-    z = -sun / np.linalg.norm(sun)
-    x = np.cross([0.0, 0.0, 1.0], z)
-    x = x / np.linalg.norm(x) if np.linalg.norm(x) > 1e-6 else np.array([1.0, 0, 0])
-    turn = np.stack([x, np.cross(z, x), z])
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn
-    matrix[:3, 3] = -np.round(turn @ middle * 2) / 2
-    return matrix
+def _light_cameras(suns: F64, middles: F64) -> F64:
+    """World to light [B, 4, 4] for directions to the sun and middles [B, 3]: z runs with the light, x and y across it;
+    the middle is the origin, to half a metre."""
+    z = -suns / np.linalg.norm(suns, axis=1, keepdims=True)
+    flat = np.hypot(z[:, 0], z[:, 1])
+    level = np.maximum(flat, 1e-6)
+    x = np.stack([-z[:, 1] / level, z[:, 0] / level, np.zeros(len(z))], 1)
+    x[flat <= 1e-6] = 1.0, 0.0, 0.0
+    turn = np.stack([x, np.cross(z, x), z], 1)
+    matrices = np.zeros((len(z), 4, 4))
+    matrices[:, :3, :3] = turn
+    matrices[:, :3, 3] = -np.round((turn @ middles[..., None])[..., 0] * 2) / 2
+    matrices[:, 3, 3] = 1.0
+    return matrices

@@ -14,7 +14,7 @@ from ssad.assets.street.model import Street
 from ssad.camera.kernels import matter
 from ssad.camera.kernels import shade as kernels
 from ssad.core.errors import ConfigError
-from ssad.core.types import F32, F64, I32
+from ssad.core.types import F32, F64, I32, Bool
 
 # pattern of a material by its name; others are plain
 PATTERNS = {
@@ -117,6 +117,36 @@ class Draws:
     layers: tuple[tuple[Layer, ...], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """The N things of B views, view by view: view, mesh and tag [N], pose [N, 4, 4], paint [N, 3], lit and hidden
+    [N]."""
+
+    things: tuple[Thing, ...]
+    view: I32
+    mesh: I32
+    pose: F64
+    paint: F32
+    tag: I32
+    lit: Bool
+    hidden: Bool
+
+
+def collect(things: Sequence[Sequence[Thing]]) -> Bodies:
+    """The things of B views in arrays.
+
+    Args:
+        things: Those of each view.
+    """
+    flat = tuple(thing for row in things for thing in row)
+    return Bodies(
+        flat, np.repeat(np.arange(len(things), dtype=np.int32), [len(row) for row in things]),
+        np.array([t.mesh for t in flat], np.int32), np.array([t.pose for t in flat], np.float64).reshape(-1, 4, 4),
+        np.array([t.paint for t in flat], np.float32).reshape(-1, 3), np.array([t.tag for t in flat], np.int32),
+        np.array([t.lit for t in flat], bool), np.array([t.hidden for t in flat], bool),
+    )  # fmt: skip
+
+
 LAMPS = ("head_lamp", "tail_lamp")
 NIGHT = {  # what the night adds to the emission of a material while lamps are on
     "head_lamp": 2.0, "tail_lamp": 0.8, "lamp_light": 4.0, "street_light": 4.0, "window_blind": 0.3,
@@ -140,7 +170,7 @@ class Scene:
             raise ConfigError("a stage needs a street or a mesh")
         vertices, faces, normals, uvs, material, surfaces = [], [], [], [], [], []
         listed = [street.order.astype(np.int32)] if street is not None else []
-        self.first, self.count, self.centre, self.radius = [], [], [], []
+        first, count, centre, radius = [], [], [], []
         base_v = base_f = base_m = 0
         place = len(listed[0]) if listed else 0
         for number, part in enumerate(parts):
@@ -152,13 +182,17 @@ class Scene:
             surfaces += [surface(m) for m in part.materials]
             if street is None or number > 0:
                 listed.append(np.arange(base_f, base_f + len(part.faces), dtype=np.int32))
-                self.first.append(place)
-                self.count.append(len(part.faces))
+                first.append(place)
+                count.append(len(part.faces))
                 low, high = part.bounds()
-                self.centre.append((low + high) / 2)
-                self.radius.append(float(np.linalg.norm(high - low) / 2))
+                centre.append((low + high) / 2)
+                radius.append(float(np.linalg.norm(high - low) / 2))
                 place += len(part.faces)
             base_v, base_f, base_m = base_v + len(part.vertices), base_f + len(part.faces), base_m + len(part.materials)
+
+        # of each mesh: where its faces begin in the list, how many there are, and the ball around it
+        self.first, self.count = np.array(first, np.int32), np.array(count, np.int32)
+        self.centre, self.radius = np.array(centre, np.float64).reshape(-1, 3), np.array(radius, np.float64)
 
         def on(values: Any, dtype: Any) -> Any:
             return wp.array(values, dtype=dtype, device=device)
@@ -238,7 +272,7 @@ class Scene:
     def gather(
         self,
         inverses: F64,
-        things: Sequence[Sequence[Thing]],
+        bodies: Bodies,
         *,
         eyes: F64,
         axes: F64 | None,
@@ -254,35 +288,29 @@ class Scene:
         first, count, view = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
         tiles = len(first)
         matrices = inverses[view]
-        shown = [[t for t in row if casting or not t.hidden] for row in things]
-        flat = [t for row in shown for t in row]
-        if flat:
-            mesh = np.array([t.mesh for t in flat])
-            owner = np.repeat(np.arange(len(shown)), [len(row) for row in shown])
-            moved = inverses[owner] @ np.stack([t.pose for t in flat])
-            middle, radius = np.array(self.centre)[mesh], np.array(self.radius)[mesh]
+        seen = np.arange(len(bodies.things)) if casting else np.flatnonzero(~bodies.hidden)
+        if len(seen):
+            mesh, owner = bodies.mesh[seen], bodies.view[seen]
+            moved = inverses[owner] @ bodies.pose[seen]
+            middle, radius = self.centre[mesh], self.radius[mesh]
             local = np.einsum("nij,nj->ni", moved[:, :3, :3], middle) + moved[:, :3, 3]
             limit = far[owner]
             if axes is not None:
                 keep = (local[:, 2] > -radius) & (local[:, 2] < limit)
             else:
                 keep = np.abs(local[:, :2]).max(1) < limit
-            mesh, owner = mesh[keep], owner[keep]
-            flat = [t for t, k in zip(flat, keep, strict=True) if k]
-            first = np.concatenate([first, np.array(self.first, np.int32)[mesh]])
-            count = np.concatenate([count, np.array(self.count, np.int32)[mesh]])
-            view = np.concatenate([view, owner.astype(np.int32)])
+            seen, mesh, owner = seen[keep], mesh[keep], owner[keep]
+            first = np.concatenate([first, self.first[mesh]])
+            count = np.concatenate([count, self.count[mesh]])
+            view = np.concatenate([view, owner])
             matrices = np.concatenate([matrices, moved[keep]])
         if not len(first):  # nothing but sky: one range without faces
             first, count, view, matrices = *(np.zeros(1, np.int32) for _ in range(3)), np.eye(4)[None]
             tiles = 1
         n = len(first)
         paints, tags, lit = np.zeros((n, 3), np.float32), np.zeros(n, np.int32), np.ones(n, np.int32)
-        if flat:
-            paints[tiles:] = [t.paint for t in flat]
-            tags[tiles:] = [t.tag for t in flat]
-            lit[tiles:] = [t.lit for t in flat]
-        layers = ((),) * tiles + tuple(t.layers for t in flat)
+        paints[tiles:], tags[tiles:], lit[tiles:] = bodies.paint[seen], bodies.tag[seen], bodies.lit[seen]
+        layers = ((),) * tiles + tuple(bodies.things[k].layers for k in seen.tolist())
         return Draws(first, count, view, matrices.astype(np.float32), paints, tags, lit, layers)
 
 
