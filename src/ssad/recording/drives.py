@@ -23,7 +23,7 @@ MOST = 44  # vehicles
 TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
-    "car": 0.27, "suv": 0.15, "coupe": 0.06, "compact": 0.14, "van": 0.06, "motorcycle": 0.08, "bicycle": 0.07,
+    "car": 0.25, "suv": 0.14, "coupe": 0.06, "compact": 0.13, "van": 0.06, "motorcycle": 0.10, "bicycle": 0.09,
     "truck": 0.10, "bus": 0.07,
 }  # fmt: skip
 CARS = ("car", "suv", "coupe", "compact", "van")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -26,7 +27,8 @@ KERB = 0.12  # m, height of sidewalks
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
-WALKERS = 10  # people of a cast; many walk in more than one place
+WALKERS, WAITING = 14, 6  # people of a cast who walk and who stand; many are in more than one place
+RACK = {"bicycle": 0.75, "motorcycle": 1.15}  # m from one two-wheeler to the next where they stand side by side
 # what stands at the kerb, how often, and how much of the kerb it takes, m
 PARKED = {
     "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
@@ -285,18 +287,34 @@ def _site(
 
 
 def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, steps: int) -> None:
-    """People who walk along sidewalks or stand, groups of cones, rows of barriers."""
+    """People who walk along sidewalks, alone or in pairs, or stand, also at corners; parked two-wheelers side by side,
+    groups of cones, rows of barriers."""
     draws = generator("record sidewalks", *cast.key)
     people, standing = [], []
     for k in range(WALKERS):
         style = "child" if k % 6 == 5 else "adult"
         size = draw_size("pedestrian", style, generator=draws)
         people.append(cast.make("pedestrian", style, size, name=("walker", k), phases=PHASES))
-    for _ in range(4):
+    for _ in range(WAITING):
         standing.append(cast.make("pedestrian", "standing", draw_size("pedestrian", "standing", generator=draws)))
-    crowd = float(draws.uniform(0.1, 0.4))
+    crowd = float(draws.uniform(0.15, 0.55))
+
+    def stand(x: float, y: float, yaw: float) -> None:
+        who = standing[int(draws.integers(len(standing)))]
+        if clear.footprint(x, y, 0.0, 0.6, 0.6):
+            cast.add(who, _still(x, y, yaw, KERB))
+
     for lane in np.flatnonzero(graph.kind == LaneType.SIDEWALK):
         length = float(graph.length[lane])
+        x, y, yaw, width = graph.at(int(lane), max(length - 1.5, 0.0))
+        if draws.random() < crowd and np.hypot(way[:, 0] - x, way[:, 1] - y).min() < 45.0:
+            for k in range(int(draws.integers(1, 4))):  # at the corner, looking along the walk or across the road
+                aside = float(draws.uniform(-0.3, 0.3)) * width
+                px, py = (
+                    x - aside * np.sin(yaw) - 0.8 * k * np.cos(yaw),
+                    y + aside * np.cos(yaw) - 0.8 * k * np.sin(yaw),
+                )
+                stand(px, py, yaw + float(draws.choice([0.0, 0.5 * np.pi])) + float(draws.normal(0.0, 0.3)))
         for s in np.arange(3.0, length - 3.0, 8.0):
             x, y, yaw, width = graph.at(int(lane), float(s))
             if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > 45.0:
@@ -307,13 +325,22 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
             if pick < crowd:
                 who = people[int(draws.integers(len(people)))]
                 speed = float(draws.uniform(0.7, 1.6)) * (1 if draws.random() < 0.5 else -1)
-                cast.add(who, _walk(graph, int(lane), s0=float(s), speed=speed, aside=aside, steps=steps, dt=cast.dt))
-            elif pick < crowd + 0.06:
-                who = standing[int(draws.integers(len(standing)))]
-                turned = yaw + float(draws.uniform(-3, 3))
-                if clear.footprint(px, py, 0.0, 0.6, 0.6):
-                    cast.add(who, _still(px, py, turned, KERB))
+                walk = partial(_walk, graph, int(lane), s0=float(s), speed=speed, steps=steps, dt=cast.dt)
+                cast.add(who, walk(aside=aside))
+                if draws.random() < 0.35 and width > 1.8:  # somebody walks beside
+                    who = people[int(draws.integers(len(people)))]
+                    cast.add(who, walk(aside=aside - 0.8 * np.sign(aside)))
+            elif pick < crowd + 0.08:
+                stand(px, py, yaw + float(draws.uniform(-3, 3)))
             elif pick < crowd + 0.13:
+                kind = "bicycle" if draws.random() < 0.65 else "motorcycle"
+                facing = yaw + float(draws.choice([-0.5, 0.5])) * np.pi + float(draws.normal(0.0, 0.5 * ASKEW))
+                for k in range(int(draws.integers(2, 6))):
+                    size = draw_size(kind, "parked", generator=draws)
+                    qx, qy, _, _ = graph.at(int(lane), min(float(s) + RACK[kind] * k, length))
+                    if size[0] < width + 0.4 and clear.footprint(qx, qy, facing, size[0], size[1]):
+                        cast.add(cast.make(kind, "parked", size), _still(qx, qy, facing, KERB), parked=True)
+            elif pick < crowd + 0.2:
                 kind = "traffic_cone" if draws.random() < 0.5 else "barrier"
                 along = draws.random() < 0.6  # else barriers stand one behind the other, across the walk
                 for k in range(int(draws.integers(1, 5))):

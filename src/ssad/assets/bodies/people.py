@@ -30,6 +30,9 @@ class Look:
     skirt: bool = False
     pack: bool = False
     long_hair: bool = False
+    shorts: bool = False
+    bag: Material | None = None
+    cap: Material | None = None
     helmet: Material | None = None
 
 
@@ -61,12 +64,15 @@ def draw_look(generator: np.random.Generator, *, helmet: bool = False, rider: bo
     coat, skirt, pack, long_hair, vest = generator.random(5) < [0.28, 0.18, 0.25, 0.4, 0.06]
     if vest:
         shirt = replace(shirt, colour=HIVIS)
-    cap = cloth("helmet", (*CLOTHS[3:5], CLOTHS[0], CLOTHS[7]))
+    helmet_colour = cloth("helmet", (*CLOTHS[3:5], CLOTHS[0], CLOTHS[7]))
+    shorts, bag, cap = generator.random(3) < [0.16, 0.2, 0.22]
+    bag_colour, cap_colour = cloth("bag", CLOTHS), cloth("cap", CLOTHS)
     return Look(
         cloth("skin", SKINS), cloth("hair", HAIRS), shirt, trousers,
         cloth("shoes", (CLOTHS[0], CLOTHS[3], (0.09, 0.05, 0.03))),
         bool(coat and not rider), bool(skirt and not coat and not rider), bool(pack), bool(long_hair),
-        replace(cap, gloss=0.8) if helmet else None,
+        bool(shorts and not coat and not skirt), bag_colour if bag and not pack and not rider else None,
+        cap_colour if cap and not helmet else None, replace(helmet_colour, gloss=0.8) if helmet else None,
     )  # fmt: skip
 
 
@@ -162,7 +168,12 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
             continue
         leg = [hip + 0.03 * h * up, 0.6 * hip + 0.4 * knee, 0.1 * hip + 0.9 * knee]
         leg += [0.9 * knee + 0.1 * ankle, 0.6 * knee + 0.4 * ankle, ankle]
-        parts.append(tube(leg, np.array([0.050, 0.048, 0.038, 0.036, 0.034, 0.024]) * h, material=leg_look, segments=n))
+        wide = np.array([0.050, 0.048, 0.038, 0.036, 0.034, 0.024]) * h
+        if look.shorts:
+            parts.append(tube(leg[:3], wide[:3] * 1.12, material=leg_look, segments=n))
+            parts.append(tube(leg[2:], wide[2:] * 0.9, material=look.skin, segments=n))
+        else:
+            parts.append(tube(leg, wide, material=leg_look, segments=n))
         heel = ankle - 0.28 * (toe - ankle) * [1.0, 1.0, 0.0] - [0.0, 0.0, 0.018 * h]
         shoe = [heel, 0.5 * (ankle + toe), toe]
         parts.append(tube(shoe, np.array([0.022, 0.030, 0.018]) * h, material=look.shoes, segments=n))
@@ -174,15 +185,20 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
         fist = (0.020 * h, 0.014 * h, 0.030 * h)
         parts.append(sphere(fist, material=look.skin, centre=as_point(hand), segments=n))
     parts += _head(pose, look, h, detail, 1.35 if child else 1.0)
+    turn = np.eye(4)
+    turn[:3, :3] = np.stack([forward, [0.0, 1.0, 0.0], up], axis=1)
     if look.pack and detail > 0:
-        back = pose.pelvis + 0.62 * (pose.neck - pose.pelvis) - 0.10 * h * forward
-        half = (0.045 * h, 0.075 * h, 0.11 * h)
-        bag = crate((-half[0], -half[1], -half[2]), half, replace(look.trousers, name="pack"))
-        turn = np.eye(4)
-        turn[:3, :3] = np.stack([forward, [0.0, 1.0, 0.0], up], axis=1)
-        turn[:3, 3] = back
-        parts.append(bag.transformed(turn))
+        turn[:3, 3] = pose.pelvis + 0.62 * (pose.neck - pose.pelvis) - 0.10 * h * forward
+        parts.append(_box((0.045 * h, 0.075 * h, 0.11 * h), replace(look.trousers, name="pack")).transformed(turn))
+    if look.bag is not None and detail > 0:  # at the right hip
+        turn[:3, 3] = pose.pelvis + np.array([0.0, -0.125 * h, 0.0]) - 0.01 * h * forward
+        parts.append(_box((0.075 * h, 0.022 * h, 0.055 * h), look.bag).transformed(turn))
     return merge(parts)
+
+
+def _box(half: Point, material: Material) -> Mesh:
+    """A box about the origin."""
+    return crate((-half[0], -half[1], -half[2]), half, material)
 
 
 def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
@@ -242,6 +258,10 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
         parts.append(ball((0.051, 0.047, 0.054), look.hair, -0.012, 0.018))
         if look.long_hair and detail > 0:
             parts.append(ball((0.030, 0.042, 0.070), look.hair, -0.030, -0.035))
+        if look.cap is not None:  # its peak points ahead
+            parts.append(ball((0.056, 0.051, 0.042), look.cap, -0.006, 0.034))
+            if detail > 0:
+                parts.append(ball((0.040, 0.040, 0.008), look.cap, 0.058, 0.026, segments=6))
     if detail == 2:
         parts.append(ball((0.012, 0.009, 0.012), look.skin, 0.050, -0.008, segments=6))
         neck = [pose.neck - np.array([0.0, 0.0, 0.02 * h]), pose.head - [0.01 * h, 0.0, 0.02 * h]]
