@@ -17,8 +17,9 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import make_detector
 from ssad.detectors.checkpoints import read_card
 from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.target import parse_target
 from ssad.training import detector as training
-from ssad.training.detector import Plan, command_of, run_training
+from ssad.training.detector import Plan, command_of, describe_data, run_training
 from ssad.training.recipe import find_recipe
 
 SHORT = (("epochs", 2), ("batch", 3), ("validate", 1))
@@ -32,6 +33,14 @@ def clips(shared: Shared) -> Path:
         record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
 
     return shared("clips", make)
+
+
+@pytest.mark.parametrize("target", ["van:white:3", "stop_sign:worn:2"])
+def test_the_target_of_clips_is_part_of_their_command(target: str, tmp_path: Path) -> None:
+    about = Clips(tmp_path, (("Twinford", 2),), mode="orbit", target=parse_target(target)).identity()
+    (tmp_path / "annotations").mkdir()
+    (tmp_path / "annotations" / "all.json").write_text(json.dumps({"info": {"recording": about}}))
+    assert f"--clips orbit --towns Twinford --images 2 --target {target} " in describe_data(tmp_path)
 
 
 @pytest.fixture(scope="session")

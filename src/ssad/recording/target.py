@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from ssad.assets.bodies import BODIES, PAINTS, make_body
 from ssad.assets.mesh import Mesh, Point
@@ -94,9 +93,3 @@ def parse_target(text: str) -> TargetCar | TargetSign:
     if text.count(":") > 2 or (seed and not seed.isdigit()):
         raise ConfigError(f"--target {text}: expected STYLE, STYLE:PAINT or STYLE:PAINT:SEED, such as sedan:silver:0")
     return TargetCar(style, paint or TargetCar().paint, seed=int(seed or 0))
-
-
-def target_text(about: Mapping[str, Any]) -> str:
-    """What `parse_target` reads, of a target as a recording describes it."""
-    first = f"{about['kind']}:{about['style']}" if "kind" in about else f"{about['style']}:{about['paint']}"
-    return f"{first}:{about['seed']}"

@@ -29,7 +29,6 @@ from ssad.detectors import make_detector
 from ssad.detectors.checkpoints import Card, fit_state, hash_state, load_weights, save_weights
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.detection import score_2d, score_3d
-from ssad.recording.target import target_text
 from ssad.training.batches import Item, PictureSet, fill
 from ssad.training.data import nuscenes_items
 from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
@@ -249,7 +248,9 @@ def describe_data(folder: Path) -> str:
         towns, counts = zip(*about["images"], strict=True)
         words = ["--clips", about["clips"], "--towns", ",".join(towns), "--images", ",".join(map(str, counts))]
         target = about.get("target")
-        words += ["--target", target_text(target)] if target else []
+        # of a car style, paint and seed, of a sign kind, style and seed
+        named = [str(target[key]) for key in ("kind", "style", "paint", "seed") if key in target] if target else []
+        words += ["--target", ":".join(named)] if named else []
     elif (folder / ".parts" / "recording.json").is_file():
         about = safeio.read_json(folder / ".parts" / "recording.json")
         words = ["--towns", ",".join(about["towns"]), "--scenes", str(about["scenes"])]
