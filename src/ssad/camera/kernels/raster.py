@@ -171,9 +171,7 @@ def fill(
     has `lanes` threads, which take its faces in turn.
     """
     draw, lane = wp.tid()
-    m = matrices[draw]
     view = views[draw]
-    focal = lens[view]
     plane = near
     if ortho == 1:
         plane = -900.0
@@ -184,6 +182,8 @@ def fill(
         v = vertices[faces[face, 1]]
         w = vertices[faces[face, 2]]
         if ortho == 0 or wp.max(u[2], wp.max(v[2], w[2])) >= LOW:
+            m = matrices[draw]  # here and not before the loop: fewer registers, and no slower
+            focal = lens[view]
             p = wp.transform_point(m, u)
             q = wp.transform_point(m, v)
             r = wp.transform_point(m, w)
@@ -216,15 +216,17 @@ def fill(
                         t.c = shown(cut(r, q, plane), focal, scale, ortho)
                     else:
                         t.c = shown(cut(p, r, plane), focal, scale, ortho)
-                enter(t, largest, samples, large, count)
-                # one corner behind the plane: what is left has four
+                pieces = int(1)
                 if (q[2] >= plane) != (r[2] >= plane):
-                    t.slot += 1
-                    t.b = t.c
-                    if q[2] >= plane:
-                        t.c = shown(cut(p, r, plane), focal, scale, ortho)
-                    else:
-                        t.c = shown(r, focal, scale, ortho)
+                    pieces = 2  # one corner behind the plane: what is left has four
+                for piece in range(pieces):
+                    if piece == 1:
+                        t.slot += 1
+                        t.b = t.c
+                        if q[2] >= plane:
+                            t.c = shown(cut(p, r, plane), focal, scale, ortho)
+                        else:
+                            t.c = shown(r, focal, scale, ortho)
                     enter(t, largest, samples, large, count)
 
 
