@@ -20,7 +20,7 @@ Calibration = Literal["physical", "paper"]
 Family = Literal["environment", "sensor", "object"]
 SHIFTS: Final[dict[str, tuple[Family, str]]] = {
     "snow": ("environment", "falling snow: flakes in the air of the world, and the veil of those far away"),
-    "rain": ("environment", "falling rain: streaks of drops in the air of the world, and the veil of those far away"),
+    "rain": ("environment", "falling rain: streaks of drops in the air, the veil of those far away, and a wet road"),
     "fog": ("environment", "fog by depth (Koschmieder), patchy in the world"),
     "sunlight": ("environment", "a low sun in front of some cameras: glare, bloom, ghosts"),
     "uniform": ("sensor", "uniform noise"),
