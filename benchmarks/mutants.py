@@ -47,7 +47,7 @@ TESTS: dict[str, tuple[str, ...]] = {
         f"tests/scenarios/test_{name}.py"
         for name in ("yaml", "knowledge", "docs", "sets", "natural", "import", "sampling", "episode")
     ),
-    "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published")),
+    "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published", "_wet")),
     "jobs": (
         *(
             f"tests/jobs/test_{name}.py"

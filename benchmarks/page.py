@@ -62,7 +62,7 @@ def shifts() -> list[str]:
         "## Speed of the distribution shifts",
         "",
         "Measured by `benchmarks/shift_speed.py` on images of 1600 x 900 with 8 objects, without the codec. Mean over",
-        "severities 1, 3 and 5 of medians, on one core of a 2-core machine and on",
+        "severities 1, 3 and 5 of medians, on one core of a 2-core machine (processor time) and on",
         f"{gpu['device']} in batches of {gpu['batch']}. The last column is 3D_Corruptions_AD",
         "(one process), measured separately on a similar machine.",
         "",

@@ -138,7 +138,9 @@ def shift(
         Path,
         typer.Argument(metavar="OUT", help="Folder for the shifted nuScenes roots, or FILE.png for a contact sheet."),
     ],
-    shifts: Annotated[str, typer.Option(help="Comma-separated names (see: ssad list shifts), or all.")] = "all",
+    shifts: Annotated[
+        str, typer.Option(help="Comma-separated names (ssad list shifts), or all: the paper's 11.")
+    ] = "all",
     severity: Annotated[str, typer.Option(help="Comma-separated severities from 1 to 5, or random.")] = "random",
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     calibration: Annotated[
@@ -400,9 +402,10 @@ def _suite_list() -> dict[str, str]:
 
 
 def _shift_list() -> dict[str, str]:
-    from ssad.scenarios.static.shifts.spec import SHIFTS
+    from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
 
-    return {name: f"{family}: {text}" for name, (family, text) in SHIFTS.items()}
+    beside = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
+    return {name: f"{family}: {text}{beside.get(name, '')}" for name, (family, text) in KNOWN.items()}
 
 
 def _detector_list() -> dict[str, str]:

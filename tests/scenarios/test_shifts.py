@@ -16,23 +16,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import page_trend_test
 
+from ssad.camera.sensor import KNEE
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.frames import FORWARD, Camera, Frame, SceneContext, camera_to_world
+from ssad.core.frames import FORWARD, Camera, Frame, SceneContext, SweepFrame, camera_to_world
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.scenarios.static.shifts import (
+    KNOWN,
     SHIFTS,
     ShiftSpec,
     dealt_severities,
     random_severity,
     shift_images,
+    shift_points,
     sky_light,
     transformed_boxes,
 )
 from ssad.scenarios.static.shifts import parameters as table
+from ssad.scenarios.static.shifts.exposure import exposure_table
 from ssad.scenarios.static.shifts.light import tables, to_codes, to_linear
 from ssad.scenarios.static.shifts.objects import deformations
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
@@ -86,7 +90,7 @@ def scenery() -> tuple[U8, Frame]:
 
 
 @pytest.mark.parametrize("calibration", BOTH)
-@pytest.mark.parametrize("name", SHIFTS)
+@pytest.mark.parametrize("name", KNOWN)
 def test_a_shift_changes_the_picture_the_same_way_each_time(name: str, calibration: Any, scenery: Any) -> None:
     image, frame = scenery
     before = image.copy()
@@ -100,13 +104,13 @@ def test_a_shift_changes_the_picture_the_same_way_each_time(name: str, calibrati
     assert (shift_images(image, frame, spec)[0] == out).all()
     elsewhere = replace(frame, scene="b", sample="b")
     others = [shift_images(image, elsewhere, replace(spec, seed=seed))[0] for seed in range(4, 8)]
-    if name != "motion_blur":  # nothing is drawn for it
+    if name not in ("motion_blur", "overexposure"):  # nothing is drawn for them
         assert any((other != out).any() for other in others)
     assert (shift_images(image, frame, spec.at(0))[0] == image).all()
 
 
 @pytest.mark.parametrize("calibration", BOTH)
-@pytest.mark.parametrize("name", SHIFTS)
+@pytest.mark.parametrize("name", KNOWN)
 def test_a_picture_does_not_depend_on_its_batch(name: str, calibration: Any, scenery: Any) -> None:
     image, frame = scenery
     image, frame = (image[:-1], replace(frame, camera=replace(frame.camera, height=len(image) - 1)))  # an odd height
@@ -123,7 +127,7 @@ def test_a_picture_does_not_depend_on_its_batch(name: str, calibration: Any, sce
 @pytest.mark.parametrize("size", [(9, 8), (37, 51), (61, 123)])
 def test_any_size_works(size: tuple[int, int]) -> None:
     image = np.random.default_rng(1).integers(0, 256, (*size, 3)).astype(np.uint8)
-    for name, (family, _) in SHIFTS.items():
+    for name, (family, _) in KNOWN.items():
         for calibration in BOTH:
             out, done = shift_images(image, None, ShiftSpec(name, 3, 0, calibration))
             assert out.shape == image.shape
@@ -229,6 +233,33 @@ def test_noise_keeps_its_bits() -> None:
 
 
 GOLDEN = {"uniform": "0cb517e62c746a92", "gaussian": "9ccdf1812e7a7882", "impulse": "8116979592fd9b09"}
+
+
+def test_overexposure_is_more_light_through_the_cameras_curve() -> None:
+    ramp, frame = np.tile(np.arange(256, dtype=np.uint8)[:, None, None], (1, 8, 3)), Frame(Camera.typical(8, 256))
+    assert exposure_table(0.0).tolist() == list(range(256)), "no more light, no change"
+    before, white = np.arange(256), 256
+    for severity, stops in enumerate(table.OVEREXPOSURE, 1):
+        picture = one(ramp, frame, ShiftSpec("overexposure", severity))[:, 0, 0].astype(int)
+        light = to_linear(np.arange(256)) * 2.0**stops
+        low = light < KNEE
+        assert np.abs(picture[low] - to_codes(light[low])).max() <= 0.5, "linear in light up to the shoulder"
+        assert (np.diff(picture) >= 0).all(), "nothing dark becomes brighter than what was bright"
+        assert (picture >= before).all()
+        assert (picture[light < 1.0] < 255).all(), "a soft shoulder: what is just full is not yet white"
+        assert int(np.searchsorted(picture, 254)) < white, "more becomes white"
+        before, white = picture, int(np.searchsorted(picture, 254))
+    paper = one(ramp, frame, ShiftSpec("overexposure", 5, 3, "paper"))[:, 0, 0]
+    assert (paper == before).all()
+
+
+def test_shifts_beside_the_papers_are_extra() -> None:
+    assert len(SHIFTS) == 11
+    assert list(KNOWN)[:11] == list(SHIFTS)
+    points = np.ones((5, 5), np.float32)
+    out, done = shift_points(points, SweepFrame(), ShiftSpec("overexposure", 5))
+    assert not done.applied
+    assert (out == points).all()
 
 
 # ---------------------------------------------------------------- weather
@@ -589,7 +620,7 @@ def test_blur_is_a_box_filter_along_the_motion(velocity: tuple[float, float, flo
 # ---------------------------------------------------------------- damage by severity
 
 
-@pytest.mark.parametrize("name", SHIFTS)
+@pytest.mark.parametrize("name", KNOWN)
 def test_damage_grows_with_severity(name: str, street: NuScenes) -> None:
     """Page's trend test over pictures of two scenes, keys fixed; nothing drawn is tuned to pass it."""
     damage = []

@@ -19,7 +19,7 @@ from ssad.evaluation.camera_truth import camera_truth, scenes_of
 from ssad.evaluation.detection import to_images
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, Watched, detector_of, shifter_of
 from ssad.jobs.machine import quiet_warp
-from ssad.scenarios.static.shifts import SHIFTS
+from ssad.scenarios.static.shifts import KNOWN
 
 WIDTH, COLUMNS, LEAST, STRONG = 640, 3, 0.3, 3
 EDGES = tuple((a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit)  # corners that differ in one axis
@@ -88,7 +88,7 @@ def _tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8,
     intrinsic = np.asarray(frame.intrinsic, np.float64)
     _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
     _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
-    text = f"{title.replace('_', ' ')} ({SHIFTS[title][0]})" if title in SHIFTS else title
+    text = f"{title.replace('_', ' ')} ({KNOWN[title][0]})" if title in KNOWN else title
     cv2.rectangle(canvas, (0, 0), (12 + 11 * len(text), 26), (0, 0, 0), -1)
     cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
     return np.asarray(canvas)

@@ -14,7 +14,7 @@ from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.scenarios.static.shifts import SHIFTS, Calibration
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 from ssad.toolbox.contact_sheet import parse_box, write_sheets
 from ssad.toolbox.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
 from ssad.toolbox.options import Options, Strength
@@ -35,12 +35,12 @@ def severities(text: str) -> tuple[Strength, ...]:
 
 
 def shift_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The shifts of --shifts; ["all"] means every one. UnknownNameError."""
+    """The shifts of --shifts; ["all"] means those of the paper. UnknownNameError."""
     if list(names) == ["all"]:
         return tuple(SHIFTS)
     for name in names:
-        if name not in SHIFTS:
-            raise unknown_name("shift", name, SHIFTS)
+        if name not in KNOWN:
+            raise unknown_name("shift", name, KNOWN)
     return tuple(dict.fromkeys(names))
 
 

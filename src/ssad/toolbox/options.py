@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from ssad.core.errors import ConfigError
 from ssad.core.version import __version__
-from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, Calibration, ShiftSpec
+from ssad.scenarios.static.shifts import KNOWN, VERSIONS, Calibration, ShiftSpec
 
 Labels = Literal["original", "transformed"]
 Strength = int | Literal["random"]
@@ -98,7 +98,7 @@ class Shard:
         """Of its JPEG files."""
         if self.options.subsampling != "auto":
             return self.options.subsampling
-        return "444" if SHIFTS[self.shift][0] == "sensor" else "420"
+        return "444" if KNOWN[self.shift][0] == "sensor" else "420"
 
     def spec(self) -> ShiftSpec:
         """The shift; severity 1 stands for a random one until it is drawn."""

@@ -31,7 +31,7 @@ from ssad.evaluation.scene_boxes import (
 from ssad.jobs.machine import default_workers
 from ssad.jobs.progress import Live
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
-from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
 RECORDED = "recorded"
@@ -115,7 +115,7 @@ class Detection(Kind):
         cells = []
         for detector in detectors:
             for shift, severity in conditions:
-                family = SHIFTS[shift][0] if shift else "clean"
+                family = KNOWN[shift][0] if shift else "clean"
                 fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
                 spec = {"calibration": suite.calibration, "labels": "original"}
                 title = f"{detector}/{shift or 'clean'}/{severity}"

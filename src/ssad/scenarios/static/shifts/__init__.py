@@ -1,4 +1,4 @@
-"""The 11 natural distribution shifts on images and LiDAR sweeps (paper III.A.2).
+"""The 11 natural distribution shifts on images and LiDAR sweeps (paper III.A.2), and some more.
 
 `shift_images` for cameras, `shift_points` for the LiDAR twin, `transformed_boxes` for labels that follow the objects.
 """
@@ -7,6 +7,8 @@ from ssad.scenarios.static.shifts.apply import shift_images, sky_light, viewing_
 from ssad.scenarios.static.shifts.lidar import shift_points
 from ssad.scenarios.static.shifts.objects import transformed_boxes
 from ssad.scenarios.static.shifts.spec import (
+    EXTRA,
+    KNOWN,
     SEVERITIES,
     SHIFTS,
     VERSIONS,
@@ -17,6 +19,8 @@ from ssad.scenarios.static.shifts.spec import (
 )
 
 __all__ = [
+    "EXTRA",
+    "KNOWN",
     "SEVERITIES",
     "SHIFTS",
     "VERSIONS",

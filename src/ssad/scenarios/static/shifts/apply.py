@@ -11,6 +11,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.frames import Applied, Camera, Frame, SceneContext, camera_to_world
 from ssad.core.types import F32, U8
 from ssad.scenarios.static.shifts.batch import Batch, check_batch, like_input, to_batch
+from ssad.scenarios.static.shifts.exposure import overexpose
 from ssad.scenarios.static.shifts.noise import add_impulses, add_noise
 from ssad.scenarios.static.shifts.objects import move_objects
 from ssad.scenarios.static.shifts.spec import ShiftSpec
@@ -91,6 +92,8 @@ def _dispatch(
         return add_impulses(batch, frames, specs)
     if name in ("uniform", "gaussian"):
         return add_noise(batch, frames, specs)
+    if name == "overexposure":
+        return overexpose(batch, specs)
     if calibration == "paper":
         from ssad.scenarios.static.shifts.paper import paper_shift
 

@@ -1,4 +1,4 @@
-"""The LiDAR twin of each shift: the same weather, sun and objects, in the points of a sweep.
+"""The LiDAR twin of each shift that has one: the same weather, sun and objects, in the points of a sweep.
 
 Points [P, 5] float32 in the sensor frame: x, y, z (m), intensity (0 to 255), ring; more columns are kept. Lost points
 are removed.
@@ -16,7 +16,7 @@ from ssad.core.frames import Applied, SceneContext, SweepFrame
 from ssad.core.types import F32, F64, Bool
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.objects import affine, deformed
-from ssad.scenarios.static.shifts.spec import ShiftSpec
+from ssad.scenarios.static.shifts.spec import CAMERA_ONLY, ShiftSpec
 from ssad.scenarios.static.shifts.sun import AT_NIGHT, NIGHT, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction
 
@@ -33,6 +33,8 @@ def shift_points(
         raise ConfigError(f"points must be [P, 5] (x, y, z, intensity, ring), not {list(cloud.shape)}")
     if spec.severity == 0:
         return cloud, Applied(True, {"severity": 0})
+    if spec.name in CAMERA_ONLY:
+        return cloud, Applied(False, {}, {"changes cameras alone": 1})
     draws = spec.generator("lidar", frame.scene, frame.sample)
     if spec.family == "sensor":
         return _noise(cloud, spec, draws)

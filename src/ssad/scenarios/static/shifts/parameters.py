@@ -17,6 +17,9 @@ IMPULSE: Final[Five] = (0.03, 0.06, 0.09, 0.17, 0.27)
 # share of the impulses that are stuck pixels of the camera (physical)
 STUCK: Final = 0.2
 
+# ---- overexposure, in both calibrations: EV; 3.3 stops are ten times the light
+OVEREXPOSURE: Final[Five] = (0.7, 1.3, 2.0, 2.7, 3.3)
+
 # ---- weather, physical
 # fog: meteorological optical range, m (5 % contrast, beta = 3 / range): extinctions .005 to .06 1/m of Hahner et al.
 # 2021, which 3DC uses for LiDAR fog; so the twins agree

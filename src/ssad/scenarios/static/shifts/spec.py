@@ -1,8 +1,8 @@
 """What a shift is called, how strong it is, and where its random numbers come from.
 
-The 11 shifts are those of the paper (III.A.2). Two calibrations: `paper`, the published severity tables of
-3D_Corruptions_AD (Dong et al., CVPR 2023), image by image; `physical` (default), parameters with units, one weather in
-the world for all cameras and the LiDAR, object by object.
+The 11 shifts are those of the paper (III.A.2); some more stand beside them. Two calibrations: `paper`, the published
+severity tables of 3D_Corruptions_AD (Dong et al., CVPR 2023), image by image; `physical` (default), parameters with
+units, one weather in the world for all cameras and the LiDAR, object by object.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Calibration = Literal["physical", "paper"]
 Family = Literal["environment", "sensor", "object"]
 SHIFTS: Final[dict[str, tuple[Family, str]]] = {
     "snow": ("environment", "falling snow: flakes in the air of the world, and the veil of those far away"),
-    "rain": ("environment", "falling rain: streaks of drops in the air of the world, and the veil of those far away"),
+    "rain": ("environment", "falling rain: streaks of drops in the air, the veil of those far away, and a wet road"),
     "fog": ("environment", "fog by depth (Koschmieder), patchy in the world"),
     "sunlight": ("environment", "a low sun in front of some cameras: glare, bloom, ghosts"),
     "uniform": ("sensor", "uniform noise"),
@@ -31,6 +31,12 @@ SHIFTS: Final[dict[str, tuple[Family, str]]] = {
     "rotation": ("object", "objects turned about the vertical"),
     "motion_blur": ("object", "objects blurred along their motion"),
 }
+# beside the paper's, used only where they are named: suites and tables keep to the paper's by default
+EXTRA: Final[dict[str, tuple[Family, str]]] = {
+    "overexposure": ("sensor", "exposed for too long: bright parts are white"),
+}
+KNOWN: Final = SHIFTS | EXTRA
+CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
 VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
@@ -50,8 +56,8 @@ class ShiftSpec:
     calibration: Calibration = "physical"
 
     def __post_init__(self) -> None:
-        if self.name not in SHIFTS:
-            raise unknown_name("shift", self.name, SHIFTS)
+        if self.name not in KNOWN:
+            raise unknown_name("shift", self.name, KNOWN)
         if isinstance(self.severity, bool) or self.severity not in (0, *SEVERITIES):
             raise ConfigError(f"severity {self.severity!r} of shift '{self.name}': expected 0 to 5")
         if self.calibration not in get_args(Calibration):
@@ -60,7 +66,7 @@ class ShiftSpec:
     @property
     def family(self) -> Family:
         """environment, sensor or object."""
-        return SHIFTS[self.name][0]
+        return KNOWN[self.name][0]
 
     def at(self, severity: int) -> ShiftSpec:
         """The same shift at another severity."""

@@ -317,6 +317,13 @@ def blend_wet(
     row = int(wp.floor(fy))
     fraction = fy - float(row)
     i = b * words + y * width * 3 / 4
+    most = float(0.0)
+    for x in range(ground.shape[2]):
+        most = wp.max(most, share_of(ground, b, row, fraction, x))
+    if most <= 0.5:
+        for k in range(width * 3 / 4):
+            out[i + k] = image[i + k]
+        return
     g0 = share_of(ground, b, row, fraction, -1)
     g1 = share_of(ground, b, row, fraction, 0)
     s0 = between(shine, b, row, fraction, -1)
