@@ -206,7 +206,9 @@ def test_a_kind_of_ones_own_gets_a_report_for_nothing(tmp_path: Path) -> None:
 def start(folder: Path, count: int) -> subprocess.Popen[bytes]:
     """A run in a process of its own."""
     code = (
-        "import sys\nfrom helpers.own_kind import Dice, DiceSuite\nfrom ssad.bench.kind import Resources\n"
+        # a shell that runs this in the background has told its children to ignore Ctrl-C
+        "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from helpers.own_kind import Dice, DiceSuite\nfrom ssad.bench.kind import Resources\n"
         "from ssad.bench.run import run\nnumbers = [f'slow-{i}' for i in range(int(sys.argv[2]))]\n"
         "suite = DiceSuite(name='dice', systems=['fair'], numbers=numbers, timeout_s=60.0, batch=3)\n"
         "run(Dice().plan(suite), sys.argv[1], Resources(2))"
