@@ -70,6 +70,7 @@ def test_signs_of_the_map_stand_where_it_says() -> None:
         away = np.hypot(*(graph.sign_xy - one.pose[:2]).T)
         k = int(away.argmin())
         assert away[k] < 1.5
+        assert one.style != "all_way", "at a T-junction the main road does not stop"
         assert one.kind == {SignKind.STOP: "stop_sign", SignKind.YIELD: "yield_sign"}[SignKind(int(graph.sign_kind[k]))]
 
 

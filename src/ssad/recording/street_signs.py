@@ -64,7 +64,8 @@ def street_signs(
     Yields:
         One sign after another.
     """
-    places = [*_of_the_map(graph), *(_along_kerbs(graph, way, key) if many else ())]
+    of_map = list(_of_the_map(graph))
+    places = [*of_map, *(_along_kerbs(graph, way, key) if many else ())]
     for number, (kind, x, y, yaw, z) in enumerate(places):
         if np.hypot(way[:, 0] - x, way[:, 1] - y).min() > REACH:
             continue
@@ -73,6 +74,8 @@ def street_signs(
             continue
         own = generator("street sign", *key, number)
         style = draw_style(kind, generator=own)
+        if style == "all_way" and number < len(of_map):
+            style = "standard"  # the main road of a T-junction does not stop
         size = draw_size(kind, style, generator=own)
         facing = yaw + np.pi + float(own.normal(0.0, ASKEW))
         mesh = make_body(kind, style=style, size=size, generator=own, detail=detail)
