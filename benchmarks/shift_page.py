@@ -12,8 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from ssad.bench.kinds.detection import state_hash
+from ssad.evaluation.scene_boxes import detector_of
 from ssad.report.kinds.detection import title_of
 from ssad.report.paper import SHIFTS as PUBLISHED
+from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -120,6 +123,29 @@ def classes() -> list[str]:
     return [*lines, ""]
 
 
+def outdated(run: str) -> list[str]:
+    """How what a run measured differs from what is shipped now."""
+    about = header(run)
+    calibration = about["suite"]["calibration"]
+    then, now = about["versions"]["shifts"], str(VERSIONS[calibration])
+    found = [f"version {then} of the shifts in the {calibration} calibration (now {now})"] if then != now else []
+    changed = [name for name, known in about["weights"].items() if state_hash(detector_of(name, "", "cpu")) != known]
+    return found + ([f"earlier weights of {' and '.join(changed)}"] if changed else [])
+
+
+def notice() -> list[str]:
+    """A warning above tables that were measured before something changed."""
+    reasons = {run: outdated(run) for run in RUNS}
+    told = [f"`{run}` with {' and '.join(why)}" for run, why in reasons.items() if why]
+    if not told:
+        return []
+    return [
+        "> **Measured before the last changes:** " + "; ".join(told) + ". Images have changed since as well. Until",
+        "> the commands have run again, compare these numbers with each other only, not with a new run.",
+        "",
+    ]
+
+
 def page() -> str:
     """The page."""
     about = header(RUNS[0])
@@ -130,6 +156,7 @@ def page() -> str:
     return "\n".join([
         "# Results of the shipped 3D detectors, clean and under distribution shifts",
         "",
+        *notice(),
         "`benchmarks/shift_page.py` makes this page from `benchmarks/results/shifts` and",
         "`benchmarks/results/shifts-paper`. These folders contain the tables that two commands wrote:",
         "```",
