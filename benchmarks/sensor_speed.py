@@ -1,7 +1,8 @@
 """What the camera's sensor costs: python benchmarks/sensor_speed.py [--out FILE]
 
 The renderer's last step on one core, 640 x 640, by sensor; and in torch, forward and backward from a texture of
-256 x 256 on a car 20 m ahead: whole pictures, and only what the texture touches. Medians of the process's own time.
+256 x 256 on a car 20 m ahead: whole pictures, and only what the texture touches; beside it, YOLOv5n's losses on the
+picture, forward and backward. Medians of the process's own time.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ from ssad.camera.sensor import PINHOLE, Sensor
 from ssad.camera.texture import retexture, taps_of
 from ssad.camera.torch_jpeg import jpeg
 from ssad.camera.torch_sensor import Window, develop, draw_noise
+from ssad.core.detections import Truth
+from ssad.detectors import make_detector
 
 NOISE = 0.012
 RENDERED = {
@@ -85,6 +88,21 @@ def in_torch(picture: Any, repeats: int) -> dict[str, dict[str, float]]:
     return found
 
 
+def victim(picture: Any, repeats: int) -> float:
+    """Ms of the losses of YOLOv5n on the picture and of their gradient with respect to it."""
+    detector = make_detector("yolov5n", device="cpu")
+    image = torch.tensor(picture.image).permute(0, 3, 1, 2).float() / 255
+    truth = [Truth(torch.tensor([0]), torch.tensor([[280.0, 300.0, 360.0, 360.0]]))]
+
+    def attack() -> None:
+        leaf = image.clone().requires_grad_()
+        dense = detector.dense(leaf)
+        losses = detector.losses(dense, detector.assign(dense, truth))
+        torch.stack(list(losses.values())).sum().backward()  # type: ignore[no-untyped-call]
+
+    return median(attack, repeats)
+
+
 def main() -> None:
     """Measures, prints, writes JSON."""
     parser = argparse.ArgumentParser()
@@ -97,11 +115,13 @@ def main() -> None:
     result: dict[str, Any] = {
         "rendered_ms": rendered(view, picture.radiance, float(picture.exposure[0]), options.repeats),
         "torch_ms": in_torch(picture, options.repeats),
+        "yolov5n_ms": victim(picture, options.repeats),
     }
     for name, ms in result["rendered_ms"].items():
         print(f"{ms:6.2f} ms  renderer: {name}")
     for name, both in result["torch_ms"].items():
         print(f"{both['whole']:6.1f} ms  torch, whole picture: {name}\n{both['touched']:6.1f} ms  only what is touched")
+    print(f"{result['yolov5n_ms']:6.1f} ms  YOLOv5n, forward and backward")
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -15,7 +15,9 @@ from ssad.scenarios.static.shifts import VERSIONS
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize(("script", "name"), [("page", "benchmarks"), ("shift_page", "results")])
+@pytest.mark.parametrize(
+    ("script", "name"), [("page", "benchmarks"), ("shift_page", "results"), ("detector_accuracy", "accuracy")]
+)
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
     assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python benchmarks/{script}.py"
