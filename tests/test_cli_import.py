@@ -32,11 +32,12 @@ def test_imports_are_listed() -> None:
 @pytest.mark.parametrize("every", [100, pytest.param(1, marks=pytest.mark.slow)])
 def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     """Each of SafeBench's eight hits the blind follower and is avoidable; the Autopilot copes with the traffic, in
-    every 100th of FREA's scenarios or in all."""
+    every 100th of FREA's scenarios and half of SafeBench's routes, or in all."""
     some = [scenario.name for scenario in load_scenarios("frea")[::every]]
+    routes = [scenario.name for scenario in load_scenarios("safebench")[:: 2 if every > 1 else 1]]
     words = [
         "--set",
-        f"scenarios=[safebench,{','.join(some)}]",
+        f"scenarios=[{','.join([*routes, *some])}]",
         "--set",
         "systems=[autopilot,blind]",
         "--out",
@@ -45,7 +46,7 @@ def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     done = ssad("run", "precrash", *words, "--workers", "1" if every > 1 else "2")
     assert done.returncode == 0, done.stderr
     records = [json.loads(line) for line in (tmp_path / "results.jsonl").read_text().splitlines()]
-    assert len(records) == 2 * (32 + len(some))
+    assert len(records) == 2 * (len(routes) + len(some))
     assert {r["status"] for r in records} == {"ok"}
 
     natural = [r for r in records if r["group"] in NATURAL and r["system"] == "autopilot"]
@@ -54,15 +55,15 @@ def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     assert sum(r["metrics"]["route_completion"] for r in natural) / len(some) >= 0.95
 
     blind = [r for r in records if r["group"] not in NATURAL and r["system"] == "blind"]
-    assert len(blind) == 32
+    assert len(blind) == len(routes)
     hit = {
         group: sum(r["metrics"]["collision"] for r in blind if r["group"] == group)
         for group in {r["group"] for r in blind}
     }
     assert len(hit) == 8
-    assert min(hit.values()) >= 2
+    assert min(hit.values()) >= len(routes) / 16
     for record in blind:
         if record["metrics"]["collision"]:
             assert record["witness"]["verdict"] in ("avoidable", "anticipation", "autopilot", "unavoidable")
     avoidable = [r for r in blind if r.get("witness", {}).get("verdict") == "avoidable"]
-    assert len(avoidable) >= 24
+    assert len(avoidable) >= 0.75 * len(routes)

@@ -428,9 +428,10 @@ def test_boxes_of_one_object_in_the_image_are_suppressed(config: Mono3DConfig) -
     config = replace(config, nms=0.9, most=100000)
     free = lively(config)
     strict = lively(replace(config, image_nms=0.3))
-    images, cameras = pictures(2, 3, *SIZE), K.expand(2, 3, 3)
+    images, cameras = pictures(1, 3, *SIZE), K[None]
+    least = 0.004 if config.pgd else 0.012  # some hundred candidates
     for before, after in zip(
-        free.predict(images, cameras, threshold=0.001), strict.predict(images, cameras, threshold=0.001), strict=True
+        free.predict(images, cameras, threshold=least), strict.predict(images, cameras, threshold=least), strict=True
     ):
         keep: list[int] = []
         for k in before.score.argsort(descending=True, stable=True).tolist():
