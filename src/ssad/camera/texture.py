@@ -9,6 +9,7 @@ between the panels of an atlas) take no part, at any level: what is printed ther
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +17,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from ssad.assets.mesh import Mesh, Rectangle
-from ssad.camera.render import Picture
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
 
@@ -84,14 +84,22 @@ def paint_mask(mesh: Mesh, size: tuple[int, int], rectangle: Rectangle = (0.0, 0
     return np.asarray(fine.reshape(height, 4, width, 4).max((1, 3)) > 0)
 
 
+class Seen(Protocol):
+    """What has been seen of textures."""
+
+    @property
+    def fragments(self) -> Any:
+        """As `Picture.fragments`."""
+
+
 def taps_of(
-    picture: Picture, size: int | tuple[int, int], *, texture: int = 0, mask: Bool | None = None,
+    picture: Seen, size: int | tuple[int, int], *, texture: int = 0, mask: Bool | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Taps:  # fmt: skip
     """The taps of one texture in a picture.
 
     Args:
-        picture: Rendered with things, decals or lamps that show the texture.
+        picture: A `Picture`, or a part of one, rendered with things, decals or lamps that show the texture.
         size: Height and width of the texture, or one side of a square, texels.
         texture: Its number.
         mask: Which texels [H, W] are somewhere on the surface (see `paint_mask`); None for all.

@@ -9,7 +9,7 @@ any number of processes gives the same bytes, and a run that was stopped goes on
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -473,7 +473,29 @@ class ClipView:
         return replace(self.view, things=(replace(target, layers=layers), *others))
 
 
-def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iterator[ClipView]:
+Row = Mapping[str, Any]
+
+
+def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ...]]]:
+    """Each picture of a recording, as its annotation file has it, with what is annotated in it; in order.
+
+    Raises:
+        FormatError: No recording.
+    """
+    path = folder / "annotations" / f"{split}.json"
+    data = safeio.read_json(path, limit=1 << 30)
+    try:
+        own: dict[int, list[Row]] = {row["id"]: [] for row in data["images"]}
+        for one in data["annotations"]:
+            own[one["image_id"]].append(one)
+        return [(row, tuple(own[row["id"]])) for row in data["images"]]
+    except (KeyError, TypeError) as error:
+        raise _unknown(path, error) from None
+
+
+def clip_views(
+    folder: Path, *, split: str = "all", device: str = "cpu", only: Collection[str] | None = None
+) -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
 
     Rendering a view gives the recorded picture (before JPEG) again. Pictures of one drive share a scene.
@@ -482,20 +504,19 @@ def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iter
         folder: What `record_clips` wrote.
         split: train, test or all.
         device: Where to render.
+        only: Names of the files that are wanted; None for all.
 
     Raises:
         FormatError: No recording of this version.
     """
     path = folder / "annotations" / f"{split}.json"
-    data = safeio.read_json(path, limit=1 << 30)
+    rows = clip_rows(folder, split)
     try:
-        about = data["info"]["recording"]
-        own: dict[int, list[Mapping[str, Any]]] = {row["id"]: [] for row in data["images"]}
-        for one in data["annotations"]:
-            own[one["image_id"]].append(one)
-        clips = _clips_of(about, folder, device)
+        clips = _clips_of(safeio.read_json(path, limit=1 << 30)["info"]["recording"], folder, device)
         sets: dict[tuple[object, ...], _Set] = {}
-        for row in data["images"]:
+        for row, objects in rows:
+            if only is not None and row["file_name"] not in only:
+                continue
             key = (clips.seed, clips.mode, row["town"], row["part"], row["attempt"])
             if key not in sets:
                 # one part at a time: its pictures may come from several drives
@@ -506,10 +527,14 @@ def clip_views(folder: Path, *, split: str = "all", device: str = "cpu") -> Iter
             shot = Viewpoint(row["time"], np.array(row["pose"]), np.array(row["target_pose"]), weather, {})
             around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
             view = _view(made, row["slot"], shot, around, _camera(clips.size))
-            yield ClipView(row["file_name"], row, made.stage, view, tuple(own[row["id"]]))
+            yield ClipView(row["file_name"], row, made.stage, view, objects)
     except (KeyError, TypeError) as error:
-        why = f"({type(error).__name__}: {error})"
-        raise FormatError(f"{path}: not the clips of this version {why}; record them again") from None
+        raise _unknown(path, error) from None
+
+
+def _unknown(path: Path, error: Exception) -> FormatError:
+    why = f"({type(error).__name__}: {error})"
+    return FormatError(f"{path}: not the clips of this version {why}; record them again")
 
 
 def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:

@@ -1,0 +1,213 @@
+"""Recorded pictures as functions of the texture that their target wears: rendered once, kept on disk.
+
+What pixels see of a texture does not depend on it. So a picture is rendered once with layers on its target; from then
+on it is shown with any texture in a few milliseconds, with gradients, also by a later process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import ssad
+from ssad.camera.render import render
+from ssad.camera.scene import Layer
+from ssad.camera.sensor import Sensor
+from ssad.camera.texture import Taps, retexture, taps_of
+from ssad.camera.torch_sensor import Window
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.images import read_image
+from ssad.core.seeding import digest
+from ssad.core.types import F32, U8, Bool
+from ssad.recording.clip_recorder import ClipView, clip_rows, clip_views
+from ssad.recording.nuscenes_recorder import SENSOR
+
+KEPT = ".seen"  # folder of a recording for what has been rendered
+MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
+BLOCK = 16  # px: parts begin at blocks of JPEG
+DRAWING = ("assets", "camera", "recording", "roads", "world")  # packages that decide what a picture shows
+
+
+@dataclass(frozen=True, slots=True)
+class TexturedClip:
+    """A recorded picture whose target wears textures.
+
+    Attributes:
+        file: Its name in the folder `images`.
+        row: What the annotation file says of it.
+        objects: What is annotated in it (see `ClipView`).
+        image: As recorded, uint8 RGB [H, W, 3].
+        corner: Row and column at which `radiance` begins in it.
+        radiance: Of the part around what wears the textures, linear, textured pixels without them [h, w, 3].
+        exposure: What radiance is multiplied by.
+        fragments: What pixels of the part see of the textures (see `Picture.fragments`).
+    """
+
+    file: str
+    row: Mapping[str, Any]
+    objects: tuple[Mapping[str, Any], ...]
+    image: U8
+    corner: tuple[int, int]
+    radiance: F32
+    exposure: float
+    fragments: Any
+
+    def prepare(
+        self,
+        sizes: Mapping[int, int | tuple[int, int]],
+        *,
+        masks: Mapping[int, Bool] | None = None,
+        quality: int | None = 92,
+        sensor: Sensor = SENSOR,
+        device: str | torch.device = "cpu",
+    ) -> Wearing:
+        """The picture, ready to be shown with textures of certain sizes.
+
+        Args:
+            sizes: Number of each texture -> its height and width, or one side, texels. All that the target wears.
+            masks: Number of a texture -> which texels are on the surface (see `paint_mask`).
+            quality: Of JPEG, as it was recorded; None: not compressed.
+            sensor: The camera's.
+            device: Where pictures are made.
+
+        Raises:
+            ConfigError: A texture that the target wears has no size, or bad sizes and masks.
+        """
+        worn = set(np.unique(self.fragments["texture"]).tolist())
+        if not worn <= set(sizes):
+            raise ConfigError(f"{self.file}: no size for texture {min(worn - set(sizes))}, which its target wears")
+        masks = masks or {}
+        shape = (1, *self.radiance.shape[:2])
+        taps = {k: taps_of(self, size, texture=k, mask=masks.get(k)) for k, size in sizes.items()}
+        touched = torch.cat([one.pixel for one in taps.values()])
+        window = Window.around(touched, shape, sensor, quality=quality)
+        part = window.crop(torch.tensor(self.radiance)[None]).to(device)
+        before = torch.tensor(self.image).to(device).permute(2, 0, 1)[None].float() / 255
+        return Wearing(
+            self.corner, shape, window, part, self.exposure,
+            {k: window.taps(one).to(device) for k, one in taps.items()}, before,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Wearing:
+    """A picture that waits for textures: where its part lies, its shape, window, radiance, exposure and taps by number,
+    and the whole picture before."""
+
+    corner: tuple[int, int]
+    shape: tuple[int, int, int]
+    window: Window
+    part: Tensor
+    exposure: float
+    taps: Mapping[int, Taps]
+    before: Tensor
+
+    def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
+        """The picture with textures on its target.
+
+        Args:
+            textures: Number -> linear albedo [3, h, w] in 0 to 1.
+            noise: Draws the sensor's noise where the picture changes; None for none there.
+
+        Returns:
+            [1, 3, H, W] in [0, 1], differentiable in the textures.
+
+        Raises:
+            ConfigError: A texture of another size or beyond 0 to 1; one is missing.
+        """
+        missing = sorted(set(self.taps) - set(textures))
+        if missing:
+            raise ConfigError(f"no texture {missing[0]}")
+        radiance = self.part
+        for number, taps in self.taps.items():
+            radiance = retexture(taps, textures[number], radiance)
+        sample = None
+        if noise is not None:
+            size = radiance.shape[: 3 if self.window.sensor.mosaic else 4]
+            sample = torch.randn(size, generator=noise, device=noise.device).to(radiance)
+        developed = self.window.develop(radiance, self.exposure, sample)
+        (top, left), (_, height, width) = self.corner, self.shape
+        whole = self.before.clone()
+        place = (..., slice(top, top + height), slice(left, left + width))
+        whole[place] = self.window.paste(developed, self.before[place])
+        return whole
+
+
+def textured_clips(
+    folder: Path, layers: Sequence[Layer] = (Layer(0),), *, split: str = "all", device: str = "cpu"
+) -> Iterator[TexturedClip]:
+    """The pictures of a recording whose targets wear layers, in order; each is rendered once and then kept.
+
+    Args:
+        folder: What `record_clips` wrote; what is rendered is kept in its folder `.seen`.
+        layers: What the targets wear.
+        split: train, test or all.
+        device: Where to render.
+
+    Raises:
+        FormatError: No recording of this version, or a kept file is broken.
+        StoreError: Nothing can be written there.
+    """
+    name = digest("textured clips", _drawing(), [_layer_key(layer) for layer in layers])[:16]
+    kept = folder / KEPT / name
+    rows = clip_rows(folder, split)
+    missing = {row["file_name"] for row, _ in rows if not (kept / f"{row['file_name']}.npz").is_file()}
+    views = clip_views(folder, split=split, device=device, only=missing)
+    for row, objects in rows:
+        file = row["file_name"]
+        if file in missing:
+            safeio.make_folder(kept)
+            safeio.save_npz(kept / f"{file}.npz", _seen(next(views), layers))
+        arrays = safeio.load_npz(kept / f"{file}.npz")
+        image = read_image(folder / "images" / file)
+        corner = int(arrays["corner"][0]), int(arrays["corner"][1])
+        exposure = float(arrays["exposure"])
+        yield TexturedClip(file, row, objects, image, corner, arrays["radiance"], exposure, arrays["fragments"])
+
+
+def _seen(clip: ClipView, layers: Sequence[Layer]) -> dict[str, Any]:
+    """What is kept of a picture: the part around what wears the layers."""
+    picture = render(clip.scene, [clip.wearing(*layers)])
+    height, width = picture.radiance.shape[1:3]
+    rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
+    (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
+    fragments = picture.fragments.copy()
+    fragments["place"] = (rows - top) * (right - left) + columns - left
+    return {
+        "corner": np.array([top, left]), "radiance": picture.radiance[0, top:bottom, left:right],
+        "exposure": picture.exposure[0], "fragments": fragments,
+    }  # fmt: skip
+
+
+def _span(places: Any, most: int) -> tuple[int, int]:
+    """Where a part begins and ends that holds all places and their margin; a block if there are none."""
+    if not len(places):
+        return 0, min(BLOCK, most)
+    low = max(int(places.min()) - MARGIN, 0) // BLOCK * BLOCK
+    return low, min(int(places.max()) + MARGIN + 1, most)
+
+
+def _layer_key(layer: Layer) -> tuple[object, ...]:
+    """All that decides what of a layer is seen."""
+    mask = None if layer.mask is None else (layer.mask.shape, hashlib.sha256(layer.mask.tobytes()).hexdigest())
+    return layer.texture, layer.rectangle, layer.opacity, mask
+
+
+@cache
+def _drawing() -> str:
+    """A hash of the source that draws pictures: what another version rendered is not used."""
+    root = Path(ssad.__file__).parent
+    whole = hashlib.sha256()
+    for package in DRAWING:
+        for path in sorted((root / package).rglob("*.py")):
+            whole.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return whole.hexdigest()

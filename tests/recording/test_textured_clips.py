@@ -1,0 +1,96 @@
+"""Recorded pictures as functions of a texture: as if rendered anew, once rendered, differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import ssad.recording.textured_clips as module
+from ssad.camera.render import render
+from ssad.camera.scene import Layer
+from ssad.camera.texture import retexture, taps_of
+from ssad.camera.torch_jpeg import jpeg
+from ssad.camera.torch_sensor import develop
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.images import read_image
+from ssad.recording.clip_recorder import Clips, clip_views, record_clips
+from ssad.recording.nuscenes_recorder import SENSOR
+from ssad.recording.textured_clips import KEPT, textured_clips
+
+LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
+SIZES = {0: 32, 1: (16, 24)}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("textured") / "clips"
+    record_clips(Clips(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+    return out
+
+
+def colours() -> dict[int, torch.Tensor]:
+    draws = torch.Generator().manual_seed(4)
+    return {0: torch.rand((3, 32, 32), generator=draws), 1: torch.rand((3, 16, 24), generator=draws)}
+
+
+def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
+    """In the whole part that changes; elsewhere the recorded picture stands."""
+    textures = colours()
+    for clip, seen in zip(textured_clips(folder, LAYERS), clip_views(folder), strict=True):
+        picture = render(seen.scene, [seen.wearing(*LAYERS)])
+        radiance = torch.tensor(picture.radiance)
+        for number, size in SIZES.items():
+            radiance = retexture(taps_of(picture, size, texture=number), textures[number], radiance)
+        developed = develop(radiance, float(picture.exposure[0]), SENSOR)
+        before = torch.tensor(read_image(folder / "images" / clip.file)).permute(2, 0, 1)[None].float() / 255
+        _, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
+        for quality, whole in ((None, developed), (92, jpeg(developed, 92))):
+            shown = clip.prepare(SIZES, quality=quality).show(textures)
+            changed = (shown != before).any(1)[0]
+            assert changed.sum() > 0.3 * w * h
+            assert not changed[: max(int(y) - 40, 0)].any(), "far from the car nothing changes"
+            torch.testing.assert_close(shown[..., changed], whole[..., changed], rtol=0, atol=1e-5)
+            assert torch.equal(shown[..., ~changed], before[..., ~changed])
+
+
+def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = list(textured_clips(folder, LAYERS))
+    kept = sorted((folder / KEPT).rglob("*.npz"))
+    assert len(kept) == 1
+
+    def rendered(*given: object, only: set[str], **other: object) -> Iterator[None]:
+        assert not only, "rendered again"
+        yield from ()
+
+    monkeypatch.setattr(module, "clip_views", rendered)
+    for a, b in zip(first, textured_clips(folder, LAYERS), strict=True):
+        assert a.file == b.file
+        assert np.array_equal(a.radiance, b.radiance)
+        assert np.array_equal(a.fragments, b.fragments)
+    with pytest.raises(AssertionError, match="rendered again"):
+        next(textured_clips(folder, (Layer(0, opacity=0.9),)))
+    monkeypatch.setattr(module, "_drawing", lambda: "another version")
+    with pytest.raises(AssertionError, match="rendered again"):
+        next(textured_clips(folder, LAYERS))
+
+
+def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:
+    clip = next(textured_clips(folder, LAYERS))
+    textures = {k: v.requires_grad_() for k, v in colours().items()}
+    ready = clip.prepare(SIZES)
+    noisy = [ready.show(textures, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert torch.equal(noisy[0], noisy[1])
+    assert not torch.equal(noisy[0], noisy[2])
+    ready.show(textures).sum().backward()  # type: ignore[no-untyped-call]
+    assert all(v.grad is not None and float(v.grad.abs().sum()) > 1.0 for v in textures.values())
+    with pytest.raises(ConfigError, match="no size for texture 1"):
+        clip.prepare({0: 32})
+    with pytest.raises(ConfigError, match="no texture 1"):
+        ready.show({0: textures[0]})
+    (folder / "annotations" / "train.json").write_text('{"images": [{}]}')
+    with pytest.raises(FormatError, match="not the clips of this version"):
+        next(textured_clips(folder, split="train"))
