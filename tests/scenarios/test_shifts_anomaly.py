@@ -1,4 +1,4 @@
-"""The shift `anomaly`: where objects stand, and how they are drawn into pictures."""
+"""The shift `anomaly`: where objects stand, how they are drawn into pictures, and what a LiDAR sees of them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 from helpers.boxes import cars
 
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, camera_to_world
+from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, U8
-from ssad.scenarios.static.shifts import ShiftSpec, shift_images
+from ssad.scenarios.static.shifts import ShiftSpec, shift_images, shift_points
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.anomaly import AROUND, place_objects
 from ssad.scenarios.static.shifts.light import to_linear
@@ -75,7 +75,7 @@ def test_objects_stand_on_the_road_clear_of_boxes_and_of_the_ego() -> None:
     crowd = cars(
         *[(3.0 + 2.5 * side, y, 0.8) for side in (-1, 1) for y in np.arange(0.0, 60.0, 9.0)], velocity=(0, 0, 0)
     )
-    crossing = cars((3.0, 85.0, 0.8), velocity=(8.0, 0.0, 0.0))
+    crossing = cars(*[(3.0, y, 0.8) for y in (66.0, 75.0, 84.0, 93.0)], velocity=(8.0, 0.0, 0.0))
     seen = []
     for seed in range(12):
         for thing in place_objects(ShiftSpec("anomaly", 3, seed), "a", poses, [crowd, crossing]):
@@ -86,9 +86,9 @@ def test_objects_stand_on_the_road_clear_of_boxes_and_of_the_ego() -> None:
             grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 25), np.linspace(-0.5, 0.5, 25)), -1).reshape(-1, 2)
             pose = upright_pose(x, y, thing.yaw)
             ground = (grid * thing.size[:2]) @ pose[:2, :2].T + pose[:2, 3]
-            for boxes in (crowd, crossing):
-                apart = np.abs(ground[:, None] - boxes.centre[None, :, :2]) > 0.5 * boxes.size_lwh[:, :2]
-                assert apart.any(-1).all()
+            for boxes, moved in ((crowd, 0.0), (crossing, 0.0), (crossing, -1.9), (crossing, 1.9)):
+                apart = np.abs(ground[:, None] - boxes.centre[None, :, :2] - [moved, 0.0]) > 0.5 * boxes.size_lwh[:, :2]
+                assert apart.any(-1).all(), "in a box, or where one is between two samples"
             driven = (ground[:, 1] > 0.0) & (ground[:, 1] < 60.0)
             assert (np.abs(ground[driven, 0] - 3.0) > 1.0).all(), "the ego drives through it"
             seen.append(thing)
@@ -190,3 +190,29 @@ def test_objects_are_as_bright_as_the_ground_around_them() -> None:
         out, _ = shown(frame, CAR, picture=np.full_like(GREY, code))
         light.append(float(to_linear(out[inside]).mean()))
     assert light[1] / light[0] == pytest.approx(float(to_linear(110) / to_linear(40)), rel=0.1)
+
+
+# ---------------------------------------------------------------- LiDAR
+
+
+def test_rays_that_meet_an_object_return_from_it() -> None:
+    """A wall 40 m away, seen by rays of all heights; a block 2 m high stands before it."""
+    y, z = np.meshgrid(np.linspace(-10.0, 10.0, 81), np.linspace(-1.7, 4.0, 41))
+    wall = np.stack([np.full(y.size, 40.0), y.ravel(), z.ravel(), np.full(y.size, 9.0), np.zeros(y.size)], 1)
+    block = StandingObject("debris", "mattress", 2, (2.0, 4.0, 2.0), (21.0, 3.0, 0.0), 0.0)
+    frame = SweepFrame("s", to_ego=upright_pose(1.0, 0.0, 0.0, 1.8))
+    contexts = {"s": SceneContext("s", objects=(block,))}
+    before = wall.astype(np.float32)
+    out, done = shift_points(before, frame, ShiftSpec("anomaly", 5), contexts=contexts)
+    moved = (out != before).any(1)
+    assert done.details["moved"] == moved.sum() > 20
+    np.testing.assert_allclose(np.cross(out[moved, :3], before[moved, :3]), 0.0, atol=1e-3)  # along their rays
+    world = out[:, :3] + [1.0, 0.0, 1.8]
+    assert (np.abs(world[moved] - [21.0, 3.0, 1.0]) <= [1.01, 2.01, 1.01]).all()
+    assert world[moved, 0].max() < 21.5, "the side that looks at the sensor"
+    way = (20.0 - 1.0) / 39.0  # where the rays pass the middle of the face that looks at the sensor
+    middle = (np.abs(before[:, 1] * way - 3.0) < 1.2) & (np.abs(before[:, 2] * way + 0.8) < 0.6)
+    assert moved[middle].all()
+    far, none = shift_points(0.3 * before, frame, ShiftSpec("anomaly", 5), contexts=contexts)
+    assert not none.applied, "what is nearer than the object stays"
+    assert (far == np.float32(0.3) * before).all()

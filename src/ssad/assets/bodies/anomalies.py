@@ -194,14 +194,14 @@ def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, deta
     spine = np.stack([x, 0.04 * width * sway[:, 0], thick * np.linspace(1.4, 2.2, 5) + 0.02 * sway[:, 1]], 1)
     parts = [tube(spine, np.linspace(1.0, 0.4, 5) * thick, material=BARK, segments=sides)]
     # the root plate stands on its edge
-    roots = generator.uniform(0.65, 1.0, 9)
-    angle = np.arange(9) * (2.0 * np.pi / 9)
+    roots = generator.uniform(0.45, 1.0, 9)
+    angle = (np.arange(9) + generator.uniform(-0.4, 0.4, 9)) * (2.0 * np.pi / 9)
     plate = 0.34 * height
     for reach, a in zip(roots, angle, strict=True):
         tip = spine[0] + [
             -0.03 * length,
-            plate * 1.5 * reach * np.cos(a),
-            plate * 1.5 * reach * np.sin(a) + 0.4 * plate,
+            plate * 1.3 * reach * np.cos(a),
+            plate * 1.3 * reach * np.sin(a) + 0.4 * plate,
         ]
         tip[2] = max(tip[2], 0.03)
         path = np.stack([spine[0] + [0.05 * length, 0.0, 0.0], 0.5 * (spine[0] + tip), tip])

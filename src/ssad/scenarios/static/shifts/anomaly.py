@@ -2,7 +2,8 @@
 
 They stand still in the world beside the way that the ego drives and on its continuation, clear of every annotated box,
 so that all cameras show the same objects over the whole scene. Each is rendered by `ssad.camera`, exposed by the
-brightness of the ground around it, and mixed into the picture in linear light behind what is nearer.
+brightness of the ground around it, and mixed into the picture in linear light behind what is nearer. Rays of the LiDAR
+that meet one return from it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
 from ssad.assets.mesh import Material, Mesh, build
@@ -20,7 +22,7 @@ from ssad.camera.render import PLAIN, View, Weather, render
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.sensor import Sensor
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, camera_to_world
+from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import quaternion_to_yaw, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Bool
@@ -197,12 +199,19 @@ def add_anomalies(
     """anomaly, in both calibrations."""
     pixels, done = batch.numpy().copy(), []
     for b, (frame, spec) in enumerate(zip(frames, specs, strict=True)):
-        context = (contexts or {}).get(frame.scene)
-        objects = None if context is None else context.objects
-        if objects is None:
-            objects = place_objects(spec, frame.scene, frame.ego_to_world[None], [frame.boxes])
-        done.append(_draw(pixels[b], frame, [o for o in objects if o.level <= spec.severity]))
+        done.append(_draw(pixels[b], frame, _standing(spec, frame, contexts)))
     return to_batch(pixels, batch.device), done
+
+
+def _standing(
+    spec: ShiftSpec, frame: Frame | SweepFrame, contexts: Mapping[str, SceneContext] | None
+) -> list[StandingObject]:
+    """The objects of a severity: those of the scene, else drawn along the straight way ahead of this frame alone."""
+    context = (contexts or {}).get(frame.scene)
+    objects = None if context is None else context.objects
+    if objects is None:
+        objects = place_objects(spec, frame.scene, frame.ego_to_world[None], [frame.boxes])
+    return [thing for thing in objects if thing.level <= spec.severity]
 
 
 def _draw(picture: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
@@ -367,3 +376,73 @@ class _Canvas:
         changed = (self.drawn > 0) | self.dark
         picture[changed] = np.rint(to_codes(np.clip(self.light[changed], 0.0, 1.0))).astype(np.uint8)
         return round(float(self.drawn.mean()), 6)
+
+
+# ---------------------------------------------------------------- LiDAR
+
+
+def hit_by_rays(
+    cloud: F32, frame: SweepFrame, spec: ShiftSpec, contexts: Mapping[str, SceneContext] | None
+) -> tuple[F32, Applied]:
+    """The points [P, 5] with those behind an object moved to where their ray meets it.
+
+    A ray without a return is in no cloud, so an object before the sky gets no points.
+    """
+    pose = frame.ego_to_world @ frame.to_ego
+    rays = cloud[:, :3].astype(np.float64) @ pose[:3, :3].T
+    share, bright = np.ones(len(cloud)), cloud[:, 3].copy()
+    for thing in _standing(spec, frame, contexts):
+        if np.linalg.norm(np.array(thing.place) - pose[:3, 3]) > table.ANOMALY_FARTHEST:
+            continue
+        turn = upright_pose(0.0, 0.0, thing.yaw)[:3, :3]
+        start = (pose[:3, 3] - thing.place) @ turn
+        toward = rays @ turn
+        rows = np.flatnonzero(_enters(start, toward, thing.size))
+        corners, light = _faces(thing.kind, thing.style, thing.seed, thing.size)
+        for part in np.array_split(rows, len(rows) // 256 + 1):
+            met, face = _first_hit(start, toward[part], corners)
+            nearer = met < share[part]
+            share[part[nearer]] = met[nearer]
+            bright[part[nearer]] = light[face[nearer]]
+    moved = share < 1.0
+    cloud[moved, :3] *= share[moved, None].astype(np.float32)
+    cloud[moved, 3] = bright[moved]
+    return cloud, Applied(bool(moved.any()), {"moved": int(moved.sum())})
+
+
+@lru_cache(maxsize=64)
+def _faces(kind: str, style: str, seed: int, size: tuple[float, float, float]) -> tuple[F64, F32]:
+    """Corners [F, 3, 3] of a coarse body in its own frame, and the intensity [F] of its echoes, 0 to 255."""
+    mesh = make_body(kind, style=style, size=size, generator=generator("anomaly", kind, style, seed), detail=0)
+    grey = np.array([np.mean(material.colour) for material in mesh.materials], np.float32)
+    return mesh.corners(), np.asarray(np.clip(120.0 * grey, 2.0, 255.0)[mesh.material], np.float32)
+
+
+def _enters(start: F64, toward: F64, size: tuple[float, float, float]) -> Bool:
+    """Which rays [P, 3] from a place [3] reach a box on the ground before they end."""
+    half = 0.5 * np.array(size)
+    safe = np.where(np.abs(toward) < 1e-9, 1e-9, toward)
+    one, other = ((sign * half + [0.0, 0.0, half[2]] - start) / safe for sign in (-1.0, 1.0))
+    first, last = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
+    return np.asarray((first < last) & (last > 0.0) & (first < 1.0))
+
+
+def _first_hit(start: F64, toward: F64, corners: F64) -> tuple[F64, npt.NDArray[np.intp]]:
+    """How far along each ray [P, 3] it first meets a triangle [F, 3, 3] (2 for never), and which.
+
+    Source: Moeller and Trumbore 1997.
+    """
+    if not len(toward):
+        return np.zeros(0), np.zeros(0, np.intp)
+    a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    cross = np.cross(toward[:, None], c[None])
+    volume = np.einsum("pfk,fk->pf", cross, b)
+    inverse = 1.0 / np.where(np.abs(volume) < 1e-12, np.inf, volume)
+    away = start - a
+    u = np.einsum("pfk,fk->pf", cross, away) * inverse
+    aside = np.cross(away, b)
+    v = (toward @ aside.T) * inverse
+    t = np.einsum("fk,fk->f", c, aside) * inverse
+    t = np.where((inverse != 0.0) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0), t, 2.0)
+    face = t.argmin(1)
+    return t[np.arange(len(t)), face], face

@@ -37,7 +37,7 @@ EXTRA: Final[dict[str, tuple[Family, str]]] = {
     "anomaly": ("environment", "objects of no class on the road: debris, animals, overturned vehicles, fallen trees"),
 }
 KNOWN: Final = SHIFTS | EXTRA
-CAMERA_ONLY: Final = ("overexposure", "anomaly")  # no LiDAR twin
+CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
 VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
