@@ -196,12 +196,13 @@ def test_objects_are_as_bright_as_the_ground_around_them() -> None:
 
 
 def test_rays_that_meet_an_object_return_from_it() -> None:
-    """A wall 40 m away, seen by rays of all heights; a block 2 m high stands before it."""
+    """A wall 40 m away, seen by rays of all heights; a block 2 m high stands before it, and hides a lower one."""
     y, z = np.meshgrid(np.linspace(-10.0, 10.0, 81), np.linspace(-1.7, 4.0, 41))
     wall = np.stack([np.full(y.size, 40.0), y.ravel(), z.ravel(), np.full(y.size, 9.0), np.zeros(y.size)], 1)
     block = StandingObject("debris", "mattress", 2, (2.0, 4.0, 2.0), (21.0, 3.0, 0.0), 0.0)
+    behind = replace(block, size=(1.0, 1.0, 1.6), place=(25.0, 3.0, 0.0))
     frame = SweepFrame("s", to_ego=upright_pose(1.0, 0.0, 0.0, 1.8))
-    contexts = {"s": SceneContext("s", objects=(block,))}
+    contexts = {"s": SceneContext("s", objects=(block, behind))}
     before = wall.astype(np.float32)
     out, done = shift_points(before, frame, ShiftSpec("anomaly", 5), contexts=contexts)
     moved = (out != before).any(1)

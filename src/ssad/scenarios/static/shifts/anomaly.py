@@ -217,14 +217,13 @@ def _standing(
 def _draw(picture: U8, frame: Frame, objects: Sequence[StandingObject]) -> Applied:
     """Draws objects into a picture [H, W, 3], the farthest first, and says what is seen of each."""
     eye = camera_to_world(frame)
-    away = [float((np.array(o.place) - eye[:3, 3]) @ eye[:3, 2]) for o in objects]
     canvas = _Canvas(picture, frame)
+    gaps = [np.array(thing.place) - eye[:3, 3] for thing in objects]
+    away = [float(gap @ eye[:3, 2]) for gap in gaps]
     told = []
-    for n in np.argsort(-np.array(away), kind="stable").tolist():
+    for n in sorted(range(len(objects)), key=lambda n: (-away[n], n)):
         thing = objects[n]
-        if np.linalg.norm(np.array(thing.place) - eye[:3, 3]) > table.ANOMALY_FARTHEST:
-            continue
-        box = canvas.add(thing)
+        box = canvas.add(thing) if np.linalg.norm(gaps[n]) < table.ANOMALY_FARTHEST else None
         if box is not None:
             told.append({"kind": thing.kind, "style": thing.style, "depth_m": round(away[n], 2), "box": box})
     covered = canvas.finish(picture)
