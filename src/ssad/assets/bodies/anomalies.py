@@ -175,7 +175,7 @@ def _branch(size: Point, generator: np.random.Generator, detail: int) -> Mesh:
         path = np.stack([start, 0.5 * (start + end) + [0.0, 0.0, 0.05 * height], end])
         parts.append(tube(path, [0.4 * thick, 0.25 * thick, 0.1 * thick], material=BARK, segments=max(sides - 1, 3)))
         tuft = np.array([0.12 * length, 0.16 * width, 0.2 * height])
-        parts.append(foliage(end - 0.3 * (end - start), tuft, green, generator, detail=detail, leaf=0.13))
+        parts.append(foliage(end - 0.3 * (end - start), tuft, green, generator, detail=detail, leaf=0.11))
     return finish(parts, [], size)
 
 
@@ -229,7 +229,7 @@ def fallen_tree(style: str, size: Point, *, generator: np.random.Generator, deta
         else:
             tuft = np.array([0.11 * length, 0.2 * width, 0.24 * height]) * (0.8 + 0.3 * swell)
             where = start + 0.75 * (end - start)
-            parts.append(foliage(where, tuft, green, generator, detail=detail, leaf=0.3))
+            parts.append(foliage(where, tuft, green, generator, detail=detail, leaf=0.23))
     return finish(parts, [], size)
 
 
@@ -255,7 +255,7 @@ def foliage(
 ) -> Mesh:
     """A tuft of leaves: a dark uneven blob, and triangles about `leaf` m around it. The draws do not depend on the
     detail."""
-    count = 30
+    count = 48
     tilt, spin = generator.normal(size=(count, 3)), generator.normal(size=(count, 3))
     size = leaf * generator.uniform(0.6, 1.2, count)
     k = np.arange(count) + 0.5
@@ -263,7 +263,7 @@ def foliage(
     angle = np.pi * (1.0 + 5.0**0.5) * k
     flat = np.sqrt(1.0 - z * z)
     unit = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], 1)
-    step, grow = ((5, 2.2), (2, 1.4), (1, 1.0))[detail]
+    step, grow = ((8, 2.4), (3, 1.5), (1, 1.0))[detail]
     unit, tilt, spin, size = (values[::step] for values in (unit, tilt, spin, size))
     out = unit + 0.45 * tilt / np.linalg.norm(tilt, axis=1, keepdims=True)
     out /= np.linalg.norm(out, axis=1, keepdims=True)

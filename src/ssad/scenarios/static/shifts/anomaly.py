@@ -169,7 +169,7 @@ def _contact(mesh: Mesh) -> tuple[F32, F64]:
     above = corners[..., 2].mean(1)
     flat = np.rint((corners[..., :2] - corner) / CELL * 16).astype(np.int32)
     for face in np.argsort(-above, kind="stable"):
-        cv2.fillConvexPoly(cover, flat[face], float(np.exp(-above[face] / 0.7)), shift=4)
+        cv2.fillConvexPoly(cover, flat[face], float(np.exp(-above[face])), shift=4)
     soft = cv2.GaussianBlur(cover, (0, 0), 0.15 / CELL)
     edge = 0.25 / CELL  # nothing is left of it at the border of the map
     x, y = (np.minimum(np.arange(n), np.arange(n)[::-1]) / edge for n in (width, height))
