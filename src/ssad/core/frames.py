@@ -75,12 +75,30 @@ class SweepFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class StandingObject:
+    """A thing that stands still in the world over a whole scene.
+
+    kind, style: of `ssad.assets.bodies`; seed: of its looks; size: length, width, height, m; place: middle of its base
+    in the world, m; yaw: radians; level: least severity at which it is there.
+    """
+
+    kind: str
+    style: str
+    seed: int
+    size: tuple[float, float, float]
+    place: tuple[float, float, float]
+    yaw: float
+    level: int = 1
+
+
+@dataclass(frozen=True, slots=True)
 class SceneContext:
     """What is constant over a scene and drawn or measured once: the key, brightness, where it goes.
 
     light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); heading: of the ego in the world at
     the start of the scene, radians; start: its first time, s; sun: unit vector towards it in the world, where it was
-    chosen so that it is seen (None: drawn).
+    chosen so that it is seen (None: drawn); objects: what stands on its road and is of no class (None: drawn for each
+    picture by itself).
     """
 
     scene: str = ""
@@ -88,6 +106,7 @@ class SceneContext:
     heading: float = 0.0
     start: float = 0.0
     sun: tuple[float, float, float] | None = None
+    objects: tuple[StandingObject, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

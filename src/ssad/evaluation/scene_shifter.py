@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import FormatError
-from ssad.core.frames import Applied, Camera, Frame, SceneContext, SweepFrame
+from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import LIDAR, VISIBILITY
 from ssad.core.safeio import read_bytes
@@ -228,8 +228,11 @@ class SceneShifter:
 
     def _view(self, frame: SensorFrame) -> Frame:
         """The same by its own picture alone."""
-        objects = self.base.family == "object" or self._uses_depth
+        anomaly = self.base.name == "anomaly"
+        objects = self.base.family == "object" or self._uses_depth or anomaly
         boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else TrackedBoxes.empty()
+        if anomaly:
+            return self._frame(frame, boxes, depth=self._depth(frame))
         if not self._uses_depth:
             return self._frame(frame, boxes)
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
@@ -269,7 +272,18 @@ class SceneShifter:
 
     @property
     def _contexts(self) -> dict[str, SceneContext] | None:
+        if self.base.name == "anomaly":
+            return {self.context.scene: replace(self.context, objects=self.objects)}
         return {self.context.scene: self.context} if self.base.family == "environment" else None
+
+    @cached_property
+    def objects(self) -> tuple[StandingObject, ...]:
+        """What the shift `anomaly` puts on the road of the scene, at all severities."""
+        from ssad.scenarios.static.shifts.anomaly import place_objects
+
+        poses = np.array([f.ego_to_world for f in self.scene.frames if f.key_frame or f.modality == "camera"])
+        boxes = [boxes_of(self.scene.annotations(sample.token))[0] for sample in self.scene.samples]
+        return place_objects(self.base, self.scene.record.token, poses.reshape(-1, 4, 4), boxes)
 
     def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
         """The shifted points [P, 5] of a LiDAR frame. FormatError."""

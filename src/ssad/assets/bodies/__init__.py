@@ -12,8 +12,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from ssad.assets.bodies import anomalies, cycles, furniture, heavy, machines, people
 from ssad.assets.bodies import car as _car
-from ssad.assets.bodies import cycles, furniture, heavy, machines, people
 from ssad.assets.mesh import Mesh, Point, Rectangle
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.seeding import generator as seeded
@@ -95,6 +95,22 @@ BODIES: dict[str, Body] = {
     }),
     "yield_sign": Body(furniture.yield_sign, {
         "standard": BodyStyle((0.08, 0.90, 2.90), 0.03, 3.0), "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
+    }),
+    "debris": Body(anomalies.debris, {
+        "tyre": BodyStyle((0.68, 0.68, 0.22), 0.05), "pallet": BodyStyle((1.20, 1.00, 0.145), 0.04),
+        "boxes": BodyStyle((1.15, 0.80, 0.85), 0.08), "mattress": BodyStyle((1.95, 1.10, 0.22), 0.06),
+        "ladder": BodyStyle((3.00, 0.42, 0.09), 0.12), "branch": BodyStyle((2.40, 1.20, 0.60), 0.12),
+    }),
+    "animal": Body(anomalies.animal, {
+        "dog": BodyStyle((1.05, 0.26, 0.82), 0.08, 2.0), "deer": BodyStyle((1.55, 0.46, 1.55), 0.06, 2.0),
+        "cow": BodyStyle((2.45, 0.72, 1.50), 0.05), "horse": BodyStyle((2.35, 0.56, 2.00), 0.05),
+    }),
+    "overturned": Body(anomalies.overturned, {
+        "car_side": BodyStyle((4.75, 1.47, 1.93), 0.035, 2.0), "suv_side": BodyStyle((4.70, 1.76, 2.00), 0.04),
+        "car_roof": BodyStyle((4.15, 1.89, 1.50), 0.04), "truck_side": BodyStyle((7.60, 3.30, 2.52), 0.06),
+    }),
+    "fallen_tree": Body(anomalies.fallen_tree, {
+        "leafy": BodyStyle((8.50, 3.80, 2.60), 0.10, 2.0), "bare": BodyStyle((7.50, 3.20, 2.20), 0.10),
     }),
 }  # fmt: skip
 

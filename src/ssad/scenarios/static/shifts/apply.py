@@ -94,6 +94,10 @@ def _dispatch(
         return add_noise(batch, frames, specs)
     if name == "overexposure":
         return overexpose(batch, specs)
+    if name == "anomaly":
+        from ssad.scenarios.static.shifts.anomaly import add_anomalies
+
+        return add_anomalies(batch, frames, specs, contexts)
     if calibration == "paper":
         from ssad.scenarios.static.shifts.paper import paper_shift
 

@@ -35,6 +35,10 @@ def shift_points(
         return cloud, Applied(True, {"severity": 0})
     if spec.name in CAMERA_ONLY:
         return cloud, Applied(False, {}, {"changes cameras alone": 1})
+    if spec.name == "anomaly":
+        from ssad.scenarios.static.shifts.anomaly import hit_by_rays
+
+        return hit_by_rays(cloud, frame, spec, contexts)
     draws = spec.generator("lidar", frame.scene, frame.sample)
     if spec.family == "sensor":
         return _noise(cloud, spec, draws)

@@ -20,6 +20,18 @@ STUCK: Final = 0.2
 # ---- overexposure, in both calibrations: EV; 3.3 stops are ten times the light
 OVEREXPOSURE: Final[Five] = (0.7, 1.3, 2.0, 2.7, 3.3)
 
+# ---- anomaly, in both calibrations: what stands on each 40 m of the way, and from which severity on: 1, 2, 3, 4 and 6
+# objects. m: length of such a piece of the way, where the first begins ahead of the first pose, how far the way goes on
+# straight behind the last, how far objects stand beside it (a lane), where they are too far to be seen
+ANOMALIES: Final = (
+    ("debris", 1), ("animal", 2), ("overturned", 3), ("fallen_tree", 4), ("debris", 5), ("animal", 5),
+)  # fmt: skip
+ANOMALY_EVERY: Final = 40.0
+ANOMALY_FIRST: Final = 8.0
+ANOMALY_AHEAD: Final = 40.0
+ANOMALY_ASIDE: Final = 3.5
+ANOMALY_FARTHEST: Final = 80.0
+
 # ---- weather, physical
 # fog: meteorological optical range, m (5 % contrast, beta = 3 / range): extinctions .005 to .06 1/m of Hahner et al.
 # 2021, which 3DC uses for LiDAR fog; so the twins agree

@@ -34,6 +34,7 @@ SHIFTS: Final[dict[str, tuple[Family, str]]] = {
 # beside the paper's, used only where they are named: suites and tables keep to the paper's by default
 EXTRA: Final[dict[str, tuple[Family, str]]] = {
     "overexposure": ("sensor", "exposed for too long: bright parts are white"),
+    "anomaly": ("environment", "objects of no class on the road: debris, animals, overturned vehicles, fallen trees"),
 }
 KNOWN: Final = SHIFTS | EXTRA
 CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
