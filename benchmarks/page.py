@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from ssad.scenarios.static.shifts import VERSIONS
+
 ROOT = Path(__file__).parents[1]
 RUNS = {
     "world-cpu": "One core of a 2-core AMD EPYC machine (process CPU time)",
@@ -76,6 +78,8 @@ def shifts() -> list[str]:
         ]
         other = cpu["rows"][f"physical {name}"]["others_per_s"]
         lines.append(f"| {name} | " + " | ".join(f"{cell:,.0f} /s" for cell in cells) + f" | {other:.1f} /s |")
+    if gpu.get("versions") != VERSIONS:
+        lines += ["", f"The columns of the {gpu['device']} are of an earlier version of the shifts."]
     for kind in ("physical", "paper"):
         total = cpu["rows"][f"{kind} sum"]
         lines += [

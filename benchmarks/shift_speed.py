@@ -30,7 +30,7 @@ from ssad.core.boxes import TrackedBoxes
 from ssad.core.frames import FORWARD, Camera, Frame, SceneContext
 from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.rotations import yaw_to_quaternion
-from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, shift_images
+from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, shift_images
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
 
 # images / s of 3D_Corruptions_AD (patched to run); scale: mean time of up 3.8 and down 1.0; motion blur: of zoom 0.38
@@ -142,7 +142,7 @@ def main() -> None:
             rows[f"end to end {name}"] = {"images_per_s": 1 / whole, "codec_share": (decode + encode) / whole}
             print(f"{name:<12}end to end {1 / whole:5.0f} /s, codec {100 * (decode + encode) / whole:3.0f} % of it")
     where = wp.get_device(device).name if device != "cpu" else platform.processor() or platform.machine()
-    result = {"device": where, "batch": options.batch, "rows": rows}
+    result = {"device": where, "batch": options.batch, "versions": VERSIONS, "rows": rows}
     if options.out:
         options.out.write_text(json.dumps(result, indent=1) + "\n")
 
