@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssad.core.geometry import corners, obb_distance, rotate, to_local, to_world
+from ssad.core.geometry import corners, cross, obb_distance, rotate, to_local, to_world
 
 angle = st.floats(-50.0, 50.0)
 place = st.floats(-100.0, 100.0)
@@ -91,3 +93,15 @@ def test_obb_distance_is_batched() -> None:
     whole = obb_distance(a, b)
     assert whole.shape == (3, 4)
     assert whole[2, 3] == obb_distance(a[2, 0], b[3])
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_cross_products_are_numpys_to_the_bit(kind: Any) -> None:
+    draws = np.random.default_rng(1)
+    a, b = draws.normal(size=(40, 1, 3)).astype(kind), draws.normal(size=(7, 3)).astype(kind)
+    for u, v in ((a, b), (b, a), (a[0, 0], b), (a[0, 0], b[0])):
+        found, wanted = cross(u, v), np.cross(u, v)
+        assert found.dtype == wanted.dtype
+        assert found.shape == wanted.shape
+        assert found.tobytes() == np.ascontiguousarray(wanted).tobytes()
+    assert cross([1, 0, 0], [0.0, 1.0, 0.0]).tolist() == [0.0, 0.0, 1.0]

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import ConfigError, FormatError
+from ssad.core.geometry import cross
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -77,7 +78,7 @@ class Mesh:
     def areas(self) -> F64:
         """Area of each face [F], m^2."""
         p = self.corners()
-        return np.asarray(0.5 * np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=-1))
+        return np.asarray(0.5 * np.linalg.norm(cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=-1))
 
     def painted(self) -> npt.NDArray[np.bool_]:
         """Faces that take the paint [F]."""
@@ -201,8 +202,8 @@ def part_of(mesh: Mesh, faces: npt.NDArray[np.bool_]) -> Mesh:
 def corner_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, smooth: float = SMOOTH) -> F64:
     """Unit normals for each corner [F, 3, 3]: area-weighted over faces at the vertex within `smooth` rad."""
     v, f = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    cross = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-30)
+    area = cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
+    unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-30)
     if smooth <= 0.0:
         return np.repeat(unit[:, None], 3, axis=1)
     flat = f.ravel()
@@ -216,7 +217,7 @@ def corner_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, smooth: flo
         corner = np.flatnonzero(counts[flat] > k)
         other = order[starts[flat[corner]] + k] // 3
         near = np.einsum("ci,ci->c", own[corner], unit[other]) >= limit
-        total[corner[near]] += cross[other[near]]
+        total[corner[near]] += area[other[near]]
     length = np.linalg.norm(total, axis=1, keepdims=True)
     result = np.where(length > 1e-20, total / np.maximum(length, 1e-30), own)
     result[np.linalg.norm(result, axis=1) < 0.5] = 0.0, 0.0, 1.0
@@ -242,8 +243,7 @@ def build(
     """
     v, f = np.asarray(vertices, np.float64).reshape(-1, 3), np.asarray(faces, np.int32).reshape(-1, 3)
     table = (materials,) if isinstance(materials, Material) else tuple(materials)
-    cross = np.cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]])
-    keep = np.linalg.norm(cross, axis=1) > 2.0 * MIN_AREA
+    keep = np.linalg.norm(cross(v[f[:, 1]] - v[f[:, 0]], v[f[:, 2]] - v[f[:, 0]]), axis=1) > 2.0 * MIN_AREA
     index = np.broadcast_to(np.asarray(material, np.int32), len(f))[keep]
     names = (panel,) if isinstance(panel, str) else tuple(panels)
     place = np.asarray(0 if isinstance(panel, str) else -1 if panel is None else panel, np.int32)
@@ -251,7 +251,7 @@ def build(
     half = np.broadcast_to(np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0]]), (len(f), 3, 2))
     coordinates = (half if uv is None else np.asarray(uv, np.float64).reshape(-1, 3, 2))[keep]
     f = f[keep]
-    if outward and np.einsum("fi,fi->", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])) < 0.0:
+    if outward and np.einsum("fi,fi->", v[f[:, 0]], cross(v[f[:, 1]], v[f[:, 2]])) < 0.0:
         f, coordinates = f[:, ::-1], coordinates[:, ::-1]
     return Mesh(
         v.astype(np.float32),
@@ -326,7 +326,7 @@ def box(size: Point, *, material: Material, centre: Point = (0.0, 0.0, 0.0), pan
         normal = np.zeros(3)
         normal[axis] = sign
         up = np.array([0.0, 0.0, 1.0]) if axis < 2 else np.array([1.0, 0.0, 0.0])
-        right = np.cross(up, normal)
+        right = cross(up, normal)
         points += [normal - right - up, normal + right - up, normal + right + up, normal - right + up]
     vertices = 0.5 * np.array(points) * np.asarray(size) + np.asarray(centre)
     faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * k for k in range(6)])
@@ -436,9 +436,9 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, material: Material, segm
     along = np.gradient(p, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     helper = np.eye(3)[int(np.argmin(np.abs(along).sum(axis=0)))]
-    side = np.cross(along, helper)
+    side = cross(along, helper)
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
-    up = np.cross(along, side)
+    up = cross(along, side)
     angle = np.arange(segments) * (2.0 * np.pi / segments)
     ring = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * up[:, None]
     return loft(p[:, None] + r[:, None, None] * ring, material=material)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.assets.mesh import F64, SMOOTH, Material, Mesh, Point, Rectangle, box, build, grid_faces, lathe, merge, tube
+from ssad.core.geometry import cross
 
 PAINT = Material("paint", (0.45, 0.45, 0.46), specular=0.06, gloss=0.85, paint=True)
 CARGO = Material("cargo", (0.72, 0.72, 0.70), specular=0.04, gloss=0.4)
@@ -73,11 +74,12 @@ def pack(charts: Sequence[Chart]) -> dict[str, tuple[float, float, float]]:
     Shelves of falling height, the scale by bisection: every panel has an area in proportion to its area in m^2.
     """
     whole = sorted((c for c in charts if "/" not in c.name), key=lambda c: (-c.extent()[1], c.name))
+    sizes = [(chart.name, *chart.extent()) for chart in whole]
     best: dict[str, tuple[float, float, float]] = {}
     low, high = 0.0, 10.0
     for _ in range(30):
         scale = 0.5 * (low + high)
-        placed = _shelves(whole, scale)
+        placed = _shelves(sizes, scale)
         if placed is None:
             high = scale
         else:
@@ -85,13 +87,13 @@ def pack(charts: Sequence[Chart]) -> dict[str, tuple[float, float, float]]:
     return best
 
 
-def _shelves(charts: Sequence[Chart], scale: float) -> dict[str, tuple[float, float, float]] | None:
-    """The charts on shelves, each on the first that has room; None where they do not fit."""
+def _shelves(charts: Sequence[tuple[str, float, float]], scale: float) -> dict[str, tuple[float, float, float]] | None:
+    """The charts (name, width and height in m) on shelves, each on the first with room; None where they do not fit."""
     shelves: list[list[float]] = []  # top, height, used width
     placed: dict[str, tuple[float, float, float]] = {}
     bottom = 0.0
-    for chart in charts:
-        width, height = (side * scale + 2.0 * MARGIN for side in chart.extent())
+    for name, *sides in charts:
+        width, height = (side * scale + 2.0 * MARGIN for side in sides)
         shelf = next((s for s in shelves if s[2] + width <= 1.0 and height <= s[1] + 1e-12), None)
         if shelf is None:
             if bottom + height > 1.0 or width > 1.0:
@@ -99,7 +101,7 @@ def _shelves(charts: Sequence[Chart], scale: float) -> dict[str, tuple[float, fl
             shelf = [bottom, height, 0.0]
             shelves.append(shelf)
             bottom += height
-        placed[chart.name] = (shelf[2] + MARGIN, shelf[0] + MARGIN, scale)
+        placed[name] = (shelf[2] + MARGIN, shelf[0] + MARGIN, scale)
         shelf[2] += width
     return placed
 
@@ -195,7 +197,7 @@ SIDES = ("front", "rear", "left", "right", "top")
 def sided(mesh: Mesh, prefix: str) -> Mesh:
     """The mesh with its faces in the panels `prefix_front`, `_rear`, `_left`, `_right`, `_top`, by where they look."""
     p = mesh.corners()
-    normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    normal = cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     panel = np.where(normal[:, 1] >= 0.0, 2, 3)
     panel = np.where(np.abs(normal[:, 1]) < 1e-3, np.where(p[..., 1].mean(axis=1) >= 0.0, 2, 3), panel)

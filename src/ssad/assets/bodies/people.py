@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ssad.assets.bodies.parts import Chart, as_point, crate, unwrap
 from ssad.assets.mesh import F64, Material, Mesh, Point, loft, merge, sphere, tube
+from ssad.core.geometry import cross
 
 SKINS = ((0.62, 0.40, 0.29), (0.50, 0.31, 0.21), (0.35, 0.20, 0.13), (0.20, 0.11, 0.07), (0.10, 0.055, 0.035))
 HAIRS = ((0.015, 0.012, 0.010), (0.05, 0.03, 0.02), (0.13, 0.075, 0.04), (0.38, 0.27, 0.14), (0.40, 0.40, 0.40))
@@ -154,7 +156,7 @@ def figure(pose: Pose, look: Look, *, height: float, detail: int, child: bool = 
     h = height
     n = (4, 6, 10)[detail]
     up = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
-    forward = np.cross([0.0, 1.0, 0.0], up)
+    forward = cross([0.0, 1.0, 0.0], up)
     parts = [_trunk(pose, look, h, n=2 * n if detail else 6, child=child)]
     leg_look = look.skin if look.skirt else look.trousers
     for k in (0, 1):
@@ -203,7 +205,7 @@ def _box(half: Point, material: Material) -> Mesh:
 
 def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     up = (pose.neck - pose.pelvis) / np.linalg.norm(pose.neck - pose.pelvis)
-    forward = np.cross([0.0, 1.0, 0.0], up)
+    forward = cross([0.0, 1.0, 0.0], up)
     length = float(np.linalg.norm(pose.neck - pose.pelvis))
     long = look.coat or look.skirt
     rows = [(-0.16, 0.050, 0.070), (0.06, 0.066, 0.092), (0.16, 0.064, 0.089), (0.30, 0.060, 0.083),
@@ -281,6 +283,15 @@ def _extent(pose: Pose, h: float) -> F64:
     return np.array([[low[0], low[1], 0.0], [high[0], high[1], high[2] - floor + 0.008 * h]])
 
 
+@lru_cache(maxsize=64)
+def _cycle_extent(height: float, swing: float, spread: float, child: bool) -> tuple[F64, F64]:
+    """Lowest and highest corner [3] of the boxes of a walking cycle, m."""
+    phases = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    poses = [walking(height, phase=p, swing=swing, spread=spread, child=child) for p in phases]
+    boxes = np.array([_extent(pose, height) for pose in poses])
+    return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+
+
 def torso_charts(low: Point, high: Point) -> list[Chart]:
     """Panels of a person's shirt."""
     return [Chart("torso_front", "front", low, high), Chart("torso_back", "rear", low, high)]
@@ -308,8 +319,8 @@ def pedestrian(
     chosen = chosen.moved(z=-float(chosen.bounds()[0][2]))
     low, high = chosen.bounds()
     if not still:
-        boxes = np.array([_extent(pose(p), height) for p in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)])
-        low, high = np.minimum(low, boxes[:, 0].min(axis=0)), np.maximum(high, boxes[:, 1].max(axis=0))
+        least, most = _cycle_extent(height, swing, spread, child)
+        low, high = np.minimum(low, least), np.maximum(high, most)
     scale = np.asarray(size) / (high - low)
     matrix = np.diag([*scale, 1.0])
     matrix[:3, 3] = -scale * [0.5 * (low[0] + high[0]), 0.5 * (low[1] + high[1]), 0.0]

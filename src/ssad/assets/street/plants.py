@@ -9,6 +9,7 @@ from ssad.assets.mesh import F64
 from ssad.assets.street.model import FAR, MID, NEAR
 from ssad.assets.street.palette import Look
 from ssad.assets.street.triangles import Piece, box, cylinder, join, smooth
+from ssad.core.geometry import cross
 
 VISIBLE = NEAR | MID
 
@@ -49,7 +50,7 @@ def leaves(centre: F64, radius: F64, look: Look, *, count: int, size: float, mat
     tilt = unit + 0.75 * rng.normal(size=(count, 3))
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     tilt *= np.sign((tilt * unit).sum(axis=1, keepdims=True) + 1e-9)
-    side = np.cross(tilt, rng.normal(size=(count, 3)))
+    side = cross(tilt, rng.normal(size=(count, 3)))
     half = size * rng.uniform(0.6, 1.1, (count, 1, 1))
     normal = np.repeat(unit / radius + [0.0, 0.0, 0.15], 3, axis=0)
     # the upper leaves catch more light: lighter greens come first in the table
@@ -63,7 +64,7 @@ def _scraps(  # noqa: PLR0917
     """A triangle about each place [n, 3]: across `out` (unit), its corners turned from `side`, `half` m away."""
     side = side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
     cos, sin = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
-    corners = place[:, None] + half * (cos * side[:, None] + sin * np.cross(out, side)[:, None])
+    corners = place[:, None] + half * (cos * side[:, None] + sin * cross(out, side)[:, None])
     faces = np.arange(3 * len(place), dtype=np.int32).reshape(-1, 3)
     return smooth(corners.reshape(-1, 3), faces, normal, material, levels=NEAR)
 
@@ -161,7 +162,7 @@ def hedge(look: Look, material: int) -> Piece:
     out[::3] = 0.0, 0.0, 1.0
     tilt = out + 0.5 * rng.normal(size=(count, 3))
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
-    side = np.cross(tilt, [0.3, 0.2, 0.9])
+    side = cross(tilt, [0.3, 0.2, 0.9])
     index = np.where(rng.random(count) < 0.5, light, material)
     parts.append(_scraps(place, tilt, side, 0.12, (0.0, 2.1, 4.2), np.repeat(out, 3, axis=0), index))
     return join(parts)
