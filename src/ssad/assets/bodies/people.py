@@ -17,6 +17,10 @@ CLOTHS = ((0.02, 0.02, 0.025), (0.03, 0.045, 0.11), (0.14, 0.14, 0.15), (0.55, 0
           (0.05, 0.16, 0.08), (0.42, 0.33, 0.20), (0.07, 0.16, 0.36), (0.55, 0.38, 0.06),
           (0.36, 0.15, 0.28))  # fmt: skip
 HIVIS = (0.55, 0.75, 0.05)
+ORANGE = (0.80, 0.22, 0.02)
+BANDS = Material("bands", (0.62, 0.64, 0.66), specular=0.2, gloss=0.5)
+EYES = Material("eyes", (0.012, 0.010, 0.009), specular=0.05, gloss=0.6)
+LIPS = Material("lips", (0.16, 0.05, 0.045), specular=0.02, gloss=0.2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +40,9 @@ class Look:
     bag: Material | None = None
     cap: Material | None = None
     helmet: Material | None = None
+    inner: Material | None = None  # seen where the jacket is open
+    bands: Material | None = None  # reflecting bands of a high-visibility vest
+    beard: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +76,17 @@ def draw_look(generator: np.random.Generator, *, helmet: bool = False, rider: bo
     helmet_colour = cloth("helmet", (*CLOTHS[3:5], CLOTHS[0], CLOTHS[7]))
     shorts, bag, cap = generator.random(3) < [0.16, 0.2, 0.22]
     bag_colour, cap_colour = cloth("bag", CLOTHS), cloth("cap", CLOTHS)
+    opened, beard = generator.random(2) < [0.6, 0.2]
+    inner = cloth("inner", CLOTHS)
+    if abs(sum(inner.colour) - sum(shirt.colour)) < 0.3:  # told apart from the jacket
+        inner = replace(inner, colour=(0.60, 0.60, 0.58) if sum(shirt.colour) < 0.8 else (0.03, 0.03, 0.04))
     return Look(
         cloth("skin", SKINS), cloth("hair", HAIRS), shirt, trousers,
         cloth("shoes", (CLOTHS[0], CLOTHS[3], (0.09, 0.05, 0.03))),
         bool(coat and not rider), bool(skirt and not coat and not rider), bool(pack), bool(long_hair),
         bool(shorts and not coat and not skirt), bag_colour if bag and not pack and not rider else None,
         cap_colour if cap and not helmet else None, replace(helmet_colour, gloss=0.8) if helmet else None,
+        inner if opened else None, BANDS if vest else None, bool(beard and not long_hair),
     )  # fmt: skip
 
 
@@ -231,12 +243,22 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     front = centre @ forward >= 0.0
     neck = row >= len(rows) - 2
     shirt = (row >= hem) & (row < len(rows) - 1)
-    material = np.where(neck, 2, np.where(shirt, 0, 1)).astype(np.int32)
+    material = np.where(neck, 2, np.where(shirt, 0, 1))
+    materials = [look.shirt, look.trousers, look.skin]
+    jacket = shirt & ~neck
+    if look.bands is not None:
+        material[jacket & np.isin(row, [len(rows) - 6, len(rows) - 8])] = len(materials)
+        materials.append(look.bands)
+    if look.inner is not None and n > 6:  # a strip down the middle of the chest, 30 degrees to either side at most
+        column = np.arange(len(body.faces)) // 2 % n
+        middle = np.minimum(column, n - 1 - column) == 0
+        material[jacket & middle & (row < len(rows))] = len(materials)
+        materials.append(look.inner)
     panel = np.where(shirt & ~neck, np.where(front, 0, 1), -1).astype(np.int32)
     return replace(
         body,
-        material=material,
-        materials=(look.shirt, look.trousers, look.skin),
+        material=material.astype(np.int32),
+        materials=tuple(materials),
         panel=panel,
         panels=("torso_front", "torso_back"),
     )
@@ -257,15 +279,21 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
     if look.helmet is not None:
         parts.append(ball((0.068, 0.060, 0.060), look.helmet, -0.006, 0.022))
     else:
-        parts.append(ball((0.051, 0.047, 0.054), look.hair, -0.012, 0.018))
+        parts.append(ball((0.050, 0.048, 0.056), look.hair, -0.016, 0.016))
         if look.long_hair and detail > 0:
             parts.append(ball((0.030, 0.042, 0.070), look.hair, -0.030, -0.035))
         if look.cap is not None:  # its peak points ahead
             parts.append(ball((0.056, 0.051, 0.042), look.cap, -0.006, 0.034))
             if detail > 0:
                 parts.append(ball((0.040, 0.040, 0.008), look.cap, 0.058, 0.026, segments=6))
+    if detail > 0:  # the face: eyes under their brows, nose, mouth or beard
+        parts.append(ball((0.016, 0.030, 0.008), EYES, 0.038, 0.008, segments=6))
+        parts.append(ball((0.014, 0.009, 0.014), look.skin, 0.049, -0.009, segments=6))
+        if look.beard:
+            parts.append(ball((0.026, 0.034, 0.026), look.hair, 0.022, -0.042, segments=6))
+        elif detail == 2:
+            parts.append(ball((0.012, 0.016, 0.005), LIPS, 0.036, -0.031, segments=6))
     if detail == 2:
-        parts.append(ball((0.012, 0.009, 0.012), look.skin, 0.050, -0.008, segments=6))
         neck = [pose.neck - np.array([0.0, 0.0, 0.02 * h]), pose.head - [0.01 * h, 0.0, 0.02 * h]]
         parts.append(tube(neck, 0.030 * h, material=look.skin, segments=8))
     return parts
