@@ -75,7 +75,10 @@ def from_lanes(graph: LaneGraph, xy: npt.NDArray[np.float64]) -> npt.NDArray[np.
     return gap
 
 
-@pytest.mark.parametrize("name", TOWNS)
+@pytest.mark.parametrize(
+    "name",
+    ["Twinford", "Oldmarket", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Crossgate", "Larkhill"))],
+)
 def test_nothing_stands_on_lanes_junctions_or_crosswalks(name: str) -> None:
     graph, scene = town(name), street(name)
     p = corners(scene)

@@ -48,6 +48,7 @@ from ssad.recording.target import TargetCar, TargetSign, parse_target
 from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
+BOTH = pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=pytest.mark.slow)])
 DISTANCES, AZIMUTHS, ELEVATIONS = (5.0, 10.0, 20.0), (0.0, 90.0, 180.0, 270.0), (0.0, 15.0, 30.0)
 
 
@@ -160,7 +161,9 @@ def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: _Set) -> 
         assert np.hypot(*(np.array(row["pose"])[:2, 3] - behind)) < 0.15
 
 
+@pytest.mark.slow
 def test_an_orbit_is_seen_from_where_its_row_says(orbits: Path) -> None:
+    """By default an orbit round a sign shows it, below."""
     rows = read(orbits)["images"]
     assert len({row["target_style"] for row in rows}) > 1
     cells = set()
@@ -177,25 +180,26 @@ def test_an_orbit_is_seen_from_where_its_row_says(orbits: Path) -> None:
     assert {c[2] for c in cells} <= set(ELEVATIONS)
 
 
-def test_towns_of_train_and_test_are_apart(drives: Path, orbits: Path) -> None:
-    for root in (drives, orbits):
-        parts = {split: read(root, split) for split in ("train", "test", "all")}
-        assert {row["town"] for row in parts["train"]["images"]} == {"Twinford"}
-        assert {row["town"] for row in parts["test"]["images"]} == {"Oldmarket"}
-        for split, data in parts.items():
-            files = [row["file_name"] for row in data["images"]]
-            assert len(set(files)) == len(files) == data["info"]["images"]
-            assert data["info"]["split"] == split
-            assert sum(data["info"]["weathers"].values()) == len(files)
-            names = {c["id"]: c["name"] for c in data["categories"]}
-            counts = Counter(names[a["category_id"]] for a in data["annotations"] if not a["iscrowd"])
-            assert data["info"]["objects"] == counts
-        whole = [row["file_name"] for split in ("train", "test") for row in parts[split]["images"]]
-        assert [row["file_name"] for row in parts["all"]["images"]] == whole
-        assert sorted(p.name for p in (root / "images").iterdir()) == sorted(whole)
+@BOTH
+def test_towns_of_train_and_test_are_apart(mode: str, request: pytest.FixtureRequest) -> None:
+    root = request.getfixturevalue(mode)
+    parts = {split: read(root, split) for split in ("train", "test", "all")}
+    assert {row["town"] for row in parts["train"]["images"]} == {"Twinford"}
+    assert {row["town"] for row in parts["test"]["images"]} == {"Oldmarket"}
+    for split, data in parts.items():
+        files = [row["file_name"] for row in data["images"]]
+        assert len(set(files)) == len(files) == data["info"]["images"]
+        assert data["info"]["split"] == split
+        assert sum(data["info"]["weathers"].values()) == len(files)
+        names = {c["id"]: c["name"] for c in data["categories"]}
+        counts = Counter(names[a["category_id"]] for a in data["annotations"] if not a["iscrowd"])
+        assert data["info"]["objects"] == counts
+    whole = [row["file_name"] for split in ("train", "test") for row in parts[split]["images"]]
+    assert [row["file_name"] for row in parts["all"]["images"]] == whole
+    assert sorted(p.name for p in (root / "images").iterdir()) == sorted(whole)
 
 
-@pytest.mark.parametrize("mode", ["drives", "orbits"])
+@BOTH
 def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, request: pytest.FixtureRequest) -> None:
     root = request.getfixturevalue(mode)
     data = read(root)
@@ -241,7 +245,7 @@ def projected(row: dict[str, Any]) -> F64:
     return np.concatenate([xy.min(0), xy.max(0)])
 
 
-@pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=pytest.mark.slow)])
+@BOTH
 def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -> None:
     """Each row gives scene, view, target and labels; what is rendered is what was stored."""
     folder = request.getfixturevalue(mode)
@@ -328,25 +332,26 @@ def test_clip_views_refuses_what_it_does_not_know(drives: Path, tmp_path: Path) 
         next(clip_views(tmp_path))
 
 
-def test_pycocotools_reads_it_and_the_truth_scores_1(drives: Path, orbits: Path) -> None:
+@BOTH
+def test_pycocotools_reads_it_and_the_truth_scores_1(mode: str, request: pytest.FixtureRequest) -> None:
     coco = pytest.importorskip("pycocotools.coco")
     evaluation = pytest.importorskip("pycocotools.cocoeval")
-    for root in (drives, orbits):
-        with contextlib.redirect_stdout(io.StringIO()):
-            truth = coco.COCO(str(root / "annotations" / "all.json"))
-            assert [c["name"] for c in truth.loadCats(truth.getCatIds())] == list(CLASSES)
-            said = [
-                {"image_id": a["image_id"], "category_id": a["category_id"], "bbox": a["bbox"], "score": 0.9}
-                for a in truth.dataset["annotations"]
-                if not a["iscrowd"]
-            ]
-            found = evaluation.COCOeval(truth, truth.loadRes(said), "bbox")
-            found.params.maxDets = [1, 10, 1000]
-            found.evaluate()
-            found.accumulate()
-        precision = found.eval["precision"][..., 0, -1]
-        assert (precision > -1).any()
-        assert (precision[precision > -1] > 1 - 1e-9).all()
+    root = request.getfixturevalue(mode)
+    with contextlib.redirect_stdout(io.StringIO()):
+        truth = coco.COCO(str(root / "annotations" / "all.json"))
+        assert [c["name"] for c in truth.loadCats(truth.getCatIds())] == list(CLASSES)
+        said = [
+            {"image_id": a["image_id"], "category_id": a["category_id"], "bbox": a["bbox"], "score": 0.9}
+            for a in truth.dataset["annotations"]
+            if not a["iscrowd"]
+        ]
+        found = evaluation.COCOeval(truth, truth.loadRes(said), "bbox")
+        found.params.maxDets = [1, 10, 1000]
+        found.evaluate()
+        found.accumulate()
+    precision = found.eval["precision"][..., 0, -1]
+    assert (precision > -1).any()
+    assert (precision[precision > -1] > 1 - 1e-9).all()
 
 
 @pytest.mark.slow

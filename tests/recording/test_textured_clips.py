@@ -17,12 +17,22 @@ from ssad.camera.torch_jpeg import jpeg
 from ssad.camera.torch_sensor import develop
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
+from ssad.recording import scene_objects
 from ssad.recording.clip_recorder import Clips, clip_views, record_clips
 from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.recording.textured_clips import KEPT, textured_clips
 
 LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
 SIZES = {0: 32, 1: (16, 24)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_people() -> Iterator[None]:
+    """Bodies of people take long to make."""
+    with pytest.MonkeyPatch.context() as patch:
+        for people in ("WALKERS", "WAITING"):
+            patch.setattr(scene_objects, people, 1)
+        yield
 
 
 @pytest.fixture(scope="module")
