@@ -195,7 +195,15 @@ def test_a_body_fills_its_size_exactly(kind: str, style: str, detail: int) -> No
 
 
 @pytest.mark.parametrize(
-    ("style", "size"), [("adult", (0.73, 0.67, 1.77)), ("child", (0.5, 0.5, 1.2)), ("adult", (1.0, 0.9, 1.9))]
+    ("style", "size"),
+    [
+        ("adult", (0.73, 0.67, 1.77)),
+        ("child", (0.5, 0.5, 1.2)),
+        ("adult", (1.0, 0.9, 1.9)),
+        ("elderly", (0.70, 0.66, 1.60)),
+        ("stroller", (0.80, 0.62, 1.70)),
+        ("worker", (0.78, 0.68, 1.80)),
+    ],
 )
 def test_a_walker_fills_its_box_over_the_cycle_and_never_leaves_it(
     style: str, size: tuple[float, float, float]
@@ -224,8 +232,9 @@ def test_walking_swings_opposite_legs() -> None:
     np.testing.assert_allclose(mirrored.bounds(), other.bounds(), atol=0.02)
 
 
-def test_a_standing_person_fills_the_box() -> None:
-    mesh = make_body("pedestrian", style="standing", size=(0.5, 0.6, 1.8), generator=generator(2))
+@pytest.mark.parametrize("style", ["standing", "worker"])
+def test_a_standing_person_fills_the_box(style: str) -> None:
+    mesh = make_body("pedestrian", style=style, size=(0.5, 0.6, 1.8), generator=generator(2))
     low, high = mesh.bounds()
     np.testing.assert_allclose(high - low, (0.5, 0.6, 1.8), atol=1e-4)
 

@@ -68,7 +68,8 @@ BODIES: dict[str, Body] = {
     }, phased=True),
     "pedestrian": Body(people.pedestrian, {
         "adult": BodyStyle((0.76, 0.66, 1.74), 0.05, 6.0), "child": BodyStyle((0.55, 0.48, 1.28), 0.09, 1.0),
-        "standing": BodyStyle((0.42, 0.62, 1.74), 0.05, 1.0),
+        "standing": BodyStyle((0.42, 0.62, 1.74), 0.05, 1.0), "elderly": BodyStyle((0.70, 0.66, 1.60), 0.05, 0.8),
+        "worker": BodyStyle((0.44, 0.66, 1.80), 0.04, 0.4), "stroller": BodyStyle((0.80, 0.62, 1.70), 0.05, 0.5),
     }, phased=True),
     "traffic_cone": Body(furniture.traffic_cone, {
         "cone": BodyStyle((0.41, 0.41, 0.80), 0.08, 3.0), "tall": BodyStyle((0.36, 0.36, 1.07), 0.05, 2.0),

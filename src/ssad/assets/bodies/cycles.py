@@ -93,7 +93,7 @@ def bicycle(
 
 def motorcycle(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
     """A motorcycle that fills its size (m), with its rider when ridden."""
-    look = draw_look(generator, helmet=True, rider=True)
+    look = draw_look(generator, helmet=True, rider=True, visor=True)
     fairing = bool(generator.random() < 0.5)
     radius = 0.32
     front, rear = np.array([0.72, 0.0, radius]), np.array([-0.70, 0.0, radius])

@@ -1,4 +1,5 @@
-"""People: adults and children in a walking cycle, standing, or seated on a two-wheeler."""
+"""People: adults, children and the elderly in a walking cycle, pushing a stroller, standing, at work on the road, or
+seated on a two-wheeler."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ CLOTHS = ((0.02, 0.02, 0.025), (0.03, 0.045, 0.11), (0.14, 0.14, 0.15), (0.55, 0
 HIVIS = (0.55, 0.75, 0.05)
 ORANGE = (0.80, 0.22, 0.02)
 BANDS = Material("bands", (0.62, 0.64, 0.66), specular=0.2, gloss=0.5)
+STICK = Material("stick", (0.06, 0.03, 0.015), specular=0.05, gloss=0.5)
 EYES = Material("eyes", (0.012, 0.010, 0.009), specular=0.05, gloss=0.6)
+VISOR = Material("visor", (0.012, 0.013, 0.015), specular=0.09, gloss=0.95)
 LIPS = Material("lips", (0.16, 0.05, 0.045), specular=0.02, gloss=0.2)
 
 
@@ -43,6 +46,7 @@ class Look:
     inner: Material | None = None  # seen where the jacket is open
     bands: Material | None = None  # reflecting bands of a high-visibility vest
     beard: bool = False
+    visor: bool = False  # of a motorcycle helmet
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +65,9 @@ class Pose:
     hands: tuple[F64, F64]
 
 
-def draw_look(generator: np.random.Generator, *, helmet: bool = False, rider: bool = False) -> Look:
+def draw_look(
+    generator: np.random.Generator, *, helmet: bool = False, rider: bool = False, visor: bool = False
+) -> Look:
     """Clothes, skin and hair of a random person; a rider wears neither coat nor skirt."""
 
     def cloth(name: str, table: tuple[tuple[float, float, float], ...]) -> Material:
@@ -86,7 +92,7 @@ def draw_look(generator: np.random.Generator, *, helmet: bool = False, rider: bo
         bool(coat and not rider), bool(skirt and not coat and not rider), bool(pack), bool(long_hair),
         bool(shorts and not coat and not skirt), bag_colour if bag and not pack and not rider else None,
         cap_colour if cap and not helmet else None, replace(helmet_colour, gloss=0.8) if helmet else None,
-        inner if opened else None, BANDS if vest else None, bool(beard and not long_hair),
+        inner if opened else None, BANDS if vest else None, bool(beard and not long_hair), visor,
     )  # fmt: skip
 
 
@@ -122,6 +128,34 @@ def walking(height: float, *, phase: float, swing: float, spread: float, child: 
         hand = elbow + fore * (np.array([np.sin(bent), 0.0, -np.cos(bent)]) * np.cos(0.6 * spread) + 0.6 * out)
         limbs.append((hip, knee, ankle, toe, at, elbow, hand))
     return Pose(pelvis, neck, head, *zip(*limbs, strict=True))
+
+
+def stooped(pose: Pose, *, angle: float, height: float) -> Pose:
+    """The pose with its trunk bent forward by an angle (rad) from the hips; the arms still hang, the head looks up."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+
+    def bent(point: F64) -> F64:
+        return np.asarray(pose.pelvis + turn @ (point - pose.pelvis))
+
+    neck = bent(pose.neck)
+    shoulders = bent(pose.shoulders[0]), bent(pose.shoulders[1])
+    moves = [new - old for new, old in zip(shoulders, pose.shoulders, strict=True)]
+    elbows = pose.elbows[0] + moves[0], pose.elbows[1] + moves[1]
+    hands = pose.hands[0] + moves[0], pose.hands[1] + moves[1]
+    head = neck + np.array([0.045 * height, 0.0, 0.065 * height])
+    return replace(pose, neck=neck, head=head, shoulders=shoulders, elbows=elbows, hands=hands)
+
+
+def holding(pose: Pose, *, left: Point | None = None, right: Point | None = None, height: float) -> Pose:
+    """The pose with a hand, or both, at a place (m); the arm bends to reach it."""
+    elbows, hands = list(pose.elbows), list(pose.hands)
+    for k, goal in enumerate((left, right)):
+        if goal is not None:
+            outward = np.array([-0.5, 0.35 * (1.0 - 2.0 * k), -0.8])
+            arm = 0.172 * height, 0.15 * height
+            elbows[k], hands[k] = reach(pose.shoulders[k], np.array(goal, np.float64), *arm, outward)
+    return replace(pose, elbows=(elbows[0], elbows[1]), hands=(hands[0], hands[1]))
 
 
 def seated(
@@ -226,6 +260,9 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     if long:  # the hem goes round both thighs
         stride = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / h
         rows = [(-0.60, 0.062 + 0.9 * stride, 0.118), (0.0, 0.076 + 0.3 * stride, 0.118), *rows[2:]]
+    if look.bands is not None:  # the upper band has rows of its own
+        at = next(k for k, entry in enumerate(rows) if entry[0] > 0.52)
+        rows[at:at] = [(0.42, 0.064, 0.091), (0.52, 0.067, 0.097)]
     if child:
         rows = [(s, 1.12 * x, y) for s, x, y in rows]
     angle = np.arange(n) * (2.0 * np.pi / n)
@@ -247,7 +284,8 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     materials = [look.shirt, look.trousers, look.skin]
     jacket = shirt & ~neck
     if look.bands is not None:
-        material[jacket & np.isin(row, [len(rows) - 6, len(rows) - 8])] = len(materials)
+        banded = [k for k, entry in enumerate(rows) if entry[0] in (0.06, 0.42)]
+        material[jacket & np.isin(row, banded)] = len(materials)
         materials.append(look.bands)
     if look.inner is not None and n > 6:  # a strip down the middle of the chest, 30 degrees to either side at most
         column = np.arange(len(body.faces)) // 2 % n
@@ -276,8 +314,15 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
         return sphere((a * s, b * s, c * s), material=material, centre=centre, segments=segments)
 
     parts = [ball((0.050, 0.042, 0.064), look.skin)]
-    if look.helmet is not None:
-        parts.append(ball((0.068, 0.060, 0.060), look.helmet, -0.006, 0.022))
+    if look.helmet is not None and look.visor:
+        parts.append(ball((0.068, 0.060, 0.066), look.helmet, -0.006, 0.012))
+        if detail > 0:
+            parts.append(ball((0.030, 0.050, 0.020), VISOR, 0.038, 0.012, segments=8))
+    elif look.helmet is not None:  # its rim lies above the eyes
+        parts.append(ball((0.050, 0.048, 0.050), look.hair, -0.018, 0.004))
+        parts.append(ball((0.066, 0.058, 0.044), look.helmet, -0.006, 0.044))
+        if look.cap is not None and detail > 0:  # the peak of a safety helmet
+            parts.append(ball((0.036, 0.044, 0.008), look.cap, 0.054, 0.032, segments=6))
     else:
         parts.append(ball((0.050, 0.048, 0.056), look.hair, -0.016, 0.016))
         if look.long_hair and detail > 0:
@@ -299,11 +344,22 @@ def _head(pose: Pose, look: Look, h: float, detail: int, big: float) -> list[Mes
     return parts
 
 
+def _sole(pose: Pose, h: float) -> float:
+    """Height of the lowest sole of a pose, m."""
+    return float(min(p[2] for p in (*pose.toes, *pose.ankles))) - 0.018 * h
+
+
+def _stick(pose: Pose, h: float) -> F64:
+    """Top and tip [2, 3] of a walking stick in the right hand, m."""
+    x, y, z = as_point(pose.hands[1])
+    return np.array([(x, y, z + 0.012 * h), (x + 0.03 * h, y, _sole(pose, h) + 0.012 * h)])
+
+
 def _extent(pose: Pose, h: float) -> F64:
     """Corners [2, 3] of a box about a pose whose lowest sole is at 0, m: joints and the flesh around them."""
     joints = np.array([*pose.toes, *pose.ankles, *pose.knees, *pose.elbows, *pose.hands, *pose.shoulders, pose.head])
     flesh = h * np.array([0.004] * 2 + [0.026] * 2 + [0.036] * 2 + [0.025] * 2 + [0.016] * 2 + [0.031] * 2 + [0.064])
-    floor = float(min(p[2] for p in (*pose.toes, *pose.ankles))) - 0.018 * h
+    floor = _sole(pose, h)
     low = np.minimum(
         (joints - flesh[:, None]).min(axis=0), np.array(pose.ankles).min(axis=0) - np.array([0.028 * h, 0.0, 0.0])
     )
@@ -311,13 +367,45 @@ def _extent(pose: Pose, h: float) -> F64:
     return np.array([[low[0], low[1], 0.0], [high[0], high[1], high[2] - floor + 0.008 * h]])
 
 
+def _pose(style: str, height: float, phase: float, swing: float, spread: float) -> Pose:
+    """A moment of the walking cycle of a style (see `walking`)."""
+    walker = walking(height, phase=phase, swing=swing, spread=spread, child=style == "child")
+    if style == "elderly":
+        walker = stooped(walker, angle=0.32, height=height)
+        shoulder = walker.shoulders[1]
+        grip = shoulder[0] + (0.10 + 0.05 * np.sin(phase)) * height, shoulder[1] - 0.02 * height, 0.47 * height
+        return holding(walker, right=as_point(grip), height=height)
+    if style == "stroller":
+        left, right = ((0.235 * height, side * 0.115 * height, 0.58 * height) for side in (1.0, -1.0))
+        return holding(walker, left=left, right=right, height=height)
+    return walker
+
+
 @lru_cache(maxsize=64)
-def _cycle_extent(height: float, swing: float, spread: float, child: bool) -> tuple[F64, F64]:
+def _cycle_extent(style: str, height: float, swing: float, spread: float) -> tuple[F64, F64]:
     """Lowest and highest corner [3] of the boxes of a walking cycle, m."""
     phases = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
-    poses = [walking(height, phase=p, swing=swing, spread=spread, child=child) for p in phases]
-    boxes = np.array([_extent(pose, height) for pose in poses])
+    boxes = np.array([_extent(_pose(style, height, float(p), swing, spread), height) for p in phases])
     return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+
+
+def _dressed(look: Look, style: str, own: float) -> Look:
+    """The clothes that belong to a style; `own` in [0, 1) is drawn for the person."""
+    if style == "elderly":
+        shade = 0.30 + 0.35 * own
+        grey = replace(look.hair, colour=(shade, shade, 0.97 * shade))
+        return replace(look, hair=grey, pack=False, shorts=False, long_hair=look.long_hair and own < 0.4)
+    if style == "worker":
+        vest = replace(look.shirt, colour=HIVIS if own < 0.6 else ORANGE)
+        shell = Material("helmet", ((0.75, 0.75, 0.72), (0.80, 0.52, 0.02), ORANGE)[int(3.0 * own)], gloss=0.6)
+        dark = replace(look.trousers, colour=(0.03, 0.04, 0.08) if own < 0.7 else ORANGE)
+        return replace(
+            look, shirt=vest, trousers=dark, helmet=shell, cap=shell, bands=BANDS, coat=False, skirt=False, pack=False,
+            shorts=False, bag=None,
+        )  # fmt: skip
+    if style == "stroller":
+        return replace(look, bag=None)
+    return look
 
 
 def torso_charts(low: Point, high: Point) -> list[Chart]:
@@ -334,20 +422,23 @@ def pedestrian(
     """
     length, width, height = size
     look = draw_look(generator)
-    drawn = float(generator.uniform(0.0, 2.0 * np.pi))
-    child, still = style == "child", style == "standing"
+    drawn, own = float(generator.uniform(0.0, 2.0 * np.pi)), float(generator.random())
+    look = _dressed(look, style, own)
+    child, still = style == "child", style == "standing" or (style == "worker" and length < 0.32 * height)
     swing = float(np.arcsin(np.clip((length - 0.16 * height) / height, 0.06, 0.16 if still else 0.6)))
     spread = float(np.arcsin(np.clip((0.5 * width - 0.145 * height) / (0.27 * height), 0.03, 0.5)))
 
-    def pose(at: float) -> Pose:
-        return walking(height, phase=at, swing=swing, spread=spread, child=child)
-
     at = 0.5 * np.pi if still else drawn if phase is None else phase
-    chosen = figure(pose(at), look, height=height, detail=detail, child=child)
+    posed = _pose(style, height, at, swing, spread)
+    chosen = figure(posed, look, height=height, detail=detail, child=child)
+    if style == "elderly":
+        chosen = merge(
+            [chosen, tube(_stick(posed, height), 0.009 * height, material=STICK, segments=(3, 4, 6)[detail])]
+        )
     chosen = chosen.moved(z=-float(chosen.bounds()[0][2]))
     low, high = chosen.bounds()
     if not still:
-        least, most = _cycle_extent(height, swing, spread, child)
+        least, most = _cycle_extent(style, height, swing, spread)
         low, high = np.minimum(low, least), np.maximum(high, most)
     scale = np.asarray(size) / (high - low)
     matrix = np.diag([*scale, 1.0])
