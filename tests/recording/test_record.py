@@ -148,7 +148,17 @@ def test_a_cast_has_every_class_and_nobody_stands_in_another(recorded: Path) -> 
             assert (obb_distance(boxes[i : i + 1] * i, boxes[:i]) > 0).all(), "parked vehicles keep apart"
         walkers = [b for b in cast.bodies if b.kind == "pedestrian" and len(b.track) > 1]
         assert any(np.hypot(*np.diff(b.track[:30, :2], axis=0).T).sum() > 1.0 for b in walkers), "they walk"
+        pushing = [b for b in walkers if b.style == "stroller"]
+        strollers = [b for b in cast.bodies if b.kind == "stroller"]
+        assert len(pushing) == len(strollers) > 0
+        for who, what in zip(pushing, strollers, strict=True):
+            ahead = what.track[:, :2] - who.track[:, :2]
+            along = ahead[:, 0] * np.cos(who.track[:, 2]) + ahead[:, 1] * np.sin(who.track[:, 2])
+            np.testing.assert_allclose(along, 0.457 * who.size[0] + 0.5 * what.size[0], atol=0.05)
+        assert any(b.style == "elderly" for b in walkers)
+        assert any(b.style == "worker" for b in cast.bodies)
     assert set(kinds) >= set(BODY_CATEGORIES) - {"bus", "trailer"}
+    assert "stroller" not in BODY_CATEGORIES, "void in the detection task of nuScenes"
     assert kinds["bus"] + kinds["trailer"] > 0
 
 
@@ -193,8 +203,8 @@ def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
 
 def test_long_vehicles_stand_at_the_kerb(monkeypatch: pytest.MonkeyPatch) -> None:
     """A street full of parked cars would leave trucks, buses and trailers no room."""
-    for people in ("WALKERS", "WAITING"):  # who do not matter here, and take long to make
-        monkeypatch.setattr(scene_objects, people, 1)
+    monkeypatch.setattr(scene_objects, "WALKING", ("adult",))  # people do not matter here, and take long to make
+    monkeypatch.setattr(scene_objects, "WAITING", ("standing",))
     found: Counter[str] = Counter()
     for number in range(4):
         graph = load_town("Twinford")

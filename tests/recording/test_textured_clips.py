@@ -30,8 +30,8 @@ SIZES = {0: 32, 1: (16, 24)}
 def few_people() -> Iterator[None]:
     """Bodies of people take long to make."""
     with pytest.MonkeyPatch.context() as patch:
-        for people in ("WALKERS", "WAITING"):
-            patch.setattr(scene_objects, people, 1)
+        patch.setattr(scene_objects, "WALKING", ("adult",))
+        patch.setattr(scene_objects, "WAITING", ("standing",))
         yield
 
 

@@ -27,7 +27,12 @@ KERB = 0.12  # m, height of sidewalks
 PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
-WALKERS, WAITING = 14, 6  # people of a cast who walk and who stand; many are in more than one place
+# people of a cast who walk and who stand, by style; many are in more than one place
+WALKING = ("adult", "adult", "elderly", "adult", "adult", "child", "adult", "stroller", "adult", "adult", "elderly",
+           "child", "adult", "adult")  # fmt: skip
+WAITING = ("standing",) * 6 + ("worker",)
+SLOW = 0.65  # of the speed of others: who walks with a stick
+GRIP = 0.457, 0.575  # where who pushes a stroller holds it: ahead of the middle and up, shares of length and height
 RACK = {"bicycle": 0.75, "motorcycle": 1.15}  # m from one two-wheeler to the next where they stand side by side
 # what stands at the kerb, how often, and how much of the kerb it takes, m
 PARKED = {
@@ -264,7 +269,7 @@ def _kerb(  # noqa: PLR0917
 def _site(
     cast: SceneObjects, at: tuple[float, float, float, float], size: Size, own: np.random.Generator, clear: Clear
 ) -> None:
-    """Cones or barriers along the road side of a machine, barriers across both ends."""
+    """Cones or barriers along the road side of a machine, barriers across both ends, and up to two workers."""
     x, y, yaw, z = at
     cos, sin = np.cos(yaw), np.sin(yaw)
 
@@ -283,6 +288,13 @@ def _site(
     for end in (-1, 1):
         for k in range(int(own.integers(1, 3))):
             put("barrier", end * (size[0] / 2 + 1.2 + 1.3 * k), 0.0, 0.0)
+    for end in (-1, 1):  # between the machine and the barriers
+        if own.random() < 0.6:
+            worker = draw_size("pedestrian", "worker", generator=own)
+            forward, left = end * (size[0] / 2 + 0.5), float(own.uniform(-0.3, 0.3)) * size[1]
+            px, py = x + forward * cos - left * sin, y + forward * sin + left * cos
+            looks = float(own.uniform(-np.pi, np.pi))
+            cast.add(cast.make("pedestrian", "worker", worker), _still(px, py, looks, z))
     clear.take(x, y, yaw, size[0] + 6.0, size[1])
 
 
@@ -291,12 +303,12 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
     groups of cones, rows of barriers."""
     draws = generator("record sidewalks", *cast.key)
     people, standing = [], []
-    for k in range(WALKERS):
-        style = "child" if k % 6 == 5 else "adult"
+    for k, style in enumerate(WALKING):
         size = draw_size("pedestrian", style, generator=draws)
         people.append(cast.make("pedestrian", style, size, name=("walker", k), phases=PHASES))
-    for _ in range(WAITING):
-        standing.append(cast.make("pedestrian", "standing", draw_size("pedestrian", "standing", generator=draws)))
+    for style in WAITING:
+        standing.append(cast.make("pedestrian", style, draw_size("pedestrian", style, generator=draws)))
+    pushed = {k: _stroller(cast, who[2], draws) for k, who in enumerate(people) if who[1] == "stroller"}
     crowd = float(draws.uniform(0.15, 0.55))
 
     def stand(x: float, y: float, yaw: float) -> None:
@@ -323,13 +335,18 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
             aside = float(draws.uniform(-0.3, 0.3)) * width
             px, py = x - aside * np.sin(yaw), y + aside * np.cos(yaw)
             if pick < crowd:
-                who = people[int(draws.integers(len(people)))]
+                group = [int(draws.integers(len(people)))]
                 speed = float(draws.uniform(0.7, 1.6)) * (1 if draws.random() < 0.5 else -1)
-                walk = partial(_walk, graph, int(lane), s0=float(s), speed=speed, steps=steps, dt=cast.dt)
-                cast.add(who, walk(aside=aside))
                 if draws.random() < 0.35 and width > 1.8:  # somebody walks beside
-                    who = people[int(draws.integers(len(people)))]
-                    cast.add(who, walk(aside=aside - 0.8 * np.sign(aside)))
+                    group.append(int(draws.integers(len(people))))
+                if any(WALKING[k] == "elderly" for k in group):
+                    speed *= SLOW
+                walk = partial(_walk, graph, int(lane), s0=float(s), speed=speed, steps=steps, dt=cast.dt)
+                for k, place in zip(group, (aside, aside - 0.8 * np.sign(aside)), strict=False):
+                    track = walk(aside=place)
+                    cast.add(people[k], track)
+                    if k in pushed:
+                        cast.add(pushed[k], _ahead(track, GRIP[0] * people[k][2][0] + pushed[k][2][0] / 2 - 0.02))
             elif pick < crowd + 0.08:
                 stand(px, py, yaw + float(draws.uniform(-3, 3)))
             elif pick < crowd + 0.13:
@@ -351,6 +368,22 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
                     if clear.footprint(qx, qy, 0.0, 0.5, 0.5):
                         turn += (np.pi / 2 if kind == "barrier" and along else 0.0) + float(draws.normal(0.0, ASKEW))
                         cast.add(cast.make(kind, style, size), _still(qx, qy, turn, KERB))
+
+
+def _stroller(cast: SceneObjects, walker: Size, draws: np.random.Generator) -> tuple[str, str, Size, tuple[int, ...]]:
+    """A stroller whose handle is where the hands of a walker of a size (m) are. nuScenes does not count it to the
+    walker, and the detection task leaves it out."""
+    style = draw_style("stroller", generator=draws)
+    length, width, _ = draw_size("stroller", style, generator=draws)
+    return cast.make("stroller", style, (length, width, GRIP[1] * walker[2] + 0.03))
+
+
+def _ahead(track: F64, distance: float) -> F64:
+    """The track [T, 4] of what is a distance (m) ahead of who follows a track."""
+    moved = track.copy()
+    moved[:, 0] += distance * np.cos(track[:, 2])
+    moved[:, 1] += distance * np.sin(track[:, 2])
+    return moved
 
 
 def take_still(cast: SceneObjects, clear: Clear) -> None:

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ssad.assets.bodies import anomalies, cycles, furniture, heavy, machines, people
+from ssad.assets.bodies import anomalies, cycles, furniture, heavy, machines, people, strollers
 from ssad.assets.bodies import car as _car
 from ssad.assets.mesh import Mesh, Point, Rectangle
 from ssad.core.errors import ConfigError, unknown_name
@@ -71,6 +71,9 @@ BODIES: dict[str, Body] = {
         "standing": BodyStyle((0.42, 0.62, 1.74), 0.05, 1.0), "elderly": BodyStyle((0.70, 0.66, 1.60), 0.05, 0.8),
         "worker": BodyStyle((0.44, 0.66, 1.80), 0.04, 0.4), "stroller": BodyStyle((0.80, 0.62, 1.70), 0.05, 0.5),
     }, phased=True),
+    "stroller": Body(strollers.stroller, {
+        "buggy": BodyStyle((0.92, 0.55, 1.02), 0.04, 3.0), "pram": BodyStyle((1.00, 0.58, 1.04), 0.04, 1.0),
+    }),
     "traffic_cone": Body(furniture.traffic_cone, {
         "cone": BodyStyle((0.41, 0.41, 0.80), 0.08, 3.0), "tall": BodyStyle((0.36, 0.36, 1.07), 0.05, 2.0),
         "drum": BodyStyle((0.56, 0.56, 1.05), 0.04, 1.0),
