@@ -121,9 +121,11 @@ def bicycle(
     if detail:
         low = variant in ("city", "delivery")  # what is carried hides the usual places
         x, z = (0.70, 0.655) if low else (0.44, 0.87)
-        parts.append(sphere((0.035, 0.045, 0.045), material=HEAD, centre=(x, 0.0, z), segments=6))
+        parts.append(crate((x, -0.035, z - 0.035), (x + 0.03, 0.035, z + 0.035), HEAD))
+        parts.append(crate((x - 0.03, -0.045, z - 0.045), (x, 0.045, z + 0.045), TRIM))
         x, z = (-0.84, 0.70) if variant == "city" else (-0.36, 0.77)
         parts.append(crate((x, -0.035, z - 0.04), (x + 0.03, 0.035, z + 0.04), TAIL))
+        parts.append(crate((x + 0.03, -0.04, z - 0.045), (x + 0.04, 0.04, z + 0.045), TRIM))
     charts = side_charts("frame", (-0.5 * size[0], -0.1, 0.1 * size[2]), (0.5 * size[0], 0.1, 0.75 * size[2]))
     if style == "ridden":
         hands = [as_point(grip * [1.0, s, 1.0] + [0.0, 0.0, 0.02]) for s in (1.0, -1.0)]
