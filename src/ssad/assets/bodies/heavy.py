@@ -80,9 +80,10 @@ def truck(style: str, size: Point, *, generator: np.random.Generator, detail: in
     if style == "box":
         parts.append(_cargo((rear, -half, deck), (back, half, height)))
         panels += side_charts("cargo", (rear, -half, deck), (back, half, height))
+        if detail > 0:
+            parts.append(_doors(rear, half, deck, height))
         if detail == 2:
             parts.append(_ribs((rear, -half, deck), (back, half, height)))
-            parts.append(crate((rear - 0.0, -0.012, deck + 0.06), (rear + 0.004, 0.012, height - 0.06), TRIM))
     elif style == "flatbed":
         parts.append(crate((rear, -half, deck - 0.02), (back, half, deck + 0.14), WOOD))
         parts.append(crate((back - 0.08, -half, deck), (back, half, deck + 0.9), STEEL))
@@ -131,19 +132,39 @@ def _cab_fittings(front: float, size: Point, cab: Point, detail: int) -> list[Me
         parts.append(_plate(front - 0.005, 0.29 * cab[2]))
         blinker = (front - 0.1, 0.43 * cab[1], 0.40 * cab[2]), (front - 0.05, 0.47 * cab[1], 0.44 * cab[2])
         parts.append(crates(*blinker, BLINKER))
-    else:
-        lamp = (front - 0.1, 0.32 * cab[1], 0.22 * cab[2]), (front - 0.005, 0.46 * cab[1], 0.29 * cab[2])
-        parts.append(crates(*lamp, HEAD))
+        grille = (front - 0.1, -0.26 * cab[1], 0.25 * cab[2]), (front - 0.008, 0.26 * cab[1], 0.27 * cab[2])
+        parts.append(crate(*grille, TRIM))
+        surround = (front - 0.12, 0.29 * cab[1], 0.205 * cab[2]), (front - 0.012, 0.465 * cab[1], 0.305 * cab[2])
+        parts.append(crates(*surround, TRIM))
+    lamp = (front - 0.1, 0.31 * cab[1], 0.22 * cab[2]), (front - 0.005, 0.45 * cab[1], 0.29 * cab[2])
+    parts.append(crates(*lamp, HEAD))
     return parts
 
 
 def _rear_fittings(rear: float, half: float, z: float, detail: int) -> list[Mesh]:
-    """Tail lamps, under-run bar, plate and mud flaps."""
+    """Tail lamps, under-run bar, plate and mud flaps (which hide the lamps from the front)."""
     parts = [crates((rear, 0.62 * half, z), (rear + 0.06, 0.95 * half, z + 0.14), TAIL)]
     if detail > 0:
         parts.append(crate((rear + 0.03, -0.95 * half, z - 0.25), (rear + 0.12, 0.95 * half, z - 0.12), STEEL))
         parts.append(_plate(rear + 0.01, z + 0.07))
+        flap = (rear + 0.06, 0.60 * half, z - 0.35), (rear + 0.08, 0.97 * half, z + 0.15)
+        parts.append(crates(*flap, TRIM))
     return parts
+
+
+def _doors(rear: float, half: float, low: float, high: float) -> Mesh:
+    """Rear doors of a cargo box: the gap between them, their bars and hinges, marker lamps over them."""
+    gap = crate((rear - 0.002, -0.012, low + 0.06), (rear + 0.01, 0.012, high - 0.06), TRIM)
+    rods = [
+        crate((rear - 0.004, y * half, low + 0.05), (rear + 0.01, y * half + 0.03, high - 0.05), STEEL)
+        for y in (0.16, 0.52)
+    ]
+    hinges = [
+        crate((rear - 0.004, 0.86 * half, z), (rear + 0.01, 0.97 * half, z + 0.05), STEEL)
+        for z in np.linspace(low + 0.2, high - 0.3, 3)
+    ]
+    marker = crate((rear - 0.004, 0.84 * half, high - 0.10), (rear + 0.01, 0.96 * half, high - 0.04), TAIL)
+    return merge([gap, both_sides(merge([*rods, *hinges, marker]))])
 
 
 def _plate(x: float, z: float) -> Mesh:
@@ -303,7 +324,9 @@ def trailer(style: str, size: Point, *, generator: np.random.Generator, detail: 
         parts.append(wheels([(axle, half - 0.02)], radius, 0.16, detail=detail, steel=STEEL))
         guard = (axle - 0.40, half - 0.2, 2 * radius + 0.02), (axle + 0.40, half, 2 * radius + 0.06)
         parts.append(crates(*guard, TRIM))
-        parts += _rear_fittings(rear, half - 0.15, deck + 0.05, 0)
+        parts.append(crates((rear - 0.006, 0.62 * half, deck + 0.02), (rear + 0.01, 0.80 * half, deck + 0.12), TAIL))
+        if detail > 0:
+            parts.append(_plate(rear + 0.004, deck + 0.09))
         return finish(parts, panels, size)
     axles = [rear + 0.12 * length + k * 1.31 for k in range(3 if length > 10.0 else 2)]
     parts.append(crate((rear + 0.1, -0.5, deck - 0.32), (front - 0.3, 0.5, deck), FRAME))
@@ -321,12 +344,10 @@ def trailer(style: str, size: Point, *, generator: np.random.Generator, detail: 
         low, high = (rear, -half, deck), (front, half, height)
         parts.append(_cargo(low, high))
         panels += side_charts("cargo", low, high)
+        if detail > 0:
+            parts.append(_doors(rear, half, deck, height))
         if detail == 2:
             parts.append(_ribs(low, high))
-            parts += [
-                crate((rear - 0.004, y - 0.012, deck + 0.1), (rear + 0.01, y + 0.012, height - 0.1), STEEL)
-                for y in (-0.45, -0.01, 0.01, 0.45)
-            ]
     elif style == "flatbed":
         parts.append(crate((rear, -half, deck), (front, half, deck + 0.16), WOOD))
         parts.append(crate((front - 0.08, -half, deck), (front, half, height), STEEL))
