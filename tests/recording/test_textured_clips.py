@@ -83,6 +83,10 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
         assert np.array_equal(a.fragments, b.fragments)
     with pytest.raises(AssertionError, match="rendered again"):
         next(textured_clips(folder, (Layer(0, opacity=0.9),)))
+    with monkeypatch.context() as other:
+        other.setattr(module, "recording_of", lambda *given: {"seed": 1})
+        with pytest.raises(AssertionError, match="rendered again"):
+            next(textured_clips(folder, LAYERS))
     monkeypatch.setattr(module, "_drawing", lambda: "another version")
     with pytest.raises(AssertionError, match="rendered again"):
         next(textured_clips(folder, LAYERS))

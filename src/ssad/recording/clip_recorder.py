@@ -493,6 +493,19 @@ def clip_rows(folder: Path, split: str = "all") -> list[tuple[Row, tuple[Row, ..
         raise _unknown(path, error) from None
 
 
+def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
+    """What was recorded (see `Clips.identity`).
+
+    Raises:
+        FormatError: No recording.
+    """
+    path = folder / "annotations" / f"{split}.json"
+    try:
+        return dict(safeio.read_json(path, limit=1 << 30)["info"]["recording"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _unknown(path, error) from None
+
+
 def clip_views(
     folder: Path, *, split: str = "all", device: str = "cpu", only: Collection[str] | None = None
 ) -> Iterator[ClipView]:
@@ -512,7 +525,7 @@ def clip_views(
     path = folder / "annotations" / f"{split}.json"
     rows = clip_rows(folder, split)
     try:
-        clips = _clips_of(safeio.read_json(path, limit=1 << 30)["info"]["recording"], folder, device)
+        clips = _clips_of(recording_of(folder, split), folder, device)
         sets: dict[tuple[object, ...], _Set] = {}
         for row, objects in rows:
             if only is not None and row["file_name"] not in only:

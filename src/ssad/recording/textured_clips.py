@@ -28,13 +28,12 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.core.types import F32, U8, Bool
-from ssad.recording.clip_recorder import ClipView, clip_rows, clip_views
+from ssad.recording.clip_recorder import ClipView, clip_rows, clip_views, recording_of
 from ssad.recording.nuscenes_recorder import SENSOR
 
 KEPT = ".seen"  # folder of a recording for what has been rendered
 MARGIN = 48  # px around what a texture touches: more than lens, mosaic and JPEG read
 BLOCK = 16  # px: parts begin at blocks of JPEG
-DRAWING = ("assets", "camera", "recording", "roads", "world")  # packages that decide what a picture shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +156,8 @@ def textured_clips(
         FormatError: No recording of this version, or a kept file is broken.
         StoreError: Nothing can be written there.
     """
-    name = digest("textured clips", _drawing(), [_layer_key(layer) for layer in layers])[:16]
+    recording = recording_of(folder, split)
+    name = digest("textured clips", _drawing(), recording, [_layer_key(layer) for layer in layers])[:16]
     kept = folder / KEPT / name
     rows = clip_rows(folder, split)
     missing = {row["file_name"] for row, _ in rows if not (kept / f"{row['file_name']}.npz").is_file()}
@@ -204,10 +204,9 @@ def _layer_key(layer: Layer) -> tuple[object, ...]:
 
 @cache
 def _drawing() -> str:
-    """A hash of the source that draws pictures: what another version rendered is not used."""
+    """A hash of the source: what another version rendered is not used."""
     root = Path(ssad.__file__).parent
     whole = hashlib.sha256()
-    for package in DRAWING:
-        for path in sorted((root / package).rglob("*.py")):
-            whole.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    for path in sorted(root.rglob("*.py")):
+        whole.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     return whole.hexdigest()

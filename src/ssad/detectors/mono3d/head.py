@@ -48,8 +48,20 @@ class Unit(nn.Module):
 def group_norm_relu(x: Tensor, weight: Tensor, bias: Tensor, groups: int, eps: float) -> Tensor:
     """Group norm and ReLU of a map [B, C, H, W] in channels-last memory, written so that a compiler can fuse them.
 
-    PyTorch's own group norm copies such a map to another layout and, in mixed precision, to 32 bits: a third of the
-    time of a training step. Statistics are taken in 32 bits.
+    PyTorch's own group norm copies such a map to another layout and, in mixed precision, to 32 bits. Statistics are
+    taken in 32 bits.
+
+    Args:
+        x: The map.
+        weight: Scale of each channel [C].
+        bias: Shift of each channel [C].
+        groups: How many groups; they divide C.
+        eps: Added to the variance.
+
+    Returns:
+        [B, C, H, W], of the type of `x`.
+
+    Source: Wu and He, Group Normalization (ECCV 2018).
     """
     values = x.permute(0, 2, 3, 1).float()
     share = x.shape[1] // groups
