@@ -1,0 +1,27 @@
+"""The fast gradient sign method: one step, as long as the budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from ssad.scenarios.static.digital.attack import Access
+from ssad.scenarios.static.digital.budget import Budget
+from ssad.scenarios.static.digital.victim import Victim
+
+
+@dataclass(frozen=True, slots=True)
+class FGSM:
+    """One step of the size of the budget along the steepest direction.
+
+    Source: Goodfellow et al., Explaining and Harnessing Adversarial Examples (ICLR 2015).
+    """
+
+    name: str = "fgsm"
+    access: Access = "white-box"
+
+    def perturb(self, victim: Victim, budget: Budget) -> Tensor:
+        """See `Attack`."""
+        _, gradient = victim.gradient(victim.clean)
+        return budget.project(victim.clean + budget.radius * budget.steepest(gradient), victim.clean)

@@ -1,0 +1,85 @@
+"""Projected gradient ascent, with restarts, momentum and steps that shrink."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ssad.core.errors import ConfigError
+from ssad.scenarios.static.digital.attack import Access, keep_best
+from ssad.scenarios.static.digital.budget import Budget
+from ssad.scenarios.static.digital.victim import Victim
+
+Start = Literal["none", "uniform", "gaussian"]
+
+
+@dataclass(frozen=True, slots=True)
+class PGD:
+    """Steps along the steepest direction, each followed by a projection into the ball; the best image met is kept.
+
+    Attributes:
+        steps: gradient steps of each start.
+        step: length of the first step as a share of the radius; None: the rule below.
+        schedule: "cosine": steps shrink from the first one to nothing, so that the last ones settle. "constant": all
+            are of one length.
+        start: where the first start begins: at the clean image, or at a random place of the ball.
+        restarts: further random starts.
+        decay: of the momentum of directions; 0: none (Dong et al. 2018 take 1).
+
+    Without `step`, constant steps are 2.5 / steps of the radius, so that an image can cross the ball and turn around
+    (Madry et al. 2018); shrinking ones begin with twice that, and at the radius at most, which is as much travel.
+
+    Raises:
+        ConfigError: No step, a negative number of restarts, or a step of length 0.
+
+    Source: Madry et al., Towards Deep Learning Models Resistant to Adversarial Attacks (ICLR 2018).
+    """
+
+    steps: int = 10
+    step: float | None = None
+    schedule: Literal["cosine", "constant"] = "cosine"
+    start: Start = "uniform"
+    restarts: int = 0
+    decay: float = 0.0
+    name: str = "pgd"
+    access: Access = "white-box"
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.restarts < 0 or self.decay < 0 or (self.step is not None and self.step <= 0):
+            raise ConfigError(f"{self.name}: steps must be 1 or more, step above 0, restarts and decay 0 or more")
+
+    def perturb(self, victim: Victim, budget: Budget) -> Tensor:
+        """See `Attack`."""
+        best = victim.clean, victim.clean.new_full((len(victim),), -torch.inf, dtype=torch.float32)
+        for number in range(1 + self.restarts):
+            kind: Start = self.start if number == 0 or self.start != "none" else "uniform"
+            images = victim.clean
+            if kind != "none":
+                draws = victim.draw(kind, "start", number)
+                images = budget.project(images + budget.start(draws, kind), victim.clean)
+            best = self._ascend(victim, budget, images, best)
+        return best[0]
+
+    def _ascend(
+        self, victim: Victim, budget: Budget, images: Tensor, best: tuple[Tensor, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        momentum = torch.zeros_like(images)
+        for k in range(self.steps):
+            loss, gradient = victim.gradient(images)
+            best = keep_best(best, images, loss.float())
+            if self.decay:
+                gradient = gradient / gradient.abs().flatten(1).mean(1).clamp_min(1e-30)[:, None, None, None]
+                momentum = gradient = self.decay * momentum + gradient
+            moved = images + budget.radius * self.share(k) * budget.steepest(gradient)
+            images = budget.project(moved, victim.clean)
+        return keep_best(best, images, victim.loss(images).float())
+
+    def share(self, k: int) -> float:
+        """Length of step `k` as a share of the radius."""
+        constant = self.schedule == "constant"
+        first = self.step if self.step is not None else min(2.5 / self.steps * (1 if constant else 2), 1.0)
+        return first if constant else first * 0.5 * (1 + math.cos(math.pi * k / self.steps))
