@@ -98,7 +98,8 @@ class Budget:
 
 def lengths(change: Tensor) -> Tensor:
     """Euclidean length [B, 1, 1, 1] of each picture's change [B, 3, H, W]."""
-    return torch.linalg.vector_norm(change, dim=(1, 2, 3), keepdim=True)
+    size: Tensor = torch.linalg.vector_norm(change, dim=(1, 2, 3), keepdim=True)
+    return size
 
 
 def codes_of(images: Tensor) -> Tensor:
