@@ -134,4 +134,6 @@ def keep_best(best: tuple[Tensor, Tensor], images: Tensor, loss: Tensor) -> tupl
         loss: [B].
     """
     better = loss > best[1]
+    if bool(better.all()):
+        return images, loss
     return torch.where(better[:, None, None, None], images, best[0]), torch.where(better, loss, best[1])

@@ -59,12 +59,12 @@ class Budget:
         Returns:
             [B, 3, H, W]. To move values back into [0, 1] never moves them away from the clean ones, so both hold.
         """
-        change = images - clean
+        change = images - clean  # from here on in place: pictures are large
         if self.norm == "linf":
-            change = change.clamp(-self.radius, self.radius)
+            change.clamp_(-self.radius, self.radius)
         else:
-            change = change * (self.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0)
-        return (clean + change).clamp(0.0, 1.0)
+            change.mul_((self.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0))
+        return change.add_(clean).clamp_(0.0, 1.0)
 
     def steepest(self, gradient: Tensor) -> Tensor:
         """The direction of a step of length 1 in this norm along which a linear function rises most.
@@ -114,9 +114,10 @@ def codes_of(images: Tensor) -> Tensor:
     Raises:
         ConfigError: The images lie outside [0, 1], or are not multiples of 1/255: of them no exact budget can be kept.
     """
-    scaled = images.detach().double() * LEVELS
+    scaled = images.detach() * LEVELS
     codes = scaled.round()
-    if bool(((codes < 0) | (codes > LEVELS)).any()) or not bool(((scaled - codes).abs() < _GRID).all()):
+    low, high = (float(one) for one in codes.aminmax())
+    if not (low >= 0 and high <= LEVELS and float((scaled - codes).abs().max()) < _GRID):
         raise ConfigError("an attack needs clean images of 8 bits: multiples of 1/255 in [0, 1], as files hold them")
     return codes.int()
 
@@ -135,11 +136,11 @@ def quantise(images: Tensor, clean: Tensor, budget: Budget) -> Tensor:
     Returns:
         uint8 [B, 3, H, W].
     """
-    wanted = images.detach().double() * LEVELS - clean
     if budget.norm == "linf":
         most = int(budget.radius * LEVELS + 1e-6)
-        return (clean + wanted.round().clamp(-most, most)).clamp(0, LEVELS).to(torch.uint8)
-    wanted = (clean + wanted).clamp(0, LEVELS) - clean
+        change = (images.detach() * LEVELS).round_().sub_(clean).clamp_(-most, most)
+        return change.add_(clean).clamp_(0, LEVELS).to(torch.uint8)
+    wanted = ((images.detach().double() * LEVELS).clamp_(0, LEVELS) - clean).contiguous()
     base = wanted.trunc()
     room = (budget.radius * LEVELS) ** 2 * (1 + 1e-12)
     for change, full in zip(base, wanted, strict=True):

@@ -74,7 +74,7 @@ class PGD:
             if self.decay:
                 gradient = gradient / gradient.abs().flatten(1).mean(1).clamp_min(1e-30)[:, None, None, None]
                 momentum = gradient = self.decay * momentum + gradient
-            moved = images + budget.radius * self.share(k) * budget.steepest(gradient)
+            moved = torch.add(images, budget.steepest(gradient), alpha=budget.radius * self.share(k))
             images = budget.project(moved, victim.clean)
         return keep_best(best, images, victim.loss(images).float())
 

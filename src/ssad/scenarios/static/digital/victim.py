@@ -78,7 +78,7 @@ class Victim:
         if len(truth) != len(images):
             raise ConfigError(f"an attack on {len(images)} images got the truth of {len(truth)}")
         self.codes = codes_of(images)
-        self.clean = (self.codes.to(images.dtype) / LEVELS).contiguous()
+        self.clean = (self.codes.to(images.dtype) / LEVELS).contiguous(memory_format=torch.channels_last)
         self.detector, self.objective, self.intrinsic, self.through = detector, objective, intrinsic, through
         self.keys = [(k,) for k in range(len(images))] if keys is None else list(keys)
         self.cost = Cost()
@@ -124,7 +124,7 @@ class Victim:
                 f"{self.detector.name} gives no gradient of loss '{self.objective.name}' to the image; a white-box "
                 "attack needs one: choose a black-box attack (square, nes)"
             )
-        if not bool(found[0].isfinite().all()):
+        if not bool(found[0].sum().isfinite()):
             raise ConfigError(f"{self.detector.name}: the gradient of loss '{self.objective.name}' is not finite")
         return loss.detach(), found[0]
 
@@ -143,7 +143,7 @@ class Victim:
             if kind == "uniform":
                 draws = 2 * chance.random(shape, np.float32) - 1
             parts.append(torch.from_numpy(draws))
-        return torch.stack(parts).to(self.clean)
+        return torch.stack(parts).to(self.clean).contiguous(memory_format=torch.channels_last)
 
     @staticmethod
     def generator(key: tuple[object, ...], *use: object) -> np.random.Generator:
