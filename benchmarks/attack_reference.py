@@ -78,7 +78,8 @@ def beside_art(folder: Path, count: int, steps: int) -> None:
     images, truth = pictures(folder, count)
     detector = make_detector("yolov5n")
     print(
-        f"{count} pictures, loss full, radius {RADIUS} px, {steps} steps; clean AP50 {score(detector, images, truth):.3f}"
+        f"{count} pictures, loss full, radius {RADIUS} px, {steps} steps; "
+        f"clean AP50 {score(detector, images, truth):.3f}"
     )
     with steady(detector):
         wrapped = ForArt(detector, images, truth)
@@ -103,7 +104,8 @@ def beside_art(folder: Path, count: int, steps: int) -> None:
                 loss = detector.losses(detector.dense(found), wrapped.assignment, reduction="image")
             value = sum(float(v.mean()) for v in loss.values())
             print(
-                f"art, step {share} of the radius: loss {value:.3f}, AP50 {score(detector, found, truth):.3f}, {used:.0f} s CPU"
+                f"art, step {share} of the radius: loss {value:.3f}, AP50 {score(detector, found, truth):.3f}, "
+                f"{used:.0f} s CPU"
             )
     for name in ("pgd", "apgd"):
         began = time.process_time()

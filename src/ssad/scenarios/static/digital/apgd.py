@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -103,7 +104,7 @@ def checkpoints(steps: int) -> frozenset[int]:
     marks = [0.0, 0.22]
     while marks[-1] < 1.0:
         marks.append(marks[-1] + max(marks[-1] - marks[-2] - 0.03, 0.06))
-    return frozenset(-int(-mark * steps // 1) for mark in marks[1:] if mark < 1.0)
+    return frozenset(math.ceil(mark * steps - 1e-9) for mark in marks[1:] if mark < 1.0)
 
 
 def _each(values: Tensor) -> Tensor:

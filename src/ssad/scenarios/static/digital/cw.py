@@ -87,7 +87,7 @@ class MinimalCW:
         """Images and losses that are met with one weight each."""
         clean = victim.clean.clamp(EDGE, 1 - EDGE)
         line = torch.logit(clean).requires_grad_()
-        optimizer = torch.optim.Adam([line], lr=self.rate * 10)
+        optimizer = torch.optim.Adam([line], lr=self.rate)
         met = []
         for _ in range(self.steps):
             images = line.sigmoid()
