@@ -24,6 +24,8 @@ ATTACKS: dict[str, str] = {
     "square": f"{_HERE}.square:Square",
     "nes": f"{_HERE}.nes:NES",
     "spsa": f"{_HERE}.nes:spsa",
+    "transfer": f"{_HERE}.transfer:Transfer",
+    "universal": f"{_HERE}.universal:Universal",
     "noise": f"{_HERE}.noise:RandomNoise",
 }
 LOSS: dict[str, str] = {"cw": "margin", "cw-min": "margin"}
