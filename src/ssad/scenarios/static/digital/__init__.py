@@ -21,6 +21,11 @@ ATTACKS: dict[str, str] = {
     "momentum": f"{_HERE}.momentum:momentum",
     "apgd": f"{_HERE}.apgd:APGD",
     "cw-min": f"{_HERE}.cw:MinimalCW",
+    "square": f"{_HERE}.square:Square",
+    "nes": f"{_HERE}.nes:NES",
+    "spsa": f"{_HERE}.nes:spsa",
+    "transfer": f"{_HERE}.transfer:Transfer",
+    "universal": f"{_HERE}.universal:Universal",
     "noise": f"{_HERE}.noise:RandomNoise",
 }
 LOSS: dict[str, str] = {"cw": "margin", "cw-min": "margin"}

@@ -1,0 +1,103 @@
+"""Gradients estimated from losses alone, by pairs of probes on either side, followed as PGD follows true ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ssad.core.errors import ConfigError
+from ssad.scenarios.static.digital.attack import Access, keep_best
+from ssad.scenarios.static.digital.budget import Budget, px
+from ssad.scenarios.static.digital.pgd import PGD
+from ssad.scenarios.static.digital.victim import Victim
+
+
+@dataclass(frozen=True, slots=True)
+class NES:
+    """Natural evolution strategies: the mean over random directions of the loss's slope along each, times it.
+
+    Attributes:
+        steps: of the ascent.
+        samples: pairs of probes for each step's estimate; each pair costs two queries.
+        sigma: how far probes lie from the image, for each value, in [0, 1].
+        step: length of the first step as a share of the radius; None: the rule of `PGD`; steps shrink as there.
+        decay: of the sum of the estimates of earlier steps: it is what averages their noise.
+        directions: "gaussian" (NES), or "signs": every value by `sigma` up or down (SPSA).
+
+    The ascent starts at the clean image; the best image met is kept. Queries: (2 samples + 1) for each step, and one.
+
+    Raises:
+        ConfigError: No step or sample, a sigma or step of 0 or less, a decay below 0.
+
+    Source: Ilyas et al., Black-box Adversarial Attacks with Limited Queries and Information (ICML 2018), with its
+    antithetic draws and momentum. SPSA: Uesato et al., Adversarial Risk and the Dangers of Evaluating Against Weak
+    Attacks (ICML 2018).
+    """
+
+    steps: int = 20
+    samples: int = 25
+    sigma: float = px(1)
+    step: float | None = None
+    decay: float = 0.9
+    directions: Literal["gaussian", "signs"] = "gaussian"
+    name: str = "nes"
+    access: Access = "black-box"
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.samples < 1 or self.sigma <= 0 or self.decay < 0:
+            raise ConfigError(f"{self.name}: steps and samples must be 1 or more, sigma above 0, decay 0 or more")
+        if self.step is not None and self.step <= 0:
+            raise ConfigError(f"{self.name}: step must be above 0")
+        if self.directions not in ("gaussian", "signs"):
+            raise ConfigError(f"{self.name}: directions '{self.directions}'; choose gaussian or signs")
+
+    def perturb(self, victim: Victim, budget: Budget) -> Tensor:
+        """See `Attack`."""
+        rule = PGD(self.steps, step=self.step)
+        images = victim.clean
+        best = images, victim.loss(images).float()
+        estimate = torch.zeros_like(images)
+        for k in range(self.steps):
+            estimate = self.decay * estimate + self.estimate(victim, images, k)
+            images = budget.project(images + budget.radius * rule.share(k) * budget.steepest(estimate), victim.clean)
+            best = keep_best(best, images, victim.loss(images).float())
+        return best[0]
+
+    def estimate(self, victim: Victim, images: Tensor, use: object = 0) -> Tensor:
+        """The estimated gradient [B, 3, H, W] of the loss at images; probes are kept in [0, 1].
+
+        Args:
+            victim: What is asked.
+            images: [B, 3, H, W].
+            use: Which estimate it is: others draw other directions.
+        """
+        total = torch.zeros_like(images)
+        for j in range(self.samples):
+            direction = victim.draw("gaussian", self.name, use, j)
+            if self.directions == "signs":
+                direction = torch.where(direction < 0, -1.0, 1.0).to(images)
+            rise = victim.loss((images + self.sigma * direction).clamp(0.0, 1.0))
+            rise = rise - victim.loss((images - self.sigma * direction).clamp(0.0, 1.0))
+            total += rise.to(images)[:, None, None, None] * direction
+        return total / (2 * self.sigma * self.samples)
+
+
+def spsa(
+    *, steps: int = 20, samples: int = 25, delta: float = px(1), step: float | None = None, decay: float = 0.9
+) -> NES:
+    """Simultaneous perturbation stochastic approximation: `NES` with directions of signs.
+
+    Args:
+        steps: Of the ascent.
+        samples: Pairs of probes for each step's estimate.
+        delta: How far each value of a probe lies from the image's.
+        step: Length of the first step as a share of the radius.
+        decay: Of the sum of earlier estimates.
+
+    Returns:
+        The attack.
+    """
+    return NES(steps, samples, sigma=delta, step=step, decay=decay, directions="signs", name="spsa")

@@ -1,0 +1,134 @@
+"""One change for many pictures: those of a data set, or the frames of a drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ssad.core.errors import ConfigError
+from ssad.scenarios.static.digital.attack import Access
+from ssad.scenarios.static.digital.budget import Budget, lengths
+from ssad.scenarios.static.digital.victim import Victim, steady
+
+Batches = Iterable[Victim] | Callable[[], Iterable[Victim]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Universal:
+    """Adds one change to every picture; it asks nothing.
+
+    Attributes:
+        change: [1, 3, H, W], as `fit_universal` finds it; it is held to the budget of each run.
+
+    Raises:
+        ConfigError: The change is of another shape or not finite; later: pictures are of another size.
+    """
+
+    change: Tensor
+    name: str = "universal"
+    access: Access = "none"
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.change.shape)
+        if len(shape) != 4 or shape[:2] != (1, 3) or not bool(self.change.isfinite().all()):
+            raise ConfigError(f"universal: the change must be finite and of shape [1, 3, H, W], not {list(shape)}")
+
+    def perturb(self, victim: Victim, budget: Budget) -> Tensor:
+        """See `Attack`."""
+        _check_size(tuple(self.change.shape), victim)
+        return budget.project(victim.clean + self.change.to(victim.clean), victim.clean)
+
+
+def fit_universal(
+    batches: Batches,
+    budget: Budget,
+    *,
+    epochs: int = 20,
+    step: float = 0.25,
+    method: Literal["sign", "adam"] = "sign",
+) -> Tensor:
+    """Look for one change that raises the sum of the losses of many pictures.
+
+    Each epoch takes the gradient of the sum over all pictures and makes one step, so what is found does not depend on
+    how they are put into batches. Steps shrink to nothing by a cosine; the best change met is kept.
+
+    Args:
+        batches: Victims whose pictures all have one size; or a function that gives them anew in each epoch, where they
+            do not fit into memory together.
+        budget: How far each value (L-infinity), or each picture (L2), may be moved.
+        epochs: Passes over all pictures.
+        step: Length of the first step as a share of the radius; under Adam its first rate, likewise.
+        method: "sign": the steepest direction of the norm. "adam": Adam with the gradient as it is.
+
+    Returns:
+        [1, 3, H, W] a change within the ball.
+
+    Raises:
+        ConfigError: No pictures, pictures of different sizes, no epoch, or a step of 0 or less.
+
+    Source: Moosavi-Dezfooli et al., Universal Adversarial Perturbations (CVPR 2017), fitted by ascent of the summed
+    loss as in Shafahi et al., Universal Adversarial Training (AAAI 2020).
+    """
+    if epochs < 1 or step <= 0 or method not in ("sign", "adam"):
+        raise ConfigError("universal: epochs must be 1 or more, step above 0, method sign or adam")
+    kept = batches if callable(batches) else list(batches)
+    first = next(iter(kept() if callable(kept) else kept), None)
+    if first is None:
+        raise ConfigError("universal: there are no pictures to fit it to")
+    change = torch.zeros_like(first.clean[:1], dtype=torch.float64)
+    best, most = change, -math.inf
+    mean, square = torch.zeros_like(change), torch.zeros_like(change)
+    for k in range(epochs + 1):
+        total, gradient = _summed(kept() if callable(kept) else kept, change)
+        if total > most:
+            best, most = change, total
+        if k == epochs:
+            break
+        rate = budget.radius * step * 0.5 * (1 + math.cos(math.pi * k / epochs))
+        if method == "sign":
+            moved = rate * budget.steepest(gradient)
+        else:
+            mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+            unbiased = mean / (1 - 0.9 ** (k + 1)), square / (1 - 0.999 ** (k + 1))
+            moved = unbiased[0] / unbiased[1].sqrt().clamp_min(1e-30)
+            if budget.norm == "l2":
+                moved = moved / math.sqrt(moved.numel())
+            moved = rate * moved
+        change = _in_ball(change + moved, budget)
+    return best.to(first.clean.dtype)
+
+
+def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
+    """The sum of all losses, and its gradient to the change; image by image in float64, whatever the batches."""
+    total, gradient = 0.0, torch.zeros_like(change)
+    for victim in batches:
+        _check_size(tuple(change.shape), victim)
+        moved = victim.clean + change.to(victim.clean)
+        inside = (moved >= 0.0) & (moved <= 1.0)
+        with steady(victim.detector):
+            losses, slopes = victim.gradient(moved.clamp(0.0, 1.0))
+        for k in range(len(victim)):
+            if not bool(victim.idle[k]):
+                total += float(losses[k])
+                gradient += (slopes[k] * inside[k])[None].double()
+    return total, gradient
+
+
+def _in_ball(change: Tensor, budget: Budget) -> Tensor:
+    if budget.norm == "linf":
+        return change.clamp(-budget.radius, budget.radius)
+    return change * (budget.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0)
+
+
+def _check_size(shape: tuple[int, ...], victim: Victim) -> None:
+    wanted = tuple(victim.clean.shape[1:])
+    if shape[1:] != wanted:
+        raise ConfigError(
+            f"universal: a change of {shape[2]} x {shape[3]} for pictures of {wanted[1]} x {wanted[2]}; all pictures "
+            "must have one size"
+        )
