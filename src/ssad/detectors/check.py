@@ -12,7 +12,9 @@ from ssad.core.detections import Assignment, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES
 from ssad.core.protocols import Detector
-from ssad.detectors.check_cases import BATCH, CheckCase, modules_of
+from ssad.detectors.check_cases import BATCH, CheckCase, modules_of, usual_threshold
+from ssad.detectors.check_geometry import check_boxes, check_places, check_solids
+from ssad.detectors.check_gradients import check_loss_signs, check_slopes, check_small_changes
 
 RTOL = 2e-3
 FEW = 0.01  # share of places that may differ in a batch: choices between values that are equal but for rounding
@@ -41,10 +43,11 @@ def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[i
         return [f"it lacks {', '.join(missing)} of ssad.core.protocols.Detector"]
     trial = CheckCase(detector, size, intrinsic)
     for part in (
-        _check_names, _check_dense, _check_gradient, _check_predict, _check_batch, _check_losses, _check_modes,
-        _check_sizes, _check_refusals,
+        _check_names, _check_dense, check_places, _check_gradient, _check_predict, check_boxes, check_solids,
+        _check_batch, _check_losses, check_loss_signs, check_slopes, check_small_changes, _check_modes, _check_sizes,
+        _check_refusals,
     ):  # fmt: skip
-        with trial.guarded(part.__name__.removeprefix("_check_")):
+        with trial.guarded(part.__name__.strip("_").removeprefix("check_").replace("_", " ")):
             part(trial)
     return trial.faults
 
@@ -109,28 +112,10 @@ def _check_gradient(trial: CheckCase) -> None:
         trial.need(not bool(gradient[1].any()), f"Dense.{name} of an image does not depend on the others")
 
 
-def _usual(trial: CheckCase, images: Tensor) -> float:
-    """A threshold at which some 20 objects are found in each image."""
-    with torch.no_grad():
-        dense = trial.dense(images[:1])
-    score = dense.logit.sigmoid().amax(-1)
-    if dense.quality is not None:
-        score = score * dense.quality.sigmoid()
-    least = float(score.flatten().sort(descending=True).values[:20][-1])
-    for _ in range(20):  # the detector may count something else in
-        (found,) = trial.predict(images[:1], threshold=least)
-        if len(found.score) > 2:
-            score = found.score.detach().sort(descending=True).values
-            usable = score[(score >= least) & (score <= 1)][:20]  # wrong order and range are told elsewhere
-            return float(usable[-1]) * (1 - 1e-4) if len(usable) else least
-        least *= 0.7
-    return 0.0
-
-
 def _check_predict(trial: CheckCase) -> None:
     need, images = trial.need, trial.images()
     need(len(trial.predict(images)) == BATCH, "predict answers for each image")
-    least = _usual(trial, images)
+    least = usual_threshold(trial, images)
     everything = trial.predict(images, threshold=least)
     some = False
     for found in everything:
@@ -198,7 +183,7 @@ def _check_batch(trial: CheckCase) -> None:
             for other in (getattr(alone[k], name)[0], getattr(turned, name)[BATCH - 1 - k]):
                 fits = other.shape == whole[k].shape and _apart(whole[k], other) <= FEW
                 trial.need(fits, f"Dense.{name} of an image does not depend on its batch")
-    least = _usual(trial, images)
+    least = usual_threshold(trial, images)
     both = trial.predict(images, threshold=least)
     for k in range(BATCH):
         (single,) = trial.predict(images[k : k + 1], threshold=least)

@@ -110,6 +110,30 @@ class CheckCase:
         return Truth(label, box.clamp_min(0).minimum(limit), solid, lens[0])
 
 
+def usual_threshold(trial: CheckCase, images: Tensor) -> float:
+    """A threshold at which some 20 objects are found in each image."""
+    with torch.no_grad():
+        dense = trial.dense(images[:1])
+    score = dense.logit.sigmoid().amax(-1)
+    if dense.quality is not None:
+        score = score * dense.quality.sigmoid()
+    least = float(score.flatten().sort(descending=True).values[:20][-1])
+    for _ in range(20):  # the detector may count something else in
+        (found,) = trial.predict(images[:1], threshold=least)
+        if len(found.score) > 2:
+            score = found.score.detach().sort(descending=True).values
+            usable = score[(score >= least) & (score <= 1)][:20]  # wrong order and range are told elsewhere
+            return float(usable[-1]) * (1 - 1e-4) if len(usable) else least
+        least *= 0.7
+    return 0.0
+
+
+def noise(like: Tensor, amplitude: float) -> Tensor:
+    """Random numbers within plus and minus `amplitude`, of the shape of `like`; the same in every run."""
+    draws = torch.Generator().manual_seed(seed32("check_detector noise", *like.shape))
+    return amplitude * (2 * torch.rand(like.shape, generator=draws) - 1).to(like)
+
+
 def modules_of(detector: Any) -> list[nn.Module]:
     """The detector if it is a module, else the modules that it holds."""
     if isinstance(detector, nn.Module):
