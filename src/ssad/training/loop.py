@@ -17,6 +17,8 @@ from torch import Tensor, distributed, nn
 from ssad.core import safeio
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.seeding import seed32
+from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.training.batches import PictureSet, make_batch, order, repeats
 from ssad.training.recipe import Recipe, recipe_data
 
@@ -104,7 +106,10 @@ def train(
                 group["lr"] = rate
             key = (recipe.seed, epoch, number, share.rank)
             images, truth = make_batch(bank, indices, recipe, key=key, device=where)
-            losses = shared(images.contiguous(memory_format=layout), truth)
+            images = images.contiguous(memory_format=layout)
+            if recipe.radius:
+                images = harden(step_of, images, truth, recipe, key=key)
+            losses = shared(images, truth)
             loss = torch.stack(list(losses.values())).sum()
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
@@ -137,6 +142,38 @@ def train(
             break
     best = average if average is not None else detector
     return best.requires_grad_(False).eval()
+
+
+def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, key: tuple[int, ...]) -> Tensor:
+    """Pictures that are harder to learn from: after projected ascent of the training losses from a random start.
+
+    Args:
+        step: From pictures to losses; its parameters get no gradient from this, its norms keep their statistics.
+        images: [B, 3, H, W] in [0, 1].
+        truth: What is in each.
+        recipe: `radius` and `attack_steps`; one step is 1.25 radii long, several are 2.5 / steps of it.
+        key: What the random start comes from.
+
+    Returns:
+        [B, 3, H, W] within the radius.
+
+    Source: Madry et al. (ICLR 2018); one step: Wong et al., Fast is Better than Free (ICLR 2020).
+    """
+    detector, budget = step.detector, Budget(px(recipe.radius))
+    chance = torch.Generator(images.device).manual_seed(seed32("adversarial training", *key))
+    draws = 2 * torch.rand(images.shape, generator=chance, device=images.device) - 1
+    found = budget.project(images + budget.start(draws, "uniform"), images)
+    length = budget.radius * min(1.25, 2.5 / recipe.attack_steps)
+    modes = [(part, part.training) for part in detector.modules()]
+    for part, _ in modes:
+        part.training = part.training and not isinstance(part, nn.modules.batchnorm._BatchNorm)
+    for _ in range(recipe.attack_steps):
+        asked = found.detach().requires_grad_()
+        (gradient,) = torch.autograd.grad(torch.stack(list(step(asked, truth).values())).sum(), asked)
+        found = budget.project(found + length * budget.steepest(gradient), images)
+    for part, mode in modes:
+        part.training = mode
+    return found
 
 
 def _same(count: int, share: Share, where: torch.device) -> int:

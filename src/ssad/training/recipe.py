@@ -32,6 +32,8 @@ class Recipe:
     saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop, 2D
     only (a 3D box stays while its middle is in sight). rare: pictures with a class that fewer than this share of them
     show are repeated (see `batches.repeats`), 0 none. validate: epochs from one validation to the next.
+    radius: adversarial training: every picture is attacked by PGD on the training losses within this L-infinity radius
+    (code values of 0..255), 0 none; attack_steps: gradient steps of these attacks.
     """
 
     detector: str
@@ -58,6 +60,8 @@ class Recipe:
     keep: Part = 0.0
     rare: Part = 0.0
     validate: Whole = 5
+    radius: Least = 0.0
+    attack_steps: Whole = 1
     seed: FromNone = 0
 
     @model_validator(mode="after")
