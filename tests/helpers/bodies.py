@@ -22,3 +22,11 @@ def plain_bodies() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_objects, "make_body", box)
         yield
+
+
+@contextmanager
+def two_phases() -> Iterator[None]:
+    """People walk with two meshes instead of eight, which a few pictures do not show."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_objects, "PHASES", 2)
+        yield

@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.bodies import plain_bodies
+from helpers.bodies import plain_bodies, two_phases
 from helpers.sharing import Shared
 
 from ssad.camera.labels import label_picture
@@ -280,10 +280,13 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
 def test_an_orbit_of_a_stop_sign_shows_its_face(tmp_path: Path) -> None:
     target = TargetSign("large", seed=2)
     given: dict[str, Any] = {"distances": (5.0, 9.0), "azimuths": (), "elevations": ()}
-    record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
+    with two_phases():
+        record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
+        views = list(clip_views(tmp_path))
     data = read(tmp_path)
     assert data["info"]["recording"]["target"]["kind"] == "stop_sign"
-    for seen in clip_views(tmp_path):
+    assert len(views) == 2
+    for seen in views:
         row, thing = seen.row, target_of(data, dict(seen.row))
         assert data["categories"][thing["category_id"] - 1]["name"] == "stop_sign"
         eye, foot = np.array(row["pose"])[:3, 3], np.array(row["target_pose"])
