@@ -471,7 +471,8 @@ def test_numbers_of_pictures_are_paired_with_towns() -> None:
         (["walk"], "drive or orbit"),
         (["drive", "--images", "1,2"], "2 numbers for 4 towns"),
         (["drive", "--towns", "Nowhere", "--images", "2"], "unknown town 'Nowhere'"),
-        (["orbit", "--target", "spaceship"], "spaceship"),
+        (["orbit", "--target", "stopsign"], "closest: stop_sign"),
+        (["orbit", "--target", "spaceship"], "sedan, stop_sign, suv"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(
