@@ -29,7 +29,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.evaluation.camera_truth import scenes_of
-from ssad.evaluation.detection import FLOOR, box_table, detect, numbers
+from ssad.evaluation.detection import box_table, detect, detect_2d, numbers
 from ssad.metrics.detection import BoxTable, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 from ssad.recording.viewpoints import weather_name
@@ -85,17 +85,14 @@ class Clips:
 def found_in(name: str, clips: Clips, device: str) -> Boxes2D:
     """All detections of a detector, with the labels of the clips."""
     detector = make_detector(name, device=device)
-    label = np.array([clips.classes.index(c) if c in clips.classes else -1 for c in detector.classes])
-    parts: list[list[np.ndarray[Any, Any]]] = []
-    for start in range(0, len(clips.files), 16):
-        stacked = np.stack([read_image(file) for file in clips.files[start : start + 16]])
-        images = torch.from_numpy(stacked).to(device).permute(0, 3, 1, 2).float() / 255
-        for k, one in enumerate(detector.predict(images, threshold=FLOOR)):
-            own = label[one.label.cpu().numpy()]
-            place = np.full(len(own), start + k)
-            parts.append([v[own >= 0] for v in (place, own, one.box.cpu().double().numpy(), one.score.cpu().numpy())])
-    image, kind, box, score = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return Boxes2D(image.astype(np.int32), kind.astype(np.int32), box, score.astype(np.float64))
+    starts = range(0, len(clips.files), 16)
+    batches = (np.stack([read_image(file) for file in clips.files[start : start + 16]]) for start in starts)
+    found = detect_2d(detector, map(torch.from_numpy, batches), device=device)
+    assert found.score is not None
+    own = [clips.classes.index(c) if c in clips.classes else -1 for c in detector.classes]
+    label = np.array(own, np.int32)[found.label]
+    known = label >= 0
+    return Boxes2D(found.image[known], label[known], found.box[known], found.score[known])
 
 
 def recall(clips: Clips, found: Boxes2D, counts: np.ndarray[Any, Any], labels: int) -> float:

@@ -47,7 +47,9 @@ TESTS: dict[str, tuple[str, ...]] = {
         f"tests/scenarios/test_{name}.py"
         for name in ("yaml", "knowledge", "docs", "sets", "natural", "import", "sampling", "episode")
     ),
-    "scenarios/static": tuple(f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_published", "_wet")),
+    "scenarios/static": tuple(
+        f"tests/scenarios/test_shifts{name}.py" for name in ("", "_lidar", "_objects", "_published", "_wet")
+    ),
     "jobs": (
         *(
             f"tests/jobs/test_{name}.py"

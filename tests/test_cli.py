@@ -152,7 +152,7 @@ def test_run_report_and_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     site = tmp_path / "site-packages"
     site.mkdir()
     path = os.pathsep.join(filter(None, [str(install(site)), os.environ.get("PYTHONPATH")]))
-    first = ssad_process("run", "quick", *settings, "--workers", "2", cwd=tmp_path, PYTHONPATH=path)
+    first = ssad_process("run", "quick", *settings, "--workers", "1", cwd=tmp_path, PYTHONPATH=path)
     assert first.returncode == 0, first.stderr
     assert "Straight Obstacle" in first.stdout
     assert "report: runs/little/report.html" in first.stdout

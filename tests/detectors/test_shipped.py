@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.bodies import two_phases
 from helpers.sharing import Shared
 
 from ssad.core.errors import FormatError
@@ -31,7 +32,8 @@ def clips(shared: Shared) -> tuple[CocoSet, PictureSet]:
     """Eight pictures from 20 m behind, in a held-out town and with a seed that no training had."""
 
     def make(out: Path) -> None:
-        record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=0)
+        with two_phases():
+            record_clips(Clips(out, images=(("Larkhill", 8),), held_out=("Larkhill",), seed=77), workers=0)
 
     out = shared("shipped-clips", make)
     data = read_coco(out / "annotations" / "test.json")
@@ -76,7 +78,8 @@ def drive(shared: Shared) -> Path:
 
     def make(out: Path) -> None:
         towns = ("Larkhill",)
-        record_nuscenes(Recording(out, towns, towns, scenes=1, seconds=0.5, width=800, seed=77), workers=0)
+        with two_phases():
+            record_nuscenes(Recording(out, towns, towns, scenes=1, seconds=0.5, width=800, seed=77), workers=0)
 
     return shared("shipped-drive", make)
 

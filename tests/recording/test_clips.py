@@ -19,6 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.bodies import plain_bodies, two_phases
 from helpers.sharing import Shared
 
 from ssad.camera.labels import label_picture
@@ -27,25 +28,27 @@ from ssad.camera.scene import Layer
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
-from ssad.core.types import F64
+from ssad.core.types import F64, EpisodeTrace
 from ssad.recording.clip_recorder import (
     CLASSES,
     FOCAL,
     HIDDEN,
+    SECONDS,
     SEEN,
     SMALL,
     TARGET,
     Clips,
     _named,
-    _prepare,
-    _Set,
     clip_views,
     pair_images,
     record_clips,
 )
+from ssad.recording.drives import make_drive
+from ssad.recording.nuscenes_recorder import drive
 from ssad.recording.scene_objects import SceneObjects
 from ssad.recording.target import TargetCar, TargetSign, parse_target
 from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
+from ssad.roads import load_town
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
 BOTH = pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=pytest.mark.slow)])
@@ -80,8 +83,13 @@ class Stopped(Exception):
 
 @pytest.fixture(scope="session")
 def drives(shared: Shared) -> Path:
-    """A recording that was stopped after its first part and then gone on with."""
-    return shared("clips-drive", _stopped_recording)
+    """A recording that was stopped after its first part and then gone on with. All but the target are plain boxes."""
+
+    def make(out: Path) -> None:
+        with plain_bodies():
+            _stopped_recording(out)
+
+    return shared("clips-drive", make)
 
 
 def _stopped_recording(out: Path) -> None:
@@ -104,9 +112,10 @@ def _stopped_recording(out: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def market(drives: Path) -> _Set:
-    """The drive of the pictures in Oldmarket, made again."""
-    return _prepare(todo(drives, "drive"), "Oldmarket", (0, "drive", "Oldmarket", 0, 0))
+def market() -> EpisodeTrace:
+    """The drive of the pictures in Oldmarket, driven again."""
+    graph = load_town("Oldmarket")
+    return drive(make_drive(graph, key=("clips", 0, "drive", "Oldmarket", 0, 0), seconds=SECONDS), graph)
 
 
 @pytest.fixture(scope="session")
@@ -134,7 +143,7 @@ def turned(a: float, b: float) -> float:
     return abs((a - b + 180.0) % 360.0 - 180.0)
 
 
-def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: _Set) -> None:
+def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: EpisodeTrace) -> None:
     rows = read(drives)["images"]
     for row in rows:
         away, azimuth, elevation = place_of(row)
@@ -150,7 +159,7 @@ def test_a_drive_is_seen_from_20_m_of_way_behind(drives: Path, market: _Set) -> 
             moved = np.array(after["target_pose"])[:2, 3] - np.array(before["target_pose"])[:2, 3]
             assert np.hypot(*moved) >= 0.9, "on a bend the chord is shorter than the way"
     assert len({row["drive"] for row in rows}) == 2
-    trace = market.trace
+    trace = market
     xy = np.stack([trace.x[:, 0], trace.y[:, 0]], -1).astype(float)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
     for row in [r for r in rows if r["town"] == "Oldmarket"]:
@@ -250,7 +259,8 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
     """Each row gives scene, view, target and labels; what is rendered is what was stored."""
     folder = request.getfixturevalue(mode)
     rows = read(folder, "test")["images"]
-    again = list(clip_views(folder, split="test"))
+    with plain_bodies() if mode == "drives" else contextlib.nullcontext():
+        again = list(clip_views(folder, split="test"))
     assert [v.file for v in again] == [row["file_name"] for row in rows]
     scenes = {(v.row["town"], v.row["part"], v.row["attempt"], id(v.scene)) for v in again}
     assert len(scenes) == len({key[:3] for key in scenes}), "pictures of a drive share a scene"
@@ -270,10 +280,13 @@ def test_a_recording_is_drawn_again(mode: str, request: pytest.FixtureRequest) -
 def test_an_orbit_of_a_stop_sign_shows_its_face(tmp_path: Path) -> None:
     target = TargetSign("large", seed=2)
     given: dict[str, Any] = {"distances": (5.0, 9.0), "azimuths": (), "elevations": ()}
-    record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
+    with two_phases():
+        record_clips(todo(tmp_path, "orbit", images=(("Oldmarket", 2),), target=target, size=320, **given), workers=0)
+        views = list(clip_views(tmp_path))
     data = read(tmp_path)
     assert data["info"]["recording"]["target"]["kind"] == "stop_sign"
-    for seen in clip_views(tmp_path):
+    assert len(views) == 2
+    for seen in views:
         row, thing = seen.row, target_of(data, dict(seen.row))
         assert data["categories"][thing["category_id"] - 1]["name"] == "stop_sign"
         eye, foot = np.array(row["pose"])[:3, 3], np.array(row["target_pose"])
@@ -355,10 +368,11 @@ def test_pycocotools_reads_it_and_the_truth_scores_1(mode: str, request: pytest.
 
 
 @pytest.mark.slow
-def test_same_bytes_for_two_workers_without_a_stop(drives: Path, tmp_path: Path) -> None:
+def test_same_bytes_for_two_workers_and_after_a_stop(tmp_path: Path) -> None:
     """That processes do not matter is shown of drives in the nuScenes schema by default: they share the code."""
-    record_clips(todo(tmp_path, "drive"), workers=2)
-    assert contents(tmp_path) == contents(drives)
+    record_clips(todo(tmp_path / "two", "drive"), workers=2)
+    _stopped_recording(tmp_path / "stopped")
+    assert contents(tmp_path / "two") == contents(tmp_path / "stopped")
 
 
 def test_recording_again_changes_nothing(drives: Path) -> None:
@@ -457,7 +471,8 @@ def test_numbers_of_pictures_are_paired_with_towns() -> None:
         (["walk"], "drive or orbit"),
         (["drive", "--images", "1,2"], "2 numbers for 4 towns"),
         (["drive", "--towns", "Nowhere", "--images", "2"], "unknown town 'Nowhere'"),
-        (["orbit", "--target", "spaceship"], "spaceship"),
+        (["orbit", "--target", "stopsign"], "closest: stop_sign"),
+        (["orbit", "--target", "spaceship"], "sedan, stop_sign, suv"),
     ],
 )
 def test_the_command_says_what_is_wrong_in_one_line(
@@ -499,11 +514,9 @@ def test_a_camera_looks_at_its_point_upright() -> None:
         assert found == {"distance": 9.0, "azimuth": azimuth, "elevation": 0.0}
 
 
-def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: _Set) -> None:
-    trace = market.trace
-
+def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace) -> None:
     def shots(behind: float) -> list[Any]:
-        return follow(trace, Weather(), behind=behind, height=2.0, count=4, draws=generator(1))
+        return follow(market, Weather(), behind=behind, height=2.0, count=4, draws=generator(1))
 
     found = shots(20.0)
     assert len(found) > 20
@@ -512,7 +525,7 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: _Set) -> None
     assert len(set(times)) == len(times)
     way = sorted(s.about["way"] for s in found)
     assert min(np.diff(way)) >= 1.0 - 0.011
-    assert shots(float(trace.driven[-1])) == []
+    assert shots(float(market.driven[-1])) == []
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.bodies import plain_bodies
 
 from ssad.assets.actor_bodies import BODY_CATEGORIES
 from ssad.assets.street import cached_street
@@ -29,7 +30,6 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_shifter import SceneShifter
-from ssad.recording import scene_objects
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
@@ -133,12 +133,13 @@ def test_same_bytes_after_kill_9_at_any_moment(recorded: Path, tmp_path: Path) -
     assert contents(one) == contents(recorded)
 
 
-def test_a_cast_has_every_class_and_nobody_stands_in_another(recorded: Path) -> None:
+def test_a_cast_has_every_class_and_nobody_stands_in_another() -> None:
     kinds: Counter[str] = Counter()
     for town in ("Larkhill", "Crossgate"):
         graph, street = load_town(town), cached_street(town)
         trace = drive(make_drive(graph, key=(3, town), seconds=6.0), graph)
-        cast = place_objects(trace, graph, street, key=(5, town), detail=0)
+        with plain_bodies():
+            cast = place_objects(trace, graph, street, key=(5, town))
         kinds.update(body.kind for body in cast.bodies)
         now = cast.at(3.0, np.array([trace.x[30, 0], trace.y[30, 0]]), 80.0)
         assert len(now) > 8
@@ -201,15 +202,14 @@ def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
         drive_street(graph, "none", key=())
 
 
-def test_long_vehicles_stand_at_the_kerb(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_vehicles_stand_at_the_kerb() -> None:
     """A street full of parked cars would leave trucks, buses and trailers no room."""
-    monkeypatch.setattr(scene_objects, "WALKING", ("adult",))  # people do not matter here, and take long to make
-    monkeypatch.setattr(scene_objects, "WAITING", ("standing",))
     found: Counter[str] = Counter()
     for number in range(4):
         graph = load_town("Twinford")
         trace = drive(make_drive(graph, key=("long", number), seconds=1.0), graph)
-        cast = place_objects(trace, graph, cached_street(graph), key=("long", number), detail=0)
+        with plain_bodies():
+            cast = place_objects(trace, graph, cached_street(graph), key=("long", number))
         parked = [body for body in cast.bodies if body.parked]
         found.update(body.kind for body in parked)
         wide = [body for body in parked if body.kind not in RACK]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.bodies import plain_bodies
 
 import ssad.recording.textured_clips as module
 from ssad.camera.render import render
@@ -17,7 +18,6 @@ from ssad.camera.torch_jpeg import jpeg
 from ssad.camera.torch_sensor import develop
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.recording import scene_objects
 from ssad.recording.clip_recorder import Clips, clip_views, record_clips
 from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.recording.textured_clips import KEPT, textured_clips
@@ -27,11 +27,9 @@ SIZES = {0: 32, 1: (16, 24)}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_people() -> Iterator[None]:
-    """Bodies of people take long to make."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_objects, "WALKING", ("adult",))
-        patch.setattr(scene_objects, "WAITING", ("standing",))
+def others_are_boxes() -> Iterator[None]:
+    """A texture is worn by the target alone."""
+    with plain_bodies():
         yield
 
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from helpers.bodies import plain_bodies
 from helpers.sharing import Shared
 from torch.multiprocessing.spawn import spawn
 
@@ -30,7 +31,8 @@ def clips(shared: Shared) -> Path:
     pairs = (("Twinford", 6), ("Oldmarket", 2))
 
     def make(out: Path) -> None:
-        record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
+        with plain_bodies():
+            record_clips(Clips(out, images=pairs, held_out=("Oldmarket",), size=192), workers=0)
 
     return shared("clips", make)
 

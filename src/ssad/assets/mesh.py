@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ Rectangle = tuple[float, float, float, float]
 Point = tuple[float, float, float]
 
 SMOOTH = 0.7  # rad: neighbouring faces that meet at less are shaded as one surface
+AT_ONCE = 12  # faces at a vertex; most vertices have fewer
 MIN_AREA = 1e-9  # m^2: builders leave out smaller triangles
 
 
@@ -209,15 +211,20 @@ def corner_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, smooth: flo
     flat = f.ravel()
     order = np.argsort(flat, kind="stable")
     counts = np.bincount(flat, minlength=len(v))
-    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    starts = np.cumsum(counts) - counts
     own = np.repeat(unit, 3, axis=0)
     total = np.zeros_like(own)
-    limit = np.cos(smooth)
-    for k in range(int(counts.max(initial=0))):
-        corner = np.flatnonzero(counts[flat] > k)
-        other = order[starts[flat[corner]] + k] // 3
-        near = np.einsum("ci,ci->c", own[corner], unit[other]) >= limit
-        total[corner[near]] += area[other[near]]
+    most = int(counts.max(initial=0))
+    # some faces at the vertex of each corner at once [K, corners], summed in turn: the order of a sum decides its bits
+    for first in range(0, most, AT_ONCE):
+        corner = np.flatnonzero(counts[flat] > first)
+        vertex = flat[corner]
+        turn = np.arange(first, min(first + AT_ONCE, most))[:, None]
+        there = turn < counts[vertex]
+        other = order[np.where(there, starts[vertex] + turn, 0)] // 3
+        near = there & (np.einsum("ci,kci->kc", own[corner], unit[other]) >= np.cos(smooth))
+        parts = np.where(near[..., None], area[other], 0.0)
+        total[corner] = np.add.reduce(np.concatenate([total[corner][None], parts]), axis=0)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     result = np.where(length > 1e-20, total / np.maximum(length, 1e-30), own)
     result[np.linalg.norm(result, axis=1) < 0.5] = 0.0, 0.0, 1.0
@@ -373,7 +380,13 @@ def loft(sections: npt.ArrayLike, *, material: Material, closed: bool = True, sm
     `closed` joins last and first point of a section and fills both ends (convex sections).
     """
     s = np.asarray(sections, np.float64)
-    rows, columns = s.shape[:2]
+    faces, uv = _loft_faces(*s.shape[:2], closed)
+    return build(s.reshape(-1, 3), faces, materials=material, uv=uv, smooth=smooth, outward=closed)
+
+
+@lru_cache(256)
+def _loft_faces(rows: int, columns: int, closed: bool) -> tuple[I32, F64]:
+    """Faces [F, 3] and texture coordinates [F, 3, 2] of `loft`, not to be written to: bodies are full of equal ones."""
     faces = grid_faces(rows, columns, wrap=closed)
     across = np.linspace(0.0, 1.0, columns + int(closed))
     along = np.linspace(0.0, 1.0, rows)
@@ -391,7 +404,8 @@ def loft(sections: npt.ArrayLike, *, material: Material, closed: bool = True, sm
         circle = 0.5 + 0.5 * np.stack([np.cos(2 * np.pi * across[:-1]), np.sin(2 * np.pi * across[:-1])], -1)
         faces = np.concatenate([faces, fan[:, ::-1], last])
         uv = np.concatenate([uv, circle[fan[:, ::-1]], circle[fan]])
-    return build(s.reshape(-1, 3), faces, materials=material, uv=uv, smooth=smooth, outward=closed)
+    faces.flags.writeable = uv.flags.writeable = False
+    return faces, uv
 
 
 def lathe(

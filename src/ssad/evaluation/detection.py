@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -216,6 +216,34 @@ class Annotated(Protocol):
     def truth(self) -> Sequence[Truth]: ...
 
 
+def detect_2d(detector: Detector, batches: Iterable[torch.Tensor], *, device: str = "cpu") -> Boxes2D:
+    """All detections of a detector in pictures, one row a detection.
+
+    Args:
+        detector: What looks at them.
+        batches: Pictures, uint8 [N, H, W, 3], some at a time.
+        device: Where the detector is.
+
+    Returns:
+        The rows, in the order of the pictures; labels are the detector's own.
+    """
+    found: list[Detections] = []
+    for pictures in batches:
+        images = pictures.to(device).permute(0, 3, 1, 2).float() / 255
+        found += detector.predict(images, threshold=FLOOR)
+    return Boxes2D(
+        np.repeat(np.arange(len(found)), [len(one.score) for one in found]).astype(np.int32),
+        _rows([one.label for one in found]).astype(np.int32), _rows([one.box for one in found], 4),
+        _rows([one.score for one in found]),
+    )  # fmt: skip
+
+
+def _rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
+    """Tensors [N] or [N, width] one after the other, on the CPU."""
+    empty = np.zeros((0,) if width is None else (0, width))
+    return np.concatenate([empty, *(v.detach().cpu().double().numpy() for v in values)])
+
+
 def score_2d(
     detector: Detector, data: Annotated, *, classes: Sequence[str] | None = None, device: str = "cpu", batch: int = 32
 ) -> dict[str, float]:
@@ -234,26 +262,17 @@ def score_2d(
     names = detector.classes
     index = {name: k for k, name in enumerate(names)}
     own = np.array([index.get(name, -1) for name in (names if classes is None else classes)], np.int32)
-    found: list[tuple[int, Detections]] = []
-    for start in range(0, len(data.truth), batch):
-        images = data.pictures[start : start + batch].to(device).permute(0, 3, 1, 2).float() / 255
-        found += [(start + k, one) for k, one in enumerate(detector.predict(images, threshold=FLOOR))]
-
-    def rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:
-        empty = np.zeros((0,) if width is None else (0, width))
-        return np.concatenate([empty, *(v.detach().cpu().double().numpy() for v in values)])
-
-    predicted = Boxes2D(
-        np.repeat([k for k, _ in found], [len(one.score) for _, one in found]).astype(np.int32),
-        rows([one.label for _, one in found]).astype(np.int32), rows([one.box for _, one in found], 4),
-        rows([one.score for _, one in found]),
-    )  # fmt: skip
+    batches = (data.pictures[start : start + batch] for start in range(0, len(data.truth), batch))
+    predicted = detect_2d(detector, batches, device=device)
     crowd = [torch.zeros(len(t.label), dtype=torch.bool) if t.crowd is None else t.crowd for t in data.truth]
     image = np.repeat(np.arange(len(data.truth)), [len(t.label) for t in data.truth]).astype(np.int32)
-    label = own[rows([t.label for t in data.truth]).astype(np.int32)]
+    label = own[_rows([t.label for t in data.truth]).astype(np.int32)]
     known = label >= 0
     real = Boxes2D(
-        image[known], label[known], rows([t.box for t in data.truth], 4)[known], ignore=rows(crowd).astype(bool)[known]
+        image[known],
+        label[known],
+        _rows([t.box for t in data.truth], 4)[known],
+        ignore=_rows(crowd).astype(bool)[known],
     )
     ap = average_precision(real, predicted, labels=len(names))
     each = {f"AP50_{name}": float(value) for name, value in zip(names, ap, strict=True) if np.isfinite(value)}

@@ -228,10 +228,9 @@ class SceneShifter:
 
     def _view(self, frame: SensorFrame) -> Frame:
         """The same by its own picture alone."""
-        anomaly = self.base.name == "anomaly"
-        objects = self.base.family == "object" or self._uses_depth or anomaly
+        objects = self.base.family == "object" or self._uses_depth or self.base.places_objects
         boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else TrackedBoxes.empty()
-        if anomaly:
+        if self.base.places_objects:
             return self._frame(frame, boxes, depth=self._depth(frame))
         if not self._uses_depth:
             return self._frame(frame, boxes)
@@ -272,13 +271,13 @@ class SceneShifter:
 
     @property
     def _contexts(self) -> dict[str, SceneContext] | None:
-        if self.base.name == "anomaly":
+        if self.base.places_objects:
             return {self.context.scene: replace(self.context, objects=self.objects)}
         return {self.context.scene: self.context} if self.base.family == "environment" else None
 
     @cached_property
     def objects(self) -> tuple[StandingObject, ...]:
-        """What the shift `anomaly` puts on the road of the scene, at all severities."""
+        """What a shift that places objects puts on the road of the scene, at all severities."""
         from ssad.scenarios.static.shifts.anomaly import place_objects
 
         poses = np.array([f.ego_to_world for f in self.scene.frames if f.key_frame or f.modality == "camera"])

@@ -92,4 +92,6 @@ def parse_target(text: str) -> TargetCar | TargetSign:
     style, paint, seed = [*text.split(":"), "", "", ""][:3]
     if text.count(":") > 2 or (seed and not seed.isdigit()):
         raise ConfigError(f"--target {text}: expected STYLE, STYLE:PAINT or STYLE:PAINT:SEED, such as sedan:silver:0")
+    if style not in BODIES["car"].styles:
+        raise unknown_name("target", style, (*BODIES["car"].styles, TargetSign().kind))
     return TargetCar(style, paint or TargetCar().paint, seed=int(seed or 0))

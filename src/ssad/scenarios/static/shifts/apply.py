@@ -94,7 +94,7 @@ def _dispatch(
         return add_noise(batch, frames, specs)
     if name == "overexposure":
         return overexpose(batch, specs)
-    if name == "anomaly":
+    if specs[0].places_objects:
         from ssad.scenarios.static.shifts.anomaly import add_anomalies
 
         return add_anomalies(batch, frames, specs, contexts)

@@ -35,7 +35,7 @@ def shift_points(
         return cloud, Applied(True, {"severity": 0})
     if spec.name in CAMERA_ONLY:
         return cloud, Applied(False, {}, {"changes cameras alone": 1})
-    if spec.name == "anomaly":
+    if spec.places_objects:
         from ssad.scenarios.static.shifts.anomaly import hit_by_rays
 
         return hit_by_rays(cloud, frame, spec, contexts)

@@ -37,6 +37,7 @@ EXTRA: Final[dict[str, tuple[Family, str]]] = {
     "anomaly": ("environment", "objects of no class on the road: debris, animals, overturned vehicles, fallen trees"),
 }
 KNOWN: Final = SHIFTS | EXTRA
+PLACING: Final = ("anomaly",)  # put objects into the scene before its sensors
 CAMERA_ONLY: Final = ("overexposure",)  # no LiDAR twin
 SEVERITIES: Final = (1, 2, 3, 4, 5)
 # a change of what a shift computes changes its bits, hence its keys and manifests
@@ -68,6 +69,11 @@ class ShiftSpec:
     def family(self) -> Family:
         """environment, sensor or object."""
         return KNOWN[self.name][0]
+
+    @property
+    def places_objects(self) -> bool:
+        """Whether it puts objects into the scene, which its sensors then see."""
+        return self.name in PLACING
 
     def at(self, severity: int) -> ShiftSpec:
         """The same shift at another severity."""

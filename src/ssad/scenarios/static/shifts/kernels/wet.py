@@ -1,5 +1,7 @@
 """Wet ground: where it is, what it mirrors, and the picture with it."""
 
+from typing import Any
+
 import warp as wp
 
 from ssad.scenarios.static.shifts.kernels.light import CODES, WHITE
@@ -255,17 +257,8 @@ def mirror(
 
 
 @wp.func
-def between(grid: wp.array3d(dtype=wp.vec4), b: int, row: int, fraction: float, column: int) -> wp.vec4:
-    """Value of a grid between two of its rows, columns held at the border."""
-    x = wp.clamp(column, 0, grid.shape[2] - 1)
-    low = wp.clamp(row, 0, grid.shape[1] - 1)
-    high = wp.clamp(row + 1, 0, grid.shape[1] - 1)
-    return grid[b, low, x] * (1.0 - fraction) + grid[b, high, x] * fraction
-
-
-@wp.func
-def share_of(grid: wp.array3d(dtype=float), b: int, row: int, fraction: float, column: int) -> float:
-    """The same of a grid of numbers."""
+def between(grid: wp.array3d(dtype=Any), b: int, row: int, fraction: float, column: int):
+    """Value of a grid, of numbers or of vectors, between two of its rows, columns held at the border."""
     x = wp.clamp(column, 0, grid.shape[2] - 1)
     low = wp.clamp(row, 0, grid.shape[1] - 1)
     high = wp.clamp(row + 1, 0, grid.shape[1] - 1)
@@ -319,17 +312,17 @@ def blend_wet(
     i = b * words + y * width * 3 / 4
     most = float(0.0)
     for x in range(ground.shape[2]):
-        most = wp.max(most, share_of(ground, b, row, fraction, x))
+        most = wp.max(most, between(ground, b, row, fraction, x))
     if most <= 0.5:
         for k in range(width * 3 / 4):
             out[i + k] = image[i + k]
         return
-    g0 = share_of(ground, b, row, fraction, -1)
-    g1 = share_of(ground, b, row, fraction, 0)
+    g0 = between(ground, b, row, fraction, -1)
+    g1 = between(ground, b, row, fraction, 0)
     s0 = between(shine, b, row, fraction, -1)
     s1 = between(shine, b, row, fraction, 0)
     for q in range(width / 4):
-        g2 = share_of(ground, b, row, fraction, q + 1)
+        g2 = between(ground, b, row, fraction, q + 1)
         s2 = between(shine, b, row, fraction, q + 1)
         w0 = image[i]
         w1 = image[i + 1]
