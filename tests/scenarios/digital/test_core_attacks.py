@@ -17,7 +17,7 @@ from ssad.detectors import make_detector
 from ssad.scenarios.static.digital import Budget, default_loss, make_attack, px, run_attack
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
-from ssad.scenarios.static.digital.check import share_found, within
+from ssad.scenarios.static.digital.check import quality_left, within
 from ssad.scenarios.static.digital.objectives import Margin, Vanish
 from ssad.scenarios.static.digital.victim import Victim
 
@@ -119,9 +119,9 @@ def street() -> tuple[Tensor, list[Truth]]:
 def test_a_budget_without_bounds_leaves_nothing() -> None:
     detector = ToyDetector()
     images, truth = toy_scene()
-    assert share_found(detector.predict(images), truth) == 1.0
+    assert quality_left(detector, images, truth, None) == 1.0
     found = run_attack(make_attack("pgd"), detector, images, truth, Budget(px(255)), objective="margin")
-    assert share_found(detector.predict(found.images), truth) == 0.0
+    assert quality_left(detector, found.images, truth, None) == 0.0
 
 
 def test_the_smallest_change_is_found() -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
-from ssad.detectors.mono3d.config import FCOS3D_LIGHT, PGD_DET_LIGHT, Mono3DConfig
+from ssad.detectors.mono3d.config import FCOS3D, FCOS3D_LIGHT, PGD_DET_LIGHT, Mono3DConfig
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.scenarios.static.digital import OBJECTIVES, Aim, Budget, make_attack, make_objective, px, run_attack
 from ssad.scenarios.static.digital.check import find_weaknesses
@@ -35,9 +35,9 @@ def _on_one_thread() -> Iterator[None]:
         yield
 
 
-def seen_by(name: str | Mono3DConfig, **options: Any) -> tuple[Any, Tensor, Tensor | None, list[Truth]]:
+def seen_by(name: str | Mono3DConfig) -> tuple[Any, Tensor, Tensor | None, list[Truth]]:
     """A detector, noise, and what it says it sees in it as the truth."""
-    detector = make_detector(name, **options) if isinstance(name, str) else Mono3D(name, seed=1)
+    detector = make_detector(name) if isinstance(name, str) else Mono3D(name, seed=1)
     draws = torch.Generator().manual_seed(2)
     images = (torch.rand((1, 3, 64, 96), generator=draws) * 255).round() / 255
     lens = None
@@ -55,8 +55,11 @@ def seen_by(name: str | Mono3DConfig, **options: Any) -> tuple[Any, Tensor, Tens
     return detector, images, lens, truth
 
 
-@pytest.mark.parametrize("name", ["full", "classification", "localisation", "depth", "orientation", "vanish", "margin"])
-@pytest.mark.parametrize("config", [FCOS3D_LIGHT, PGD_DET_LIGHT], ids=lambda config: config.name)
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [(FCOS3D_LIGHT, "full"), (PGD_DET_LIGHT, "full"), (FCOS3D_LIGHT, "margin"), (PGD_DET_LIGHT, "vanish")],
+    ids=lambda value: getattr(value, "name", value),
+)
 def test_gradients_equal_finite_differences(config: Mono3DConfig, name: str) -> None:
     """Preprocessing, resizing included, is a part of what is differentiated."""
     made, images, lens, truth = seen_by(replace(config, input_width=128))
@@ -65,13 +68,16 @@ def test_gradients_equal_finite_differences(config: Mono3DConfig, name: str) -> 
 
 
 def test_gradients_through_deformable_convolution() -> None:
-    made, images, lens, truth = seen_by("fcos3d", weights="random")
+    made, images, lens, truth = seen_by(replace(FCOS3D, trunk=50))
     victim = Victim(made, images, truth, make_objective("full"), intrinsic=lens)
     assert check_gradient(victim) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["vanish", "margin", "mislabel", "localisation", "fabricate"])
-@pytest.mark.parametrize("detector", ["yolov5n", "yolov3-tiny"])
+@pytest.mark.parametrize(
+    ("detector", "name"),
+    [("yolov5n", "vanish"), ("yolov5n", "mislabel"), ("yolov5n", "localisation"), ("yolov3-tiny", "margin"),
+     ("yolov3-tiny", "fabricate")],
+)  # fmt: skip
 def test_gradients_of_yolo(detector: str, name: str) -> None:
     made, images, lens, truth = seen_by(detector)
     objective = Mislabel(confidence=100.0) if name == "mislabel" else make_objective(name)
@@ -257,7 +263,7 @@ class OverBudget(PGD):
     ("attack", "objective", "message"),
     [
         (PGD(step=0.01, schedule="constant", start="none"), "full", "fgsm of the same budget"),
-        (PGD(), Detected(), "leaves .* of the objects"),
+        (PGD(), Detected(), "leaves an average precision"),
         (PGD(), Detached(), "gradient of loss 'detached'.*is wrong"),
         (PGD(), Flipped(), "gradient of loss 'flipped'.*is wrong"),
         (PGD(), Shared(), "depends on the other images"),

@@ -9,24 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
-from torchvision.ops import box_iou
 
-from ssad.core.detections import Detections, Truth
+from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
 from ssad.scenarios.static.digital.attack import Attack, run_attack
 from ssad.scenarios.static.digital.budget import LEVELS, Budget, codes_of, lengths
 from ssad.scenarios.static.digital.fgsm import FGSM
+from ssad.scenarios.static.digital.image_quality import image_quality
 from ssad.scenarios.static.digital.noise import RandomNoise
 from ssad.scenarios.static.digital.objectives import Margin, Objective, make_objective
 from ssad.scenarios.static.digital.pgd import PGD
 from ssad.scenarios.static.digital.victim import Victim, steady
 
 SLACK = 0.02  # share of the rise of the loss that an attack may lack beside another
-BESIDE = 0.1  # share of the objects that it may leave beyond what the reference leaves
-NEAR = 2.0  # m on the ground within which a 3D box counts as found
+BESIDE = 0.1  # average precision that it may leave beyond what the reference leaves
 
 
 def find_weaknesses(
@@ -82,10 +80,11 @@ def find_weaknesses(
             PGD(own.cost.gradients), detector, images, truth, budget, objective=Margin(), intrinsic=intrinsic,
             check=False,
         )  # fmt: skip
-        left, least = (share_found(detector.predict(one.images, intrinsic), truth) for one in (own, reference))
+        left, least = (quality_left(detector, one.images, truth, intrinsic) for one in (own, reference))
         if left > least + BESIDE:
             faults.append(
-                f"it leaves {left:.0%} of the objects, PGD on the loss margin with as many steps leaves {least:.0%}"
+                f"it leaves an average precision of {left:.0%}, PGD on the loss margin with as many steps leaves "
+                f"{least:.0%}"
             )
     return faults
 
@@ -124,29 +123,12 @@ def _batch_faults(  # noqa: PLR0917
     return faults
 
 
-def share_found(found: Sequence[Detections], truth: Sequence[Truth], *, threshold: float = 0.25) -> float:
-    """Share of the true objects of some images, crowd aside, that have a detection of their class on them.
-
-    Args:
-        found: Detections of each image.
-        truth: What is in each image.
-        threshold: Least score that counts.
-
-    Returns:
-        0 to 1: a 2D box covers (IoU 0.5), a 3D box lies within 2 m on the ground; NaN without objects.
-    """
-    hits, count = 0, 0
-    for one, real in zip(found, truth, strict=True):
-        wanted = torch.ones_like(real.label, dtype=torch.bool) if real.crowd is None else ~real.crowd
-        sure = one.score >= threshold
-        if one.solid is not None and real.solid is not None:
-            fits = torch.cdist(real.solid.centre[:, [0, 2]], one.solid.centre[sure][:, [0, 2]]) < NEAR
-        else:
-            fits = box_iou(real.box, one.box[sure].to(real.box)) >= 0.5
-        fits &= real.label[:, None] == one.label[sure]
-        hits += int((fits.any(1) & wanted).sum())
-        count += int(wanted.sum())
-    return hits / count if count else float("nan")
+def quality_left(detector: Detector, images: Tensor, truth: Sequence[Truth], intrinsic: Tensor | None) -> float:
+    """Mean over images of what a detector still gets right of each (see `image_quality`), 0 to 1."""
+    found = detector.predict(images, intrinsic)
+    pairs = zip(found, truth, strict=True)
+    values = [image_quality(*pair, task=detector.task, classes=len(detector.classes)).value for pair in pairs]
+    return sum(values) / len(values)
 
 
 def within(images: Tensor, clean: Tensor, budget: Budget) -> bool:
