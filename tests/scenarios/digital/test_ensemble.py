@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -89,11 +89,15 @@ def test_quality_of_solids_by_hand() -> None:
 
     assert image_quality(found([(0.5, 9, 11), (3.0, 0, 11.9)]), truth, task="3d").value == 1.0  # height is free
     assert image_quality(found([(0.0, 0, 12.1), (5.1, 0, 10)]), truth, task="3d").value == 0.0
-    # the first takes the nearer of two, the second the other one
-    assert image_quality(found([(1.6, 0, 10), (1.4, 0, 10)]), truth, task="3d").value == 1.0
+    # the first takes the nearer of two, and the other is left for the second
+    assert image_quality(found([(1.4, 0, 10), (4.5, 0, 10)]), truth, task="3d").value == 1.0
+    assert image_quality(found([(1.6, 0, 10), (-1.5, 0, 10)]), truth, task="3d").value == 1.0
+    # one of another class takes nothing away
+    both = replace(found([(0.0, 0, 10), (0.0, 0, 10), (3.0, 0, 10)]), label=torch.tensor([1, 0, 0]))
+    assert image_quality(both, truth, task="3d").value == 1.0
     assert image_quality(found([(0.0, 0, 10), (3.0, 0, 10)], label=1), truth, task="3d").value == 0.0
     crowd = Truth(truth.label, truth.box, truth.solid, crowd=torch.tensor([False, True]))
-    assert image_quality(found([(3.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d").value == 1.0
+    assert image_quality(found([(3.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d") == Quality(1.0, pytest.approx(-0.5))
     assert image_quality(found([(8.0, 0, 10), (0.0, 0, 10)]), crowd, task="3d").value == pytest.approx(0.5)
     with pytest.raises(ConfigError, match="needs 3D boxes"):
         image_quality(found([(0.0, 0, 10)]), Truth(truth.label, truth.box), task="3d")

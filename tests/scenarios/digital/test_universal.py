@@ -43,7 +43,7 @@ def test_it_raises_the_loss_of_pictures_that_it_was_not_fitted_to(budget: Budget
 def test_it_does_not_depend_on_the_batches_and_may_be_read_anew() -> None:
     detector, (images, truth) = ToyDetector(), toy_scene(4)
     one = fit_universal([Victim(detector, images, truth, Vanish())], BUDGETS[0], epochs=4)
-    parts = [Victim(detector, images[k : k + 2], truth[k : k + 2], Vanish()) for k in (0, 2)]
+    parts = [Victim(detector, images[a:b], truth[a:b], Vanish()) for a, b in ((0, 1), (1, 4))]
     assert torch.equal(fit_universal(iter(parts), BUDGETS[0], epochs=4), one)
     read = []
 
@@ -65,6 +65,9 @@ def test_a_smaller_budget_holds_a_larger_change() -> None:
         moved = ((found.images - images).double() * 255).round().flatten(1)
         longest = moved.abs().max() if budget.norm == "linf" else moved.norm(dim=1).max()
         assert 0.8 * budget.radius * 255 < float(longest) <= budget.radius * 255 + 1e-9
+        inside = attack.perturb(Victim(detector, images, truth, Vanish()), budget) - images
+        size = inside.abs().max() if budget.norm == "linf" else inside.flatten(1).norm(dim=1).max()
+        assert float(size) <= budget.radius * (1 + 1e-5)
 
 
 def test_the_detector_is_as_it_was() -> None:

@@ -26,6 +26,7 @@ ATTACKS: dict[str, str] = {
     "spsa": f"{_HERE}.nes:spsa",
     "transfer": f"{_HERE}.transfer:Transfer",
     "universal": f"{_HERE}.universal:Universal",
+    "expected": f"{_HERE}.expectation:Expected",
     "noise": f"{_HERE}.noise:RandomNoise",
 }
 LOSS: dict[str, str] = {"cw": "margin", "cw-min": "margin"}

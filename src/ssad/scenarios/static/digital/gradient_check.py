@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor, nn
@@ -20,7 +21,8 @@ def check_gradient(victim: Victim) -> float:
     """Compare the slope along the gradient of each image's loss with central finite differences.
 
     A detector that is a module is copied and asked in float64, so that a step may be small enough not to cross the
-    kinks of its activations; any other is asked as it is, with a larger step.
+    kinks of its activations; any other is asked as it is, with a larger step. A defence that rounds or
+    draws is left out.
 
     Args:
         victim: What will be attacked; its costs do not count.
@@ -43,6 +45,7 @@ def check_gradient(victim: Victim) -> float:
 
 
 def _error(victim: Victim) -> float:
+    victim = _without_stairs(victim)
     exact = isinstance(victim.detector, nn.Module)
     asked = _in_double(victim) if exact else victim
     step = STEP if exact else COARSE
@@ -58,6 +61,19 @@ def _error(victim: Victim) -> float:
     rise = asked.loss(asked.clean + step * direction) - asked.loss(asked.clean - step * direction)
     wrong = (rise / (2 * step) - size).abs() / size.clamp_min(1e-30)
     return float(wrong[some].max())
+
+
+def _without_stairs(victim: Victim) -> Victim:
+    """Without a defence that is not smooth: finite differences say nothing about the slope across its stairs."""
+    found = copy.copy(victim)
+    found.cost = copy.copy(victim.cost)
+    if not getattr(victim.through, "smooth", True):
+        found.through = None
+    if not getattr(getattr(victim.detector, "defence", None), "smooth", True):
+        bare: Any = victim.detector
+        found.detector = bare.detector
+        found.situation = replace(victim.situation, detector=bare.detector)
+    return found
 
 
 def _in_double(victim: Victim) -> Victim:
