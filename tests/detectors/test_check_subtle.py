@@ -399,7 +399,8 @@ def test_it_names_the_convention_by_the_losses(convention: str | None) -> None:
     assert all(fault.endswith(f"{CONVENTION}: {reading}") for fault in trial.faults), trial.faults
 
 
-def test_weights_that_are_not_trained_are_no_other_convention() -> None:
-    trial = CheckCase(lively(TINY_PGD, seed=3), (96, 128), None)
+@pytest.mark.parametrize("seed", [3, 6])
+def test_weights_that_are_not_trained_are_no_other_convention(seed: int) -> None:
+    trial = CheckCase(lively(TINY_PGD, seed=seed), (96, 128), None)
     check_solids(trial)
     assert trial.faults == []
