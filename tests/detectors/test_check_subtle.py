@@ -32,7 +32,7 @@ SHIPPED = ["yolov5n", "yolov3-tiny", "fcos3d-light", "pgd-det-light"]
 def test_the_shipped_ones_keep_every_promise(name: str) -> None:
     detector = make_detector(name)
     if detector.task == "3d":
-        detector.config = replace(detector.config, input_width=96)  # in place of 800, to be quick
+        detector.config = replace(detector.config, input_width=128)  # in place of 800, to be quick
     assert find_faults(detector, size=SIZE) == []
 
 
@@ -222,7 +222,7 @@ CONVENTION = "these fit better if read otherwise"
 SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] = {
     f"{kind.__name__}-{name}": (part, name, kind, promise)
     for part, name, kind, promise in (
-        (check_slopes, "yolov5n", WithTheGradientTurned, f"the gradient of Dense.logit {SLOPE} (these are -1 times"),
+        (check_slopes, "yolov5n", WithTheGradientTurned, f"the gradient of Dense.logit {SLOPE} (these are -"),
         (check_slopes, "fcos", WithTheGradientTurned, f'the gradient of losses["size"] {SLOPE} (these are -'),
         (check_slopes, "yolov3-tiny", WithATenthOfTheGradient, f'the gradient of losses["obj"] {SLOPE}'),
         (check_slopes, "yolov3-tiny", WithTheLogitsGradientTurned, f"the gradient of Dense.logit {SLOPE} (these are -"),
@@ -368,7 +368,7 @@ class ThatKnowsTheTruth:
         truth = some_truth(size=self.size, focal=0.8 * self.size[1])
         self.told, _ = perfect(self.inner, truth, self.size)
         for maps in self.told.maps["bbox_preds"]:
-            maps[:, 9:] *= 2
+            maps[:, 9:] *= 1.25
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         maps = {name: [m.expand(len(images), *m.shape[1:]) for m in levels] for name, levels in self.told.maps.items()}
@@ -399,7 +399,8 @@ def test_it_names_the_convention_by_the_losses(convention: str | None) -> None:
     assert all(fault.endswith(f"{CONVENTION}: {reading}") for fault in trial.faults), trial.faults
 
 
-def test_weights_that_are_not_trained_are_no_other_convention() -> None:
-    trial = CheckCase(lively(TINY_PGD, seed=3), (96, 128), None)
+@pytest.mark.parametrize("seed", [3, 6])
+def test_weights_that_are_not_trained_are_no_other_convention(seed: int) -> None:
+    trial = CheckCase(lively(TINY_PGD, seed=seed), (96, 128), None)
     check_solids(trial)
     assert trial.faults == []
