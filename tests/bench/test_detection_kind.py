@@ -37,7 +37,7 @@ def no_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     def detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str]]:
         return {name: f"hash of {name}" for name in suite.detectors}, {name: f"{name}.pth" for name in suite.detectors}
 
-    monkeypatch.setattr(detection, "_detectors", detectors)
+    monkeypatch.setattr(detection, "detectors_of", detectors)
 
 
 def plan_of(device: str = "cpu", **changes: Any) -> Plan:

@@ -7,7 +7,7 @@ import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -100,7 +100,7 @@ class DetectionSuite(DetectorSuite):
 class DetectorKind(Kind):
     """Cells are detectors under a condition; work is shared by scenes: a piece is a scene under a condition."""
 
-    columns = (
+    columns: ClassVar[tuple[Column, ...]] = (
         Column("mAP", "mean average precision", "", "higher"),
         Column("NDS", "nuScenes detection score", "", "higher"),
         Column("AP_car", "average precision of cars", "", "higher"),
@@ -203,8 +203,8 @@ class Detection(DetectorKind):
                 raise ConfigError(f"suite {suite.name}: a {what} appears twice")
         for known in suite.shifts:
             ShiftSpec(known, calibration=suite.calibration)
-        weights, detectors = _detectors(suite)
-        data = _data(suite)
+        weights, detectors = detectors_of(suite)
+        data = data_of(suite)
         conditions: list[tuple[str | None, int | str]] = [
             (None, 0),
             *((shift, s) for shift in suite.shifts for s in suite.severities),
@@ -262,7 +262,7 @@ class Detection(DetectorKind):
         return lambda: detection_sheet(examination, suite.split, suite.shifts, severity), caption
 
 
-def _detectors(suite: DetectorSuite) -> tuple[dict[str, str], dict[str, str]]:
+def detectors_of(suite: DetectorSuite) -> tuple[dict[str, str], dict[str, str]]:
     """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones)."""
     weights: dict[str, str] = {}
     files: dict[str, str] = {}
@@ -293,7 +293,7 @@ def state_hash(detector: Any) -> str:
     return hash_state(detector.state_dict())[:12] if hasattr(detector, "state_dict") else ""
 
 
-def _data(suite: DetectorSuite) -> dict[str, Any]:
+def data_of(suite: DetectorSuite) -> dict[str, Any]:
     """What the results depend on of the data set, which is looked at. ConfigError, FormatError."""
     if suite.data == RECORDED:
         if suite.split not in ("val", "all"):
