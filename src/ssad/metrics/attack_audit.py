@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 NOISE = 0.02  # share of the clean score that two attacks may differ by without meaning
 LEFT = 0.05  # share of the clean score under which an attack has done its work
@@ -175,7 +175,7 @@ def _along(attempts: Sequence[Attempt], what: str) -> Iterator[tuple[Attempt, At
         groups.setdefault(tuple(getattr(one, name) for name in names), []).append(one)
     for group in groups.values():
         ordered = sorted(group, key=lambda one: float(getattr(one, what)))
-        yield from ((a, b) for a, b in zip(ordered, ordered[1:], strict=False) if getattr(a, what) < getattr(b, what))
+        yield from ((a, b) for a, b in pairwise(ordered) if getattr(a, what) < getattr(b, what))
 
 
 def _steps(attempts: Sequence[Attempt]) -> Iterator[Finding]:
@@ -214,8 +214,8 @@ def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
         wrong = _pair(many, few, "restarts made it weaker, so the best start is not kept")
         if wrong is None and few.score - many.score > RESTARTS * few.clean and weaker(few, many):
             wrong = (
-                f"{few.title} leaves {_percent(few.score)}, {many.title} {_percent(many.score)}: restarts gain much, so "
-                "one start ends far from the best"
+                f"{few.title} leaves {_percent(few.score)}, {many.title} {_percent(many.score)}: restarts gain much, "
+                "so one start ends far from the best"
             )
         yield wrong
 
@@ -225,9 +225,13 @@ def _above_noise(attempts: Sequence[Attempt]) -> Iterator[Finding]:
         for one in group if noise is not None and noise.score > LEFT * noise.clean else ():
             assert noise is not None
             beaten = one.score < noise.score
-            yield None if beaten else (
-                f"{one.title} leaves {_percent(one.score)}, random noise of the same size {_percent(noise.score)}: "
-                "it attacks nothing"
+            yield (
+                None
+                if beaten
+                else (
+                    f"{one.title} leaves {_percent(one.score)}, random noise of the same size {_percent(noise.score)}: "
+                    "it attacks nothing"
+                )
             )
 
 
@@ -243,9 +247,13 @@ def _sizes(attempts: Sequence[Attempt]) -> Iterator[tuple[Attempt | None, list[A
 def _unbounded(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for one in _own(attempts):
         if one.norm == "linf" and one.radius >= UNBOUNDED and one.steps > 1:
-            yield None if one.score <= LEFT * one.clean else (
-                f"{one.title} leaves {_percent(one.score)} of {_percent(one.clean)}: a budget that hides the picture "
-                "must leave nothing, so the loss stops before the detections do"
+            yield (
+                None
+                if one.score <= LEFT * one.clean
+                else (
+                    f"{one.title} leaves {_percent(one.score)} of {_percent(one.clean)}: a budget that hides the "
+                    "picture must leave nothing, so the loss stops before the detections do"
+                )
             )
 
 
@@ -264,36 +272,52 @@ def _rises(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 def _gradient(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for one in _own(attempts):
         if one.gradient_error is not None:
-            yield None if one.gradient_error <= GRADIENT else (
-                f"{one.title}: its gradient differs from finite differences by {one.gradient_error:.0%}: it is "
-                "detached, or masked"
+            yield (
+                None
+                if one.gradient_error <= GRADIENT
+                else (
+                    f"{one.title}: its gradient differs from finite differences by {one.gradient_error:.0%}: it is "
+                    "detached, or masked"
+                )
             )
 
 
 def _coupling(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for one in _own(attempts):
         if one.coupling is not None:
-            yield None if one.coupling <= COUPLED else (
-                f"{one.title}: an image's loss changes by {one.coupling:.0%} with what else is in its batch: images "
-                "are not attacked each by itself"
+            yield (
+                None
+                if one.coupling <= COUPLED
+                else (
+                    f"{one.title}: an image's loss changes by {one.coupling:.0%} with what else is in its batch: "
+                    "images are not attacked each by itself"
+                )
             )
 
 
 def _budget(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for one in attempts:
         if one.change is not None:
-            yield None if one.change <= one.radius * (1 + 1e-5) + 1e-6 else (
-                f"{one.title}: a stored picture is {one.change:g} px from the clean one: the budget does not hold "
-                "after rounding"
+            yield (
+                None
+                if one.change <= one.radius * (1 + 1e-5) + 1e-6
+                else (
+                    f"{one.title}: a stored picture is {one.change:g} px from the clean one: the budget does not hold "
+                    "after rounding"
+                )
             )
 
 
 def _used(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for one in _own(attempts):
         if one.used is not None and one.score > LEFT * one.clean:
-            yield None if one.used >= USED else (
-                f"{one.title} uses {one.used:.0%} of its budget and leaves {_percent(one.score)}: its steps are too "
-                "small"
+            yield (
+                None
+                if one.used >= USED
+                else (
+                    f"{one.title} uses {one.used:.0%} of its budget and leaves {_percent(one.score)}: its steps are "
+                    "too small"
+                )
             )
 
 

@@ -70,7 +70,7 @@ class DigitalSuite(DetectorSuite):
         default=[Entry(name="fgsm"), Entry(name="pgd"), Entry(name="cw"), Entry(name="pgd", loss="margin")],
         min_length=1,
     )
-    sweeps: list[Sweep] = []
+    sweeps: list[Sweep] = Field(default=[])
     radius: Radius = Field(default=5.0, gt=0.0)
     steps: Steps = 10
     batch: int = Field(default=12, ge=1)
@@ -162,8 +162,8 @@ class Digital(DetectorKind):
         """One moment under the attacks of the table."""
         specs = list(dict.fromkeys(_spec(suite, one, one.radius, one.steps) for one in suite.attacks))
         caption = (
-            f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the whole "
-            "budget is from black to white), what it finds (orange, score at least 0.3) and what is there (white)."
+            f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the "
+            "largest change is black or white), what it finds (orange, score at least 0.3) and what is there (white)."
         )
         return lambda: attack_sheet(examination, suite.split, specs), caption
 
@@ -178,7 +178,9 @@ def _spec(suite: DigitalSuite, method: Method, radius: float | None, steps: int 
     norm: Norm = method.norm
     size = suite.radius if radius is None else radius
     if not size > 0:
-        raise ConfigError(f"suite {suite.name}: attack {method.name}: the radius must be above 0; clean data always run")
+        raise ConfigError(
+            f"suite {suite.name}: attack {method.name}: the radius must be above 0; clean data always run"
+        )
     try:
         safeio.dump_json(options)
         hash(spec := AttackSpec(method.name, loss, norm, float(size), tuple(sorted(options.items()))))
