@@ -408,6 +408,19 @@ def _shift_list() -> dict[str, str]:
     return {name: f"{family}: {text}{beside.get(name, '')}" for name, (family, text) in KNOWN.items()}
 
 
+def _attack_list() -> dict[str, str]:
+    from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack
+
+    def about(name: str, where: str) -> str:
+        if name not in ATTACKS:
+            return where
+        access = make_attack(name).access
+        return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
+
+    rows = {name: about(name, where) for name, where in attack_names().items()}
+    return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
+
+
 def _detector_list() -> dict[str, str]:
     from ssad.detectors import SHIPPED, detector_names
 
@@ -438,6 +451,7 @@ LISTS = {
     "detectors": _detector_list,
     "recipes": _recipe_list,
     "shifts": _shift_list,
+    "attacks": _attack_list,
     "towns": _town_list,
 }
 ALIASES = {"agents": "systems"}

@@ -37,7 +37,7 @@ def no_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     def detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str]]:
         return {name: f"hash of {name}" for name in suite.detectors}, {name: f"{name}.pth" for name in suite.detectors}
 
-    monkeypatch.setattr(detection, "_detectors", detectors)
+    monkeypatch.setattr(detection, "detectors_of", detectors)
 
 
 def plan_of(device: str = "cpu", **changes: Any) -> Plan:
@@ -171,7 +171,7 @@ def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monke
 
     monkeypatch.setattr(detection, "score_scenes", score)
     kind, cell = Detection(), plan_of(detectors=["one"]).cells[2]
-    expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), "physical", 7, "cuda", 3)
+    expected = Examination(tmp_path, Path("/data"), "v1.0-mini", (("one", "one.pth"),), 7, "cuda", 3, "physical")
     kind.make("name", ["fog", 3, "scene-1"], ["one", "two"], job(tmp_path))
     assert found == [(expected, ShiftedScene("fog", 3, "scene-1"), ["one", "two"])]
     results = kind.execute([cell], job(tmp_path))
@@ -309,7 +309,7 @@ def test_the_picture_shows_the_middle_severity(
     plan = plan_of("cuda", severities=severities, seed=4)
     for _ in range(2):
         Detection().finish(plan, tmp_path)
-    expected = Examination(tmp_path, tmp_path / "data", "v1.0-found", (("one", "one.pth"),), "physical", 4, "cuda", 1)
+    expected = Examination(tmp_path, tmp_path / "data", "v1.0-found", (("one", "one.pth"),), 4, "cuda", 1, "physical")
     assert sheets == [(expected, "val", ["fog"], shown)], "made once"
     captions: Mapping[str, str] = json.loads((tmp_path / "pictures" / "pictures.json").read_text())
     assert list(captions) == ["detections.jpg"]

@@ -50,7 +50,7 @@ def test_copies_never_narrow_an_interval(recorded: Path, monkeypatch: pytest.Mon
         return [replace(one, token=one.token + path.stem.removeprefix(name)) for one in found[name]], {}
 
     monkeypatch.setattr(scene_boxes, "read_boxes", boxes)
-    examination = Examination(Path(), recorded, "v1.0-ssad", (("oracle", ""),), "physical", 0, "cpu", 1)
+    examination = Examination(Path(), recorded, "v1.0-ssad", (("oracle", ""),), 0, "cpu", 1)
     results = []
     for told in (truth, twice(truth)):
         monkeypatch.setattr(scene_boxes, "_truth", lambda *parts, told=told: told)

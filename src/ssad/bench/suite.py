@@ -21,6 +21,7 @@ from ssad.core.safeio import Document, dotted, parse_yaml, read_yaml_document
 KINDS: dict[str, str] = {
     "driving": "ssad.bench.kinds.driving:Driving",
     "detection": "ssad.bench.kinds.detection:Detection",
+    "digital": "ssad.bench.kinds.digital:Digital",
 }
 """Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
 
@@ -151,8 +152,18 @@ def command_of(suite: SuiteBase) -> str:
     words = ["ssad", "run", name]
     for key, value in values.items():
         if value != stock.get(key):
-            text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else str(value)
-            if isinstance(value, dict):
-                text = "{" + ", ".join(f"{k}: {v}" for k, v in value.items()) + "}"
-            words += ["--set", f"{key}={text}"]
+            words += ["--set", f"{key}={_flow(value)}"]
     return shlex.join(words)
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML in one line; keys without a value are left out of mappings in lists."""
+    if isinstance(value, list):
+        return f"[{','.join(_flow(_given(one)) for one in value)}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(one)}" for key, one in value.items()) + "}"
+    return "null" if value is None else str(value)
+
+
+def _given(value: Any) -> Any:
+    return {key: one for key, one in value.items() if one not in (None, {}, [])} if isinstance(value, dict) else value

@@ -84,9 +84,13 @@ def detect_scene(
 
 
 def detect_with(
-    detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
-) -> list[list[SampleBoxes]]:
-    """As `detect_scene` for several detectors, which are shown the same pictures: a list a detector."""
+    detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None,
+    ahead: bool = True,
+) -> list[list[SampleBoxes]]:  # fmt: skip
+    """As `detect_scene` for several detectors, which are shown the same pictures: a list a detector.
+
+    ahead: the next pictures are made while these are looked at; not where `look` needs a detector for itself.
+    """
     by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
@@ -100,13 +104,13 @@ def detect_with(
                 return look(frames)
             return list(pool.map(lambda frame: read_image(root / frame.filename), frames))
 
-        with ThreadPoolExecutor(1) as ahead:  # the next pictures are made while these are looked at
+        with ThreadPoolExecutor(1) as maker:
             blocks = [scene.samples[k : k + step] for k in range(0, len(scene.samples), step)]
             flat = [[f for s in block for f in by_sample.get(s.token, [])] for block in blocks]
-            waiting = [ahead.submit(read, frames) for frames in flat[:2]]
+            waiting = [maker.submit(read, frames) for frames in (flat[:2] if ahead else [])]
             for number, block in enumerate(blocks):
-                pictures = waiting[number].result()
-                waiting += [ahead.submit(read, frames) for frames in flat[number + 2 : number + 3]]
+                pictures = waiting[number].result() if ahead else read(flat[number])
+                waiting += [maker.submit(read, frames) for frames in (flat[number + 2 : number + 3] if ahead else [])]
                 for k, boxes in enumerate(_predict(detectors, flat[number], pictures, device)):
                     found[k] += _merged(block, by_sample, boxes)
     return found

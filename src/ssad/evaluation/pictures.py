@@ -45,19 +45,19 @@ def detection_sheet(examination: Examination, split: str, shifts: Sequence[str],
     name, weights = examination.detectors[0]
     detector = Watched(detector_of(name, weights, examination.device)), examination.device
     with NuScenes(examination.root, examination.version) as data:
-        scene, frame = _richest(data, scenes_of(data, split))
-        tiles = [_tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
+        scene, frame = richest(data, scenes_of(data, split))
+        tiles = [tile(detector, scene, frame, read_image(examination.root / frame.filename), title="clean")]
         for shift in shifts:
             shifter = shifter_of(examination, data, ShiftedScene(shift, severity, scene.record.name))
             assert shifter is not None
-            tiles.append(_tile(detector, scene, frame, shifter.image(frame)[0], title=shift))
+            tiles.append(tile(detector, scene, frame, shifter.image(frame)[0], title=shift))
     while len(tiles) % COLUMNS:
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]
     return np.concatenate(rows)
 
 
-def _richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorFrame]:
+def richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, SensorFrame]:
     """The camera frame with most objects within 30 m, by day if it can be, among the first of each scene."""
     best: tuple[float, SceneData, SensorFrame] | None = None
     for name in scenes:
@@ -75,7 +75,7 @@ def _richest(data: NuScenes, scenes: tuple[str, ...]) -> tuple[SceneData, Sensor
 
 
 @torch.no_grad()
-def _tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, *, title: str) -> U8:
+def tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, *, title: str) -> U8:
     """A picture with the boxes of a detector (on a device) and the true ones, and its name."""
     detector, device = eye
     truth = camera_truth(frame, scene.annotations(frame.sample_token))
@@ -89,9 +89,14 @@ def _tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8,
     _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
     _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
     text = f"{title.replace('_', ' ')} ({KNOWN[title][0]})" if title in KNOWN else title
+    title_on(canvas, text)
+    return np.asarray(canvas)
+
+
+def title_on(canvas: U8, text: str) -> None:
+    """Writes a name into the upper left corner."""
     cv2.rectangle(canvas, (0, 0), (12 + 11 * len(text), 26), (0, 0, 0), -1)
     cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
-    return np.asarray(canvas)
 
 
 def _draw(

@@ -1,4 +1,7 @@
-"""What detectors find in one scene under one shift, kept as files: the work that cells of a detection suite share."""
+"""What detectors find in one scene under one condition, kept as files: the work that cells of a suite share.
+
+A condition is what the pictures went through: nothing, a shift, a digital attack.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,11 @@ import io
 import re
 import zipfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -28,7 +31,7 @@ from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
-from ssad.evaluation.detection import SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.evaluation.detection import Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
@@ -36,6 +39,62 @@ from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
 FOLDER = "detections"
 _COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label", "attribute")  # as nuScenes has them
+
+
+@dataclass(frozen=True, slots=True)
+class Examination:
+    """What is the same for all scenes of a run.
+
+    Attributes:
+        folder: of the results.
+        root, version: of the data set.
+        detectors: name -> weights ("" for the shipped ones).
+        seed: of the random numbers.
+        device: where detectors, shifts and attacks run.
+        threads: of linear algebra.
+        calibration: of the shifts.
+    """
+
+    folder: Path
+    root: Path
+    version: str
+    detectors: tuple[tuple[str, str], ...]
+    seed: int
+    device: str
+    threads: int
+    calibration: Calibration = "physical"
+
+
+@dataclass(slots=True)
+class Shown:
+    """How detectors are shown a scene.
+
+    Attributes:
+        look: gives the pictures of camera frames; None: the files as they are.
+        notes: plain data for the file of boxes, complete when all was looked at.
+        ahead: the next pictures may be made while a detector looks at these.
+    """
+
+    look: Look | None = None
+    notes: Callable[[], Mapping[str, Any]] = field(default=dict)
+    ahead: bool = True
+
+
+class Condition(Protocol):
+    """One scene under one condition.
+
+    Attributes:
+        scene: name of the scene.
+        name: its place below the folder of a detector's boxes: CONDITION/SCENE.
+    """
+
+    @property
+    def scene(self) -> str: ...
+    @property
+    def name(self) -> str: ...
+
+    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
+        """How these detectors are shown the scene."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,31 +107,25 @@ class ShiftedScene:
 
     @property
     def name(self) -> str:
-        """Its place below the folder of a detector's boxes."""
+        """See `Condition`."""
         return f"{'clean' if self.shift is None else f'{self.shift}-{self.severity}'}/{self.scene}"
 
+    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
+        """See `Condition`: all detectors are shown the same pictures; noted is how often the shift was applied."""
+        shifter = shifter_of(examination, data, self)
+        if shifter is None:
+            return Shown()
+        applied: Counter[str] = Counter()
 
-@dataclass(frozen=True, slots=True)
-class Examination:
-    """What is the same for all scenes of a run.
+        def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
+            device = None if examination.device == "cpu" else examination.device
+            images, done = shifter.images(frames, device=device)
+            applied.update("applied" if one.applied else "not applied" for one in done)
+            for one in done:
+                applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
+            return images
 
-    Attributes:
-        folder: of the results.
-        root, version: of the data set.
-        detectors: name -> weights ("" for the shipped ones).
-        calibration, seed: of the shifts.
-        device: where detectors and shifts run.
-        threads: of linear algebra.
-    """
-
-    folder: Path
-    root: Path
-    version: str
-    detectors: tuple[tuple[str, str], ...]
-    calibration: Calibration
-    seed: int
-    device: str
-    threads: int
+        return Shown(look, lambda: applied)
 
 
 def detector_of(name: str, weights: str, device: str) -> Any:
@@ -80,11 +133,15 @@ def detector_of(name: str, weights: str, device: str) -> Any:
     return make_detector(name.partition("@")[0], weights=weights or None, device=device)
 
 
-def boxes_path(folder: Path, detector: str, scene: ShiftedScene) -> Path:
-    """Where the boxes of a detector lie: detections/DETECTOR/SHIFT-SEVERITY/SCENE.npz."""
-    plain = re.sub(r"[^\w.@-]", "-", detector)
-    own = plain if plain == detector else f"{plain}-{digest(detector)[:6]}"
-    return folder / FOLDER / own / f"{scene.name}.npz"
+def boxes_path(folder: Path, detector: str, scene: Condition) -> Path:
+    """Where the boxes of a detector lie: detections/DETECTOR/CONDITION/SCENE.npz."""
+    return folder / FOLDER / file_name(detector) / f"{scene.name}.npz"
+
+
+def file_name(name: str) -> str:
+    """A name as a file's: what is no letter, digit, ., @ or - becomes -, and then a hash keeps names apart."""
+    plain = re.sub(r"[^\w.@-]", "-", name)
+    return plain if plain == name else f"{plain}-{digest(name)[:6]}"
 
 
 class Watched:
@@ -110,13 +167,17 @@ class Watched:
                 if not self.reason:
                     return found
             except Exception as error:  # whatever a stranger's detector raises
-                if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
-                    raise
-                text = " ".join(str(error).split())
-                self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
+                self.failed(error)
         nothing, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
         solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
         return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
+
+    def failed(self, error: Exception) -> None:
+        """Takes note of what the detector raised; raises it if memory is used up or the device is lost."""
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or "CUDA error" in str(error):
+            raise error
+        text = " ".join(str(error).split())
+        self.reason = text if isinstance(error, SSADError) else f"{type(error).__name__}: {text}"[:300]
 
     def _broken(self, found: Sequence[Detections], images: int) -> str:
         if len(found) != images:
@@ -145,8 +206,8 @@ def shifter_of(examination: Examination, data: NuScenes, scene: ShiftedScene) ->
     return SceneShifter(examination.root, data.scene(scene.scene), spec, random=drawn)
 
 
-def find_boxes(examination: Examination, scene: ShiftedScene, detectors: Sequence[str]) -> None:
-    """Writes the boxes that detectors find in a scene, unless they are there; all are shown the same pictures.
+def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[str]) -> None:
+    """Writes the boxes that detectors find in a scene, unless they are there.
 
     A detector that raises, or breaks a promise, leaves the reason in place of its boxes. Memory that is used up, and a
     device that is lost, raise.
@@ -159,31 +220,19 @@ def find_boxes(examination: Examination, scene: ShiftedScene, detectors: Sequenc
     if not names:
         return
     with NuScenes(examination.root, examination.version) as data:
-        shifter = shifter_of(examination, data, scene)
-        applied: Counter[str] = Counter()
-
-        def look(frames: Sequence[SensorFrame]) -> Sequence[U8]:
-            assert shifter is not None
-            device = None if examination.device == "cpu" else examination.device
-            images, done = shifter.images(frames, device=device)
-            applied.update("applied" if one.applied else "not applied" for one in done)
-            for one in done:
-                applied.update({f"skipped: {why}": int(count) for why, count in one.skipped.items()})
-            return images
-
         weights = dict(examination.detectors)
-        watched: list[Any] = [
-            Watched(_loaded(name, weights[name], examination.device, examination.threads)) for name in names
-        ]
+        watched = [Watched(_loaded(name, weights[name], examination.device, examination.threads)) for name in names]
+        shown = scene.shown(examination, data, watched)
+        eyes: list[Any] = list(watched)
         found = detect_with(
-            watched, examination.root, data.scene(scene.scene), device=examination.device,
-            look=None if shifter is None else look,
+            eyes, examination.root, data.scene(scene.scene), device=examination.device, look=shown.look,
+            ahead=shown.ahead,
         )  # fmt: skip
     for name, samples, one in zip(names, found, watched, strict=True):
-        _write(boxes_path(folder, name, scene), samples, one.reason, applied)
+        _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes())
 
 
-def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, applied: Mapping[str, int]) -> None:
+def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, notes: Mapping[str, Any]) -> None:
     columns: dict[str, Any] = {"failed": np.array(reason)} if reason else {}
     if not reason:
         boxes = [sample.boxes for sample in samples]
@@ -191,7 +240,7 @@ def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, applied: Map
         columns["count"] = np.array([len(b) for b in boxes], np.int32)
         for name, parts in zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True):
             columns[name] = np.concatenate(parts)
-        columns["applied"] = np.array(safeio.dump_json(dict(sorted(applied.items()))))
+        columns["applied"] = np.array(safeio.dump_json(dict(sorted(notes.items()))))
     file = io.BytesIO()
     np.savez_compressed(file, **columns)
     safeio.write_atomic(path, file.getvalue())
@@ -214,8 +263,8 @@ class DetectorFailed(SSADError):
     """A detector failed on a scene; why."""
 
 
-def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, int]]:
-    """Boxes by sample, and how often the shift was applied.
+def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, Any]]:
+    """Boxes by sample, and what the condition noted: of a shift, how often it was applied.
 
     Raises:
         DetectorFailed: it has a reason instead.
@@ -228,11 +277,11 @@ def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, int]]:
             ends = np.cumsum(file["count"])
             parts = [np.split(file[c], ends[:-1]) for c in _COLUMNS]
             tokens = [str(token) for token in file["sample"]]
-            applied = safeio.parse_json(str(file["applied"]))
+            notes = safeio.parse_json(str(file["applied"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
     found = [SampleBoxes(token, _from_columns(*(part[k] for part in parts))) for k, token in enumerate(tokens)]
-    return found, {str(k): int(v) for k, v in applied.items()}
+    return found, {str(k): v for k, v in notes.items()}
 
 
 def forget_failures(paths: Sequence[Path]) -> None:
@@ -250,35 +299,47 @@ def _truth(root: Path, version: str, scenes: tuple[str, ...]) -> GroundTruth:
     return read_truth(root, version, scenes=frozenset(scenes))
 
 
+Sum = Callable[[Sequence[Mapping[str, Any]]], Mapping[str, Any]]
+
+
+def sum_applied(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How often a shift was applied, over all scenes."""
+    applied: Counter[str] = Counter()
+    for one in notes:
+        applied.update({name: int(count) for name, count in one.items()})
+    return {"applied": dict(sorted(applied.items()))}
+
+
 def score_scenes(
-    examination: Examination, detector: str, scenes: Sequence[ShiftedScene], *, replicates: int
+    examination: Examination, detector: str, scenes: Sequence[Condition], *, replicates: int, notes: Sum = sum_applied
 ) -> dict[str, Any]:
     """Metrics of a detector over scenes whose boxes are there, for a record.
 
     Args:
         examination: of the run.
         detector: name.
-        scenes: one shift and severity each.
-        replicates: of the bootstrap over scenes; the draws are the same for every detector and shift, so that
+        scenes: each under its condition.
+        replicates: of the bootstrap over scenes; the draws are the same for every detector and condition, so that
             differences are paired. Scenes of equal truth are copies: they are drawn, and count, together.
+        notes: makes a record's columns of what the conditions noted.
 
     Returns:
-        metrics, intervals (95 %, see `replicate_estimate`), replicates, n (samples of different scenes), scenes,
-        applied.
+        metrics, intervals (95 %, see `replicate_estimate`), replicates, n (samples of different scenes), scenes, and
+        the columns of the notes.
 
     Raises:
         DetectorFailed: it failed on a scene.
     """
     truth = _truth(examination.root, examination.version, tuple(one.scene for one in scenes))
     found: list[SampleBoxes] = []
-    applied: Counter[str] = Counter()
+    noted = []
     for one in scenes:
         try:
-            boxes, counts = read_boxes(boxes_path(examination.folder, detector, one))
+            boxes, own = read_boxes(boxes_path(examination.folder, detector, one))
         except DetectorFailed as error:
             raise DetectorFailed(f"{one.scene}: {error}") from None
         found += boxes
-        applied.update(counts)
+        noted.append(own)
     matches = match_boxes(found, truth)
     case = distinct_scenes(truth)
     count = int(case.max()) + 1
@@ -295,8 +356,7 @@ def score_scenes(
     return {
         "metrics": metrics,
         "intervals": {k: [round(e.low, 5), round(e.high, 5)] for k, e in limits.items() if np.isfinite(e.low)},
-        "replicates": values, "n": samples, "scenes": count,
-        "applied": dict(sorted(applied.items())),
+        "replicates": values, "n": samples, "scenes": count, **notes(noted),
     }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""The paper's own tables of whole driving systems (Li et al., "Towards Benchmarking and Assessing the Safety and
+"""The paper's own tables (Li et al., "Towards Benchmarking and Assessing the Safety and
 Robustness of Autonomous Driving on Safety-critical Scenarios"), to be shown beside ours.
 
 They were measured in CARLA 0.9.13 with SafeBench's agents; ours are another simulator. A test holds them against the
@@ -69,3 +69,12 @@ SHIFTS: dict[str, dict[str, tuple[float, float]]] = {
     "motion_blur": {"FCOS3D": (9.34, 20.30), "PGD": (8.19, 18.95)},
 }
 DETECTORS = {"fcos3d": "FCOS3D", "pgd-det": "PGD"}  # how a detector's name begins -> its column in the paper
+
+# digital attack -> detector -> mAP, NDS in percent; nuScenes val, L-infinity ("": clean)
+DIGITAL: dict[str, dict[str, tuple[float, float]]] = {
+    "": {"FCOS3D": (29.8, 37.7), "PGD": (31.74, 39.34)},
+    "PGD": {"FCOS3D": (3.90, 18.73), "PGD": (19.61, 31.42)},
+    "FGSM": {"FCOS3D": (8.30, 21.44), "PGD": (8.77, 17.99)},
+    "C&W": {"FCOS3D": (2.59, 7.18), "PGD": (2.71, 8.28)},
+}
+DIGITAL_STEPS = {"FGSM": 1, "PGD": 10, "C&W": 10}

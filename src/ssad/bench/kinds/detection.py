@@ -1,11 +1,13 @@
-"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema."""
+"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema; and what
+it has in common with other kinds that score 3D detectors under conditions."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -14,12 +16,14 @@ from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
+from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.detectors.checkpoints import hash_state
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.pictures import STRONG, detection_sheet
 from ssad.evaluation.scene_boxes import (
+    Condition,
     Examination,
     ShiftedScene,
     boxes_path,
@@ -57,46 +61,139 @@ class Recorded(BaseModel):
     seed: int = Field(default=0, ge=0)
 
 
-class DetectionSuite(SuiteBase):
-    """One table: 3D detectors x shifts x severities, beside the clean data.
+class DetectorSuite(SuiteBase):
+    """What suites say that score 3D detectors.
 
     Attributes:
-        detectors: names, with weights of your own as NAME=FILE, or module:object; the first is the baseline of mCE.
+        detectors: names, with weights of your own as NAME=FILE, or module:object.
         data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the one that is
             there) and split.
         recorded: what is recorded.
-        shifts: names.
-        severities: 1 to 5, or random (dealt to the scenes, all as often, give or take one; drawn by sample in the
-            calibration of the paper).
-        calibration: of the shifts.
         replicates: of the bootstrap over scenes.
-        timeout_s: seconds that one scene under one shift, or one score, may take.
+        timeout_s: seconds that one scene under one condition, or one score, may take.
     """
 
-    kind: Literal["detection"]
     detectors: Names = Field(default=["fcos3d-light", "pgd-det-light"], min_length=1)
     data: str = Field(default=RECORDED, min_length=1)
     version: str | None = None
     split: str = "val"
     recorded: Recorded = Recorded()
-    shifts: Names = Field(default=list(SHIFTS), min_length=1)
-    severities: Annotated[list[Severity], Field(min_length=1)] = Field(default=[1, 2, 3, 4, 5, "random"], min_length=1)
-    calibration: Literal["physical", "paper"] = "physical"
     replicates: int = Field(default=100, ge=0, le=10_000)
 
 
-class Detection(Kind):
-    """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
+class DetectionSuite(DetectorSuite):
+    """One table: 3D detectors x shifts x severities, beside the clean data; the first detector is the baseline of mCE.
 
-    name = "detection"
-    suite = DetectionSuite
-    columns = (
+    Attributes:
+        shifts: names.
+        severities: 1 to 5, or random (dealt to the scenes, all as often, give or take one; drawn by sample in the
+            calibration of the paper).
+        calibration: of the shifts.
+    """
+
+    kind: Literal["detection"]
+    shifts: Names = Field(default=list(SHIFTS), min_length=1)
+    severities: Annotated[list[Severity], Field(min_length=1)] = Field(default=[1, 2, 3, 4, 5, "random"], min_length=1)
+    calibration: Literal["physical", "paper"] = "physical"
+
+
+class DetectorKind(Kind):
+    """Cells are detectors under a condition; work is shared by scenes: a piece is a scene under a condition."""
+
+    columns: ClassVar[tuple[Column, ...]] = (
         Column("mAP", "mean average precision", "", "higher"),
         Column("NDS", "nuScenes detection score", "", "higher"),
         Column("AP_car", "average precision of cars", "", "higher"),
     )
-    factors = ("detector", "shift", "severity")
     patience = 2
+
+    @abstractmethod
+    def scenes(self, cell: Cell, job: Job) -> Sequence[Condition]:
+        """The scenes of a cell, each under its condition."""
+
+    @abstractmethod
+    def condition(self, data: Any) -> Condition:
+        """A scene under its condition from the plain data of a piece."""
+
+    @abstractmethod
+    def settings(self, suite: Any) -> dict[str, Any]:
+        """What workers are told besides what all kinds that score detectors tell them."""
+
+    @abstractmethod
+    def sheet(self, examination: Examination, suite: Any) -> tuple[Callable[[], U8], str]:
+        """How the picture for the report is made, which shows the first detector at work, and its caption."""
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Records the data set if none is given; which scenes there are."""
+        suite: DetectorSuite = plan.suite
+        root = Path(suite.data).expanduser()
+        if suite.data == RECORDED:
+            total = suite.recorded.scenes * len(suite.recorded.towns)
+            with Live("recording", total, 0, console=resources.console, unit="scenes") as live:
+                root = record_nuscenes(
+                    recording_of(suite, folder / "data"), workers=resources.workers, ray=resources.ray,
+                    progress=live.show,
+                )  # fmt: skip
+        with NuScenes(root, suite.version) as data:
+            version = data.version
+            tokens = {name: data.scene(name).record.token for name in scenes_of(data, suite.split)}
+        settings = {
+            "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
+            "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,
+            "threads": max(1, default_workers() // (resources.workers or default_workers())), **self.settings(suite),
+        }  # fmt: skip
+        job = Job(folder, plan.device, settings)
+        forget_failures([boxes_path(folder, c.system, one) for c in retry for one in self.scenes(c, job)])
+        return settings
+
+    def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
+        """Boxes of one scene under one condition."""
+        find_boxes(_examination(job), self.condition(data), systems)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Scores of a cell; boxes that could not be found together with others are looked for alone."""
+        examination, results = _examination(job), {}
+        for cell in cells:
+            scenes = self.scenes(cell, job)
+            for one in scenes:
+                find_boxes(examination, one, [cell.system])
+            folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
+            results[cell.key] = self.score(examination, cell, scenes, job) | {"artefacts": {"detections": folders}}
+        return results
+
+    def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
+        """The record of a cell whose boxes are there."""
+        return score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"])
+
+    def finish(self, plan: Plan, folder: Path) -> None:
+        """What the first detector sees: DIR/pictures/detections.jpg."""
+        suite: DetectorSuite = plan.suite
+        path = folder / "pictures" / "detections.jpg"
+        root = folder / "data" if suite.data == RECORDED else Path(suite.data).expanduser()
+        version = ""
+        if not path.is_file():
+            with NuScenes(root, suite.version) as data:
+                version = data.version
+        first = next(iter(plan.details.items()))
+        settings = self.settings(suite)
+        examination = Examination(
+            folder, root, version, (first,), suite.seed, plan.device, 1, settings.get("calibration", "physical")
+        )
+        picture, caption = self.sheet(examination, suite)
+        if not path.is_file():
+            try:
+                save_picture(path, picture())
+            except FormatError:  # a picture that cannot be read has failed its cells, which say so
+                return
+        safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n")
+
+
+class Detection(DetectorKind):
+    """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
+
+    name = "detection"
+    suite = DetectionSuite
+    factors = ("detector", "shift", "severity")
 
     def plan(self, suite: DetectionSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Detectors are built once, the data set is looked at."""
@@ -106,8 +203,8 @@ class Detection(Kind):
                 raise ConfigError(f"suite {suite.name}: a {what} appears twice")
         for known in suite.shifts:
             ShiftSpec(known, calibration=suite.calibration)
-        weights, detectors = _detectors(suite)
-        data = _data(suite)
+        weights, detectors = detectors_of(suite)
+        data = data_of(suite)
         conditions: list[tuple[str | None, int | str]] = [
             (None, 0),
             *((shift, s) for shift in suite.shifts for s in suite.severities),
@@ -124,29 +221,6 @@ class Detection(Kind):
         versions = {"shifts": str(VERSIONS[suite.calibration])}
         return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, versions, detectors)
 
-    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Records the data set if none is given; which scenes each shift and severity needs."""
-        suite: DetectionSuite = plan.suite
-        root = Path(suite.data).expanduser()
-        if suite.data == RECORDED:
-            total = suite.recorded.scenes * len(suite.recorded.towns)
-            with Live("recording", total, 0, console=resources.console, unit="scenes") as live:
-                root = record_nuscenes(
-                    recording_of(suite, folder / "data"), workers=resources.workers, ray=resources.ray,
-                    progress=live.show,
-                )  # fmt: skip
-        with NuScenes(root, suite.version) as data:
-            version = data.version
-            tokens = {name: data.scene(name).record.token for name in scenes_of(data, suite.split)}
-        settings = {
-            "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
-            "calibration": suite.calibration, "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,
-            "threads": max(1, default_workers() // (resources.workers or default_workers())),
-        }  # fmt: skip
-        job = Job(folder, plan.device, settings)
-        forget_failures([boxes_path(folder, c.system, one) for c in retry for one in _scenes(c, job)])
-        return settings
-
     def order(self, cell: Cell) -> float:
         """Clean first, then what the main table tells, the middle severity, the others."""
         severity = cell.fields["severity"]
@@ -156,51 +230,39 @@ class Detection(Kind):
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """Scenes whose boxes are still to be found."""
-        scenes = _scenes(cell, job)
+        scenes = self.scenes(cell, job)
         missing = [one for one in scenes if not boxes_path(job.folder, cell.system, one).is_file()]
         return {one.name: [one.shift, one.severity, one.scene] for one in missing}
 
-    def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
-        """Boxes of one scene under one shift."""
-        find_boxes(_examination(job), ShiftedScene(*data), systems)
+    def scenes(self, cell: Cell, job: Job) -> list[ShiftedScene]:
+        """See `DetectorKind`. A severity dealt to a scene is one of the five: nothing runs twice."""
+        tokens: Mapping[str, str] = job.settings["scenes"]
+        shift, severity = cell.fields["shift"], cell.fields["severity"]
+        if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
+            return [ShiftedScene(shift, severity, scene) for scene in tokens]
+        spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
+        dealt = dealt_severities(spec, tokens.values())
+        return [ShiftedScene(shift, dealt[token], scene) for scene, token in tokens.items()]
 
-    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
-        """Scores of a cell; boxes that could not be found together with others are looked for alone."""
-        examination, results = _examination(job), {}
-        for cell in cells:
-            scenes = _scenes(cell, job)
-            for one in scenes:
-                find_boxes(examination, one, [cell.system])
-            found = score_scenes(examination, cell.system, scenes, replicates=job.settings["replicates"])
-            folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
-            results[cell.key] = found | {"artefacts": {"detections": folders}}
-        return results
+    def condition(self, data: Any) -> ShiftedScene:
+        """See `DetectorKind`."""
+        return ShiftedScene(*data)
 
-    def finish(self, plan: Plan, folder: Path) -> None:
-        """What the first detector sees under each shift: DIR/pictures/detections.jpg."""
-        suite: DetectionSuite = plan.suite
-        path = folder / "pictures" / "detections.jpg"
+    def settings(self, suite: DetectionSuite) -> dict[str, Any]:
+        """See `DetectorKind`."""
+        return {"calibration": suite.calibration}
+
+    def sheet(self, examination: Examination, suite: DetectionSuite) -> tuple[Callable[[], U8], str]:
+        """One moment under each shift."""
         severity = min([s for s in suite.severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
-        name, weights = next(iter(plan.details.items()))
-        if not path.is_file():
-            root = folder / "data" if suite.data == RECORDED else Path(suite.data).expanduser()
-            with NuScenes(root, suite.version) as data:
-                version = data.version
-            examination = Examination(
-                folder, root, version, ((name, weights),), suite.calibration, suite.seed, plan.device, 1
-            )
-            try:
-                save_picture(path, detection_sheet(examination, suite.split, suite.shifts, severity))
-            except FormatError:  # a picture that cannot be read has failed its cells, which say so
-                return
         caption = (
-            f"What {name} finds (orange, score at least 0.3) and what is there (white), clean and under each shift at "
-            f"severity {severity}."
+            f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
+            f"and under each shift at severity {severity}."
         )
-        safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n")
+        return lambda: detection_sheet(examination, suite.split, suite.shifts, severity), caption
 
 
-def _detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str]]:
+def detectors_of(suite: DetectorSuite) -> tuple[dict[str, str], dict[str, str]]:
     """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones)."""
     weights: dict[str, str] = {}
     files: dict[str, str] = {}
@@ -231,7 +293,7 @@ def state_hash(detector: Any) -> str:
     return hash_state(detector.state_dict())[:12] if hasattr(detector, "state_dict") else ""
 
 
-def _data(suite: DetectionSuite) -> dict[str, Any]:
+def data_of(suite: DetectorSuite) -> dict[str, Any]:
     """What the results depend on of the data set, which is looked at. ConfigError, FormatError."""
     if suite.data == RECORDED:
         if suite.split not in ("val", "all"):
@@ -249,7 +311,7 @@ def _data(suite: DetectionSuite) -> dict[str, Any]:
     return about
 
 
-def recording_of(suite: DetectionSuite, out: Path) -> Recording:
+def recording_of(suite: DetectorSuite, out: Path) -> Recording:
     """On the CPU, on any machine: it decides bits."""
     own = suite.recorded
     towns = tuple(own.towns)
@@ -259,17 +321,6 @@ def recording_of(suite: DetectionSuite, out: Path) -> Recording:
 def _examination(job: Job) -> Examination:
     own = job.settings
     return Examination(
-        job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["calibration"], own["seed"],
-        job.device, own["threads"],
+        job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["seed"], job.device,
+        own["threads"], own.get("calibration", "physical"),
     )  # fmt: skip
-
-
-def _scenes(cell: Cell, job: Job) -> list[ShiftedScene]:
-    """The scenes of a cell. A severity dealt to a scene is one of the five: nothing runs twice."""
-    tokens: Mapping[str, str] = job.settings["scenes"]
-    shift, severity = cell.fields["shift"], cell.fields["severity"]
-    if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
-        return [ShiftedScene(shift, severity, scene) for scene in tokens]
-    spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
-    dealt = dealt_severities(spec, tokens.values())
-    return [ShiftedScene(shift, dealt[token], scene) for scene, token in tokens.items()]

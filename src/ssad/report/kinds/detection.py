@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from html import escape
-from typing import Any
+from typing import Any, Protocol
 
 from ssad.core.errors import ConfigError
 from ssad.metrics import replicate_estimate
 from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
 from ssad.report.artefacts import pictures
+from ssad.report.curves import Panel, Point, panels
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.paper import DETECTORS
@@ -72,29 +72,40 @@ class DetectionRun:
         return FAMILIES[own["family"]] if own else ""
 
 
+class Resampled(Protocol):
+    """A run whose scenes were resampled for the intervals.
+
+    Attributes:
+        scenes: how many.
+    """
+
+    @property
+    def scenes(self) -> int: ...
+
+
 def load_detection_run(run: Run) -> DetectionRun:
     """The records of a run folder."""
     records = {(r["detector"], r["shift"] or "", str(r["severity"])): r for r in run.lines}
     return DetectionRun(run, records)
 
 
-def score_cell(run: DetectionRun, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
+def score_cell(run: Resampled, value: float, replicates: Sequence[float], n: int, *, bounded: bool = True) -> Cell:
     """A score in percent with its interval: the one place where intervals of this page come from."""
     return Cell.of(replicate_estimate(value, replicates, n=n, clusters=run.scenes, bounded=bounded).scaled(100.0))
 
 
-def cell_of(run: DetectionRun, record: Mapping[str, Any] | None, metric: str) -> Cell:
+def cell_of(run: Resampled, record: Mapping[str, Any] | None, metric: str) -> Cell:
     """A metric in percent with its interval; n/a where there is none."""
     value = None if record is None else record["metrics"].get(metric)
     if record is None or value is None:
         return Cell(math.nan)
-    replicates, given = _replicates(record, metric), (record.get("intervals") or {}).get(metric)
+    replicates, given = replicates_of(record, metric), (record.get("intervals") or {}).get(metric)
     if not replicates and given:
         return Cell(100 * value, 100 * given[0], 100 * given[1], record["n"], method="given")
     return score_cell(run, value, replicates, record["n"])
 
 
-def _replicates(record: Mapping[str, Any], metric: str) -> list[float]:
+def replicates_of(record: Mapping[str, Any], metric: str) -> list[float]:
     """A metric's bootstrap replicates; empty if the record has none."""
     return (record.get("replicates") or {}).get(metric) or []
 
@@ -107,7 +118,7 @@ def summary_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> C
     if not found or len(found) < len(run.numbers) or any(r["metrics"].get(metric) is None for r in found):
         return Cell(math.nan)
     mean = math.fsum(r["metrics"][metric] for r in found) / len(found)
-    draws = [_replicates(r, metric) for r in found]
+    draws = [replicates_of(r, metric) for r in found]
     means = [math.fsum(row) / len(row) for row in zip(*draws, strict=True)] if all(draws) else []
     return score_cell(run, mean, means, found[0]["n"])
 
@@ -119,12 +130,12 @@ def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell
         return Cell(math.nan)
     drawn = run.record(detector, shift, "random")
     found = [drawn] if drawn else [r for s in run.numbers if (r := run.record(detector, shift, s)) is not None]
-    rows = zip(*(_replicates(r, metric) for r in (clean, *found)), strict=True)
+    rows = zip(*(replicates_of(r, metric) for r in (clean, *found)), strict=True)
     shares = [math.fsum(row[1:]) / len(found) / row[0] for row in rows if row[0] > 0]
     return score_cell(run, own.mean / 100.0 / clean["metrics"][metric], shares, own.n, bounded=False)
 
 
-def interval_note(run: DetectionRun) -> str:
+def interval_note(run: Resampled) -> str:
     """How the intervals of the page are made, in a sentence."""
     if run.scenes < MIN_CLUSTERS:
         return f"no intervals, since {run.scenes} scenes are too few (five are the least)."
@@ -238,7 +249,7 @@ def robustness_table(run: DetectionRun) -> Table | None:
                 return None
             whole = {s: [r for r in row if r is not None] for s, row in records.items()}
             found[detector, metric] = {s: [r["metrics"][metric] for r in row] for s, row in whole.items()}
-            draws[detector, metric] = {s: [_replicates(r, metric) for r in row] for s, row in whole.items()}
+            draws[detector, metric] = {s: [replicates_of(r, metric) for r in row] for s, row in whole.items()}
     rows = []
     for detector in run.detectors:
         cells = []
@@ -283,55 +294,22 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
     """A small plot for each shift: the metric over severity, a line a detector, its interval as a band; as SVG."""
     if len(run.numbers) < 2:
         return ""
-    wide, high, columns, gap = 178, 118, 4, 34
     steps = ["0", *run.numbers]
-    top = max(
-        (
-            cell.mean if math.isnan(cell.high) else cell.high
+    ticks = [(int(n) / 5, "clean" if n == "0" else n) for n in steps]
+    found = []
+    for shift in run.shifts:
+        lines = [
+            [
+                Point(
+                    int(n) / 5, cell_of(run, run.record(d, shift if n != "0" else "", n), metric),
+                    f"{d}, {title_of(shift)} {n}",
+                )
+                for n in steps
+            ]
             for d in run.detectors
-            for s in ["", *run.shifts]
-            for n in steps
-            if not math.isnan((cell := cell_of(run, run.record(d, s, n), metric)).mean)
-        ),
-        default=1.0,
-    )
-    top = max(10.0, 10 * math.ceil(top / 10))
-    parts = []
-    for number, shift in enumerate(run.shifts):
-        left, under = 36 + (number % columns) * (wide + gap), 24 + (number // columns) * (high + 46)
-
-        def place(severity: str, value: float, left: int = left, under: int = under) -> str:
-            x = left + wide * int(severity) / 5
-            return f"{x:.1f},{under + high * (1 - min(max(value / top, 0.0), 1.0)):.1f}"
-
-        parts.append(f'<text x="{left}" y="{under - 8}" class="name">{escape(title_of(shift))}</text>')
-        for share in (0.0, 0.5, 1.0):
-            y = under + high * (1 - share)
-            parts.append(f'<line x1="{left}" x2="{left + wide}" y1="{y:.1f}" y2="{y:.1f}" class="grid"/>')
-            parts.append(f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{top * share:.0f}</text>')
-        for n in steps:
-            x = left + wide * int(n) / 5
-            label = "clean" if n == "0" else n
-            parts.append(f'<text x="{x:.1f}" y="{under + high + 15}" text-anchor="middle">{label}</text>')
-        for index, detector in enumerate(run.detectors):
-            found = [(n, cell_of(run, run.record(detector, shift if n != "0" else "", n), metric)) for n in steps]
-            found = [(n, c) for n, c in found if not math.isnan(c.mean)]
-            colour = f"var(--s{index % 5})"
-            known = [(n, c) for n, c in found if not math.isnan(c.low)]
-            if known:
-                edge = [place(n, c.high) for n, c in known] + [place(n, c.low) for n, c in reversed(known)]
-                parts.append(f'<polygon points="{" ".join(edge)}" fill="{colour}" opacity=".16"/>')
-            line = " ".join(place(n, c.mean) for n, c in found)
-            parts.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="2"/>')
-            for n, c in found:
-                at, down = place(n, c.mean).split(",")
-                tip = escape(f"{detector}, {title_of(shift)} {n}: {c.text} {c.interval}")
-                parts.append(f'<circle cx="{at}" cy="{down}" r="3" fill="{colour}"><title>{tip}</title></circle>')
-    rows = -(-len(run.shifts) // columns)
-    return (
-        f'<svg viewBox="0 0 {36 + columns * (wide + gap)} {rows * (high + 46) + 12}" role="img" '
-        f'aria-label="{metric} over severity">{"".join(parts)}</svg>'
-    )
+        ]  # fmt: skip
+        found.append(Panel(title_of(shift), ticks, lines))
+    return panels(found, label=f"{metric} over severity")
 
 
 def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:

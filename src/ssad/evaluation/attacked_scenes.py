@@ -1,0 +1,340 @@
+"""A scene whose camera images a digital attack has changed, each by itself, and what the attack took."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core.detections import Truth
+from ssad.core.errors import ConfigError
+from ssad.core.images import read_image
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.types import U8
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
+from ssad.evaluation.camera_truth import camera_truth
+from ssad.evaluation.detection import to_images
+from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name
+from ssad.scenarios.static.digital import ATTACKS, Attack, Attacked, Budget, make_attack, make_objective, px, run_attack
+from ssad.scenarios.static.digital.budget import LEVELS, Norm
+from ssad.scenarios.static.digital.gradient_check import check_gradient
+from ssad.scenarios.static.digital.victim import Victim, steady
+
+
+@dataclass(frozen=True, slots=True)
+class AttackSpec:
+    """An attack with all its settings.
+
+    Attributes:
+        attack: name (`ssad list attacks`).
+        loss: what it ascends.
+        norm: of the budget.
+        radius: of the budget, in 8-bit code values.
+        options: further settings of the attack, such as ("steps", 10), in order of their names.
+    """
+
+    attack: str
+    loss: str
+    norm: Norm
+    radius: float
+    options: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Such as "pgd-full-linf-5-steps10"; tells specs apart and can be a file's name."""
+        parts = [
+            self.attack,
+            self.loss,
+            self.norm,
+            f"{self.radius:g}",
+            *(f"{key}{value}" for key, value in self.options),
+        ]
+        return file_name("-".join(parts))
+
+    @property
+    def steps(self) -> int:
+        """Steps of gradient ascent: those it was told, 1 if it is white-box and takes no steps, else 0."""
+        told = dict(self.options).get("steps")
+        return int(told) if told is not None else int(self.make().access == "white-box")
+
+    def make(self) -> Attack:
+        """The attack.
+
+        Raises:
+            UnknownNameError: there is no such attack.
+            ConfigError: it refuses a setting.
+        """
+        found: Attack = make_attack(self.attack, **dict(self.options))
+        return found
+
+
+def takes(attack: str, option: str) -> bool:
+    """Whether an attack of our own has an option.
+
+    Args:
+        attack: name.
+        option: name of a setting, such as "steps".
+
+    Raises:
+        UnknownNameError: there is no such attack.
+    """
+    from ssad.core.registry import resolve
+
+    build = resolve("attack", ATTACKS, attack)
+    return callable(build) and option in inspect.signature(build).parameters
+
+
+@dataclass(frozen=True, slots=True)
+class AttackedScene:
+    """One scene under one attack on one detector; see `ssad.evaluation.scene_boxes.Condition`.
+
+    Attributes:
+        spec: the attack.
+        scene: name of the scene.
+        batch: camera images at once on a GPU; on the CPU it is one.
+    """
+
+    spec: AttackSpec
+    scene: str
+    batch: int = 12
+
+    @property
+    def name(self) -> str:
+        """See `Condition`."""
+        return f"{self.spec.name}/{self.scene}"
+
+    def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
+        """See `Condition`: a detector is shown what was made against it. Its gradient, missing or wrong, is a failure
+        of the detector, with its reason."""
+        (watched,) = detectors
+        attacker = SceneAttacker(self, examination, data.scene(self.scene), watched)
+        return Shown(attacker.look, attacker.tally.notes, ahead=False)
+
+
+@dataclass(slots=True)
+class Tally:
+    """What attacks on the images of a scene took, put together.
+
+    Attributes:
+        images, idle: how many, and how many of them held nothing to attack.
+        gradients, queries: forward and backward passes, and forward passes alone, over all images.
+        before, after: sums of the losses.
+        used: sum over the images that were attacked of the share of the budget that was used: mean change over the
+            radius (L-infinity), or length over the radius (L2).
+        change: the largest change of an image, in the norm, 8-bit code values.
+        batch: the least number of images that had to be attacked at once for lack of memory, 0: none yet.
+        gradient_error: of the gradient against finite differences; None: not looked at.
+        coupling: relative change of an image's loss when another one is in its batch; None: not looked at.
+        access: of the attack.
+    """
+
+    access: str
+    images: int = 0
+    idle: int = 0
+    gradients: int = 0
+    queries: int = 0
+    before: float = 0.0
+    after: float = 0.0
+    used: float = 0.0
+    change: float = 0.0
+    batch: int = 0
+    gradient_error: float | None = None
+    coupling: float | None = None
+
+    def add(self, found: Attacked, clean: Tensor, budget: Budget) -> None:
+        """Counts a batch of attacked images."""
+        count = len(found.images)
+        self.images += count
+        self.idle += int(found.idle.sum())
+        self.gradients += count * found.cost.gradients
+        self.queries += count * found.cost.queries
+        self.before += float(found.before.double().sum())
+        self.after += float(found.after.double().sum())
+        change = ((found.images - clean).double() * LEVELS).round().abs().flatten(1)
+        radius = max(budget.radius * LEVELS, 1e-9)
+        sizes, mean = change.amax(1), change.mean(1)
+        if budget.norm == "l2":
+            sizes = mean = change.norm(dim=1)
+        self.change = max(self.change, float(sizes.max()))
+        self.used += float((mean / radius)[~found.idle].sum())
+        self.batch = min(self.batch or count, count)
+
+    def notes(self) -> dict[str, Any]:
+        """Plain data."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the scenes of a cell noted (see `Tally`) as columns of its record.
+
+    Args:
+        notes: of each scene.
+
+    Returns:
+        access; images and idle; gradients, queries and mean losses before and after, an image; used, the mean share of
+        the budget; change_px, the largest change; batch; gradient_error and coupling, the largest, None where they were
+        not looked at.
+    """
+    some = [one for one in notes if one["images"]]
+    images = sum(one["images"] for one in some)
+    active = images - sum(one["idle"] for one in some)
+
+    def mean(name: str, count: int) -> float | None:
+        value = math.fsum(one[name] for one in some) / count if count else math.nan
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+
+    def largest(name: str) -> float | None:
+        known = [one[name] for one in some if one[name] is not None]
+        return float(f"{max(known):.6g}") if known else None
+
+    return {
+        "access": notes[0]["access"] if notes else "", "images": images, "idle": images - active,
+        "gradients": mean("gradients", images), "queries": mean("queries", images),
+        "loss_before": mean("before", images), "loss_after": mean("after", images), "used": mean("used", active),
+        "change_px": largest("change"), "batch": max((one["batch"] for one in some), default=0),
+        "gradient_error": largest("gradient_error"), "coupling": largest("coupling"),
+    }  # fmt: skip
+
+
+@dataclass(slots=True)
+class SceneAttacker:
+    """Attacks the camera images of a scene, against one detector. An image's random numbers come from the seed of the
+    suite and its own token: what comes out depends on no other image.
+
+    Attributes:
+        view: the scene and its attack.
+        examination: data, device, seed.
+        scene: the data.
+        watched: the detector; what it raises is kept there.
+        tally: what was done.
+    """
+
+    view: AttackedScene
+    examination: Examination
+    scene: SceneData
+    watched: Watched
+    attack: Attack = field(init=False)
+    tally: Tally = field(init=False)
+    batch: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.attack = self.view.spec.make()
+        self.tally = Tally(self.attack.access)
+        self.batch = 1 if self.examination.device == "cpu" else self.view.batch
+
+    def look(self, frames: Sequence[SensorFrame]) -> list[U8]:
+        """Attacked pictures of camera frames; the clean ones once the detector has failed.
+
+        Raises:
+            FormatError: a picture cannot be read.
+        """
+        pictures = [self._read(frame) for frame in frames]
+        if self.watched.reason or not frames:
+            return pictures
+        try:
+            if not self.tally.images:
+                self._inspect()
+            for size in sorted({picture.shape[:2] for picture in pictures}):
+                rows = [k for k, picture in enumerate(pictures) if picture.shape[:2] == size]
+                for k, image in zip(
+                    rows, self._all([frames[k] for k in rows], [pictures[k] for k in rows]), strict=True
+                ):
+                    pictures[k] = image
+        except Exception as error:  # whatever a stranger's detector raises
+            self.watched.failed(error)
+        return pictures
+
+    def _read(self, frame: SensorFrame) -> U8:
+        return read_image(self.examination.root / frame.filename)
+
+    def _truth(self, frame: SensorFrame) -> Truth:
+        return camera_truth(frame, self.scene.annotations(frame.sample_token))
+
+    def _all(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
+        """Pictures of one size, in batches; smaller ones from where memory does not suffice."""
+        found: list[U8] = []
+        while len(found) < len(frames):
+            part = slice(len(found), len(found) + self.batch)
+            try:
+                found += self._some(frames[part], pictures[part])
+                continue
+            except torch.OutOfMemoryError:
+                count = len(frames[part])
+                if count == 1:
+                    raise
+            torch.cuda.empty_cache()
+            self.batch = count // 2
+        return found
+
+    def _some(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
+        """One batch."""
+        spec = self.view.spec
+        budget = Budget(px(spec.radius), spec.norm)
+        images, lens = self._tensors(frames, pictures)
+        truth = [self._truth(frame) for frame in frames]
+        active = self._attackable(images, lens, truth)
+        out = list(pictures)
+        self.tally.images += len(frames) - len(active)
+        self.tally.idle += len(frames) - len(active)
+        if not active:
+            return out
+        own = images[active]
+        found = run_attack(
+            self.attack, self.watched.detector, own, [truth[k] for k in active], budget, objective=spec.loss,
+            intrinsic=lens[active], keys=[(self.examination.seed, frames[k].token) for k in active], check=False,
+        )  # fmt: skip
+        self.tally.add(found, own, budget)
+        codes = (found.images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
+        for k, picture in zip(active, codes, strict=True):
+            out[k] = np.ascontiguousarray(picture)
+        return out
+
+    def _tensors(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> tuple[Tensor, Tensor]:
+        """Images [B, 3, H, W] and intrinsics [B, 3, 3] on the device."""
+        device = self.examination.device
+        lens = np.stack([np.asarray(frame.intrinsic, np.float32) for frame in frames])
+        return to_images(pictures, device), torch.from_numpy(lens).to(device)
+
+    def _attackable(self, images: Tensor, lens: Tensor, truth: Sequence[Truth]) -> list[int]:
+        """Images in which there is something to attack, for this loss: in any batch the same."""
+        if not make_objective(self.view.spec.loss).needs_objects:
+            return list(range(len(images)))
+        detector: Any = self.watched.detector
+        with steady(detector), torch.no_grad():
+            label = detector.assign(detector.dense(images, lens), truth).label
+        return [k for k, any_ in enumerate((label >= 0).any(1).tolist()) if any_]
+
+    def _inspect(self) -> None:
+        """Before the first attack on a scene: the gradient of the loss against finite differences, on the image with
+        most objects, and whether this image's loss changes with what else is in the batch."""
+        if tuple(getattr(self.watched.detector, "classes", ())) != MMDET3D_CLASSES:
+            raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
+        frames = [frame for frame in self.scene.frames if frame.modality == "camera" and frame.key_frame]
+        counted = sorted(frames, key=lambda frame: -len(self._truth(frame).label))
+        first = counted[0]
+        alike = [f for f in counted[1:] if (f.width, f.height) == (first.width, first.height)][:1]
+        if self.attack.access == "none" or not len(self._truth(first).label):
+            return
+        chosen = [first, *alike]
+        images, lens = self._tensors(chosen, [self._read(frame) for frame in chosen])
+        truth = [self._truth(frame) for frame in chosen]
+        if 0 not in self._attackable(images[:1], lens[:1], truth[:1]):
+            return
+        detector: Any = self.watched.detector
+        objective = make_objective(self.view.spec.loss)
+        with steady(detector):
+            alone = Victim(detector, images[:1], truth[:1], objective, intrinsic=lens[:1])
+            if self.attack.access == "white-box":
+                self.tally.gradient_error = check_gradient(alone)
+            if alike:
+                both = Victim(detector, images, truth, objective, intrinsic=lens)
+                own = float(alone.loss(alone.clean)[0])
+                other = float(both.loss(both.clean)[0])
+                self.tally.coupling = abs(other - own) / max(abs(own), 1e-6)

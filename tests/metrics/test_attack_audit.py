@@ -1,0 +1,123 @@
+"""The audit of attacks: sound ones pass, weakened ones are named, and so is the paper's own row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit, weaker
+from ssad.report.kinds.digital import published_attempts
+
+CLEAN = 0.3
+BASE = Attempt(
+    "eye", "pgd", 0.02, CLEAN, "full", "linf", 5.0, 10, "white-box", "", (), before=1.0, after=9.0, gradient_error=1e-3,
+    coupling=1e-7, used=0.7, change=5.0,
+)  # fmt: skip
+NOISE = replace(BASE, attack="noise", score=0.29, steps=0, access="none", used=1.0, gradient_error=None, coupling=None)
+FGSM = replace(BASE, attack="fgsm", score=0.06, steps=1, used=1.0)
+SOUND = [
+    NOISE, FGSM, BASE, replace(BASE, radius=2.0, score=0.1, change=2.0), replace(BASE, steps=20, score=0.01),
+    replace(BASE, options="restarts=2", score=0.018), replace(BASE, radius=255.0, score=0.0, change=255.0, used=0.3),
+    replace(BASE, attack="square", access="black-box", score=0.1, steps=0, gradient_error=None),
+]  # fmt: skip
+
+
+def rules(verdict: Verdict) -> list[str]:
+    return [fault.rule for fault in verdict.faults]
+
+
+def with_changed(**changes: Any) -> list[Attempt]:
+    """The sound attempts, PGD with ten steps at 5 px changed."""
+    return [replace(one, **changes) if one is BASE else one for one in SOUND]
+
+
+def test_sound_attacks_pass_and_every_rule_was_looked_at() -> None:
+    verdict = audit(SOUND)
+    assert verdict.faults == ()
+    assert verdict.passed
+    assert all(verdict.compared[name] for name in RULES), verdict.compared
+    assert verdict.text == f"Audit passed: {sum(verdict.compared.values())} comparisons, no fault."
+
+
+WEAKENED: dict[str, tuple[dict[str, Any], str, str]] = {
+    "a step that is too small": ({"used": 0.05, "score": 0.2}, "used", "uses 5% of its budget"),
+    "a loss on suppressed boxes": ({"radius": 255.0, "score": 0.1, "change": 255.0}, "unbounded", "must leave nothing"),
+    "a gradient that is detached": ({"gradient_error": 0.9}, "gradient", "differs from finite differences by 90%"),
+    "a sign error": ({"after": 0.5, "score": 0.31}, "loss", "fell from 1 to 0.5: a wrong sign"),
+    "a loss that is coupled by the batch": ({"coupling": 0.4}, "coupling", "changes by 40% with what else is in"),
+    "a budget before rounding": ({"change": 6.0}, "budget", "6 px from the clean one"),
+}
+
+
+@pytest.mark.parametrize("case", WEAKENED.values(), ids=WEAKENED.keys())
+def test_six_weakened_attacks_are_named(case: tuple[dict[str, Any], str, str]) -> None:
+    changes, rule, words = case
+    verdict = audit(with_changed(**changes))
+    assert not verdict.passed
+    assert rule in rules(verdict)
+    (text,) = [fault.text for fault in verdict.faults if fault.rule == rule]
+    assert words in text
+    assert "pgd on loss full with 10 steps" in text
+    assert verdict.text.startswith("Audit: ")
+
+
+ORDER: dict[str, tuple[list[Attempt], str, str]] = {
+    "more steps": ([BASE, replace(BASE, steps=20, score=0.1)], "steps", "with 20 steps at 5 px leaves 10.00 mAP"),
+    "a larger budget": ([BASE, replace(BASE, radius=8.0, score=0.1)], "radius", "at 8 px leaves 10.00 mAP"),
+    "ten steps and one": ([FGSM, replace(BASE, score=0.1)], "iterated", "weaker than a single step is mis-tuned"),
+    "a black-box attack": (
+        [BASE, replace(BASE, attack="square", access="black-box", score=0.0, loss="margin")], "access", "masked",
+    ),
+    "restarts that lose": ([BASE, replace(BASE, options="restarts=3", score=0.1)], "restarts", "start is not kept"),
+    "restarts that gain": (
+        [replace(BASE, score=0.1), replace(BASE, options="restarts=3", score=0.02)], "restarts", "restarts gain much",
+    ),
+    "noise": ([NOISE, replace(BASE, score=0.29)], "noise", "random noise of the same size 29.00 mAP"),
+    "a flat loss": ([replace(BASE, after=1.0)], "loss", "did not move"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ORDER.values(), ids=ORDER.keys())
+def test_attacks_in_the_wrong_order_are_named(case: tuple[list[Attempt], str, str]) -> None:
+    attempts, rule, words = case
+    verdict = audit([replace(one, change=None, used=None) for one in attempts])
+    assert rules(verdict) == [rule]
+    assert words in verdict.faults[0].text
+
+
+def test_detectors_losses_norms_and_sizes_are_not_mixed() -> None:
+    worse = replace(BASE, score=0.1)
+    for changed in (
+        {"detector": "other"}, {"loss": "margin"}, {"norm": "l2", "change": 1.0}, {"radius": 3.0, "change": 3.0},
+    ):  # fmt: skip
+        assert audit([FGSM, replace(worse, **changed)]).compared["iterated"] == 0
+    assert audit([BASE, replace(worse, attack="apgd")]).faults == ()
+
+
+def test_what_differs_by_noise_alone_is_no_fault() -> None:
+    draws = tuple(0.02 + 0.01 * k for k in range(-2, 3))
+    one, other = replace(BASE, score=0.05, draws=draws[::-1]), replace(FGSM, score=0.02, draws=draws)
+    assert not weaker(one, other), "two standard errors of the paired difference are 0.063"
+    assert weaker(replace(one, draws=draws), other), "paired draws that move together tell"
+    assert weaker(replace(one, draws=()), other)
+    assert not weaker(replace(one, score=0.02 + 0.019 * CLEAN, draws=()), other), (
+        "less than a fiftieth of the clean score"
+    )
+
+
+def test_an_attack_that_has_done_its_work_need_not_use_its_budget() -> None:
+    assert audit([replace(BASE, used=0.01, score=0.0)]).passed
+
+
+def test_a_run_in_which_nothing_can_be_compared_does_not_pass() -> None:
+    verdict = audit([])
+    assert not verdict.passed
+    assert verdict.text.startswith("Audit: nothing to look at. Not in this run: more steps")
+
+
+def test_the_papers_own_row_is_flagged_and_its_others_are_not() -> None:
+    (fault,) = audit(published_attempts()).faults
+    assert (fault.rule, fault.detector) == ("iterated", "PGD (paper)")
+    assert "PGD with 10 steps at 5 px leaves 19.61 mAP, FGSM with 1 step at 5 px 8.77 mAP" in fault.text
