@@ -137,10 +137,8 @@ class WithLossesTurnedAndLifted(Wrapped):
 
 
 class WithFourBits(Wrapped):
-    steps = 15
-
     def see(self, images: Tensor) -> Tensor:
-        coarse = (images * self.steps).round() / self.steps if is_picture(images) else images
+        coarse = (images * 15).round() / 15 if is_picture(images) else images
         return images + (coarse - images).detach() if is_picture(images) else images
 
 
@@ -212,11 +210,6 @@ class WithYBeforeX(Wrapped):
         return replace(found, box=found.box[..., [1, 0, 3, 2]])
 
 
-class WithYBeforeXInPredict(Wrapped):
-    def alter(self, found: Detections) -> Detections:
-        return replace(found, box=found.box[..., [1, 0, 3, 2]])
-
-
 SLOPE = "has the sign and roughly the size of its finite differences"
 CONVENTION = "these fit better if read otherwise"
 SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] = {
@@ -258,7 +251,6 @@ SUBTLE: dict[str, tuple[Callable[[CheckCase], None], str, type[Wrapped], str]] =
         (check_boxes, "yolov3-tiny", WithPixelsOfTheInput, "Dense.box is in pixels of the picture"),
         (check_boxes, "fcos", WithYBeforeX, "Dense.box is x1, y1, x2, y2"),
         (check_boxes, "yolov5n", WithYBeforeX, "Dense.box is x1, y1, x2, y2"),
-        (check_boxes, "yolov5n", WithYBeforeXInPredict, "the boxes of predict are among those of dense"),
     )
 }
 
