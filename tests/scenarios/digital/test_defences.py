@@ -117,6 +117,27 @@ def test_a_defended_detector_is_a_detector(defence: Defence, task: str) -> None:
     assert bool((behind.after > behind.before).all())
 
 
+@pytest.mark.parametrize(
+    "images", [torch.zeros(3, 16, 16), torch.zeros(1, 1, 16, 16), torch.zeros(1, 3, 16, 16).byte()]
+)
+@pytest.mark.parametrize("defence", ALL, ids=lambda one: one.name)
+def test_what_is_no_image_is_refused_before_a_defence(defence: Defence, images: Tensor) -> None:
+    detector = Defended(ToyDetector(), defence)
+    for call in (detector.predict, detector.dense):
+        with pytest.raises(ConfigError, match=r"images are \[B, 3, H, W\] of floats"):
+            call(images)
+
+
+@pytest.mark.parametrize("defence", [Blur(1.3), RandomResize(0.5)], ids=lambda one: one.name)
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_white_and_black_have_a_gradient(defence: Defence, value: float) -> None:
+    images = torch.full((1, 3, 24, 24), value, requires_grad=True)
+    shown = defence(images)
+    assert 0.0 <= float(shown.detach().min()) <= float(shown.detach().max()) <= 1.0
+    (gradient,) = torch.autograd.grad(shown.sum(), images)
+    assert float(gradient.sum()) == pytest.approx(shown.numel(), rel=1e-3)
+
+
 def test_what_is_behind_a_defence_is_kept_steady() -> None:
     part = ToyDetector()
     part.train()

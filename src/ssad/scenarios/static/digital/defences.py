@@ -148,8 +148,7 @@ class Blur:
         wide: Tensor = (
             functional.pad(images, (reach, reach, reach, reach), mode="replicate").unfold(2, len(line), 1) @ line
         )
-        found: Tensor = (wide.unfold(3, len(line), 1) @ line).clamp(0.0, 1.0)
-        return found
+        return _in_range(wide.unfold(3, len(line), 1) @ line)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +206,12 @@ class RandomResize:
         whole = (int(image.shape[2]), int(image.shape[3]))
         small = tuple(max(round(share * side), min(side, SMALLEST)) for side in whole)
         less = functional.interpolate(image, size=small, mode="bilinear", antialias=True)
-        return functional.interpolate(less, size=whole, mode="bilinear").clamp(0.0, 1.0)
+        return _in_range(functional.interpolate(less, size=whole, mode="bilinear"))
+
+
+def _in_range(images: Tensor) -> Tensor:
+    """Means of values in [0, 1] without their last digit's excess, and with the gradient even where they are white."""
+    return images.clamp(0.0, 1.0).detach() + (images - images.detach())
 
 
 DEFENCES: dict[str, Callable[..., Any]] = {"jpeg": Jpeg, "bits": BitDepth, "blur": Blur, "resize": RandomResize}
@@ -256,12 +260,18 @@ class Defended:
     ) -> list[Detections]:
         """See `Detector`."""
         with torch.no_grad():
-            shown = self.defence(images)
+            shown = self._shown(images)
         return self.detector.predict(shown, intrinsic, threshold=threshold)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """See `Detector`."""
-        return self.detector.dense(self.defence(images), intrinsic)
+        return self.detector.dense(self._shown(images), intrinsic)
+
+    def _shown(self, images: Tensor) -> Tensor:
+        """What the detector sees; a defence might hide from it that these are no images."""
+        if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
+            raise ConfigError(f"images are [B, 3, H, W] of floats, not {list(images.shape)} {images.dtype}")
+        return self.defence(images)
 
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
         """See `Detector`."""
