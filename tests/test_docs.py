@@ -46,7 +46,7 @@ def exists(dotted: str) -> bool:
     return False
 
 
-GROUPS = {"ssad.systems", "ssad.detectors", "ssad.scenarios", "ssad.kinds"}  # of entry points
+GROUPS = {"ssad.systems", "ssad.detectors", "ssad.scenarios", "ssad.kinds", "ssad.attacks"}  # of entry points
 
 
 @page
