@@ -31,6 +31,7 @@ from ssad.evaluation.scene_boxes import Examination, Watched, detector_of
 from ssad.report import write_report
 from ssad.report.kinds.digital import attempts_of, load_digital_run, lost_table, main_table
 from ssad.report.load import load_run
+from ssad.report.paper import DIGITAL as PUBLISHED
 from ssad.report.terminal import summary
 from ssad.training.data import nuscenes_items
 
@@ -188,6 +189,8 @@ def test_published_rows_stand_beside_detectors_of_the_same_kind(folder: Path) ->
         ("clean", ""): [29.8, 37.7, 31.74, 39.34], ("FGSM", "5 px, 1 step"): [8.3, 21.44, 8.77, 17.99],
         ("PGD", "5 px, 10 steps"): [3.9, 18.73, 19.61, 31.42],
     }  # fmt: skip
+    heads = [row.head[0] for row in table.rows]
+    assert heads == ["clean", "clean", "noise", "FGSM, full loss", "FGSM", "PGD, full loss", "PGD"], "each beside ours"
     lost = {row.head[0]: row.cells[0].mean for row in lost_table(run).rows if row.published}
     assert lost["PGD"] == pytest.approx(100 * (1 - 3.9 / 29.8))
 
@@ -343,3 +346,17 @@ def test_the_shipped_suites_load_and_their_command_repeats_them() -> None:
 
 def test_a_column_says_which_share_is_lost() -> None:
     assert [column.name for column in digital.Digital.columns] == ["mAP", "NDS", "AP_car", "drop"]
+
+
+def test_the_papers_table_is_the_papers(data_dir: Path) -> None:
+    source = sorted((data_dir.parent / "paper").glob("*.txt"))
+    if not source:
+        pytest.skip("the paper's source is not beside the data folder")
+    table = source[0].read_text(errors="replace").replace(" ", "").partition("underdigitalattacksonnuScenes")[2]
+    names = {"": "{Benign}", "C&W": r"C$\&$W"}
+    for attack, scores in PUBLISHED.items():
+        (line,) = [
+            one for one in table.splitlines()[:20] if f"{names.get(attack, attack)}&" in one and one.count("&") > 3
+        ]
+        numbers = [float(value) for value in line.rstrip("\\").split("&")[-4:]]
+        assert numbers == [*scores["FCOS3D"], *scores["PGD"]], attack

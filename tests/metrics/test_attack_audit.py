@@ -96,6 +96,14 @@ def test_detectors_losses_norms_and_sizes_are_not_mixed() -> None:
     assert audit([BASE, replace(worse, attack="apgd")]).faults == ()
 
 
+def test_a_budget_may_be_too_small_for_an_attack_and_for_noise() -> None:
+    small = replace(BASE, radius=1.0, change=1.0, score=CLEAN)
+    noise = replace(NOISE, radius=1.0, change=1.0, score=CLEAN)
+    assert audit([NOISE, BASE, noise, small]).passed
+    assert rules(audit([noise, small])) == ["noise"], "at its largest budget it must do something"
+    assert rules(audit([NOISE, BASE, replace(noise, score=0.2), small])) == ["noise"]
+
+
 def test_what_differs_by_noise_alone_is_no_fault() -> None:
     draws = tuple(0.02 + 0.01 * k for k in range(-2, 3))
     one, other = replace(BASE, score=0.05, draws=draws[::-1]), replace(FGSM, score=0.02, draws=draws)

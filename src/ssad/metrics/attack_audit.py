@@ -221,18 +221,29 @@ def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _above_noise(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    for noise, group in _sizes(attempts):
-        for one in group if noise is not None and noise.score > LEFT * noise.clean else ():
-            assert noise is not None
-            beaten = one.score < noise.score
-            yield (
-                None
-                if beaten
-                else (
-                    f"{one.title} leaves {_percent(one.score)}, random noise of the same size {_percent(noise.score)}: "
-                    "it attacks nothing"
-                )
+    """A budget may be too small for anything to change, so that an attack must beat noise at its largest one only; at
+    none may it be beaten by noise."""
+    pairs = [
+        (noise, one)
+        for noise, group in _sizes(attempts)
+        for one in group
+        if noise is not None and noise.score > LEFT * noise.clean
+    ]
+    largest: dict[tuple[object, ...], float] = {}
+    for _, one in pairs:
+        kind = one.attack, one.loss, one.norm, one.steps, one.options
+        largest[kind] = max(one.radius, largest.get(kind, 0.0))
+    for noise, one in pairs:
+        last = one.radius == largest[one.attack, one.loss, one.norm, one.steps, one.options]
+        beaten = weaker(one, noise) or (last and one.score >= noise.score)
+        yield (
+            None
+            if not beaten
+            else (
+                f"{one.title} leaves {_percent(one.score)}, random noise of the same size {_percent(noise.score)}: "
+                "it attacks nothing"
             )
+        )
 
 
 def _sizes(attempts: Sequence[Attempt]) -> Iterator[tuple[Attempt | None, list[Attempt]]]:
