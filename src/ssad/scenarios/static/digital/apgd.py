@@ -11,7 +11,7 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access, keep_best
 from ssad.scenarios.static.digital.budget import Budget
-from ssad.scenarios.static.digital.pgd import Start
+from ssad.scenarios.static.digital.pgd import Start, starts
 from ssad.scenarios.static.digital.victim import Victim
 
 INERTIA = 0.75  # share of the new step; the rest repeats the last one
@@ -45,12 +45,7 @@ class APGD:
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """See `Attack`."""
         best = victim.clean, victim.clean.new_full((len(victim),), -torch.inf, dtype=torch.float32)
-        for number in range(1 + self.restarts):
-            kind: Start = self.start if number == 0 or self.start != "none" else "uniform"
-            images = victim.clean
-            if kind != "none":
-                draws = victim.draw(kind, "start", number)
-                images = budget.project(images + budget.start(draws, kind), victim.clean)
+        for images in starts(victim, budget, self.start, self.restarts):
             best = keep_best(best, *self._run(victim, budget, images))
         return best[0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -83,16 +84,15 @@ class MinimalCW:
             weight = torch.where(high.isinf(), weight * 10, (low + high) / 2)
         return budget.project(found, victim.clean)
 
-    def _descend(self, victim: Victim, weight: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def _descend(self, victim: Victim, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """Images and losses that are met with one weight each."""
         clean = victim.clean.clamp(EDGE, 1 - EDGE)
         line = torch.logit(clean).requires_grad_()
         optimizer = torch.optim.Adam([line], lr=self.rate)
-        met = []
         for _ in range(self.steps):
             images = line.sigmoid()
             loss, gradient = victim.gradient(images)
-            met.append((images.detach(), loss))
+            yield images.detach(), loss
             with torch.enable_grad():
                 shown = line.sigmoid()
                 size = ((shown - victim.clean) ** 2).flatten(1).sum(1)
@@ -100,4 +100,3 @@ class MinimalCW:
                 (size - weight * ascended).sum().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             optimizer.zero_grad()
-        return met

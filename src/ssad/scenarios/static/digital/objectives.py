@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import torch
@@ -205,8 +206,8 @@ class Mislabel:
 
 
 OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
-    "full": lambda: TrainingLosses("full"),
-    **{name: (lambda name=name, terms=terms: TrainingLosses(name, terms)) for name, terms in TERMS.items()},  # type: ignore[misc]
+    "full": partial(TrainingLosses, "full"),
+    **{name: partial(TrainingLosses, name, terms) for name, terms in TERMS.items()},
     "vanish": Vanish,
     "margin": Margin,
     "fabricate": Fabricate,

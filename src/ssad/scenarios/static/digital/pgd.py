@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +16,24 @@ from ssad.scenarios.static.digital.budget import Budget
 from ssad.scenarios.static.digital.victim import Victim
 
 Start = Literal["none", "uniform", "gaussian"]
+
+
+def starts(victim: Victim, budget: Budget, first: Start, restarts: int) -> Iterator[Tensor]:
+    """Images [B, 3, H, W] from which an attack begins: as `first` says, then random ones of the ball.
+
+    Args:
+        victim: What is attacked.
+        budget: The ball.
+        first: Where the first start lies.
+        restarts: How many follow; where `first` is the clean image, they are uniform.
+    """
+    for number in range(1 + restarts):
+        kind: Start = first if number == 0 or first != "none" else "uniform"
+        images = victim.clean
+        if kind != "none":
+            draws = victim.draw(kind, "start", number)
+            images = budget.project(images + budget.start(draws, kind), victim.clean)
+        yield images
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +74,7 @@ class PGD:
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """See `Attack`."""
         best = victim.clean, victim.clean.new_full((len(victim),), -torch.inf, dtype=torch.float32)
-        for number in range(1 + self.restarts):
-            kind: Start = self.start if number == 0 or self.start != "none" else "uniform"
-            images = victim.clean
-            if kind != "none":
-                draws = victim.draw(kind, "start", number)
-                images = budget.project(images + budget.start(draws, kind), victim.clean)
+        for images in starts(victim, budget, self.start, self.restarts):
             best = self._ascend(victim, budget, images, best)
         return best[0]
 
