@@ -409,11 +409,13 @@ def _shift_list() -> dict[str, str]:
 
 
 def _attack_list() -> dict[str, str]:
-    from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack
+    from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
 
     def about(name: str, where: str) -> str:
         if name not in ATTACKS:
             return where
+        if needs(name):
+            return f"made in Python: needs {', '.join(needs(name))} (docs/attacks.md)"
         access = make_attack(name).access
         return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
 

@@ -11,10 +11,11 @@ import torch
 from helpers.mono3d import one_thread
 from torch import Tensor
 
+from ssad.cli import _attack_list
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
-from ssad.scenarios.static.digital import Budget, default_loss, make_attack, px, run_attack
+from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
 from ssad.scenarios.static.digital.check import quality_left, within
@@ -227,8 +228,10 @@ def test_bad_images_are_one_line(images: Tensor, message: str) -> None:
 def test_names_and_options() -> None:
     with pytest.raises(UnknownNameError, match="pgd"):
         make_attack("pdg")
-    with pytest.raises(ConfigError, match="attack pgd"):
+    with pytest.raises(ConfigError, match="attack pgd: there is no option 'stepps'; it has steps, step,"):
         make_attack("pgd", stepps=3)
+    with pytest.raises(ConfigError, match="attack transfer: it needs surrogate and inner"):
+        make_attack("transfer")
     with pytest.raises(ConfigError, match="steps must be 1"):
         make_attack("pgd", steps=0)
     with pytest.raises(ConfigError, match="steps must be 2"):
@@ -237,6 +240,14 @@ def test_names_and_options() -> None:
         make_attack("cw-min", rounds=0)
     with pytest.raises(UnknownNameError, match="loss"):
         run_attack(make_attack("pgd"), ToyDetector(), *toy_scene(), Budget(px(5)), objective="los")
+
+
+def test_all_names_are_listed_with_what_they_need() -> None:
+    rows = _attack_list()
+    assert rows.keys() == {*ATTACKS, "module:object"}
+    assert rows["pgd"] == "white-box, loss full"
+    assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
+    assert [name for name in ATTACKS if needs(name)] == ["transfer", "universal", "expected"]
 
 
 def test_checkpoints_shrink() -> None:

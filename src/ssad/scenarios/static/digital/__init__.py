@@ -6,8 +6,10 @@ choice unless it is told another.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
+from ssad.core.errors import ConfigError
 from ssad.core.registry import names, resolve
 from ssad.scenarios.static.digital.attack import Attack, Attacked, run_attack
 from ssad.scenarios.static.digital.budget import Budget, px
@@ -49,15 +51,35 @@ def make_attack(name: str, **options: Any) -> Any:
         UnknownNameError: There is no such attack.
         ConfigError: An option that it does not have, or a value that it refuses.
     """
-    from ssad.core.errors import ConfigError
-
     build = resolve("attack", ATTACKS, name)
     if not callable(build):
         return build
-    try:
-        return build(**options)
-    except TypeError as error:
-        raise ConfigError(f"attack {name}: {error}") from None
+    known = inspect.signature(build).parameters
+    open_ended = any(one.kind is one.VAR_KEYWORD for one in known.values())
+    for option in options:
+        if option not in known and not open_ended:
+            own = ", ".join(one for one in known if one not in ("name", "access")) or "none"
+            raise ConfigError(
+                f"attack {name}: there is no option '{option}'; {f'it has {own}' if own else 'it has none'}"
+            )
+    missing = [option for option in needs(name) if option not in options]
+    if missing:
+        raise ConfigError(f"attack {name}: it needs {' and '.join(missing)}: make it in Python (docs/attacks.md)")
+    return build(**options)
+
+
+def needs(name: str) -> tuple[str, ...]:
+    """Options without which an attack cannot be made; a suite cannot run an attack that has any.
+
+    Args:
+        name: As for `make_attack`.
+    """
+    build = resolve("attack", ATTACKS, name)
+    if not callable(build):
+        return ()
+    positional = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    parameters = inspect.signature(build).parameters.items()
+    return tuple(option for option, one in parameters if one.default is one.empty and one.kind in positional)
 
 
 def default_loss(name: str) -> str:
@@ -77,6 +99,7 @@ __all__ = [
     "default_loss",
     "make_attack",
     "make_objective",
+    "needs",
     "px",
     "run_attack",
 ]
