@@ -161,10 +161,10 @@ def test_corners_tell_how_far_a_body_leaves_the_road() -> None:
 def test_a_lane_that_widens_is_wider_in_between() -> None:
     graph = straight_graph()
     width = graph.width.copy()
-    width[:5] = [2.0, 4.0, 4.0, 4.0, 4.0]  # at x = 0, 2, 4 ...
+    width[:5] = [3.0, 3.2, 3.2, 3.2, 3.2]  # at x = 0, 2, 4 ...
     field = RoadField(replace(graph, width=width), [LaneType.DRIVING])
     places = torch.tensor([[0.5, -3.0], [1.0, -3.0], [5.0, -3.0]], dtype=torch.float64)
-    np.testing.assert_allclose(field(places).numpy(), [1.75, 1.5, 1.0], atol=1e-6)
+    np.testing.assert_allclose(field(places).numpy(), [1.475, 1.45, 1.4], atol=1e-6)
 
 
 def test_one_state_and_many_controls_are_broadcast() -> None:
