@@ -139,9 +139,10 @@ class Victim:
         for key in self.keys:
             chance = self.generator(key, *use)
             shape = tuple(self.clean.shape[1:])
-            draws = chance.standard_normal(shape, np.float32)
             if kind == "uniform":
                 draws = 2 * chance.random(shape, np.float32) - 1
+            else:
+                draws = chance.standard_normal(shape, np.float32)
             parts.append(torch.from_numpy(draws))
         return torch.stack(parts).to(self.clean).contiguous(memory_format=torch.channels_last)
 
