@@ -372,8 +372,12 @@ def _named_points(suite: DigitalSuite) -> list[Point]:
 def _points(suite: DigitalSuite) -> list[Point]:
     """All that every detector is shown, without transfer: the clean data first, then noise, rows and curves, each once;
     clean data on fewer scenes, and behind a defence, where something else is compared with them. ConfigError."""
-    rows, curves = _named_points(suite), _swept(suite)
-    moved = _moved(suite)
+    rows, curves, moved = _named_points(suite), _swept(suite), _moved(suite)
+    bare = [
+        replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)
+        for one in rows if one.defence
+    ]  # fmt: skip
+    curves = [*curves, *bare]
     noise = [
         Point((AttackSpec("noise", default_loss("noise"), spec.norm, spec.radius),), scenes=one.scenes, row=row)
         for row, points in ((True, rows), (False, [*curves, *moved]))
