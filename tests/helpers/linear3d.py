@@ -29,13 +29,13 @@ class Linear(nn.Module):
     task: Literal["3d"] = "3d"
     classes: tuple[str, ...] = MMDET3D_CLASSES
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, seed: int = 0) -> None:
         super().__init__()
         self.known = fill(list(nuscenes_items(root, None, "all")), threads=1)
         pictures = cast(Tensor, self.known.pictures)
         self.register_buffer("small", pictures[:, ::4, ::4].float().permute(0, 3, 1, 2) / 255, persistent=False)
         self.register_buffer("clean", pictures.permute(0, 3, 1, 2).float() / 255, persistent=False)
-        draws = torch.Generator().manual_seed(0)
+        draws = torch.Generator().manual_seed(seed)
         pattern = torch.randint(0, 2, pictures.shape[1:3], generator=draws).float() * 2 - 1
         self.register_buffer("pattern", pattern.expand(3, -1, -1).clone(), persistent=False)
         self.most = max(len(truth.label) for truth in self.known.truth)
@@ -111,6 +111,11 @@ class Blind(Linear):
 def build() -> Detector:
     """For the data set that LINEAR_DATA names."""
     return cast(Detector, Linear(Path(os.environ["LINEAR_DATA"])))
+
+
+def build_other() -> Detector:
+    """One whose pattern has nothing to do with that of `build`: what fools one does nothing to the other."""
+    return cast(Detector, Linear(Path(os.environ["LINEAR_DATA"]), seed=1))
 
 
 def build_blind() -> Detector:

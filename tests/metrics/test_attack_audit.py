@@ -21,6 +21,7 @@ SOUND = [
     NOISE, FGSM, BASE, replace(BASE, radius=2.0, score=0.1, change=2.0), replace(BASE, steps=20, score=0.01),
     replace(BASE, options="restarts=2", score=0.018), replace(BASE, radius=255.0, score=0.0, change=255.0, used=0.3),
     replace(BASE, attack="square", access="black-box", score=0.1, steps=0, gradient_error=None),
+    replace(BASE, source="other", score=0.25, gradient_error=None),
 ]  # fmt: skip
 
 
@@ -70,6 +71,7 @@ ORDER: dict[str, tuple[list[Attempt], str, str]] = {
     "a black-box attack": (
         [BASE, replace(BASE, attack="square", access="black-box", score=0.0, loss="margin")], "access", "masked",
     ),
+    "transfer": ([replace(BASE, score=0.1), replace(BASE, source="other")], "transfer", "against other"),
     "restarts that lose": ([BASE, replace(BASE, options="restarts=3", score=0.1)], "restarts", "start is not kept"),
     "restarts that gain": (
         [replace(BASE, score=0.1), replace(BASE, options="restarts=3", score=0.02)], "restarts", "restarts gain much",

@@ -1,4 +1,8 @@
-"""A scene whose camera images a digital attack has changed, each by itself, and what the attack took."""
+"""A scene whose camera images a digital attack has changed, each by itself, and what the attack took.
+
+The pictures are made against one system, the source, and may be shown to others as well: to other detectors (transfer),
+or to the same detector behind a defence that the attack does not know.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +25,25 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.evaluation.camera_truth import camera_truth
 from ssad.evaluation.detection import to_images
-from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name
-from ssad.scenarios.static.digital import ATTACKS, Attack, Attacked, Budget, make_attack, make_objective, px, run_attack
+from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name, system_of
+from ssad.scenarios.static.digital import (
+    ATTACKS,
+    Aim,
+    Attack,
+    Attacked,
+    Budget,
+    make_attack,
+    make_objective,
+    px,
+    run_attack,
+)
 from ssad.scenarios.static.digital.budget import LEVELS, Norm
+from ssad.scenarios.static.digital.defences import RandomResize
+from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.victim import Victim, steady
+
+_INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +56,9 @@ class AttackSpec:
         norm: of the budget.
         radius: of the budget, in 8-bit code values.
         options: further settings of the attack, such as ("steps", 10), in order of their names.
+        classes: names of the classes that are attacked; empty: all.
+        becomes: (class, class that its objects should be taken for); empty: any other.
+        draws: of a random defence that the attack knows, over which it ascends the mean loss; 0: it knows none.
     """
 
     attack: str
@@ -45,6 +66,9 @@ class AttackSpec:
     norm: Norm
     radius: float
     options: tuple[tuple[str, Any], ...] = ()
+    classes: tuple[str, ...] = ()
+    becomes: tuple[tuple[str, str], ...] = ()
+    draws: int = 0
 
     @property
     def name(self) -> str:
@@ -55,6 +79,9 @@ class AttackSpec:
             self.norm,
             f"{self.radius:g}",
             *(f"{key}{value}" for key, value in self.options),
+            *self.classes,
+            *(f"{one}-to-{other}" for one, other in self.becomes),
+            *([f"draws{self.draws}"] if self.draws else []),
         ]
         return file_name("-".join(parts))
 
@@ -63,6 +90,17 @@ class AttackSpec:
         """Steps of gradient ascent: those it was told, 1 if it is white-box and takes no steps, else 0."""
         told = dict(self.options).get("steps")
         return int(told) if told is not None else int(self.make().access == "white-box")
+
+    @property
+    def aim(self) -> Aim:
+        """Which objects are attacked, and what they should become."""
+        return Aim(classes=self.classes or None, becomes=dict(self.becomes))
+
+    @property
+    def passes(self) -> int:
+        """Forward and backward passes that an image takes."""
+        restarts = int(dict(self.options).get("restarts", 0))
+        return self.steps * (1 + restarts) * max(self.draws, 1) if self.make().access == "white-box" else 0
 
     def make(self) -> Attack:
         """The attack.
@@ -93,29 +131,41 @@ def takes(attack: str, option: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class AttackedScene:
-    """One scene under one attack on one detector; see `ssad.evaluation.scene_boxes.Condition`.
+    """One scene under one attack on one system; see `ssad.evaluation.scene_boxes.Condition`.
 
     Attributes:
         spec: the attack.
         scene: name of the scene.
         batch: camera images at once on a GPU; on the CPU it is one.
+        source: name of the system that is attacked.
     """
 
     spec: AttackSpec
     scene: str
     batch: int = 12
+    source: str = ""
 
     @property
     def name(self) -> str:
         """See `Condition`."""
-        return f"{self.spec.name}/{self.scene}"
+        return f"{self.spec.name}{f'@{file_name(self.source)}' if self.source else ''}/{self.scene}"
 
     def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """See `Condition`: a detector is shown what was made against it. Its gradient, missing or wrong, is a failure
-        of the detector, with its reason."""
-        (watched,) = detectors
-        attacker = SceneAttacker(self, examination, data.scene(self.scene), watched)
-        return Shown(attacker.look, attacker.tally.notes, ahead=False)
+        """See `Condition`: all systems are shown the same pictures, which are made once, against the source. Its
+        gradient, missing or wrong, is a failure of all cells that need the pictures, with its reason."""
+        source = next((one for one in detectors if one.name == self.source), None)
+        if source is None:
+            source = Watched(system_of(examination, self.source), self.source)
+        attacker = SceneAttacker(self, examination, data.scene(self.scene), source)
+
+        def look(frames: Sequence[SensorFrame]) -> list[U8]:
+            pictures = attacker.look(frames)
+            for one in detectors:
+                if source.reason and one is not source and not one.reason:
+                    one.reason = f"the attack on {self.source} failed: {source.reason}"
+            return pictures
+
+        return Shown(look, attacker.tally.notes, ahead=False)
 
 
 @dataclass(slots=True)
@@ -212,7 +262,7 @@ class SceneAttacker:
         view: the scene and its attack.
         examination: data, device, seed.
         scene: the data.
-        watched: the detector; what it raises is kept there.
+        watched: the system that is attacked; what it raises is kept there.
         tally: what was done.
     """
 
@@ -226,6 +276,9 @@ class SceneAttacker:
 
     def __post_init__(self) -> None:
         self.attack = self.view.spec.make()
+        defence = getattr(self.watched.detector, "defence", None)
+        if self.view.spec.draws and isinstance(defence, RandomResize):
+            self.attack = Expected(self.attack, defence, self.view.spec.draws)
         self.tally = Tally(self.attack.access)
         self.batch = 1 if self.examination.device == "cpu" else self.view.batch
 
@@ -288,7 +341,8 @@ class SceneAttacker:
         own = images[active]
         found = run_attack(
             self.attack, self.watched.detector, own, [truth[k] for k in active], budget, objective=spec.loss,
-            intrinsic=lens[active], keys=[(self.examination.seed, frames[k].token) for k in active], check=False,
+            aim=spec.aim, intrinsic=lens[active], check=False,
+            keys=[(self.examination.seed, frames[k].token) for k in active],
         )  # fmt: skip
         self.tally.add(found, own, budget)
         codes = (found.images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
@@ -304,37 +358,57 @@ class SceneAttacker:
 
     def _attackable(self, images: Tensor, lens: Tensor, truth: Sequence[Truth]) -> list[int]:
         """Images in which there is something to attack, for this loss: in any batch the same."""
-        if not make_objective(self.view.spec.loss).needs_objects:
+        aim = self.view.spec.aim
+        if not make_objective(self.view.spec.loss).needs_objects and aim.everything:
             return list(range(len(images)))
         detector: Any = self.watched.detector
         with steady(detector), torch.no_grad():
-            label = detector.assign(detector.dense(images, lens), truth).label
-        return [k for k, any_ in enumerate((label >= 0).any(1).tolist()) if any_]
+            places = aim.places(detector, detector.assign(detector.dense(images, lens), truth))
+        return [k for k, any_ in enumerate(places.any(1).tolist()) if any_]
 
     def _inspect(self) -> None:
         """Before the first attack on a scene: the gradient of the loss against finite differences, on the image with
-        most objects, and whether this image's loss changes with what else is in the batch."""
+        most objects to attack, and whether this image's loss changes with what else is in the batch. Attacks on one
+        loss of one system share what was found."""
         if tuple(getattr(self.watched.detector, "classes", ())) != MMDET3D_CLASSES:
             raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
         frames = [frame for frame in self.scene.frames if frame.modality == "camera" and frame.key_frame]
-        counted = sorted(frames, key=lambda frame: -len(self._truth(frame).label))
+        if self.attack.access == "none":
+            return
+        own, spec = self.examination, self.view.spec
+        asked = (
+            str(own.root), own.version, own.detectors, own.device, self.view.source, self.scene.record.name, spec.loss,
+            spec.classes, spec.becomes, self.attack.access,
+        )  # fmt: skip
+        if not self.view.source or asked not in _INSPECTED:
+            _INSPECTED[asked] = self._inspected(frames)
+        self.tally.gradient_error, self.tally.coupling = _INSPECTED[asked]
+
+    def _inspected(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
+        """Error of the gradient and coupling; None where there is nothing to look at."""
+        names = [*self.view.spec.classes, *dict(self.view.spec.becomes)] or MMDET3D_CLASSES
+        wanted = torch.tensor([MMDET3D_CLASSES.index(name) for name in names])
+        counted = sorted(frames, key=lambda frame: -int(torch.isin(self._truth(frame).label, wanted).sum()))
         first = counted[0]
         alike = [f for f in counted[1:] if (f.width, f.height) == (first.width, first.height)][:1]
-        if self.attack.access == "none" or not len(self._truth(first).label):
-            return
+        if not len(self._truth(first).label):
+            return None, None
         chosen = [first, *alike]
         images, lens = self._tensors(chosen, [self._read(frame) for frame in chosen])
         truth = [self._truth(frame) for frame in chosen]
         if 0 not in self._attackable(images[:1], lens[:1], truth[:1]):
-            return
+            return None, None
         detector: Any = self.watched.detector
+        error = coupling = None
         objective = make_objective(self.view.spec.loss)
         with steady(detector):
-            alone = Victim(detector, images[:1], truth[:1], objective, intrinsic=lens[:1])
+            aim = self.view.spec.aim
+            alone = Victim(detector, images[:1], truth[:1], objective, intrinsic=lens[:1], aim=aim)
             if self.attack.access == "white-box":
-                self.tally.gradient_error = check_gradient(alone)
+                error = check_gradient(alone)
             if alike:
-                both = Victim(detector, images, truth, objective, intrinsic=lens)
+                both = Victim(detector, images, truth, objective, intrinsic=lens, aim=aim)
                 own = float(alone.loss(alone.clean)[0])
                 other = float(both.loss(both.clean)[0])
-                self.tally.coupling = abs(other - own) / max(abs(own), 1e-6)
+                coupling = abs(other - own) / max(abs(own), 1e-6)
+        return error, coupling

@@ -35,6 +35,7 @@ from ssad.evaluation.detection import Look, SampleBoxes, detect_with, match_boxe
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
+from ssad.scenarios.static.digital.defences import Defence, Defended
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
 FOLDER = "detections"
@@ -53,6 +54,8 @@ class Examination:
         device: where detectors, shifts and attacks run.
         threads: of linear algebra.
         calibration: of the shifts.
+        defended: systems that are a detector behind a defence: name -> the detector's name and the defence. All other
+            systems are detectors.
     """
 
     folder: Path
@@ -63,6 +66,7 @@ class Examination:
     device: str
     threads: int
     calibration: Calibration = "physical"
+    defended: Mapping[str, tuple[str, Defence]] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -150,11 +154,12 @@ class Watched:
     Memory that is used up and a device that is lost are raised. What it finds is on the host.
 
     Attributes:
+        name: of the system.
         reason: why it failed, in one line; "" while it works.
     """
 
-    def __init__(self, detector: Any) -> None:
-        self.detector, self.reason = detector, ""
+    def __init__(self, detector: Any, name: str = "") -> None:
+        self.detector, self.name, self.reason = detector, name, ""
 
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
@@ -196,6 +201,19 @@ def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
     return detector_of(name, weights, device)
 
 
+def system_of(examination: Examination, name: str) -> Any:
+    """A system of a run by name: a detector, or one behind a defence; a detector is loaded once.
+
+    Args:
+        examination: of the run.
+        name: of the system.
+    """
+    bare, defence = examination.defended.get(name, (name, None))
+    weights = dict(examination.detectors)[bare]
+    detector = _loaded(bare, weights, examination.device, examination.threads)
+    return detector if defence is None else Defended(detector, defence)
+
+
 def shifter_of(examination: Examination, data: NuScenes, scene: ShiftedScene) -> SceneShifter | None:
     """The scene through its shift; None for the clean one."""
     if scene.shift is None:
@@ -220,8 +238,7 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
     if not names:
         return
     with NuScenes(examination.root, examination.version) as data:
-        weights = dict(examination.detectors)
-        watched = [Watched(_loaded(name, weights[name], examination.device, examination.threads)) for name in names]
+        watched = [Watched(system_of(examination, name), name) for name in names]
         shown = scene.shown(examination, data, watched)
         eyes: list[Any] = list(watched)
         found = detect_with(
@@ -330,7 +347,29 @@ def score_scenes(
     Raises:
         DetectorFailed: it failed on a scene.
     """
-    truth = _truth(examination.root, examination.version, tuple(one.scene for one in scenes))
+    found, noted = read_scenes(examination, detector, scenes)
+    truth = truth_of(examination, [one.scene for one in scenes])
+    return {**score_found(examination, found, truth, replicates=replicates), **notes(noted)}
+
+
+def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
+    """The ground truth of some scenes."""
+    return _truth(examination.root, examination.version, tuple(scenes))
+
+
+def read_scenes(
+    examination: Examination, detector: str, scenes: Sequence[Condition]
+) -> tuple[list[SampleBoxes], list[dict[str, Any]]]:
+    """Boxes of a system in scenes, and what was noted in each.
+
+    Args:
+        examination: of the run.
+        detector: name of the system.
+        scenes: each under its condition.
+
+    Raises:
+        DetectorFailed: it failed on a scene.
+    """
     found: list[SampleBoxes] = []
     noted = []
     for one in scenes:
@@ -340,6 +379,20 @@ def score_scenes(
             raise DetectorFailed(f"{one.scene}: {error}") from None
         found += boxes
         noted.append(own)
+    return found, noted
+
+
+def score_found(
+    examination: Examination, found: Sequence[SampleBoxes], truth: GroundTruth, *, replicates: int
+) -> dict[str, Any]:
+    """As `score_scenes`, of boxes that are at hand.
+
+    Args:
+        examination: of the run.
+        found: boxes of all samples.
+        truth: of the same samples.
+        replicates: of the bootstrap over scenes.
+    """
     matches = match_boxes(found, truth)
     case = distinct_scenes(truth)
     count = int(case.max()) + 1
@@ -356,7 +409,7 @@ def score_scenes(
     return {
         "metrics": metrics,
         "intervals": {k: [round(e.low, 5), round(e.high, 5)] for k, e in limits.items() if np.isfinite(e.low)},
-        "replicates": values, "n": samples, "scenes": count, **notes(noted),
+        "replicates": values, "n": samples, "scenes": count,
     }  # fmt: skip
 
 

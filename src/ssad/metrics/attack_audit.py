@@ -38,6 +38,9 @@ class Attempt:
         draws: bootstrap replicates of the score, paired between attempts.
         before, after: mean of the ascended loss.
         gradient_error, coupling, used, change: see `ssad.evaluation.attacked_scenes`.
+        source: what the pictures were made against, if it was not what they are shown to.
+        group: what else must be equal for scores to be compared, such as a defence or a target; part of what the
+            sentences call the detector.
     """
 
     detector: str
@@ -57,6 +60,8 @@ class Attempt:
     coupling: float | None = None
     used: float | None = None
     change: float | None = None
+    source: str = ""
+    group: str = ""
 
     @property
     def restarts(self) -> int:
@@ -70,7 +75,9 @@ class Attempt:
         parts = [self.attack, f"on loss {self.loss}" if self.loss and self.attack != "noise" else ""]
         parts.append("" if self.attack == "noise" else f"with {self.steps} step{'s' if self.steps != 1 else ''}")
         parts.append(f"at {self.radius:g} px" + (" (L2)" if self.norm == "l2" else ""))
-        return " ".join(part for part in [*parts, f"({self.options})" if self.options else ""] if part)
+        parts.append(f"({self.options})" if self.options else "")
+        parts.append(f"against {self.source}" if self.source else "")
+        return " ".join(part for part in parts if part)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +134,7 @@ def audit(attempts: Iterable[Attempt]) -> Verdict:
     """
     by_detector: dict[str, list[Attempt]] = {}
     for one in attempts:
-        by_detector.setdefault(one.detector, []).append(one)
+        by_detector.setdefault(", ".join(filter(None, [one.detector, one.group])), []).append(one)
     compared, faults = dict.fromkeys(RULES, 0), []
     for name, (_, rule) in RULES.items():
         for detector, own in by_detector.items():
@@ -163,8 +170,8 @@ def _percent(score: float) -> str:
 
 
 def _own(attempts: Sequence[Attempt]) -> list[Attempt]:
-    """Attacks without the noise."""
-    return [one for one in attempts if one.attack != "noise"]
+    """Attacks on what is shown the pictures, without the noise."""
+    return [one for one in attempts if one.attack != "noise" and not one.source]
 
 
 def _along(attempts: Sequence[Attempt], what: str) -> Iterator[tuple[Attempt, Attempt]]:
@@ -203,6 +210,17 @@ def _access(attempts: Sequence[Attempt]) -> Iterator[Finding]:
         if all(sides):
             white, black = (min(side, key=lambda one: one.score) for side in sides)
             yield _pair(white, black, "a black-box attack beats the best white-box one, so the gradient is masked")
+
+
+def _transfer(attempts: Sequence[Attempt]) -> Iterator[Finding]:
+    def method(one: Attempt) -> tuple[object, ...]:
+        words = [word for word in one.options.split() if not word.startswith("draws=")]
+        return one.attack, one.loss, one.norm, one.radius, one.steps, words
+
+    for other in (one for one in attempts if one.source):
+        for own in _own(attempts):
+            if method(own) == method(other):
+                yield _pair(own, other, "what was made against something else hurts more, so the gradient is masked")
 
 
 def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
@@ -337,6 +355,7 @@ RULES: Mapping[str, tuple[str, Rule]] = {
     "radius": ("a larger budget is never weaker", _radius),
     "iterated": ("iterated attacks are at least as strong as a single step", _iterated),
     "access": ("white-box attacks are at least as strong as black-box ones", _access),
+    "transfer": ("pictures made against another detector, or without its defence, are no stronger", _transfer),
     "restarts": ("restarts gain little", _restarts),
     "noise": ("attacks are stronger than noise of the same size", _above_noise),
     "unbounded": ("an unbounded budget leaves nothing", _unbounded),

@@ -18,6 +18,7 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import SceneData
 from ssad.detectors import DETECTORS, SHIPPED
 from ssad.detectors.checkpoints import hash_state
 from ssad.evaluation.camera_truth import scenes_of
@@ -35,6 +36,7 @@ from ssad.evaluation.scene_boxes import (
 from ssad.jobs.machine import default_workers
 from ssad.jobs.progress import Live
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
@@ -119,6 +121,10 @@ class DetectorKind(Kind):
     def settings(self, suite: Any) -> dict[str, Any]:
         """What workers are told besides what all kinds that score detectors tell them."""
 
+    def about(self, scenes: Mapping[str, SceneData]) -> dict[str, Any]:
+        """What workers are told of the scenes besides their names."""
+        return {}
+
     @abstractmethod
     def sheet(self, examination: Examination, suite: Any) -> tuple[Callable[[], U8], str]:
         """How the picture for the report is made, which shows the first detector at work, and its caption."""
@@ -136,11 +142,13 @@ class DetectorKind(Kind):
                 )  # fmt: skip
         with NuScenes(root, suite.version) as data:
             version = data.version
-            tokens = {name: data.scene(name).record.token for name in scenes_of(data, suite.split)}
+            scenes = {name: data.scene(name) for name in scenes_of(data, suite.split)}
+            tokens = {name: scene.record.token for name, scene in scenes.items()}
         settings = {
             "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
             "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,
             "threads": max(1, default_workers() // (resources.workers or default_workers())), **self.settings(suite),
+            **self.about(scenes),
         }  # fmt: skip
         job = Job(folder, plan.device, settings)
         forget_failures([boxes_path(folder, c.system, one) for c in retry for one in self.scenes(c, job)])
@@ -320,7 +328,11 @@ def recording_of(suite: DetectorSuite, out: Path) -> Recording:
 
 def _examination(job: Job) -> Examination:
     own = job.settings
+    defended = {
+        name: (detector, make_defence(kind, **options))
+        for name, (detector, kind, options) in own.get("defended", {}).items()
+    }
     return Examination(
         job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["seed"], job.device,
-        own["threads"], own.get("calibration", "physical"),
+        own["threads"], own.get("calibration", "physical"), defended,
     )  # fmt: skip

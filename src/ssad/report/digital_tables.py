@@ -1,0 +1,99 @@
+"""Tables of a digital run beside the main one: transfer between detectors, defences, targets, distances."""
+
+from __future__ import annotations
+
+import math
+
+from ssad.report.digital_run import (
+    DigitalRun,
+    Setting,
+    defence_of,
+    metric_cell,
+    scenes_of,
+    size_of,
+    title_of,
+)
+from ssad.report.tables import Cell, Row, Table
+
+BANDS = {"0-20": "0 to 20 m", "20-40": "20 to 40 m", "40+": "beyond 40 m"}
+
+
+def transfer_table(run: DigitalRun) -> Table:
+    """For each attack a matrix: mAP of the detector in the column under pictures made against that in the row."""
+    rows = []
+    for own in dict.fromkeys(s._replace(source="") for s in run.settings if s.source):
+        clean = tuple(metric_cell(run.clean(d, own), "mAP") for d in run.detectors)
+        rows.append(Row((title_of(own), size_of(own), scenes_of(own), "nobody: clean"), clean))
+        for source in run.detectors:
+            seen = [run.record(d, own if d == source else own._replace(source=source)) for d in run.detectors]
+            head = (title_of(own), size_of(own), scenes_of(own), source)
+            rows.append(Row(head, tuple(metric_cell(one, "mAP") for one in seen)))
+    note = (
+        "mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was asked "
+        "of the detector that is shown the pictures."
+    )
+    heads = ("Attack", "Budget", "Scenes", "Made against")
+    return Table("transfer", "Transfer between detectors", heads, tuple(run.detectors), tuple(rows), note)
+
+
+def defence_table(run: DigitalRun) -> Table:
+    """Detector x defence x attack: what the defence costs on clean pictures, and what it is worth."""
+    rows = []
+    for detector in run.detectors:
+        found: dict[tuple[str, Setting], dict[bool, Setting]] = {}
+        for setting in run.settings:
+            if setting.defence and setting.attack:
+                bare = setting._replace(defence="", aware=False, options=_without_draws(setting.options))
+                found.setdefault((setting.defence, bare), {})[setting.aware] = setting
+        for (_, bare), both in found.items():
+            one = next(iter(both.values()))
+            records = [run.clean(detector, bare), run.clean(detector, one)]
+            records += [run.record(detector, bare)]
+            records += [run.record(detector, both[aware]) if aware in both else None for aware in (False, True)]
+            head = (detector, defence_of(one), title_of(bare), size_of(bare), scenes_of(bare))
+            rows.append(Row(head, tuple(metric_cell(record, "mAP") for record in records)))
+    note = (
+        "mAP in percent. An attack that knows the defence follows gradients through it, of random resizing the mean "
+        "over several draws; one that does not was made against the bare detector. What a defence is worth is what it "
+        "leaves under an attack that knows it."
+    )
+    heads = ("Detector", "Defence", "Attack", "Budget", "Scenes")
+    columns = ("clean", "clean, defended", "attacked", "attacked, defended; unknown", "attacked, defended; known")
+    return Table("defences", "Defences", heads, columns, tuple(rows), note)
+
+
+def _without_draws(options: str) -> str:
+    return " ".join(word for word in options.split() if not word.startswith("draws="))
+
+
+def target_table(run: DigitalRun) -> Table:
+    """Targeted attacks: how often they reach their target."""
+    rows = []
+    for (detector, setting), record in run.records.items():
+        if setting.target and record["status"] == "ok":
+            metrics = record["metrics"]
+            count, share = metrics.get("targets"), metrics.get("success")
+            cells = [Cell(math.nan if share is None else 100 * share), Cell(math.nan if count is None else count)]
+            head = (detector, title_of(setting), size_of(setting._replace(target="")), setting.target)
+            rows.append(Row((*head, scenes_of(setting)), (*cells, metric_cell(record, "mAP"))))
+    note = (
+        "Success in percent of the objects that are found in the clean pictures, by the best box within 2 m with a "
+        "score of at least 0.1: it is of the wanted class under the attack, or gone where no class is wanted."
+    )
+    heads = ("Detector", "Attack", "Budget", "Target", "Scenes")
+    return Table("targets", "Targeted attacks", heads, ("success", "objects", "mAP"), tuple(rows), note)
+
+
+def distance_table(run: DigitalRun) -> Table:
+    """Scores of near and far objects under the attacks of the table."""
+    names = [f"{metric}_{band}" for band in BANDS for metric in ("mAP", "recall")]
+    rows = [
+        Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), name) for name in names))
+        for d in run.detectors for s in run.rows
+    ]  # fmt: skip
+    columns = tuple(f"{metric}, {text}" for text in BANDS.values() for metric in ("mAP", "recall"))
+    note = (
+        "Percent, by distance from the ego, boxes and truth each by their own. mAP is the mean over the classes that "
+        "are there; recall is the share of objects with a box of their class within 2 m, whatever its score."
+    )
+    return Table("distances", "By distance", ("Detector", "Attack", "Budget"), columns, tuple(rows), note)

@@ -1,0 +1,229 @@
+"""Suites of kind `digital`: transfer, defences, targets, ensembles, curves on fewer scenes, distances."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.sharing import Shared
+from rich.console import Console
+
+from ssad.bench.kind import Job, Resources
+from ssad.bench.kinds.digital import Digital, DigitalSuite
+from ssad.bench.run import run
+from ssad.core.errors import SSADError
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.evaluation import attacked_scenes
+from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample
+from ssad.evaluation.attacked_scenes import AttackedScene
+from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
+from ssad.report import write_report
+from ssad.report.digital_tables import defence_table, target_table, transfer_table
+from ssad.report.kinds.digital import attempts_of, load_digital_run, main_table
+from ssad.report.load import load_run
+
+ONE, OTHER = "helpers.linear3d:build", "helpers.linear3d:build_other"
+BLIND = "helpers.linear3d:build_blind"
+PGD = {"name": "pgd", "steps": 2}
+
+
+@pytest.fixture(scope="session")
+def root(tiny_set: Path) -> Path:
+    return tiny_set
+
+
+@pytest.fixture(autouse=True)
+def known(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LINEAR_DATA", str(root))
+
+
+def suite_of(root: Path, **changes: Any) -> DigitalSuite:
+    base: dict[str, Any] = {
+        "kind": "digital", "name": "t", "detectors": [ONE, OTHER], "data": str(root), "split": "all", "replicates": 0,
+        "attacks": [
+            "fgsm", PGD, {"name": "ensemble", "members": ["fgsm", PGD]},
+            {**PGD, "defence": "bits", "scenes": 1}, {**PGD, "defence": "bits", "aware": True, "scenes": 1},
+            {**PGD, "defence": "resize", "scenes": 1},
+            {**PGD, "defence": "resize", "aware": True, "draws": 2, "scenes": 1},
+            {"name": "fgsm", "loss": "vanish", "classes": ["car"]},
+        ],
+        "sweeps": [{"name": "pgd", "radii": [0, 5], "scenes": 1, "options": {"steps": 2}}], "transfer": [PGD],
+    }  # fmt: skip
+    return DigitalSuite.model_validate(base | changes)
+
+
+@pytest.fixture(scope="session")
+def folder(root: Path, shared: Shared) -> Path:
+    def make(out: Path) -> None:
+        attacked: Counter[str] = Counter()
+        real = attacked_scenes.run_attack
+
+        def counted(attack: Any, detector: Any, images: Any, *given: Any, **named: Any) -> Any:
+            about = f"{attack.name} on {detector.name}"
+            if hasattr(detector, "pattern"):
+                about += f" {int(detector.pattern[0].sum())}"
+            attacked[f"{about}, {named['objective']}, {named['aim'].classes}"] += len(images)
+            return real(attack, detector, images, *given, **named)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("LINEAR_DATA", str(root))
+            patch.setattr(attacked_scenes, "run_attack", counted)
+            console = Console(file=io.StringIO(), width=200)
+            run(Digital().plan(suite_of(root)), out, Resources(0, console=console))
+            write_report(out)
+        (out / "attacked.json").write_text(json.dumps({"counts": attacked, "said": console.file.getvalue()}))
+
+    return shared("digital-rows", make)
+
+
+def lines(folder: Path) -> list[dict[str, Any]]:
+    found = [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+    assert {r["status"] for r in found} == {"ok"}, [r.get("reason") for r in found]
+    return found
+
+
+def one(folder: Path, **wanted: Any) -> dict[str, Any]:
+    """The record of the first detector with these fields."""
+    base = {"detector": ONE, "attack": "pgd", "source": "", "defence": "", "aware": False, "subset": 0, "target": ""}
+    fitting = [r for r in lines(folder) if all(r[key] == value for key, value in (base | wanted).items())]
+    assert len(fitting) == 1, [(r["attack"], r["defence"], r["subset"]) for r in fitting]
+    return fitting[0]
+
+
+def test_no_picture_is_attacked_twice(folder: Path) -> None:
+    told = json.loads((folder / "attacked.json").read_text())
+    counts = told["counts"]
+    plain = [count for about, count in counts.items() if about.startswith(("pgd on linear ", "fgsm on linear "))]
+    assert len(plain) == 6, "two detectors: PGD, FGSM, and FGSM on cars"
+    assert max(plain) == 24, "for table, ensemble, transfer, unknown defences and the curve at once"
+    behind = [count for about, count in counts.items() if "+" in about]
+    assert behind == [24, 24], "known ones, 12 pictures of one scene, two detectors"
+    passes = 2 * (24 * (2 + 1 + 1) + 12 * (2 + 2 * 2))
+    assert f"{passes:,} forward and backward passes for 2 detectors" in told["said"]
+
+
+def test_what_fools_one_detector_does_nothing_to_another(folder: Path) -> None:
+    moved, white, clean = (one(folder, **w) for w in ({"source": OTHER}, {}, {"attack": None}))
+    assert white["metrics"]["mAP"] < clean["metrics"]["mAP"] == pytest.approx(moved["metrics"]["mAP"])
+    theirs = one(folder, detector=OTHER)
+    assert moved["loss_after"] == theirs["loss_after"], "what the attack on the other one took"
+    own = load_digital_run(load_run(folder))
+    table = transfer_table(own)
+    assert table.columns == (ONE, OTHER)
+    assert [row.head[-1] for row in table.rows] == ["nobody: clean", ONE, OTHER]
+    values = np.array([[cell.mean for cell in row.cells] for row in table.rows])
+    assert values[1, 0] == pytest.approx(100 * white["metrics"]["mAP"])
+    assert values[1, 1] == pytest.approx(values[0, 1])
+    assert values[2, 0] == pytest.approx(100 * moved["metrics"]["mAP"])
+
+
+def test_defences_are_scored_clean_unknown_and_known(folder: Path) -> None:
+    own = load_digital_run(load_run(folder))
+    table = defence_table(own)
+    rows = {row.head[:2]: [cell.mean for cell in row.cells] for row in table.rows}
+    assert set(rows) == {(d, name) for d in (ONE, OTHER) for name in ("bit depth", "random resizing")}
+    records = [
+        one(folder, attack=None, subset=1), one(folder, attack=None, subset=1, defence="bits"), one(folder, subset=1),
+        one(folder, subset=1, defence="bits"), one(folder, subset=1, defence="bits", aware=True),
+    ]  # fmt: skip
+    assert rows[ONE, "bit depth"] == pytest.approx([100 * r["metrics"]["mAP"] for r in records])
+    assert records[3]["loss_after"] == records[2]["loss_after"], "the same pictures"
+    known = one(folder, subset=1, defence="resize", aware=True)
+    assert known["options"] == "draws=2"
+    assert known["gradients"] == 4
+    assert known["clean_mAP"] == one(folder, attack=None, subset=1, defence="resize")["metrics"]["mAP"]
+
+
+def test_an_ensemble_leaves_no_more_than_any_member(folder: Path) -> None:
+    worst = one(folder, attack="ensemble")
+    members = [one(folder, attack="fgsm"), one(folder)]
+    assert worst["metrics"]["mAP"] <= min(r["metrics"]["mAP"] for r in members)
+    assert worst["gradients"] == sum(r["gradients"] for r in members)
+    assert worst["options"] == "of fgsm full, pgd full"
+    heads = [row.head[0] for row in main_table(load_digital_run(load_run(folder))).rows]
+    assert "worst of fgsm full, pgd full" in heads
+
+
+def test_a_target_is_reached_where_the_car_is_gone(folder: Path, root: Path) -> None:
+    found = one(folder, attack="fgsm", target="car")
+    assert found["metrics"]["targets"] > 0
+    assert 0 < found["metrics"]["success"] <= 1
+    (row, _) = target_table(load_digital_run(load_run(folder))).rows
+    assert row.cells[0].mean == pytest.approx(100 * found["metrics"]["success"])
+    examination = Examination(folder, root, "v1.0-mini", (), 0, "cpu", 1)
+    with NuScenes(root) as data:
+        names = [scene.name for scene in data.scenes()]
+    clean, _ = read_scenes(examination, ONE, [ShiftedScene(None, 0, name) for name in names])
+    truth = truth_of(examination, names)
+    same = target_success(clean, clean, truth, classes=["car"], becomes={})
+    assert same == {"targets": found["metrics"]["targets"], "success": 0.0}
+    assert target_success(clean, clean, truth, classes=[], becomes={"car": "car"})["success"] == 1.0
+    assert "success" not in target_success(clean, clean, truth, classes=["trailer"], becomes={})
+    bands = by_distance(clean, truth)
+    told = one(folder, attack=None)["metrics"]
+    assert bands == {key: value for key, value in told.items() if key.endswith(("0-20", "20-40", "40+"))}
+    assert "mAP_0-20" in bands
+    assert all(0 < value <= 1 for value in bands.values())
+    assert worst_by_sample([clean, clean], truth) == clean
+
+
+def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:
+    few, clean = one(folder, subset=1), one(folder, attack=None, subset=1)
+    assert few["scenes"] == 1
+    assert few["clean_mAP"] == clean["metrics"]["mAP"]
+    assert few["images"] == 12
+    groups = {a.group for a in attempts_of(load_digital_run(load_run(folder)))}
+    assert groups == {"", "1 of each town", "car", "bit depth, 1 of each town", "random resizing, 1 of each town"}
+
+
+def test_scenes_are_the_first_of_each_town(root: Path) -> None:
+    plan = Digital().plan(suite_of(root))
+    scenes = {"a": "", "b": "", "c": "", "d": ""}
+    towns = {"a": "x", "b": "x", "c": "y", "d": "y"}
+    job = Job(Path(), "cpu", {"scenes": scenes, "towns": towns, "batch": 1})
+    (cell,) = [c for c in plan.cells if c.fields["subset"] == 1 and not c.fields["attack"] and c.system == ONE]
+    assert [scene.scene for scene in Digital().scenes(cell, job)] == ["a", "c"]
+    whole = next(c for c in plan.cells if c.fields["attack"] == "fgsm" and not c.fields["subset"])
+    assert [scene.scene for scene in Digital().scenes(whole, job)] == ["a", "b", "c", "d"]
+
+
+def test_a_failed_attack_fails_what_needs_its_pictures(root: Path, tmp_path: Path) -> None:
+    suite = suite_of(root, detectors=[ONE, BLIND], attacks=["fgsm"], sweeps=[], transfer=["fgsm"])
+    records = run(Digital().plan(suite), tmp_path, Resources(0, console=Console(file=io.StringIO())))
+    status = {(r["detector"], r["attack"], r["source"]): r for r in records}
+    assert status[ONE, "fgsm", ""]["status"] == status[BLIND, "fgsm", ONE]["status"] == "ok"
+    assert "gives no gradient" in status[BLIND, "fgsm", ""]["reason"]
+    assert f"the attack on {BLIND} failed: " in status[ONE, "fgsm", BLIND]["reason"]
+
+
+def test_pictures_against_different_systems_lie_apart(tmp_path: Path) -> None:
+    spec = attacked_scenes.AttackSpec("fgsm", "full", "linf", 5.0)
+    paths = {boxes_path(tmp_path, "eye", AttackedScene(spec, "s", 1, source)) for source in ("a", "b", "a+jpeg")}
+    assert len(paths) == 3
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "no such defence": ({"attacks": [{**PGD, "defence": "jpg"}]}, "unknown defence 'jpg'"),
+    "no such option": ({"attacks": [{**PGD, "defence": {"name": "jpeg", "options": {"q": 3}}}]}, "defence jpeg: "),
+    "aware of nothing": ({"attacks": [{**PGD, "aware": True}]}, "aware of which defence"),
+    "no such class": ({"attacks": [{**PGD, "classes": ["cat"]}]}, "unknown class 'cat'"),
+    "becomes": ({"attacks": [{**PGD, "becomes": {"car": "bus"}}]}, "becomes needs loss: mislabel"),
+    "no members": ({"attacks": ["ensemble"]}, "an ensemble has members"),
+    "members": ({"attacks": [{**PGD, "members": ["fgsm"]}]}, "an ensemble has members"),
+    "budgets": (
+        {"attacks": [{"name": "ensemble", "members": ["fgsm", {"name": "pgd", "radius": 2}]}]}, "different budgets",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD.values(), ids=BAD.keys())
+def test_bad_rows_end_in_one_line(root: Path, case: tuple[dict[str, Any], str]) -> None:
+    changes, words = case
+    with pytest.raises(SSADError, match=words) as caught:
+        Digital().plan(suite_of(root, **changes))
+    assert "\n" not in str(caught.value)
