@@ -16,7 +16,7 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.kind import Plan, Resources
+from ssad.bench.kind import Job, Plan, Resources
 from ssad.bench.kinds import digital
 from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
@@ -239,6 +239,15 @@ def test_an_image_is_attacked_alike_in_any_batch_and_order(root: Path) -> None:
     assert any((a != b).any() for a, b in zip(first, other_seed.look(frames), strict=True))
 
 
+def test_several_samples_fill_a_batch_on_a_gpu(root: Path) -> None:
+    base, _ = attacker(root, batch=1)
+    with NuScenes(root) as data:
+        for batch, samples in ((12, 6), (36, 6), (40, 7), (96, 16)):
+            view = AttackedScene(PGD, base.view.scene, batch, LINEAR)
+            shown = view.shown(base.examination, data, [Watched(base.watched.detector, LINEAR)])
+            assert shown.at_once == samples
+
+
 def test_where_memory_does_not_suffice_batches_are_halved(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, frames = attacker(root, batch=4)
     whole.batch = 4
@@ -335,13 +344,27 @@ def test_what_no_suite_may_say(root: Path, changes: dict[str, Any]) -> None:
 
 def test_the_shipped_suites_load_and_their_command_repeats_them() -> None:
     full, quick = load_suite("digital"), load_suite("digital-quick")
-    assert {one.name for one in full.attacks} == {one.name for one in quick.attacks} == {"fgsm", "pgd", "cw"}
+    assert {one.name for one in quick.attacks} == {"fgsm", "pgd", "cw"}
+    assert {one.name for one in full.attacks} == {"fgsm", "pgd", "cw", "ensemble"}
+    assert {one.defence.name for one in full.attacks if one.defence and one.aware} == {"jpeg", "bits", "blur", "resize"}
     assert (full.radius, full.steps, full.data) == (5, 10, "recorded")
     changed = load_suite("digital", ["attacks=[{name: pgd, steps: 3, options: {restarts: 1}}, fgsm]", "steps=4"])
     words = command_of(changed)
     setting = "attacks=[{name: pgd, norm: linf, options: {restarts: 1}, steps: 3},{name: fgsm, norm: linf}]"
     assert words == f"ssad run digital --set '{setting}' --set steps=4"
     assert load_suite("digital", [setting, "steps=4"]) == changed
+
+
+def test_the_suite_digital_takes_150_000_gradients_of_a_detector_at_most() -> None:
+    suite = load_suite("digital")
+    plan = Digital().plan(suite)
+    towns = {f"{town} {number}": town for town in suite.recorded.towns for number in range(suite.recorded.scenes)}
+    job = Job(Path(), "cuda", {"scenes": towns, "towns": towns, "batch": 12})
+    every = {one.name + one.source: one for cell in plan.cells for one in Digital().scenes(cell, job)
+             if isinstance(one, AttackedScene)}  # fmt: skip
+    images = 6 * int(2 * suite.recorded.seconds)
+    passes = images * sum(one.spec.passes for one in every.values())
+    assert 100_000 < passes / len(suite.detectors) <= 150_000
 
 
 def test_a_column_says_which_share_is_lost() -> None:

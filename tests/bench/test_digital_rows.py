@@ -18,9 +18,11 @@ from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
 from ssad.core.errors import SSADError
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation import attacked_scenes
-from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample
+from ssad.datasets.nuscenes.truth import GroundTruth
+from ssad.evaluation import attack_scores, attacked_scenes
+from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample, worst_of
 from ssad.evaluation.attacked_scenes import AttackedScene
+from ssad.evaluation.detection import SampleBoxes
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
 from ssad.report import write_report
 from ssad.report.digital_tables import defence_table, target_table, transfer_table
@@ -155,21 +157,55 @@ def test_a_target_is_reached_where_the_car_is_gone(folder: Path, root: Path) -> 
     assert 0 < found["metrics"]["success"] <= 1
     (row, _) = target_table(load_digital_run(load_run(folder))).rows
     assert row.cells[0].mean == pytest.approx(100 * found["metrics"]["success"])
-    examination = Examination(folder, root, "v1.0-mini", (), 0, "cpu", 1)
-    with NuScenes(root) as data:
-        names = [scene.name for scene in data.scenes()]
-    clean, _ = read_scenes(examination, ONE, [ShiftedScene(None, 0, name) for name in names])
-    truth = truth_of(examination, names)
+    clean, attacked, truth = boxes_of(folder, root)
     same = target_success(clean, clean, truth, classes=["car"], becomes={})
     assert same == {"targets": found["metrics"]["targets"], "success": 0.0}
     assert target_success(clean, clean, truth, classes=[], becomes={"car": "car"})["success"] == 1.0
+    fewer = target_success(attacked, clean, truth, classes=["car"], becomes={})
+    assert fewer["targets"] < same["targets"], "only what was found before can be lost"
     assert "success" not in target_success(clean, clean, truth, classes=["trailer"], becomes={})
     bands = by_distance(clean, truth)
     told = one(folder, attack=None)["metrics"]
     assert bands == {key: value for key, value in told.items() if key.endswith(("0-20", "20-40", "40+"))}
     assert "mAP_0-20" in bands
     assert all(0 < value <= 1 for value in bands.values())
-    assert worst_by_sample([clean, clean], truth) == clean
+
+
+def boxes_of(folder: Path, root: Path) -> tuple[list[SampleBoxes], list[SampleBoxes], GroundTruth]:
+    """Boxes of the first detector on clean pictures and under FGSM, and the truth."""
+    examination = Examination(folder, root, "v1.0-mini", (), 0, "cpu", 1)
+    with NuScenes(root) as data:
+        names = [scene.name for scene in data.scenes()]
+    spec = attacked_scenes.AttackSpec("fgsm", "full", "linf", 5.0)
+    clean, _ = read_scenes(examination, ONE, [ShiftedScene(None, 0, name) for name in names])
+    attacked, _ = read_scenes(examination, ONE, [AttackedScene(spec, name, 1, ONE) for name in names])
+    return clean, attacked, truth_of(examination, names)
+
+
+def test_the_worst_of_several_attacks(folder: Path, root: Path) -> None:
+    clean, attacked, truth = boxes_of(folder, root)
+    first = [attacked[0], *clean[1:]]
+    others = [clean[0], *attacked[1:]]
+    assert tokens(worst_by_sample([first, others], truth)) == tokens(attacked), "each moment by itself"
+    assert worst_of({"one": first, "two": others}, truth)[0] == "mixture"
+    for order in (("clean", "attacked"), ("attacked", "clean")):
+        name, boxes = worst_of({one: clean if one == "clean" else attacked for one in order}, truth)
+        assert name == "attacked", "of equal ones the first"
+        assert tokens(boxes) == tokens(attacked)
+
+
+def test_an_ensemble_is_not_worse_than_its_members_where_the_mixture_is(
+    folder: Path, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clean, attacked, truth = boxes_of(folder, root)
+    monkeypatch.setattr(attack_scores, "worst_by_sample", lambda found, truth: clean)
+    name, boxes = worst_of({"one": clean, "two": attacked}, truth)
+    assert name == "two"
+    assert tokens(boxes) == tokens(attacked)
+
+
+def tokens(boxes: list[SampleBoxes]) -> list[tuple[str, float]]:
+    return [(one.token, float(one.boxes.score.sum())) for one in boxes]
 
 
 def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:

@@ -120,6 +120,24 @@ def worst_by_sample(found: Sequence[Sequence[SampleBoxes]], truth: GroundTruth) 
     return [tables[min(range(len(found)), key=lambda m: (left[m, k], -noise[m, k]))][t] for k, t in enumerate(tokens)]
 
 
+def worst_of(candidates: Mapping[str, Sequence[SampleBoxes]], truth: GroundTruth) -> tuple[str, list[SampleBoxes]]:
+    """The boxes that score least over the whole set: those of one of the attacks, or the worst of each moment.
+
+    The mixture of moments alone guarantees nothing, as mAP over a set is no mean over moments.
+
+    Args:
+        candidates: Boxes of all samples under each attack, by its name.
+        truth: Of the same samples.
+
+    Returns:
+        A name, "mixture" for the worst of each moment, and its boxes: their mAP is at most that of each attack.
+    """
+    every = {**candidates, "mixture": worst_by_sample(list(candidates.values()), truth)}
+    left = {name: match_boxes(boxes, truth).scores().mean_ap for name, boxes in every.items()}
+    name = min(left, key=lambda one: left[one])
+    return name, list(every[name])
+
+
 def _by_sample(matches: Matches) -> F64:
     """mAP of each sample alone [S], of the classes that are in it."""
     found = np.zeros(matches.samples)

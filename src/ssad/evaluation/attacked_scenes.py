@@ -24,7 +24,7 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.evaluation.camera_truth import camera_truth
-from ssad.evaluation.detection import to_images
+from ssad.evaluation.detection import AT_ONCE, to_images
 from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name, system_of
 from ssad.scenarios.static.digital import (
     ATTACKS,
@@ -43,6 +43,7 @@ from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.victim import Victim, steady
 
+CAMERAS = 6  # of a sample, as nuScenes has them
 _INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
 
 
@@ -165,7 +166,8 @@ class AttackedScene:
                     one.reason = f"the attack on {self.source} failed: {source.reason}"
             return pictures
 
-        return Shown(look, attacker.tally.notes, ahead=False)
+        # enough pictures at once to fill a batch, of one sample's cameras or of several
+        return Shown(look, attacker.tally.notes, ahead=False, at_once=max(AT_ONCE, math.ceil(self.batch / CAMERAS)))
 
 
 @dataclass(slots=True)

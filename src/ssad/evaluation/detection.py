@@ -85,18 +85,19 @@ def detect_scene(
 
 def detect_with(
     detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None,
-    ahead: bool = True,
+    ahead: bool = True, at_once: int = AT_ONCE,
 ) -> list[list[SampleBoxes]]:  # fmt: skip
     """As `detect_scene` for several detectors, which are shown the same pictures: a list a detector.
 
     ahead: the next pictures are made while these are looked at; not where `look` needs a detector for itself.
+    at_once: samples that a GPU is shown at once.
     """
     by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
             by_sample.setdefault(frame.sample_token, []).append(frame)
     found: list[list[SampleBoxes]] = [[] for _ in detectors]
-    step = AT_ONCE if device != "cpu" else 1
+    step = at_once if device != "cpu" else 1
     with ThreadPoolExecutor(4) as pool:
 
         def read(frames: Sequence[SensorFrame]) -> Sequence[U8]:

@@ -31,7 +31,7 @@ from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
-from ssad.evaluation.detection import Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.evaluation.detection import AT_ONCE, Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
@@ -77,11 +77,13 @@ class Shown:
         look: gives the pictures of camera frames; None: the files as they are.
         notes: plain data for the file of boxes, complete when all was looked at.
         ahead: the next pictures may be made while a detector looks at these.
+        at_once: samples that a GPU is shown at once.
     """
 
     look: Look | None = None
     notes: Callable[[], Mapping[str, Any]] = field(default=dict)
     ahead: bool = True
+    at_once: int = AT_ONCE
 
 
 class Condition(Protocol):
@@ -243,7 +245,7 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
         eyes: list[Any] = list(watched)
         found = detect_with(
             eyes, examination.root, data.scene(scene.scene), device=examination.device, look=shown.look,
-            ahead=shown.ahead,
+            ahead=shown.ahead, at_once=shown.at_once,
         )  # fmt: skip
     for name, samples, one in zip(names, found, watched, strict=True):
         _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes())

@@ -16,10 +16,9 @@ from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
-from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample
+from ssad.evaluation.attack_scores import by_distance, target_success, worst_of
 from ssad.evaluation.attack_sheet import attack_sheet
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, sum_notes, takes
-from ssad.evaluation.detection import match_boxes
 from ssad.evaluation.scene_boxes import (
     Condition,
     Examination,
@@ -299,11 +298,7 @@ class Digital(DetectorKind):
         told: dict[str, Any] = {}
         boxes = found[0]
         if len(specs) > 1:
-            candidates = {spec.name: own for spec, own in zip(specs, found, strict=True)}
-            candidates["the worst of each moment"] = worst_by_sample(found, truth)
-            left = {name: match_boxes(own, truth).scores().mean_ap for name, own in candidates.items()}
-            told["worst"] = min(left, key=lambda name: left[name])
-            boxes = candidates[told["worst"]]
+            told["worst"], boxes = worst_of(dict(zip((spec.name for spec in specs), found, strict=True)), truth)
         after = score_found(examination, boxes, truth, replicates=count)
         metrics = after["metrics"] | by_distance(boxes, truth)
         clean_score = before["metrics"]["mAP"]
