@@ -21,6 +21,7 @@ SOUND = [
     NOISE, FGSM, BASE, replace(BASE, radius=2.0, score=0.1, change=2.0), replace(BASE, steps=20, score=0.01),
     replace(BASE, options="restarts=2", score=0.018), replace(BASE, radius=255.0, score=0.0, change=255.0, used=0.3),
     replace(BASE, attack="square", access="black-box", score=0.1, steps=0, gradient_error=None),
+    replace(BASE, attack="cw", loss="margin", score=0.0), replace(BASE, loss="depth", score=0.2),
     replace(BASE, source="other", score=0.25, gradient_error=None),
 ]  # fmt: skip
 
@@ -68,6 +69,9 @@ ORDER: dict[str, tuple[list[Attempt], str, str]] = {
     "more steps": ([BASE, replace(BASE, steps=20, score=0.1)], "steps", "with 20 steps at 5 px leaves 10.00 mAP"),
     "a larger budget": ([BASE, replace(BASE, radius=8.0, score=0.1)], "radius", "at 8 px leaves 10.00 mAP"),
     "ten steps and one": ([FGSM, replace(BASE, score=0.1)], "iterated", "weaker than a single step is mis-tuned"),
+    "many steps and one on another loss": (
+        [FGSM, replace(BASE, attack="cw", loss="margin", steps=5, score=0.1)], "losses", "even on another loss",
+    ),
     "a black-box attack": (
         [BASE, replace(BASE, attack="square", access="black-box", score=0.0, loss="margin")], "access", "masked",
     ),
@@ -96,6 +100,18 @@ def test_detectors_losses_norms_and_sizes_are_not_mixed() -> None:
     ):  # fmt: skip
         assert audit([FGSM, replace(worse, **changed)]).compared["iterated"] == 0
     assert audit([BASE, replace(worse, attack="apgd")]).faults == ()
+
+
+def test_what_may_be_weaker_than_a_single_step_on_another_loss() -> None:
+    worse = replace(BASE, attack="cw", loss="margin", score=0.1)
+    assert [fault.rule for fault in audit([FGSM, worse]).faults] == ["losses"]
+    paired = {"draws": (0.02, 0.14, 0.05, 0.2)}
+    noisy = replace(worse, draws=(0.2, 0.02, 0.15, 0.03))
+    for sound in (
+        replace(worse, loss="depth"), replace(worse, steps=2), replace(worse, radius=2.0, change=2.0),
+        replace(worse, norm="l2", change=1.0), replace(worse, score=0.065), replace(worse, source="other"), noisy,
+    ):  # fmt: skip
+        assert audit([replace(FGSM, **paired), sound]).faults == ()
 
 
 def test_a_budget_may_be_too_small_for_an_attack_and_for_noise() -> None:

@@ -18,6 +18,8 @@ RESTARTS = 0.05  # share of the clean score that restarts may take away besides
 GRADIENT = 0.25  # relative error of a gradient; that of losses with a detached target is up to a fifth
 COUPLED = 0.01  # relative change of an image's loss by another image of the batch
 USED = 0.25  # share of its budget that an attack uses at least, unless it has done its work
+MANY = 5  # steps from which an attack is expected to beat a single step on any loss
+WHOLE = frozenset({"full", "classification", "vanish", "margin"})  # losses about all that a detector finds
 UNBOUNDED = 64.0  # code values from which an L-infinity budget hides any picture
 
 
@@ -204,6 +206,16 @@ def _iterated(attempts: Sequence[Attempt]) -> Iterator[Finding]:
                 yield _pair(many, single, "an iterated attack weaker than a single step is mis-tuned")
 
 
+def _losses(attempts: Sequence[Attempt]) -> Iterator[Finding]:
+    """A loss about one thing only, such as depth, may do less than a single step on the whole training loss."""
+    own = [one for one in _own(attempts) if one.access == "white-box"]
+    for single in own:
+        for many in own:
+            alike = (single.norm, single.radius) == (many.norm, many.radius) and single.loss != many.loss
+            if alike and single.steps == 1 and many.steps >= MANY and many.loss in WHOLE:
+                yield _pair(many, single, "many steps weaker than one, even on another loss, are mis-tuned")
+
+
 def _access(attempts: Sequence[Attempt]) -> Iterator[Finding]:
     for _, group in _sizes(attempts):
         sides = [[one for one in group if one.access == access] for access in ("white-box", "black-box")]
@@ -354,6 +366,7 @@ RULES: Mapping[str, tuple[str, Rule]] = {
     "steps": ("more steps are never weaker", _steps),
     "radius": ("a larger budget is never weaker", _radius),
     "iterated": ("iterated attacks are at least as strong as a single step", _iterated),
+    "losses": (f"{MANY} steps or more are at least as strong as one on another loss", _losses),
     "access": ("white-box attacks are at least as strong as black-box ones", _access),
     "transfer": ("pictures made against another detector, or without its defence, are no stronger", _transfer),
     "restarts": ("restarts gain little", _restarts),

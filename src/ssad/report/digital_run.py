@@ -121,7 +121,8 @@ def title_of(setting: Setting) -> str:
     if not attack:
         return "clean"
     if attack == "ensemble":
-        return f"worst {setting.options}"
+        members = [one.split() for one in setting.options.removeprefix("of ").split(", ")]
+        return f"worst of {', '.join(' '.join([TITLES.get(name, name), *rest]) for name, *rest in members)}"
     return f"{TITLES.get(attack, attack)}{f', {loss} loss' if loss else ''}"
 
 

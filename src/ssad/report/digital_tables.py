@@ -23,7 +23,7 @@ def transfer_table(run: DigitalRun) -> Table:
     rows = []
     for own in dict.fromkeys(s._replace(source="") for s in run.settings if s.source):
         clean = tuple(metric_cell(run.clean(d, own), "mAP") for d in run.detectors)
-        rows.append(Row((title_of(own), size_of(own), scenes_of(own), "nobody: clean"), clean))
+        rows.append(Row((title_of(own), size_of(own), scenes_of(own), "nothing: clean"), clean))
         for source in run.detectors:
             seen = [run.record(d, own if d == source else own._replace(source=source)) for d in run.detectors]
             head = (title_of(own), size_of(own), scenes_of(own), source)
@@ -58,7 +58,7 @@ def defence_table(run: DigitalRun) -> Table:
         "leaves under an attack that knows it."
     )
     heads = ("Detector", "Defence", "Attack", "Budget", "Scenes")
-    columns = ("clean", "clean, defended", "attacked", "attacked, defended; unknown", "attacked, defended; known")
+    columns = ("clean", "clean, defended", "attacked", "attacked, defended; unaware", "attacked, defended; aware")
     return Table("defences", "Defences", heads, columns, tuple(rows), note)
 
 

@@ -223,6 +223,20 @@ def test_the_check_of_gradients_leaves_stairs_out_and_still_sees_faults() -> Non
                     assert check_gradient(victim) < 0.01
 
 
+def test_what_is_behind_a_defence_is_checked_in_double() -> None:
+    asked: set[torch.dtype] = set()
+
+    class Noted(ToyDetector):
+        def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Any:
+            asked.add(images.dtype)
+            return super().dense(images, intrinsic)
+
+    victim = Victim(Defended(Noted(), Blur(1.0)), *toy_scene(1), TrueLogits())
+    asked.clear()
+    assert check_gradient(victim) < 1e-6
+    assert asked == {torch.float64}
+
+
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [

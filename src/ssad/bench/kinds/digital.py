@@ -374,9 +374,8 @@ def _points(suite: DigitalSuite) -> list[Point]:
     ]  # fmt: skip
     curves = [*curves, *bare]
     noise = [
-        Point((AttackSpec("noise", default_loss("noise"), spec.norm, spec.radius),), scenes=one.scenes, row=row)
-        for row, points in ((True, rows), (False, [*curves, *moved]))
-        for one in points if one.defence is None for spec in one.specs[:1]
+        replace(one, specs=(AttackSpec("noise", default_loss("noise"), one.specs[0].norm, one.specs[0].radius),))
+        for one in [*rows, *curves, *moved] if one.defence is None
     ]  # fmt: skip
     clean = [Point(scenes=one.scenes, defence=one.defence) for one in [*rows, *curves, *moved]]
     return list(dict.fromkeys([Point(row=True), *clean, *noise, *rows, *curves, *moved]))

@@ -13,7 +13,7 @@ from torchvision.ops import batched_nms
 
 from ssad.core.detections import Dense, Detections, Truth
 from ssad.core.errors import ConfigError
-from ssad.detectors.eval_mode import evaluating
+from ssad.core.eval_mode import evaluating
 from ssad.detectors.yolo.assign import Targets, pad_truth
 
 

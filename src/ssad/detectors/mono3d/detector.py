@@ -13,9 +13,9 @@ from torchvision.ops import batched_nms
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.eval_mode import evaluating
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.detectors.adapters.common import check_images, check_threshold, scale_of, size_inside
-from ssad.detectors.eval_mode import evaluating
 from ssad.detectors.mono3d.backbone import Backbone, Neck
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import (

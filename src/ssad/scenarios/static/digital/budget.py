@@ -59,12 +59,40 @@ class Budget:
         Returns:
             [B, 3, H, W]. To move values back into [0, 1] never moves them away from the clean ones, so both hold.
         """
-        change = images - clean  # from here on in place: pictures are large
+        return self.around(clean, images - clean)
+
+    def around(self, clean: Tensor, change: Tensor) -> Tensor:
+        """As `project`, of images that are told by their change.
+
+        Args:
+            clean: [B, 3, H, W], in [0, 1].
+            change: [B, 3, H, W]; its memory is used up for the result.
+        """
+        return self.within(change).add_(clean).clamp_(0.0, 1.0)
+
+    def within(self, change: Tensor) -> Tensor:
+        """The nearest change within the ball.
+
+        Args:
+            change: [B, 3, H, W]; it is changed in place, as pictures are large.
+        """
         if self.norm == "linf":
-            change.clamp_(-self.radius, self.radius)
-        else:
-            change.mul_((self.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0))
-        return change.add_(clean).clamp_(0.0, 1.0)
+            return change.clamp_(-self.radius, self.radius)
+        return change.mul_((self.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0))
+
+    def ascend(self, images: Tensor, gradient: Tensor, clean: Tensor, length: float) -> Tensor:
+        """One step along the steepest direction, and back into the ball.
+
+        Args:
+            images: [B, 3, H, W] where the step begins.
+            gradient: [B, 3, H, W] there.
+            clean: [B, 3, H, W].
+            length: of the step, in this norm.
+
+        Returns:
+            [B, 3, H, W]. Only this takes fresh memory: on a CPU that costs more than the arithmetic.
+        """
+        return self.around(clean, self.steepest(gradient).mul_(length).add_(images).sub_(clean))
 
     def steepest(self, gradient: Tensor) -> Tensor:
         """The direction of a step of length 1 in this norm along which a linear function rises most.

@@ -24,4 +24,4 @@ class FGSM:
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """See `Attack`."""
         _, gradient = victim.gradient(victim.clean)
-        return budget.project(victim.clean + budget.radius * budget.steepest(gradient), victim.clean)
+        return budget.ascend(victim.clean, gradient, victim.clean, budget.radius)

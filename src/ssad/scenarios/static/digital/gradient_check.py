@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ssad.core.detections import Assignment, Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.scenarios.static.digital.defences import Defended
 from ssad.scenarios.static.digital.victim import Victim
 
 WRONG = 0.5  # relative error beyond which an attack is refused
@@ -20,9 +21,9 @@ COARSE = 0.05  # the same for a detector that computes in float32 only
 def check_gradient(victim: Victim) -> float:
     """Compare the slope along the gradient of each image's loss with central finite differences.
 
-    A detector that is a module is copied and asked in float64, so that a step may be small enough not to cross the
-    kinks of its activations; any other is asked as it is, with a larger step. A defence that rounds or
-    draws is left out.
+    A detector that is a module, or one behind a defence, is copied and asked in float64, so that a step may be small
+    enough not to cross the kinks of its activations; any other is asked as it is, with a larger step. A defence that
+    rounds or draws is left out.
 
     Args:
         victim: What will be attacked; its costs do not count.
@@ -46,9 +47,9 @@ def check_gradient(victim: Victim) -> float:
 
 def _error(victim: Victim) -> float:
     victim = _without_stairs(victim)
-    exact = isinstance(victim.detector, nn.Module)
-    asked = _in_double(victim) if exact else victim
-    step = STEP if exact else COARSE
+    exact = _doubled(victim.detector)
+    asked = victim if exact is None else _in_double(victim, exact)
+    step = COARSE if exact is None else STEP
     _, gradient = asked.gradient(asked.clean)
     size = gradient.flatten(1).norm(dim=1)
     some = (size > 0) & ~victim.idle
@@ -76,11 +77,17 @@ def _without_stairs(victim: Victim) -> Victim:
     return found
 
 
-def _in_double(victim: Victim) -> Victim:
+def _doubled(detector: Any) -> Any:
+    """A copy of a detector in float64, behind its defence if it has one; None if it is no module."""
+    if isinstance(detector, Defended):
+        inner = _doubled(detector.detector)
+        return None if inner is None else Defended(inner, detector.defence)
+    return copy.deepcopy(detector).double() if isinstance(detector, nn.Module) else None
+
+
+def _in_double(victim: Victim, detector: Any) -> Victim:
     """The same questions to a copy of the detector in float64."""
     found = copy.copy(victim)
-    detector: Any = copy.deepcopy(victim.detector)
-    detector.double()
     found.detector = detector
     found.clean = victim.clean.double()
     found.intrinsic = None if victim.intrinsic is None else victim.intrinsic.double()

@@ -62,7 +62,7 @@ class NES:
         estimate = torch.zeros_like(images)
         for k in range(self.steps):
             estimate = self.decay * estimate + self.estimate(victim, images, k)
-            images = budget.project(images + budget.radius * rule.share(k) * budget.steepest(estimate), victim.clean)
+            images = budget.ascend(images, estimate, victim.clean, budget.radius * rule.share(k))
             best = keep_best(best, images, victim.loss(images).float())
         return best[0]
 

@@ -32,7 +32,7 @@ def starts(victim: Victim, budget: Budget, first: Start, restarts: int) -> Itera
         images = victim.clean
         if kind != "none":
             draws = victim.draw(kind, "start", number)
-            images = budget.project(images + budget.start(draws, kind), victim.clean)
+            images = budget.around(victim.clean, budget.start(draws, kind))
         yield images
 
 
@@ -88,8 +88,7 @@ class PGD:
             if self.decay:
                 gradient = gradient / gradient.abs().flatten(1).mean(1).clamp_min(1e-30)[:, None, None, None]
                 momentum = gradient = self.decay * momentum + gradient
-            moved = torch.add(images, budget.steepest(gradient), alpha=budget.radius * self.share(k))
-            images = budget.project(moved, victim.clean)
+            images = budget.ascend(images, gradient, victim.clean, budget.radius * self.share(k))
         return keep_best(best, images, victim.loss(images).float())
 
     def share(self, k: int) -> float:

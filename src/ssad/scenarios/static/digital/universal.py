@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access
-from ssad.scenarios.static.digital.budget import Budget, lengths
+from ssad.scenarios.static.digital.budget import Budget
 from ssad.scenarios.static.digital.victim import Victim, steady
 
 Batches = Iterable[Victim] | Callable[[], Iterable[Victim]]
@@ -82,24 +82,22 @@ def fit_universal(
         raise ConfigError("universal: there are no pictures to fit it to")
     change = torch.zeros_like(first.clean[:1], dtype=torch.float64)
     best, most = change, -math.inf
-    mean, square = torch.zeros_like(change), torch.zeros_like(change)
+    adam = torch.optim.Adam([change], eps=1e-30, maximize=True)
+    unit = math.sqrt(change.numel()) if budget.norm == "l2" else 1.0  # length of a change whose values are all 1
     for k in range(epochs + 1):
         total, gradient = _summed(kept() if callable(kept) else kept, change)
         if total > most:
-            best, most = change, total
+            best, most = change.clone(), total
         if k == epochs:
             break
         rate = budget.radius * step * 0.5 * (1 + math.cos(math.pi * k / epochs))
         if method == "sign":
-            moved = rate * budget.steepest(gradient)
+            change.add_(budget.steepest(gradient), alpha=rate)
         else:
-            mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
-            unbiased = mean / (1 - 0.9 ** (k + 1)), square / (1 - 0.999 ** (k + 1))
-            moved = unbiased[0] / unbiased[1].sqrt().clamp_min(1e-30)
-            if budget.norm == "l2":
-                moved = moved / math.sqrt(moved.numel())
-            moved = rate * moved
-        change = _in_ball(change + moved, budget)
+            adam.param_groups[0]["lr"] = rate / unit
+            change.grad = gradient
+            adam.step()
+        budget.within(change)
     return best.to(first.clean.dtype)
 
 
@@ -117,12 +115,6 @@ def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
                 total += float(losses[k])
                 gradient += (slopes[k] * inside[k])[None].double()
     return total, gradient
-
-
-def _in_ball(change: Tensor, budget: Budget) -> Tensor:
-    if budget.norm == "linf":
-        return change.clamp(-budget.radius, budget.radius)
-    return change * (budget.radius / lengths(change).clamp_min(1e-30)).clamp_max(1.0)
 
 
 def _check_size(shape: tuple[int, ...], victim: Victim) -> None:

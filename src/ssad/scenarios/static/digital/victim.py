@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError
+from ssad.core.eval_mode import evaluating
 from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
 from ssad.scenarios.static.digital.budget import LEVELS, codes_of
@@ -135,16 +136,17 @@ class Victim:
             kind: "uniform" in [-1, 1], or "gaussian".
             *use: What they are for.
         """
-        parts = []
-        for key in self.keys:
+        draws = np.empty(tuple(self.clean.shape), np.float32)
+        for own, key in zip(draws, self.keys, strict=True):
             chance = self.generator(key, *use)
-            shape = tuple(self.clean.shape[1:])
             if kind == "uniform":
-                draws = 2 * chance.random(shape, np.float32) - 1
+                chance.random(dtype=np.float32, out=own)
             else:
-                draws = chance.standard_normal(shape, np.float32)
-            parts.append(torch.from_numpy(draws))
-        return torch.stack(parts).to(self.clean).contiguous(memory_format=torch.channels_last)
+                chance.standard_normal(dtype=np.float32, out=own)
+        found = torch.from_numpy(draws)
+        if kind == "uniform":
+            found.mul_(2).sub_(1)
+        return found.to(self.clean).contiguous(memory_format=torch.channels_last)
 
     @staticmethod
     def generator(key: tuple[object, ...], *use: object) -> np.random.Generator:
@@ -158,18 +160,16 @@ def steady(detector: Any) -> Iterator[None]:
     flags, gradients and buffers are what they were, whatever an attack or the detector did."""
     roots = [detector] if isinstance(detector, nn.Module) else []
     roots += [value for value in getattr(detector, "__dict__", {}).values() if isinstance(value, nn.Module)]
-    modes = [(part, part.training) for root in roots for part in root.modules()]
     flags = [(one, one.requires_grad, one.grad) for root in roots for one in root.parameters()]
     buffers = [(one, one.clone()) for root in roots for one in root.buffers()]
-    for part, _ in modes:
-        part.training = False
     for weight, _, _ in flags:
         weight.requires_grad_(False)
     try:
-        yield
+        with ExitStack() as stack:
+            for root in roots:
+                stack.enter_context(evaluating(root))
+            yield
     finally:
-        for part, mode in modes:
-            part.training = mode
         for weight, flag, grad in flags:
             weight.requires_grad_(flag)
             weight.grad = grad

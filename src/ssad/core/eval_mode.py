@@ -10,12 +10,12 @@ from torch import nn
 
 @contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
-    """Every part in eval mode within the block, then each in the mode it had."""
-    training = [part for part in module.modules() if part.training]
-    for part in training:
+    """Every part in eval mode within the block, then each in the mode it had, whatever was done in the block."""
+    modes = [(part, part.training) for part in module.modules()]
+    for part, _ in modes:
         part.training = False
     try:
         yield
     finally:
-        for part in training:
-            part.training = True
+        for part, mode in modes:
+            part.training = mode
