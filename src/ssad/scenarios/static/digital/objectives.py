@@ -244,7 +244,7 @@ def _weights(dense: Dense, situation: Situation) -> Tensor:
     chosen = situation.aim.places(situation.detector, situation.assignment)
     for k, truth in enumerate(situation.assignment.truth):
         aimed = torch.unique(situation.assignment.owner[k][chosen[k]])
-        chosen[k] |= _on(dense.place, truth.box[aimed].to(dense.place))
+        chosen[k] |= _on(dense.place, truth.box.to(dense.place)[aimed])
     return chosen.to(dense.logit.dtype)
 
 
