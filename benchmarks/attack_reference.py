@@ -30,6 +30,7 @@ from torch.nn import functional
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.detectors import make_detector
 from ssad.evaluation.detection import score_2d
+from ssad.jobs.machine import keep_memory
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.victim import Victim, steady
 from ssad.training.batches import PictureSet
@@ -262,6 +263,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
+    keep_memory()  # as workers do
     if chosen.what == "torchattacks":
         found = beside_torchattacks(chosen.steps)
     elif chosen.what == "art":
