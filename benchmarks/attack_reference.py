@@ -1,21 +1,24 @@
 """Our attacks beside those of other libraries, and beside bare forward and backward passes, in one run.
 
     pip install --no-deps adversarial-robustness-toolbox torchattacks scikit-learn joblib threadpoolctl
-    python benchmarks/attack_reference.py art CLIPS [--images 8] [--steps 10]
-    python benchmarks/attack_reference.py torchattacks [--steps 10]
-    python benchmarks/attack_reference.py overhead CLIPS [--images 2] [--repeats 9]
+    python benchmarks/attack_reference.py art CLIPS [--images 8] [--steps 10] [--json FILE]
+    python benchmarks/attack_reference.py torchattacks [--steps 10] [--json FILE]
+    python benchmarks/attack_reference.py overhead CLIPS [--images 2] [--repeats 9] [--json FILE]
 
 art: PGD of adversarial-robustness-toolbox on YOLOv5n, wrapped as its estimator of object detectors, and ours, on the
 same pictures, loss, budget and number of steps. torchattacks: its APGD and ours on a small network trained on the
-handwritten digits of scikit-learn. CLIPS: a folder that `ssad record --clips` wrote.
+handwritten digits of scikit-learn. CLIPS: a folder that `ssad record --clips` wrote. FILE, such as
+benchmarks/results/attacks.json, keeps the figures of the three side by side; benchmarks/page.py shows them.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 import time
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +30,7 @@ from torch.nn import functional
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.detectors import make_detector
 from ssad.evaluation.detection import score_2d
+from ssad.jobs.machine import keep_memory
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.victim import Victim, steady
 from ssad.training.batches import PictureSet
@@ -70,17 +74,14 @@ def score(detector: Any, images: Tensor, truth: Sequence[Truth]) -> float:
     return score_2d(detector, PictureSet(stored, tuple(truth)))["AP50"]
 
 
-def beside_art(folder: Path, count: int, steps: int) -> None:
+def beside_art(folder: Path, count: int, steps: int) -> dict[str, Any]:
     """AP50 and loss after PGD of the toolbox and after ours."""
     from art.attacks.evasion import ProjectedGradientDescent
     from art.estimators.object_detection import PyTorchObjectDetector
 
     images, truth = pictures(folder, count)
     detector = make_detector("yolov5n")
-    print(
-        f"{count} pictures, loss full, radius {RADIUS} px, {steps} steps; "
-        f"clean AP50 {score(detector, images, truth):.3f}"
-    )
+    rows = [{"attack": "clean", "AP50": score(detector, images, truth)}]
     with steady(detector):
         wrapped = ForArt(detector, images, truth)
         estimator = PyTorchObjectDetector(
@@ -92,7 +93,7 @@ def beside_art(folder: Path, count: int, steps: int) -> None:
             for t in truth
         ]
         full = detector.losses(detector.dense(images), wrapped.assignment, reduction="image")
-        print(f"clean loss {sum(float(v.mean()) for v in full.values()):.3f}")
+        rows[0]["loss"] = sum(float(v.mean()) for v in full.values())
         for share in (0.1, 0.2, 0.25):
             began = time.process_time()
             attack = ProjectedGradientDescent(
@@ -103,10 +104,8 @@ def beside_art(folder: Path, count: int, steps: int) -> None:
             with torch.no_grad():
                 loss = detector.losses(detector.dense(found), wrapped.assignment, reduction="image")
             value = sum(float(v.mean()) for v in loss.values())
-            print(
-                f"art, step {share} of the radius: loss {value:.3f}, AP50 {score(detector, found, truth):.3f}, "
-                f"{used:.0f} s CPU"
-            )
+            name = f"PGD of adversarial-robustness-toolbox, step {share} of the radius"
+            rows.append({"attack": name, "loss": value, "AP50": score(detector, found, truth), "cpu_s": used})
     for name in ("pgd", "apgd"):
         began = time.process_time()
         found = run_attack(
@@ -114,7 +113,9 @@ def beside_art(folder: Path, count: int, steps: int) -> None:
         )
         used = time.process_time() - began
         value = float(found.after.mean())
-        print(f"ssad {name}: loss {value:.3f}, AP50 {score(detector, found.images, truth):.3f}, {used:.0f} s CPU")
+        left = score(detector, found.images, truth)
+        rows.append({"attack": f"{name.upper()} of SSAD", "loss": value, "AP50": left, "cpu_s": used})
+    return {"images": len(images), "radius_px": RADIUS, "steps": steps, "rows": rows, "versions": _versions()}
 
 
 class Classifier(nn.Module):
@@ -167,7 +168,7 @@ def digits() -> tuple[Tensor, Tensor]:
     return grey[:, None].expand(-1, 3, -1, -1).contiguous(), torch.from_numpy(data.target)
 
 
-def beside_torchattacks(steps: int) -> None:
+def beside_torchattacks(steps: int) -> dict[str, Any]:
     """Accuracy that is left after APGD of torchattacks and after ours, with both losses."""
     import torchattacks
 
@@ -188,21 +189,23 @@ def beside_torchattacks(steps: int) -> None:
         with torch.no_grad():
             return float((model.net((found * 255).round() / 255).argmax(1) == labels).float().mean())
 
-    print(f"{len(images)} digits, {steps} steps; clean accuracy {accuracy(images):.3f}")
+    rows = []
     for radius in (10, 20, 30, 40):
-        row = [f"radius {radius} px:"]
+        row: dict[str, float] = {"radius_px": radius}
         for loss_name in ("ce", "dlr"):
             attack = torchattacks.APGD(model.net, eps=px(radius), steps=steps, loss=loss_name)
-            row.append(f"torchattacks apgd {loss_name} {accuracy(attack(images, labels)):.3f},")
+            row[f"APGD of torchattacks, {loss_name}"] = accuracy(attack(images, labels))
         for name, objective in (("apgd", "full"), ("apgd", "mislabel"), ("pgd", "mislabel")):
             found = run_attack(
                 make_attack(name, steps=steps), model, images, truth, Budget(px(radius)), objective=objective
             )
-            row.append(f"ssad {name} {objective} {accuracy(found.images):.3f}")
-        print(" ".join(row))
+            row[f"{name.upper()} of SSAD, {objective}"] = accuracy(found.images)
+        rows.append(row)
+    clean = accuracy(images)
+    return {"images": len(images), "steps": steps, "clean": clean, "rows": rows, "versions": _versions()}
 
 
-def overhead(folder: Path, count: int, repeats: int) -> None:
+def overhead(folder: Path, count: int, repeats: int) -> dict[str, Any]:
     """Time of PGD over that of its forward and backward passes alone, in turn."""
     images, truth = pictures(folder, count)
     detector = make_detector("yolov5n")
@@ -215,8 +218,9 @@ def overhead(folder: Path, count: int, repeats: int) -> None:
             loss = victim.objective(detector.dense(asked), victim.situation)
             torch.autograd.grad(loss.sum(), asked)
         with torch.no_grad():
-            for _ in range(4):  # target assignment, and the losses before, at the end and after rounding
-                detector.dense(images)
+            detector.dense(images)  # for the target assignment
+            for _ in range(3):  # the losses before, at the end and after rounding
+                victim.objective(detector.dense(images), victim.situation)
 
     def whole() -> None:
         run_attack(attack, detector, images, truth, Budget(px(RADIUS)), objective=_objective(), check=False)
@@ -230,7 +234,16 @@ def overhead(folder: Path, count: int, repeats: int) -> None:
             seconds[name] = time.process_time() - began
         ratios.append(seconds["whole"] / seconds["bare"])
     ratios.sort()
-    print(f"PGD over its bare passes: {statistics.median(ratios):.3f} [{ratios[1]:.3f}, {ratios[-2]:.3f}] of {repeats}")
+    return {
+        "images": len(images), "repeats": repeats, "ratio": statistics.median(ratios), "ratios": ratios,
+        "interval": [ratios[1], ratios[-2]],
+    }  # fmt: skip
+
+
+def _versions() -> dict[str, str]:
+    wanted = ("torch", "adversarial-robustness-toolbox", "torchattacks")
+    there = {one.metadata["Name"]: one.version for one in metadata.distributions()}
+    return {name: there[name] for name in wanted if name in there}
 
 
 def _objective() -> Any:
@@ -247,14 +260,20 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
+    keep_memory()  # as workers do
     if chosen.what == "torchattacks":
-        beside_torchattacks(chosen.steps)
+        found = beside_torchattacks(chosen.steps)
     elif chosen.what == "art":
-        beside_art(chosen.clips, chosen.images, chosen.steps)
+        found = beside_art(chosen.clips, chosen.images, chosen.steps)
     else:
-        overhead(chosen.clips, chosen.images, chosen.repeats)
+        found = overhead(chosen.clips, chosen.images, chosen.repeats)
+    print(json.dumps(found, indent=1))
+    if chosen.json:
+        kept = json.loads(chosen.json.read_text()) if chosen.json.is_file() else {}
+        chosen.json.write_text(json.dumps({**kept, chosen.what: found}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -195,6 +195,46 @@ def detectors() -> list[str]:
     return lines
 
 
+def attacks() -> list[str]:
+    """Digital attacks beside those of other libraries, and beside bare passes."""
+    data = read("attacks")
+    art, other, cost = (data[name] for name in ("art", "torchattacks", "overhead"))
+    libraries = sorted({**art["versions"], **other["versions"]}.items())
+    lines = [
+        "## Strength of digital attacks",
+        "",
+        f"Measured by `benchmarks/attack_reference.py`, with {', '.join(' '.join(pair) for pair in libraries)}.",
+        f"YOLOv5n on {art['images']} images of towns that were not used for training, the detector's own training",
+        f"loss, {art['steps']} steps, at most {art['radius_px']} code values; CPU time of one core. Lower AP50 and",
+        "higher loss are a stronger attack:",
+        "",
+        "| attack | loss | AP50 | CPU s |",
+        "|---|---:|---:|---:|",
+    ]
+    for row in art["rows"]:
+        seconds = f"{row['cpu_s']:.0f}" if "cpu_s" in row else ""
+        lines.append(f"| {row['attack']} | {row['loss']:.2f} | {100 * row['AP50']:.1f} % | {seconds} |")
+    columns = [name for name in other["rows"][0] if name != "radius_px"]
+    lines += [
+        "",
+        f"Accuracy that a small classifier of handwritten digits keeps ({other['images']} test images, clean",
+        f"{100 * other['clean']:.1f} %; {other['steps']} steps):",
+        "",
+        f"| radius (code values) | {' | '.join(columns)} |",
+        f"|---:|{'---:|' * len(columns)}",
+    ]
+    for row in other["rows"]:
+        left = " | ".join(f"{100 * row[name]:.1f} %" for name in columns)
+        lines.append(f"| {row['radius_px']:.0f} | {left} |")
+    return [
+        *lines,
+        "",
+        f"Ten steps of PGD take {cost['ratio']:.2f} times the CPU time of the forward and backward passes in them",
+        f"(median of {cost['repeats']} runs in turn; {cost['interval'][0]:.2f} to {cost['interval'][1]:.2f}).",
+        "",
+    ]
+
+
 def scores() -> list[str]:
     """Scoring beside the official toolkit."""
     data = read("score_speed")
@@ -232,7 +272,7 @@ def page() -> str:
     ]
     for name in RUNS:
         lines += section(name, json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text()))
-    lines += shifts() + scores() + camera() + sensor() + recorder() + detectors()
+    lines += shifts() + scores() + camera() + sensor() + recorder() + detectors() + attacks()
     return "\n".join(lines)
 
 

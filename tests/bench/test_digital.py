@@ -16,9 +16,10 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
+from ssad.bench.digital_points import DigitalSuite
 from ssad.bench.kind import Job, Plan, Resources
 from ssad.bench.kinds import digital
-from ssad.bench.kinds.digital import Digital, DigitalSuite
+from ssad.bench.kinds.digital import Digital
 from ssad.bench.run import run
 from ssad.bench.suite import command_of, load_suite
 from ssad.core.errors import SSADError
@@ -26,7 +27,8 @@ from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation import attacked_scenes
 from ssad.evaluation.attack_sheet import magnified
-from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker, sum_notes
+from ssad.evaluation.attack_tally import sum_notes
+from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
 from ssad.evaluation.scene_boxes import Examination, Watched, detector_of
 from ssad.report import write_report
 from ssad.report.kinds.digital import attempts_of, load_digital_run, lost_table, main_table

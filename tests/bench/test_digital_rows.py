@@ -13,8 +13,9 @@ import pytest
 from helpers.sharing import Shared
 from rich.console import Console
 
+from ssad.bench.digital_points import DigitalSuite
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.digital import Digital, DigitalSuite
+from ssad.bench.kinds.digital import Digital
 from ssad.bench.run import run
 from ssad.core.errors import SSADError
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -25,7 +26,9 @@ from ssad.evaluation.attacked_scenes import AttackedScene
 from ssad.evaluation.detection import SampleBoxes
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
 from ssad.report import write_report
+from ssad.report.digital_run import Resampling
 from ssad.report.digital_tables import defence_table, target_table, transfer_table
+from ssad.report.kinds.detection import interval_note
 from ssad.report.kinds.digital import attempts_of, load_digital_run, main_table
 from ssad.report.load import load_run
 
@@ -241,6 +244,11 @@ def test_a_failed_attack_fails_what_needs_its_pictures(root: Path, tmp_path: Pat
     assert status[ONE, "fgsm", ""]["status"] == status[BLIND, "fgsm", ONE]["status"] == "ok"
     assert "gives no gradient" in status[BLIND, "fgsm", ""]["reason"]
     assert f"the attack on {BLIND} failed: " in status[ONE, "fgsm", BLIND]["reason"]
+
+
+def test_a_page_with_one_scene_says_so_in_the_singular() -> None:
+    assert interval_note(Resampling(1)) == "no intervals, since one scene is too few (five are the least)."
+    assert interval_note(Resampling(2)).startswith("no intervals, since 2 scenes are too few")
 
 
 def test_pictures_against_different_systems_lie_apart(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -14,6 +16,7 @@ from ssad.jobs.machine import (
     cuda_driver,
     default_workers,
     gpu_workers,
+    keep_memory,
     pick_device,
     quiet_warp,
     versions,
@@ -161,3 +164,32 @@ def test_gpus_are_shared_by_as_many_as_their_memory_takes(
 
     monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=SimpleNamespace(get_device_properties=properties)))
     assert gpu_workers(len(memory)) == workers
+
+
+FAULTS = """
+import resource, sys
+import torch
+from ssad.jobs.machine import keep_memory
+if sys.argv[1] == "keep":
+    keep_memory()
+torch.zeros(10 << 20)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(20):
+    torch.zeros(10 << 20)  # 40 MiB
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be told")
+def test_memory_is_kept_for_the_next_tensor() -> None:
+    faults = {
+        how: int(subprocess.run([sys.executable, "-c", FAULTS, how], capture_output=True, check=True).stdout)
+        for how in ("keep", "leave")
+    }
+    assert faults["keep"] < faults["leave"] / 4
+
+
+def test_other_libraries_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
+    monkeypatch.setattr(machine.ctypes, "CDLL", lambda name: pytest.fail("there is no glibc to be told"))
+    keep_memory()

@@ -33,7 +33,7 @@ from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.evaluation.detection import AT_ONCE, Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
 from ssad.evaluation.scene_shifter import SceneShifter
-from ssad.jobs.machine import quiet_warp
+from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
 from ssad.scenarios.static.digital.defences import Defence, Defended
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
@@ -200,6 +200,8 @@ class Watched:
 def _loaded(name: str, weights: str, device: str, threads: int) -> Any:
     quiet_warp()  # it runs the shifts
     torch.set_num_threads(threads)
+    if device == "cpu":
+        keep_memory()
     return detector_of(name, weights, device)
 
 

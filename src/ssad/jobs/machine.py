@@ -38,6 +38,16 @@ def quiet_warp() -> None:
         os.close(null)
 
 
+def keep_memory(size: int = 1 << 30) -> None:
+    """Let this process keep the memory that tensors on the CPU come and go in, up to some bytes, where the C library is
+    glibc: it hands large blocks back to the system otherwise, and takes them anew, page by page, in each pass of a
+    network."""
+    if platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.mallopt(-3, size)  # M_MMAP_THRESHOLD
+        library.mallopt(-1, size)  # M_TRIM_THRESHOLD
+
+
 def pick_device(wanted: str) -> str:
     """auto, cpu or cuda as a device of the world. ConfigError when it is not there."""
     if wanted == "cpu":

@@ -138,7 +138,8 @@ def left_cell(run: DetectionRun, detector: str, shift: str, metric: str) -> Cell
 def interval_note(run: Resampled) -> str:
     """How the intervals of the page are made, in a sentence."""
     if run.scenes < MIN_CLUSTERS:
-        return f"no intervals, since {run.scenes} scenes are too few (five are the least)."
+        few = "one scene is" if run.scenes == 1 else f"{run.scenes} scenes are"
+        return f"no intervals, since {few} too few (five are the least)."
     return f"95 % intervals by the bootstrap over {run.scenes} scenes (beta limits; Student's t for ratios)."
 
 
@@ -347,7 +348,11 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
         "detection.html", found, main=main, left=left, severities=severities, cars=cars, classes=classes,
         robust=robust, tiles=tiles(run, robust), plot=curves(run), plot_map=curves(run, "mAP"),
         pictures=pictures(found.folder), samples=max(int(r.get("n", 0)) for r in run.records.values()),
-        scenes=run.scenes, failures=[r for r in run.records.values() if r["status"] != "ok"], skipped=_skipped(run),
+        scenes=run.scenes, skipped=_skipped(run),
+        failures=[
+            (r["detector"], r["shift"] or "clean", r["severity"], r["reason"])
+            for r in run.records.values() if r["status"] != "ok"
+        ],
     )  # fmt: skip
     return page, [t for t in (main, left, robust, severities, cars, classes) if t is not None]
 

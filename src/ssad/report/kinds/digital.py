@@ -281,7 +281,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
         plot=curves(run, "radius"), plot_steps=curves(run, "steps"), pictures=pictures(found.folder),
         samples=max(int(r.get("n", 0)) for r in run.records.values()), scenes=run.scenes,
         failures=[
-            (detector, title_of(setting), size_of(setting), record["reason"])
+            (detector, title_of(setting), size_of(setting), circumstances(setting), record["reason"])
             for (detector, setting), record in run.records.items()
             if record["status"] != "ok"
         ],

@@ -1,0 +1,266 @@
+"""What suites of kind `digital` say, and the points that follow: what each system is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from ssad.bench.kinds.detection import DetectorSuite
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.evaluation.attacked_scenes import AttackSpec, takes
+from ssad.scenarios.static.digital import default_loss, make_objective
+from ssad.scenarios.static.digital.budget import Norm
+from ssad.scenarios.static.digital.defences import make_defence
+
+Radius = Annotated[float, Field(ge=0.0, le=255.0 * 4000, allow_inf_nan=False)]
+Steps = Annotated[int, Field(ge=1)]
+Scenes = Annotated[int, Field(ge=1)]
+ENSEMBLE = "ensemble"
+DRAWS = 4  # of a random defence that an attack knows, if the suite does not say it
+
+
+class Method(BaseModel):
+    """An attack as a suite names it.
+
+    Attributes:
+        name: of the attack (`ssad list attacks`).
+        loss: what it ascends (default: what the attack is about).
+        norm: of the budget.
+        options: further settings, such as restarts.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1)
+    loss: str | None = None
+    norm: Literal["linf", "l2"] = "linf"
+    options: dict[str, Any] = {}
+
+
+class Row(Method):
+    """An attack with its settings: radius (8-bit code values) and steps, where they are not the suite's; scenes: the
+    first of each town, where it does not run on all."""
+
+    radius: Radius | None = None
+    steps: Steps | None = None
+    scenes: Scenes | None = None
+
+
+class Guard(BaseModel):
+    """A defence before the detector: its name (jpeg, bits, blur, resize) and further settings."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1)
+    options: dict[str, Any] = {}
+
+
+class Entry(Row):
+    """A row of a table.
+
+    Attributes:
+        defence: what stands before the detector; the clean data are scored behind it as well.
+        aware: whether the attack knows the defence; it then ascends the loss through it, of a random one the mean over
+            `draws` draws (default: 4). An attack that does not know it is made against the bare detector.
+        draws: see `aware`.
+        classes: the classes whose objects are attacked; empty: all.
+        becomes: class -> class that its objects should be taken for.
+        members: of the attack `ensemble`: the attacks of which the worst is kept at each moment.
+    """
+
+    defence: Guard | None = None
+    aware: bool | None = None
+    draws: Steps | None = None
+    classes: list[str] = []
+    becomes: dict[str, str] = {}
+    members: list[Row] = []
+
+    @field_validator("defence", "members", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """A name alone has nothing else said."""
+        return {"name": value} if isinstance(value, str) else named(value)
+
+
+class Sweep(Method):
+    """A curve: an attack over radii at the suite's steps, and over steps at the suite's radius; scenes as in `Row`."""
+
+    radii: list[Radius] = []
+    steps: list[Steps] = []
+    scenes: Scenes | None = None
+
+
+def named(value: Any) -> Any:
+    """Names in a list of attacks as attacks with nothing else said."""
+    return [{"name": one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
+
+
+class DigitalSuite(DetectorSuite):
+    """One table: 3D detectors x digital attacks, beside the clean data and random noise of the same size.
+
+    Attributes:
+        attacks: names, or mappings with the keys of `Entry`.
+        sweeps: curves.
+        transfer: attacks whose pictures, made against each detector, are shown to every other.
+        radius: 8-bit code values that a picture may be moved by, where an attack does not say it.
+        steps: gradient steps, likewise.
+        batch: camera images that are attacked at once on a GPU; where memory does not suffice they are fewer.
+    """
+
+    kind: Literal["digital"]
+    attacks: list[Entry] = Field(
+        default=[Entry(name="fgsm"), Entry(name="pgd"), Entry(name="cw"), Entry(name="pgd", loss="margin")],
+        min_length=1,
+    )
+    sweeps: list[Sweep] = Field(default=[])
+    transfer: list[Row] = Field(default=[])
+    radius: Radius = Field(default=5.0, gt=0.0)
+    steps: Steps = 10
+    batch: int = Field(default=12, ge=1)
+
+    @field_validator("attacks", "sweeps", "transfer", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """A name alone is an attack with nothing else said."""
+        return named(value)
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A defence with its settings: name, and options in order of their names."""
+
+    name: str
+    options: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def text(self) -> str:
+        """Such as "jpeg quality=50"."""
+        return " ".join([self.name, *(f"{key}={value}" for key, value in self.options)])
+
+
+@dataclass(frozen=True)
+class Point:
+    """What a system is shown: the clean data, or attacks (several: the worst of them at each moment).
+
+    Attributes:
+        specs: the attacks; none: clean data.
+        defence: before the detector.
+        aware: whether the attacks know it.
+        source: detector that is attacked, if it is not the one that is shown the pictures.
+        scenes: the first of each town; 0: all.
+        row: whether it stands in the main table.
+    """
+
+    specs: tuple[AttackSpec, ...] = ()
+    defence: Guarded | None = None
+    aware: bool = False
+    source: str = ""
+    scenes: int = 0
+    row: bool = field(default=False, compare=False)
+
+
+def system_name(detector: str, guard: Guarded | None) -> str:
+    """What a detector behind a defence is called."""
+    return detector if guard is None else f"{detector}+{guard.text.replace(' ', '-')}"
+
+
+def guard_of(suite: DigitalSuite, entry: Entry) -> Guarded | None:
+    """The defence of a row; it is built, to see whether it takes its options. ConfigError."""
+    if entry.defence is None:
+        if entry.aware:
+            raise ConfigError(f"suite {suite.name}: attack {entry.name}: aware of which defence? it names none")
+        return None
+    make_defence(entry.defence.name, **entry.defence.options)
+    found = Guarded(entry.defence.name, tuple(sorted(entry.defence.options.items())))
+    if any(not isinstance(value, str | int | float) for _, value in found.options):
+        raise ConfigError(f"suite {suite.name}: defence {found.name}: options are numbers and words")
+    return found
+
+
+def rows_of(suite: DigitalSuite) -> list[Point]:
+    """The rows of the tables. ConfigError."""
+    found = []
+    for one in suite.attacks:
+        guard = guard_of(suite, one)
+        if bool(one.members) != (one.name == ENSEMBLE):
+            raise ConfigError(f"suite {suite.name}: attack {one.name}: an ensemble has members, no other attack has")
+        specs = [_spec(suite, member, member.radius or one.radius, member.steps) for member in one.members]
+        if len({(spec.norm, spec.radius) for spec in specs}) > 1:
+            raise ConfigError(f"suite {suite.name}: attack {ENSEMBLE}: its members have different budgets")
+        if not specs:
+            draws = (one.draws or DRAWS) if guard and one.aware and hasattr(make_defence(guard.name), "drawn") else 0
+            classes, becomes = tuple(one.classes), tuple(sorted(one.becomes.items()))
+            for name in [*classes, *one.becomes, *one.becomes.values()]:
+                if name not in MMDET3D_CLASSES:
+                    raise unknown_name("class", name, MMDET3D_CLASSES)
+            if becomes and (one.loss or default_loss(one.name)) != "mislabel":
+                raise ConfigError(f"suite {suite.name}: attack {one.name}: becomes needs loss: mislabel")
+            specs = [replace(_spec(suite, one, one.radius, one.steps), classes=classes, becomes=becomes, draws=draws)]
+        found.append(
+            Point(tuple(specs), guard, bool(one.aware), "", one.scenes or 0, row=guard is None and not one.scenes)
+        )
+    if len(set(found)) != len(found):
+        raise ConfigError(f"suite {suite.name}: attacks: one of them appears twice")
+    return found
+
+
+def points_of(suite: DigitalSuite) -> list[Point]:
+    """All that every detector is shown, without transfer: the clean data first, then noise, rows and curves, each once;
+    clean data on fewer scenes, and behind a defence, where something else is compared with them. ConfigError."""
+    rows, curves, moved = rows_of(suite), _swept(suite), transfers_of(suite)
+    bare = [
+        replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)
+        for one in rows if one.defence
+    ]  # fmt: skip
+    curves = [*curves, *bare]
+    noise = [
+        replace(one, specs=(AttackSpec("noise", default_loss("noise"), one.specs[0].norm, one.specs[0].radius),))
+        for one in [*rows, *curves, *moved] if one.defence is None
+    ]  # fmt: skip
+    clean = [Point(scenes=one.scenes, defence=one.defence) for one in [*rows, *curves, *moved]]
+    return list(dict.fromkeys([Point(row=True), *clean, *noise, *rows, *curves, *moved]))
+
+
+def transfers_of(suite: DigitalSuite) -> list[Point]:
+    """The attacks whose pictures are shown to other detectors. ConfigError."""
+    return [Point((_spec(suite, one, one.radius, one.steps),), scenes=one.scenes or 0) for one in suite.transfer]
+
+
+def _spec(suite: DigitalSuite, method: Method, radius: float | None, steps: int | None) -> AttackSpec:
+    """An attack with all its settings; it is built, to see whether it takes them. ConfigError."""
+    options = dict(method.options)
+    if steps is not None or takes(method.name, "steps"):
+        options.setdefault("steps", suite.steps if steps is None else steps)
+    loss = method.loss or default_loss(method.name)
+    make_objective(loss)
+    norm: Norm = method.norm
+    size = suite.radius if radius is None else radius
+    if not size > 0:
+        raise ConfigError(
+            f"suite {suite.name}: attack {method.name}: the radius must be above 0; clean data always run"
+        )
+    try:
+        safeio.dump_json(options)
+        hash(spec := AttackSpec(method.name, loss, norm, float(size), tuple(sorted(options.items()))))
+    except (TypeError, ValueError):
+        raise ConfigError(
+            f"suite {suite.name}: attack {method.name}: options are numbers and words, not {options}"
+        ) from None
+    spec.make()
+    return spec
+
+
+def _swept(suite: DigitalSuite) -> list[Point]:
+    """The points of the curves; a radius of 0 is the clean data. ConfigError."""
+    found = []
+    for one in suite.sweeps:
+        if not one.radii and not one.steps:
+            raise ConfigError(f"suite {suite.name}: sweeps: {one.name} has neither radii nor steps")
+        specs = [_spec(suite, one, radius, None) for radius in one.radii if radius > 0]
+        specs += [_spec(suite, one, None, steps) for steps in one.steps]
+        found += [Point((spec,), scenes=one.scenes or 0) for spec in specs]
+    return found
