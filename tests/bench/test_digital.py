@@ -167,7 +167,7 @@ def test_the_report_has_the_papers_numbers_the_audit_and_the_failures(folder: Pa
     assert "mAP over the budget" in page
     assert 'src="data:image/jpeg' in page
     assert {path.stem for path in (folder / "tables").glob("*.csv")} == {
-        "digital", "lost", "audit", "effort", "cells", "classes", "distances",
+        "digital", "lost", "audit", "effort", "cells", "classes", "distances", "halving",
     }  # fmt: skip
     own = load_digital_run(load_run(folder))
     assert [row.head[0] for row in main_table(own).rows] == ["clean", "noise", "FGSM, full loss", "PGD, full loss"], (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from ssad.evaluation.detection import SampleBoxes
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
 from ssad.report import write_report
 from ssad.report.digital_run import Resampling
-from ssad.report.digital_tables import defence_table, target_table, transfer_table
+from ssad.report.digital_tables import defence_table, halving, halving_table, target_table, transfer_table
 from ssad.report.kinds.detection import interval_note
 from ssad.report.kinds.digital import attempts_of, load_digital_run, main_table
 from ssad.report.load import load_run
@@ -58,7 +59,7 @@ def suite_of(root: Path, **changes: Any) -> DigitalSuite:
             {"name": "fgsm", "loss": "vanish", "classes": ["car"]},
             {"name": "fgsm", "loss": "vanish", "classes": ["truck"], "scenes": 1},
         ],
-        "sweeps": [{"name": "pgd", "radii": [0, 5], "scenes": 1, "options": {"steps": 2}}], "transfer": [PGD],
+        "sweeps": [{"name": "pgd", "radii": [0, 1, 5], "scenes": 1, "options": {"steps": 2}}], "transfer": [PGD],
     }  # fmt: skip
     return DigitalSuite.model_validate(base | changes)
 
@@ -95,7 +96,18 @@ def lines(folder: Path) -> list[dict[str, Any]]:
 
 def one(folder: Path, **wanted: Any) -> dict[str, Any]:
     """The record of the first detector with these fields."""
-    base = {"detector": ONE, "attack": "pgd", "source": "", "defence": "", "aware": False, "subset": 0, "target": ""}
+    if "attack" in wanted and wanted["attack"] is None:
+        wanted["radius"] = 0.0
+    base = {
+        "detector": ONE,
+        "attack": "pgd",
+        "source": "",
+        "defence": "",
+        "aware": False,
+        "radius": 5.0,
+        "subset": 0,
+        "target": "",
+    }
     fitting = [r for r in lines(folder) if all(r[key] == value for key, value in (base | wanted).items())]
     assert len(fitting) == 1, [(r["attack"], r["defence"], r["subset"]) for r in fitting]
     return fitting[0]
@@ -106,10 +118,10 @@ def test_no_picture_is_attacked_twice(folder: Path) -> None:
     counts = told["counts"]
     plain = [count for about, count in counts.items() if about.startswith(("pgd on linear ", "fgsm on linear "))]
     assert len(plain) == 8, "two detectors: PGD, FGSM, and FGSM on cars and on trucks"
-    assert max(plain) == 24, "for table, ensemble, transfer, unknown defences and the curve at once"
+    assert max(plain) == 24 + 12, "for table, ensemble, transfer, unknown defences and the curve at once; and at 1 px"
     behind = [count for about, count in counts.items() if "+" in about]
     assert behind == [24, 24], "known ones, 12 pictures of one scene, two detectors"
-    passes = 2 * (24 * (2 + 1 + 1) + 12 * (1 + 2 + 2 * 2))
+    passes = 2 * (24 * (2 + 1 + 1) + 12 * (1 + 2 + 2 * 2 + 2))
     assert f"{passes:,} forward and backward passes for 2 detectors" in told["said"]
 
 
@@ -214,11 +226,23 @@ def tokens(boxes: list[SampleBoxes]) -> list[tuple[str, float]]:
     return [(one.token, float(one.boxes.score.sum())) for one in boxes]
 
 
+def test_the_radius_that_halves_a_score() -> None:
+    assert halving([(0.0, 0.4), (1.0, 0.3), (3.0, 0.1), (5.0, 0.0)]) == pytest.approx(2.0)
+    assert halving([(0.0, 0.4), (2.0, 0.2)]) == 2.0
+    for never in ([(0.0, 0.4), (5.0, 0.21)], [(0.0, 0.0), (5.0, 0.0)], [(0.0, 0.4)], []):
+        assert math.isnan(halving(never))
+
+
 def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:
     few, clean = one(folder, subset=1), one(folder, attack=None, subset=1)
     assert few["scenes"] == 1
     assert few["clean_mAP"] == clean["metrics"]["mAP"]
     assert few["images"] == 12
+    table = halving_table(load_digital_run(load_run(folder)))
+    (row,) = table.rows
+    assert row.head == ("PGD, full loss", "2 steps", "1 of each town")
+    assert row.cells[1].mean == pytest.approx(100 * one(folder, subset=1, radius=1.0)["metrics"]["mAP"])
+    assert 1 < row.cells[0].mean < 5
     groups = {a.group for a in attempts_of(load_digital_run(load_run(folder)))}
     assert groups == {
         "", "1 of each town", "car", "truck, 1 of each town", "bit depth, 1 of each town",

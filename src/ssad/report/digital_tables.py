@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 from ssad.report.digital_run import (
     DigitalRun,
@@ -82,6 +84,45 @@ def target_table(run: DigitalRun) -> Table:
     )
     heads = ("Detector", "Attack", "Budget", "Target", "Scenes")
     return Table("targets", "Targeted attacks", heads, ("success", "objects", "mAP"), tuple(rows), note)
+
+
+def halving_table(run: DigitalRun) -> Table:
+    """For each curve over the budget: the radius that halves mAP, and what is left at 1 px."""
+    groups: dict[Setting, set[float]] = {}
+    for setting in run.settings:
+        if setting.plain and setting.attack not in ("", "noise", "ensemble"):
+            groups.setdefault(setting._replace(radius=0.0), set()).add(setting.radius)
+    rows = []
+    for group, radii in groups.items():
+        if len(radii) < 2:
+            continue
+        cells = []
+        for detector in run.detectors:
+            records = {0.0: run.clean(detector, group)}
+            records |= {radius: run.record(detector, group._replace(radius=radius)) for radius in sorted(radii)}
+            curve = [(radius, record["metrics"]["mAP"]) for radius, record in records.items() if record]
+            cells += [Cell(halving(curve)), metric_cell(records.get(1.0), "mAP")]
+        about = ", ".join(part for part in [f"{group.steps} steps", group.options] if part)
+        rows.append(Row((title_of(group), about, scenes_of(group)), tuple(cells)))
+    columns = tuple(f"{d} {what}" for d in run.detectors for what in ("half of mAP at (px)", "mAP at 1 px (%)"))
+    note = "The radius that leaves half of the clean mAP, on straight lines between the radii that ran."
+    return Table("halving", "Smallest budgets that hurt", ("Attack", "Settings", "Scenes"), columns, tuple(rows), note)
+
+
+def halving(curve: Sequence[tuple[float, float]]) -> float:
+    """The radius at which a curve first falls to half of its first score.
+
+    Args:
+        curve: Radius and score, by radius; the first is the clean data.
+
+    Returns:
+        On straight lines between the points; NaN if it never falls so far, or the first score is 0.
+    """
+    half = curve[0][1] / 2 if curve else 0.0
+    for (low, before), (high, after) in pairwise(curve):
+        if after <= half < before:
+            return low + (before - half) / (before - after) * (high - low)
+    return math.nan
 
 
 def distance_table(run: DigitalRun) -> Table:

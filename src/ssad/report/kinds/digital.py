@@ -22,7 +22,7 @@ from ssad.report.digital_run import (
     size_of,
     title_of,
 )
-from ssad.report.digital_tables import defence_table, distance_table, target_table, transfer_table
+from ssad.report.digital_tables import defence_table, distance_table, halving_table, target_table, transfer_table
 from ssad.report.kinds.detection import CLASSES, interval_note, replicates_of
 from ssad.report.load import Run
 from ssad.report.pages import render
@@ -272,7 +272,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     verdict = audit(attempts_of(run))
     main, lost, effort = main_table(run), lost_table(run), effort_table(run)
     every, classes, checked = every_table(run), class_table(run), audit_table(verdict)
-    others = [t for t in (transfer_table(run), defence_table(run), target_table(run)) if t.rows]
+    others = [t for t in (transfer_table(run), defence_table(run), target_table(run), halving_table(run)) if t.rows]
     distances = distance_table(run)
     page = render(
         "digital.html", found, others=others, distances=distances,
