@@ -92,6 +92,7 @@ def _junctions(
     route: Route, graph: LaneGraph, yaw: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Distance to the next junction and turn rank there, for every route point."""
+    ruled = set(graph.rule_lane.tolist())
     n = len(route.xy)
     inside = np.zeros(n, bool)
     known = route.lane >= 0
@@ -102,7 +103,9 @@ def _junctions(
     runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
     for start, stop in reversed(list(runs)):
         turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
-        kind = TurnRank.STRAIGHT if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
+        kind = int(TurnRank.STRAIGHT) if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
+        if start > 0 and int(route.lane[start - 1]) in ruled:
+            kind += TurnRank.YIELD
         entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
         rank[: start + 1] = kind
         entry[start:stop] = 0.0

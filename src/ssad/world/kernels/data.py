@@ -35,6 +35,7 @@ class TurnRank(IntEnum):
     STRAIGHT = 0
     RIGHT = 1
     LEFT = 2
+    YIELD = 3  # added to the others on an approach with a stop or yield sign: whoever has none goes first
 
 
 class End(IntEnum):
