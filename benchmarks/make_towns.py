@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from ssad.core.lane_graph import save_graph
 from ssad.core.safeio import write_atomic
 from ssad.roads.bake import bake
 from ssad.roads.library import BUILT_IN
-from ssad.roads.writer import Point, RoadSpec, Town, write_town
+from ssad.roads.writer import write_town
+from ssad.roads.writer_parts import Interchange, Point, RoadSpec, Roundabout, Town
 
 
 def _chain(stops: list[Point], make: Callable[[tuple[Point, ...]], RoadSpec]) -> list[RoadSpec]:
@@ -202,12 +204,95 @@ def larkhill() -> Town:
     return Town("Larkhill", tuple(streets), signalled=(south, centre, fork))
 
 
+def ringmere() -> Town:
+    """Two-lane streets of a small town with two roundabouts, one of four arms and one of three; 450 x 330 m."""
+
+    def street(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=2.5, limit=30.0, radius=32.0)
+
+    ring, east, west = (220.0, 170.0), (450.0, 170.0), (0.0, 150.0)
+    north, south, cross = (220.0, 330.0), (220.0, 0.0), (340.0, 170.0)
+    upper, lower = (340.0, 330.0), (340.0, 0.0)
+    streets = [
+        street(ring, (150.0, 170.0), (80.0, 150.0), west),
+        street(ring, north),
+        street(ring, south),
+        street(ring, cross),
+        street(cross, east),
+        street(cross, upper),
+        street(cross, lower),
+        street(west, (0.0, 330.0), north),
+        street(west, (0.0, 0.0), south),
+        street(north, upper),
+        street(south, lower),
+        street(upper, (450.0, 330.0), east),
+        street(lower, (450.0, 0.0), east),
+    ]
+    rings = (Roundabout(ring, 22.0), Roundabout(east, 20.0))
+    return Town("Ringmere", tuple(streets), signalled=(cross, north, south), roundabouts=rings)
+
+
+def longreach() -> Town:
+    """A motorway of 2 + 2 lanes, 3 + 3 between its two interchanges, and two-lane streets on both sides; 1,500 x 500 m.
+
+    The motorway begins and ends at a signalled T-junction. An interchange has a ramp on and a ramp off, which meet the
+    streets at signalled crossroads. The town looks the same when it is turned by half a turn.
+    """
+
+    def street(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.5, shoulder=0.5, sidewalk=2.0, limit=35.0, radius=30.0)
+
+    def ramp(*points: Point) -> RoadSpec:
+        return RoadSpec(points, lanes=1, width=3.75, shoulder=2.0, sidewalk=0.0, limit=40.0, radius=60.0, one_way=True)
+
+    def motorway(*points: Point, lanes: int, limit: float) -> RoadSpec:
+        return RoadSpec(points, lanes, 3.75, 2.0, 0.0, limit, radius=500.0, median=4.0)
+
+    def turned(point: Point) -> Point:
+        return 1500.0 - point[0], 60.0 - point[1]
+
+    end, interchange = (0.0, 0.0), (350.0, 0.0)
+    on, off = (348.0, -9.5), (348.0, 9.5)  # beside the outermost lane of the narrower part
+    south, north = (150.0, -110.0), (150.0, 110.0)
+    mill, mill_end, park, hill = (420.0, -110.0), (420.0, -220.0), (700.0, -110.0), (1000.0, -50.0)
+    far = turned(north)
+    half = [
+        motorway(end, interchange, lanes=2, limit=50.0),
+        ramp(south, (150.0, -50.0), (285.0, -9.5), on),
+        ramp(off, (285.0, 9.5), (150.0, 50.0), north),
+        street(end, (0.0, -110.0), south),
+        street(end, (0.0, 110.0), north),
+        street(south, mill),
+        street(mill, park),
+        street(park, (780.0, -110.0), (920.0, -50.0), hill),
+        street(hill, far),
+        street(south, (150.0, -220.0), mill_end),
+        street(mill, mill_end),
+        street(mill_end, (700.0, -220.0), park),
+        street(hill, (1000.0, -150.0), (1350.0, -150.0), far),
+    ]
+    middle = motorway(interchange, (620.0, 0.0), (880.0, 60.0), turned(interchange), lanes=3, limit=60.0)
+    other = [replace(road, points=tuple(turned(point) for point in road.points)) for road in half]
+    lights = (end, south, north)
+    return Town(
+        "Longreach",
+        (*half, middle, *other),
+        signalled=(*lights, *(turned(place) for place in lights)),
+        interchanges=(
+            Interchange(interchange, on, off),
+            Interchange(turned(interchange), turned(on), turned(off)),
+        ),
+    )
+
+
 _MAKERS: dict[str, Callable[[], Town]] = {
     "Twinford": twinford,
     "Crossgate": crossgate,
     "ProvingGround": proving_ground,
     "Oldmarket": oldmarket,
     "Larkhill": larkhill,
+    "Ringmere": ringmere,
+    "Longreach": longreach,
 }
 TOWNS = {name: _MAKERS[name] for name in BUILT_IN}  # those that load by name
 

@@ -91,9 +91,10 @@ def drive(episodes: Sequence[Episode], system: str) -> list[EpisodeTrace]:
     from ssad.drivers import make_system
     from ssad.jobs.machine import quiet_warp
     from ssad.world.rollout import rollout
+    from ssad.world.world import World
 
     quiet_warp()
-    return rollout(episodes, {e.town: load_town(e.town) for e in episodes}, make_system(system))
+    return rollout(World(episodes, {e.town: load_town(e.town) for e in episodes}), make_system(system))
 
 
 def danger(seeds: int, systems: Sequence[str] = ("blind", "autopilot")) -> dict[str, dict[str, dict[str, Any]]]:

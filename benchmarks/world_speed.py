@@ -15,6 +15,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -22,7 +23,15 @@ import warp as wp
 from ssad.core.types import Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.kernels.look import OBSERVATION, look
+from ssad.world.sensors import launcher
 from ssad.world.world import World
+
+
+def make_look(world: World) -> Any:
+    """The launch that observes every ego."""
+    egos = np.stack([np.arange(world.batch), np.zeros(world.batch)], 1).astype(np.int32)
+    return launcher(world, look, egos, (world.batch, OBSERVATION), world.batch)[0]
 
 
 def make_world(batch: int, device: str, episodes: int) -> World:
@@ -49,6 +58,7 @@ def timed(work: Callable[[], None], clock: Callable[[], float], repeats: int) ->
 def measure(batch: int, device: str, *, observe: bool, repeats: int, budget: float) -> dict[str, float]:
     """Median agent-steps a second at one batch size."""
     world = make_world(batch, device, min(batch, 150))
+    see = make_look(world)
     cuda = device != "cpu"
     clock = time.perf_counter if cuda else time.process_time
 
@@ -56,13 +66,13 @@ def measure(batch: int, device: str, *, observe: bool, repeats: int, budget: flo
         for _ in range(n):
             world.step()
             if observe:
-                world._look.launch()
+                see.launch()
         if cuda:
             wp.synchronize_device(device)
 
     once(20)
     if cuda:
-        world.capture(observe=observe)
+        world.capture(more=[see] if observe else [])
 
         def once(n: int) -> None:
             for _ in range(n):
@@ -87,12 +97,13 @@ def measure(batch: int, device: str, *, observe: bool, repeats: int, budget: flo
 def parts(batch: int, device: str, repeats: int = 5) -> dict[str, float]:
     """Share of the step that each kernel takes, in microseconds."""
     world = make_world(batch, device, min(batch, 150))
+    see = make_look(world)
     for _ in range(50):
         world.step()
     names = ["restart", "restart_record", "sight", "meet", "drive", "move", "contact", "record", "look"]
     spent: dict[str, list[float]] = {n: [] for n in names}
     for _ in range(repeats * 10):
-        for name, command in zip(names, [*world._step, world._look], strict=True):
+        for name, command in zip(names, [*world._plan, *world._advance, see], strict=True):
             wp.synchronize_device(device)
             start = time.perf_counter()
             command.launch()

@@ -22,6 +22,7 @@ def test_a_driving_system_of_your_own(tmp_path: Path, monkeypatch: pytest.Monkey
     from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
     from ssad.world.rollout import rollout
+    from ssad.world.world import World
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -29,7 +30,7 @@ def test_a_driving_system_of_your_own(tmp_path: Path, monkeypatch: pytest.Monkey
     town = load_town("ProvingGround")
     found = [load_scenarios(name)[0] for name in ("StraightObstacle/00", "LaneChanging/00")]
     episodes = [build_episode(s, town, seed=1) for s in found]
-    traces = rollout(episodes, {"ProvingGround": town}, make_system("mine:Mine"))
+    traces = rollout(World(episodes, {"ProvingGround": town}), make_system("mine:Mine"))
     assert all(trace.driven[-1] > 20 for trace in traces)
     assert not any(trace.off_road.any() for trace in traces)
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from ssad.core.version import __version__
 
 if TYPE_CHECKING:
+    from ssad.core.driving import Driver as Driver
+    from ssad.core.driving import Observation as Observation
     from ssad.core.errors import SSADError as SSADError
-    from ssad.core.protocols import DrivingSystem as DrivingSystem
-    from ssad.core.protocols import Observation as Observation
     from ssad.core.types import Controller as Controller
     from ssad.core.types import Episode as Episode
     from ssad.core.types import EpisodeTrace as EpisodeTrace
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from ssad.scenarios.dynamic import build_episode as build_episode
     from ssad.scenarios.dynamic import load_scenarios as load_scenarios
     from ssad.scenarios.dynamic import save_scenarios as save_scenarios
-    from ssad.world.check import check_world as check_world
+    from ssad.world.check import check_driver as check_driver
+    from ssad.world.check import check_simulator as check_simulator
     from ssad.world.env import VectorEnv as VectorEnv
     from ssad.world.rollout import rollout as rollout
     from ssad.world.witness import find_witness as find_witness
@@ -36,8 +37,8 @@ _WHERE = {
     "SSADError": "core.errors",
     "aggregate": "metrics",
     "episode_metrics": "metrics",
-    "DrivingSystem": "core.protocols",
-    "Observation": "core.protocols",
+    "Driver": "core.driving",
+    "Observation": "core.driving",
     "load_town": "roads",
     "build_episode": "scenarios.dynamic",
     "load_scenarios": "scenarios.dynamic",
@@ -46,7 +47,8 @@ _WHERE = {
     "Episode": "core.types",
     "EpisodeTrace": "core.types",
     "Scenario": "core.types",
-    "check_world": "world.check",
+    "check_driver": "world.check",
+    "check_simulator": "world.check",
     "VectorEnv": "world.env",
     "rollout": "world.rollout",
     "find_witness": "world.witness",

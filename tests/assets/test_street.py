@@ -21,7 +21,7 @@ from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.types import LaneType
 from ssad.roads.query import LaneQuery
 
-TOWNS = ("Twinford", "Crossgate", "Oldmarket", "Larkhill")
+TOWNS = ("Twinford", "Crossgate", "Oldmarket", "Larkhill", "Ringmere")
 GROUND = ("asphalt", "asphalt_patch", "asphalt_worn", "marking_white", "marking_yellow", "cast_iron")
 WALLS = ("plaster", "brick", "boards", "cladding", "sheet", "roof_tiles", "stone")
 STREETS = (LaneType.DRIVING, LaneType.PARKING)

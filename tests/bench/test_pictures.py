@@ -19,6 +19,7 @@ from ssad.recording.onboard import above, body_of, moments, onboard_sheet, pick_
 from ssad.roads import load_town
 from ssad.world.models import MODELS
 from ssad.world.rollout import rollout
+from ssad.world.world import World
 
 pytest.importorskip("cv2")
 
@@ -58,7 +59,7 @@ def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
     scenario = next(s for s in load_scenarios("precrash") if s.name == "StraightObstacle/00")
     graph = load_town(scenario.town)
     episode = build_episode(scenario, graph, seed=0)
-    trace = rollout([episode], {graph.name: graph}, make_system("blind"))[0]
+    trace = rollout(World([episode], {graph.name: graph}), make_system("blind"))[0]
     assert len(moments(trace)) == 3
     people = things_at(trace, 0, ego=False)
     assert {t.tag for t in people} == {a + 1 for a in range(1, len(trace.models)) if trace.active[0, a]}

@@ -33,6 +33,7 @@ from ssad.report.tables import tex, to_csv, to_latex, to_markdown
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.rollout import rollout
+from ssad.world.world import World
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -55,7 +56,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     lines, episodes, cells = [], [], []
     for system in ("autopilot", "blind"):
         built = [build_episode(s, graphs[s.town], seed=1) for s in scenarios]
-        for k, (s, trace) in enumerate(zip(scenarios, rollout(built, graphs, make_system(system)), strict=True)):
+        for k, (s, trace) in enumerate(zip(scenarios, rollout(World(built, graphs), make_system(system)), strict=True)):
             key = f"{system}{k}"
             save_trace(folder / "traces" / f"{key}.npz", trace)
             name = HOSTILE if k == 1 else s.name

@@ -18,11 +18,11 @@ from ssad.core.lane_graph import load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import npz_bytes
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, LaneType
+from ssad.core.types import ENDS, Controller, LaneType
 from ssad.roads import LaneGraph, bake, random_route
 from ssad.roads.library import BUILT_IN
 from ssad.scenarios.dynamic import build_episode
-from ssad.world.world import ENDS, World
+from ssad.world.world import World
 
 NEW = ("Oldmarket", "Larkhill")
 FOUR = ("Twinford", "Crossgate", *NEW)

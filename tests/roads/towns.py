@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ssad.roads import LaneGraph, load_graph, load_town
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
 IMPORTED = ("Town_Safebench_Light", "Town02", "Town05")
 
 

@@ -18,6 +18,7 @@ from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scen
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.world.models import model
 from ssad.world.rollout import rollout
+from ssad.world.world import World
 
 SHIPPED = load_scenarios("precrash")
 NATURAL = load_scenarios("natural")
@@ -122,7 +123,7 @@ def test_an_ego_that_does_not_react_is_hit_in_all_32() -> None:
     graphs = {"ProvingGround": town("ProvingGround")}
     for speed in (8.0, 9.0, 10.0):
         episodes = [build_episode(replace(s, target_speed=speed), graphs["ProvingGround"], seed=0) for s in SHIPPED]
-        ends = {t.key.split("@")[0]: t.end for t in rollout(episodes, graphs, Follow())}
+        ends = {t.key.split("@")[0]: t.end for t in rollout(World(episodes, graphs), Follow())}
         assert {name for name, end in ends.items() if end != "collision"} == set(), f"at {speed} m/s"
 
 

@@ -8,10 +8,9 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from ssad.core.types import Condition
+from ssad.core.types import ENDS, Condition
 from ssad.world import kernels
 from ssad.world.kernels.data import End, When
-from ssad.world.world import ENDS
 
 CODED = ("kind", "controller", "active", "end", "contact", "who", "light")
 SOURCES = sorted(Path(kernels.__file__).parent.glob("*.py"))

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.core.types import Controller
+from ssad.core.types import ENDS, Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.world.world import ENDS, World
+from ssad.world.world import World
 
 
 def run(name: str, ego: Controller) -> World:
@@ -40,5 +40,5 @@ def test_natural_traffic_hurts_nobody_and_gets_through() -> None:
     assert (world.ended() == ENDS.index("collision")).mean() <= 0.02
     assert touched.mean() <= 0.02
     assert world.array("ego.complete").mean() >= 95.0
-    moved = world.array("travelled")[world.kind > 0]
+    moved = world.array("travelled")[world.state().kind > 0]
     assert np.median(moved) > 20.0  # not by standing still

@@ -9,6 +9,7 @@ import numpy as np
 from ssad.core.types import Condition, Controller, EpisodeAgent, Phase, Pose
 from ssad.world.rollout import rollout
 from ssad.world.witness import _drive, find_witness, shifted
+from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode, line_route
 
 
@@ -42,11 +43,11 @@ def test_a_late_walker_is_avoidable_and_the_witness_can_be_run() -> None:
     m = found.manoeuvre
     assert m is not None
     assert m.start >= found.trigger
-    blind = rollout([one], GRAPHS, Asked())[0]
+    blind = rollout(World([one], GRAPHS), Asked())[0]
     assert blind.end == "collision"
     place = float(np.argmin(np.abs(blind.x[int(m.start / 0.1), 0] - blind.route[:, 0])))
     again = replace(one, agents=(_drive(one.agents[0], m, place), *one.agents[1:]))
-    assert rollout([again], GRAPHS, Asked())[0].end == "complete"
+    assert rollout(World([again], GRAPHS), Asked())[0].end == "complete"
 
 
 def test_a_wall_that_nobody_can_pass_needs_no_collision_but_one_at_the_bumper_is_unavoidable() -> None:

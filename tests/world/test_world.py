@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.types import Condition, Controller, EpisodeAgent, Limits, Phase, Pose
+from ssad.core.types import ENDS, Condition, Controller, EpisodeAgent, Limits, Phase, Pose
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.world.check import check_world
+from ssad.world.check import check_simulator
 from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS
-from ssad.world.world import ENDS, World
+from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode, line_route
 
 
@@ -238,10 +238,10 @@ def bank() -> list:
 
 def test_world_keeps_its_promises() -> None:
     episodes = bank()
-    check_world(lambda assign: World(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL), episodes=len(episodes))
+    check_simulator(lambda assign: World(episodes, GRAPHS, assign=assign), episodes=len(episodes))
 
 
-def test_check_world_catches_a_world_that_depends_on_its_batch() -> None:
+def test_check_simulator_catches_a_world_that_depends_on_its_batch() -> None:
     episodes = bank()
 
     class Leaky(World):
@@ -250,10 +250,7 @@ def test_check_world_catches_a_world_that_depends_on_its_batch() -> None:
             self.array("speed")[...] += np.float32(1e-3 * self.batch)
 
     with pytest.raises(AssertionError, match="a scene alone gives the bits"):
-        check_world(
-            lambda assign: Leaky(episodes, GRAPHS, assign=assign, ego=Controller.EXTERNAL),
-            episodes=len(episodes),
-        )
+        check_simulator(lambda assign: Leaky(episodes, GRAPHS, assign=assign), episodes=len(episodes))
 
 
 def test_bad_episodes_are_refused() -> None:

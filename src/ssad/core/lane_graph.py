@@ -146,6 +146,12 @@ class LaneGraph:
         width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
         return float(x), float(y), float(self.yaw[i]) + t * turn, width
 
+    def divided(self, lane: int) -> bool:
+        """Whether no lane of the other way lies beside those of a lane's own way: a one-way road, or a median."""
+        while (left := int(self.left[lane])) >= 0 and self.same_direction(lane, left):
+            lane = left
+        return left < 0 or self.kind[left] != LaneType.DRIVING
+
     def same_direction(self, lane: int, other: int) -> bool:
         """Whether two lanes of one road carry traffic the same way (OpenDRIVE: ids of one sign)."""
         return bool(self.lane_id[lane] * self.lane_id[other] > 0 and self.road[lane] == self.road[other])

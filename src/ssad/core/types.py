@@ -84,7 +84,8 @@ class Controller(IntEnum):
     """Who steers an agent.
 
     NONE stands still; EXTERNAL takes the action given to `World.step`; AUTOPILOT follows its route, sees everything
-    and yields; FOLLOW keeps its route and target speed and sees nothing; SCRIPT runs its phases.
+    and yields; FOLLOW keeps its route and target speed and sees nothing; SCRIPT runs its phases; PLACED is put where
+    `World.place` says: how a log is replayed, or another simulator mirrored.
     """
 
     NONE = 0
@@ -92,6 +93,22 @@ class Controller(IntEnum):
     AUTOPILOT = 2
     FOLLOW = 3
     SCRIPT = 4
+    PLACED = 5
+
+
+class End(IntEnum):
+    """Why an episode ended."""
+
+    RUNNING = 0
+    COLLISION = 1
+    COMPLETE = 2
+    MAX_STEPS = 3
+    MAX_DISTANCE = 4
+    MAX_TIME = 5
+
+
+# what traces call these; "" while the episode runs
+ENDS = tuple("" if end == End.RUNNING else end.name.lower() for end in End)
 
 
 @dataclass(frozen=True)
@@ -177,11 +194,15 @@ class TrafficPlan:
 
 @dataclass(frozen=True)
 class Limits:
-    """What ends an episode besides a collision and the end of the route."""
+    """What ends an episode besides the end of the route.
+
+    contact says what a contact of the ego does: `end` the episode, only `count`, or `remove` the other agent and go on.
+    """
 
     max_steps: int = 300
     max_time: float = 60.0
     max_distance: float = 1.0e9
+    contact: Literal["end", "count", "remove"] = "end"
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import cast
 
+from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError
-from ssad.core.protocols import DrivingSystem
 from ssad.core.types import Controller
 
 SYSTEMS: dict[str, str] = {
@@ -14,10 +14,10 @@ SYSTEMS: dict[str, str] = {
 }
 
 
-def make_system(name: str) -> DrivingSystem:
+def make_system(name: str) -> Driver:
     """A driving system by name, entry point or "module:object"; a class is called without arguments.
 
-    Raises UnknownNameError, or ConfigError if the object is not a DrivingSystem.
+    Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
     from ssad.core.registry import resolve
 
@@ -28,15 +28,16 @@ def make_system(name: str) -> DrivingSystem:
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")
     if not isinstance(controller, Controller):
         raise ConfigError(f"system '{name}': controller must be a ssad.core.types.Controller, not {controller!r}")
-    return _Named(name, controller, cast(DrivingSystem, system))
+    return _Named(name, controller, cast(Driver, system))
 
 
 class _Named:
-    """A system under the name it was asked for; fills in what a short user class leaves out."""
+    """A driver under the name it was asked for; fills in what a short user class leaves out."""
 
-    def __init__(self, name: str, controller: Controller, system: DrivingSystem) -> None:
+    def __init__(self, name: str, controller: Controller, system: Driver) -> None:
         self.name = name
         self.controller = controller
         self.target_speed: float | None = getattr(system, "target_speed", None)
+        self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset
         self.act = system.act

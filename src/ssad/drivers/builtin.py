@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ssad.core.protocols import Observation
+from ssad.core.driving import Observation
 from ssad.core.types import F32, Controller, Episode
 
 

@@ -20,6 +20,8 @@ from ssad.world.models import model
 NEAR = 120.0  # m from the ego's way within which traffic starts
 WAY = 260.0  # m of the ego's way that counts for this: what is driven in 30 s
 MOST = 44  # vehicles
+TOWN_SPEED = 12.0  # m/s that a driver who wants the most drives in town
+FAST = 21.0  # m/s: on roads with a higher limit everybody wants to drive faster in proportion
 TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
@@ -65,9 +67,8 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
     if not len(lanes):
         raise MapError(f"town '{graph.name}' has no driving lane of 25 m or more; nothing can be recorded there")
     route = _way(graph, lanes, draws)
-    ego = EpisodeAgent(
-        "ego", "car", Controller.EXTERNAL, _pose(route), target_speed=float(draws.uniform(7, 10)), route=route
-    )
+    wish = float(draws.uniform(7, 10)) * _haste(route)
+    ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, _pose(route), target_speed=wish, route=route)
     agents = [ego]
     way = route.xy[: int(WAY) : 5]
     density = float(draws.uniform(0.25, 0.8))
@@ -91,10 +92,12 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
             path = random_route(graph, lane, s, 400.0, draws)
         else:
             body = "compact"
+        if body == "bicycle" and _haste(path) > 1.0:
+            body = "motorcycle"  # nobody cycles on a motorway
         room = 0.5 * model(body).length + 4.0
         if any(math.hypot(a.pose.x - x, a.pose.y - y) < room + 0.5 * model(a.model).length for a in agents):
             continue
-        wanted = 5.0 if body == "bicycle" else float(draws.uniform(5.5, 11.0))
+        wanted = 5.0 if body == "bicycle" else float(draws.uniform(5.5, 11.0)) * _haste(path)
         limit = float(graph.speed_limit[lane])
         pose = Pose(x, y, yaw)
         agents.append(
@@ -122,6 +125,12 @@ def _way(graph: LaneGraph, lanes: np.ndarray, draws: np.random.Generator) -> Rou
             break
     assert found is not None
     return found
+
+
+def _haste(route: Route) -> float:
+    """Times as fast as in town that somebody on this way wants to drive, where its roads and bends let them."""
+    fastest = float(route.speed_limit.max())
+    return fastest / TOWN_SPEED if fastest > FAST else 1.0
 
 
 def _pose(route: Route) -> Pose:

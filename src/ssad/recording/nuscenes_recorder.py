@@ -259,8 +259,9 @@ def drive(episode: Episode, graph: LaneGraph) -> EpisodeTrace:
     """The Autopilot drives an episode."""
     from ssad.drivers import make_system
     from ssad.world.rollout import rollout
+    from ssad.world.world import World
 
-    return rollout([episode], {graph.name: graph}, make_system("autopilot"))[0]
+    return rollout(World([episode], {graph.name: graph}), make_system("autopilot"))[0]
 
 
 @dataclass(slots=True)

@@ -236,6 +236,8 @@ def _kerb(  # noqa: PLR0917
         walk = int(graph.right[lane])
         if walk < 0 or graph.kind[walk] != LaneType.SIDEWALK or graph.junction[lane] >= 0:
             continue
+        if graph.left[lane] >= 0 and graph.divided(int(graph.left[lane])):
+            continue  # nobody parks in a roundabout
         s = 9.0 + float(draws.uniform(0, 3))
         while s < float(graph.length[lane]) - 9.0:
             x, y, yaw, width = graph.at(int(lane), s)  # the edge of the driving lane:

@@ -11,7 +11,7 @@ from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.safeio import home
 from ssad.roads.bake import bake
 
-BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill")
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
 
 
 def town_names() -> dict[str, str]:

@@ -14,6 +14,7 @@ from ssad.core.types import F64, LaneType
 from ssad.roads.xodr import Network
 
 ARMS = 3  # a junction with fewer arms needs no signal
+TOUCHING = 2.5  # m between the middles of two ways at which they meet
 SETBACK = 1.0  # m from the stop line to a crosswalk
 _TAIL = 15.0  # m before the end of a lane in which a crosswalk moves its stop line
 
@@ -48,8 +49,8 @@ def place_signals(data: Approaches) -> dict[str, Any]:
     """The signal and stop arrays of a LaneGraph.
 
     Every arm of a junction with lights gets one signal and a stop line on each of its lanes; a junction of at
-    least three arms without lights gets the same, marked virtual. Phases come from the map's controllers
-    where every light has one, else arms that face each other share a phase.
+    least three arms without lights gets the same, marked virtual, if ways of different arms meet there. Phases
+    come from the map's controllers where every light has one, else arms that face each other share a phase.
     """
     signals: list[tuple[float, float, float, int, int, bool]] = []
     stops: list[tuple[int, int, float]] = []
@@ -59,7 +60,7 @@ def place_signals(data: Approaches) -> dict[str, Any]:
         for arm in approaches:
             arm.light = _facing(data, arm, inner)
         real = any(arm.light for arm in approaches)
-        if not approaches or (not real and len(arms) < ARMS):
+        if not approaches or (not real and (len(arms) < ARMS or not _meet(data, approaches, set(inner)))):
             continue
         for arm, phase in zip(approaches, _phases(data, approaches), strict=True):
             outer = min(arm.lanes, key=lambda i: -abs(data.keys[i][2]))
@@ -164,6 +165,13 @@ def _arms(data: Approaches) -> dict[int, list[_Approach]]:
                 out, _, lane_out = data.keys[j]
                 arms.setdefault(here, {}).setdefault((out, lane_out > 0), _Approach(here, []))
     return {junction: [found[k] for k in sorted(found)] for junction, found in sorted(arms.items())}
+
+
+def _meet(data: Approaches, arms: list[_Approach], inner: set[int]) -> bool:
+    """Whether ways of different arms come so near that two vehicles could touch; not so at a motorway's interchange."""
+    ways = [[data.line[j][0] for j in sorted({j for i in arm.lanes for j in data.links[i]} & inner)] for arm in arms]
+    pairs = ((a, b) for k, mine in enumerate(ways) for other in ways[k + 1 :] for a in mine for b in other)
+    return any(float(np.hypot(*np.moveaxis(a[:, None] - b[None], -1, 0)).min()) < TOUCHING for a, b in pairs)
 
 
 def _facing(data: Approaches, arm: _Approach, inner: list[int]) -> str | None:

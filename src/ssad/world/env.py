@@ -12,22 +12,32 @@ from gymnasium.vector.utils import batch_space
 
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Controller, Episode
-from ssad.world.kernels.data import End
-from ssad.world.world import ENDS, World
+from ssad.core.types import ENDS, Controller, End, Episode
+from ssad.world.rewards import REWARDS, Reward
+from ssad.world.rollout import Drivers, Loop
+from ssad.world.sensors import SENSORS
+from ssad.world.world import World
 
 Observation = Literal["safebench", "frea"]
 Action = Literal["safebench", "frea", "controls"]
-_SLICE = {"safebench": slice(0, 4), "frea": slice(4, 28)}
+_SIZE = {"safebench": 4, "frea": 24}
 _BOUND = np.float32(1.0e4)
 
 
 def observation_space(kind: Observation) -> gym.spaces.Box:
-    """`safebench`: [4] lateral offset m, heading error rad, speed m/s, hazard 0/1; `frea`: [24], see kernels.look."""
-    if kind not in _SLICE:
-        raise ConfigError(f"unknown observation '{kind}'; known: {', '.join(_SLICE)}")
-    n = _SLICE[kind].stop - _SLICE[kind].start
-    return gym.spaces.Box(-_BOUND, _BOUND, (n,), np.float32)
+    """`safebench`: [4] lateral offset m, heading error rad, speed m/s, hazard 0/1; `frea`: [24], see world.sensors."""
+    if kind not in _SIZE:
+        raise ConfigError(f"unknown observation '{kind}'; known: {', '.join(_SIZE)}")
+    return gym.spaces.Box(-_BOUND, _BOUND, (_SIZE[kind],), np.float32)
+
+
+def reward_of(reward: str | Reward) -> Reward:
+    """A reward by its name in `ssad.world.rewards.REWARDS`, or a function from a state to [B] as it is."""
+    if callable(reward):
+        return reward
+    if reward not in REWARDS:
+        raise ConfigError(f"unknown reward '{reward}'; known: {', '.join(REWARDS)}")
+    return REWARDS[reward]
 
 
 def action_space(kind: Action) -> gym.spaces.Box:
@@ -44,26 +54,28 @@ def to_controls(kind: Action, action: npt.NDArray[np.floating[Any]]) -> npt.NDAr
     """Policy actions [B, n] to throttle, brake, steer [B, 3], by the rules of SafeBench and FREA."""
     a = np.asarray(action, np.float32)
     out = np.zeros((len(a), 3), np.float32)
+    if kind != "controls":
+        a = np.minimum(np.maximum(a, -1.0), 1.0)
     if kind == "controls":
         out[:] = a
     elif kind == "safebench":
-        push = np.clip(a[:, 0], -1, 1) * 3.0
-        out[:, 0] = np.where(push > 0, np.clip(push / 3.0, 0, 1), 0)
-        out[:, 1] = np.where(push > 0, 0, np.clip(-push / 8.0, 0, 1))
-        out[:, 2] = np.clip(a[:, 1], -1, 1) * 0.3
+        push = a[:, 0] * 3.0
+        out[:, 0] = np.minimum(np.maximum(push / 3.0, 0.0), 1.0)
+        out[:, 1] = np.maximum(-push / 8.0, 0.0)
+        out[:, 2] = a[:, 1] * 0.3
     else:
-        throttle = np.clip(np.clip(a[:, 0], -1, 1) * 0.5 + 0.5, 0, 1)
-        brake = np.clip(a[:, 2], -1, 1) * 0.5 + 0.5
+        throttle = a[:, 0] * 0.5 + 0.5
+        brake = a[:, 2] * 0.5 + 0.5
         brake = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
-        out[:, 0], out[:, 1], out[:, 2] = throttle, brake, np.clip(a[:, 1], -1, 1) * 0.3
+        out[:, 0], out[:, 1], out[:, 2] = throttle, brake, a[:, 1] * 0.3
     return out
 
 
 class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """`num_envs` scenes, each an episode drawn from the bank; an ended scene starts another one in the same step.
 
-    Observations [num_envs, 4 | 24] float32, actions as `action_space`, reward SafeBench's
-    (-1 collision + speed along the lane - 10 above 8 m/s - 1 beyond 4 m - 5 steer^2 - 0.2 |steer| v^2).
+    Observations [num_envs, 4 | 24] float32, actions as `action_space`, `reward` "safebench", "frea" or a function of
+    the state. `drivers` act for other agents than the ego, as in `rollout`. Without `restart` ended scenes stand still.
     Terminated by collision or completion, truncated by the episode's limits. `info["end"]` names why.
     """
 
@@ -77,7 +89,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         *,
         observation: Observation = "safebench",
         action: Action = "safebench",
+        reward: str | Reward = "safebench",
+        drivers: Drivers | None = None,
         device: str = "cpu",
+        restart: bool = True,
     ) -> None:
         super().__init__()
         if num_envs < 1:
@@ -87,8 +102,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.single_action_space = action_space(action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._slice = _SLICE[observation]
+        self._sensor = SENSORS[observation]
         self._action: Action = action
+        self._restart = restart
+        self._reward = reward_of(reward)
         self.world = World(
             episodes,
             graphs,
@@ -96,10 +113,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             device=device,
             ego=Controller.EXTERNAL,
         )
+        self._loop = Loop(self.world, drivers or {})
+        self._egos = np.stack([np.arange(num_envs), np.zeros(num_envs)], 1).astype(np.int32)
+        self._controls = np.zeros((num_envs, self.world.agents, 3), np.float32)
 
     def _observe(self) -> npt.NDArray[np.float32]:
-        rows = self.world.observe()[:, self._slice]
-        return np.clip(rows, -_BOUND, _BOUND).astype(np.float32)
+        rows: npt.NDArray[np.float32] = self._sensor(self.world, self._egos)
+        return np.minimum(np.maximum(rows, -_BOUND), _BOUND)
 
     def _draw(self, count: int) -> npt.NDArray[np.int32]:
         return self.np_random.integers(len(self.world.episodes), size=count).astype(np.int32)
@@ -112,7 +132,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         super().reset(seed=one)
         chosen = (options or {}).get("episodes")
         order = self._draw(self.num_envs) if chosen is None else np.asarray(chosen, np.int32)
-        self.world.reset(episodes=order)
+        self._loop.reset(episodes=order)
         return self._observe(), {"episode": order.copy()}
 
     def step(
@@ -125,9 +145,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         dict[str, Any],
     ]:
         """One step of 0.1 s in every scene."""
-        self.world.step(to_controls(self._action, actions))
+        self._controls[:, 0] = to_controls(self._action, actions)
+        self._loop.step(self._controls)
         end = self.world.ended().copy()
-        reward = self.world.array("ego.reward").astype(np.float64)
+        reward = self._reward(self.world.state())
         terminated = (end == End.COLLISION) | (end == End.COMPLETE)
         truncated = (end != 0) & ~terminated
         info: dict[str, Any] = {}
@@ -143,34 +164,22 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "end": np.array([ENDS[k] for k in end], dtype=object),
                 "_end": end != 0,
             }
-            self.world.reset(done, episodes=self._draw(len(done)))
-            observation = self._observe()
+            if self._restart:
+                self._loop.reset(done, episodes=self._draw(len(done)))
+                observation = self._observe()
         return observation, reward, terminated, truncated, info
 
 
 class SingleEnv(gym.Env[Any, Any]):
-    """One scene of the same world; reset draws the episode from its seeded generator."""
+    """One scene of the same world; reset draws the episode from its seeded generator. Options as `VectorEnv`."""
 
     metadata = {"render_modes": []}  # noqa: RUF012
 
-    def __init__(
-        self,
-        episodes: Sequence[Episode],
-        graphs: Mapping[str, LaneGraph],
-        *,
-        observation: Observation = "safebench",
-        action: Action = "safebench",
-        device: str = "cpu",
-    ) -> None:
-        self.observation_space = observation_space(observation)
-        self.action_space = action_space(action)
-        self._slice = _SLICE[observation]
-        self._action: Action = action
-        self.world = World(episodes, graphs, assign=[0], device=device, ego=Controller.EXTERNAL)
-
-    def _observe(self) -> npt.NDArray[np.float32]:
-        row = self.world.observe()[0, self._slice]
-        return np.clip(row, -_BOUND, _BOUND).astype(np.float32)
+    def __init__(self, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], **options: Any) -> None:
+        self._many = VectorEnv(episodes, graphs, 1, restart=False, **options)
+        self.world = self._many.world
+        self.observation_space = self._many.single_observation_space
+        self.action_space = self._many.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -179,16 +188,13 @@ class SingleEnv(gym.Env[Any, Any]):
         super().reset(seed=seed)
         chosen = (options or {}).get("episode")
         k = int(self.np_random.integers(len(self.world.episodes))) if chosen is None else int(chosen)
-        self.world.reset([0], episodes=[k])
-        return self._observe(), {"episode": k}
+        observation, _ = self._many.reset(options={"episodes": [k]})
+        return observation[0], {"episode": k}
 
     def step(
         self, action: npt.NDArray[np.float32]
     ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One step of 0.1 s."""
-        self.world.step(to_controls(self._action, np.asarray(action)[None]))
-        end = int(self.world.ended()[0])
-        terminated = end in (End.COLLISION, End.COMPLETE)
-        reward = float(self.world.array("ego.reward")[0])
-        info = {"end": ENDS[end]} if end else {}
-        return self._observe(), reward, terminated, end != 0 and not terminated, info
+        observation, reward, terminated, truncated, info = self._many.step(np.asarray(action)[None])
+        about = {"end": info["end"][0]} if "end" in info else {}
+        return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), about

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, Route
 from ssad.roads.query import CELL, DRIVABLE, build_grid
-from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, TurnRank, When, array_types
+from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
 from ssad.world.models import MODELS, model
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
@@ -27,12 +28,14 @@ TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
     line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m
-    that the next 64 m leave the straight line along the point's heading."""
+    that the next 64 m leave the straight line along the point's heading; lane [N] of the town, -1 none."""
 
     path: F32
     rule: F32
     signal: npt.NDArray[np.int32]
     bend: F32
+    lane: npt.NDArray[np.int32]
+    town: str
 
 
 def _bend(route: Route) -> F32:
@@ -66,6 +69,8 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
         np.stack([cap, stop, entry, rank], 1).astype(np.float32),
         signal,
         _bend(route),
+        route.lane.astype(np.int32),
+        graph.name,
     )
 
 
@@ -92,6 +97,7 @@ def _junctions(
     route: Route, graph: LaneGraph, yaw: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Distance to the next junction and turn rank there, for every route point."""
+    ruled = set(graph.rule_lane.tolist())
     n = len(route.xy)
     inside = np.zeros(n, bool)
     known = route.lane >= 0
@@ -102,7 +108,9 @@ def _junctions(
     runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
     for start, stop in reversed(list(runs)):
         turn = yaw[min(stop, n - 1)] - yaw[max(start - 1, 0)]
-        kind = TurnRank.STRAIGHT if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
+        kind = int(TurnRank.STRAIGHT) if abs(turn) < TURN else (TurnRank.LEFT if turn > 0 else TurnRank.RIGHT)
+        if start > 0 and int(route.lane[start - 1]) in ruled:
+            kind += TurnRank.YIELD
         entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
         rank[: start + 1] = kind
         entry[start:stop] = 0.0
@@ -172,16 +180,35 @@ def _put_agent(  # noqa: PLR0917
         a["phase_speed"][e, i, k] = phase.speed
 
 
+@dataclass(frozen=True)
+class Bank:
+    """What does not change while a world runs: for the kernels, and for `WorldState`.
+
+    kind [E, A] AgentKind of every slot, size [E, A, 2] length and width m, route [E, A, 2] as in `EpisodeArrays`;
+    program [E, S, 4] of the town's signals and forced [E, S] states (-1 none) until [E] s.
+    """
+
+    episodes: EpisodeArrays
+    roads: Roads
+    tables: RoadTables
+    agents: int
+    kind: npt.NDArray[np.int32]
+    size: F32
+    route: npt.NDArray[np.int32]
+    program: npt.NDArray[np.float64]
+    forced: npt.NDArray[np.int32]
+    until: F32
+
+
 def build(
     episodes: Sequence[Episode],
     graphs: Mapping[str, LaneGraph],
     device: str,
     ego: Controller | None,
-    speed: float | None = None,
-) -> tuple[EpisodeArrays, Roads, int]:
-    """Arrays of all episodes on `device`, and the number of agent slots.
+) -> Bank:
+    """Arrays of all episodes on `device`.
 
-    `ego` and `speed` replace the egos' controller and target speed.
+    `ego` replaces the egos' controller.
     """
     if not episodes:
         raise ConfigError("a world needs at least one episode")
@@ -205,6 +232,7 @@ def build(
         "town": np.zeros(len(episodes), np.int32),
         "signal": np.full((len(episodes), signals), -1, np.int32),
         "limits": np.zeros((len(episodes), 4), np.float32),
+        "contact": np.zeros(len(episodes), np.int32),
     }
     pool = _Pool()
     for e, episode in enumerate(episodes):
@@ -216,12 +244,11 @@ def build(
             _put_agent(a, e, i, agent, names, route)
         if ego is not None:
             a["controller"][e, 0] = int(ego)
-        if speed is not None:
-            a["cruise"][e, 0, 0] = speed
         a["town"][e] = towns.index(episode.town)
         for index, state in episode.signal_override.items():
             a["signal"][e, index] = int(state)
         limits = episode.limits
+        a["contact"][e] = ContactPolicy[limits.contact.upper()]
         a["limits"][e] = limits.max_steps, limits.max_time, limits.max_distance, episode.override_until
     body = [(m.length / 2, m.width / 2, max(m.wheelbase, 0.1), m.max_steer) for m in MODELS.values()]
     power = [(m.max_accel, m.max_brake, m.max_speed, 0.0) for m in MODELS.values()]
@@ -231,7 +258,40 @@ def build(
     bank = EpisodeArrays()
     for name, array in array_types(EpisodeArrays).items():
         setattr(bank, name, wp.array(a[name], dtype=array.dtype, device=device))
-    return bank, _roads([graphs[t] for t in towns], pool, device), count
+    found = [graphs[t] for t in towns]
+    program = np.zeros((len(towns), signals, 4))
+    for k, graph in enumerate(found):
+        program[k, : len(graph.signal_phase)] = signal_programs(graph)
+    models = np.asarray(a["model"])
+    return Bank(
+        bank,
+        _roads(found, pool, device),
+        _tables(found, pool),
+        count,
+        np.where(models < 0, int(AgentKind.NONE), np.asarray(a["kind"])[np.maximum(models, 0)]).astype(np.int32),
+        (2 * np.asarray(a["body"])[np.maximum(models, 0), :2]).astype(np.float32),
+        np.asarray(a["route"]),
+        program[np.asarray(a["town"])],
+        np.asarray(a["signal"]),
+        np.asarray(a["limits"])[:, 3],
+    )
+
+
+def _tables(graphs: Sequence[LaneGraph], pool: _Pool) -> RoadTables:
+    """The same routes for the host; lanes are counted over all towns, as in `Roads`."""
+    first = dict(zip([g.name for g in graphs], np.cumsum([0, *(len(g.kind) for g in graphs)]), strict=False))
+
+    def shifted(lanes: npt.NDArray[np.int32], town: str) -> npt.NDArray[np.int32]:
+        return np.where(lanes >= 0, lanes + first[town], -1).astype(np.int32)
+
+    return RoadTables(
+        path=np.concatenate([t.path for t in pool.tables]),
+        rule=np.concatenate([t.rule for t in pool.tables]),
+        signal=np.concatenate([t.signal for t in pool.tables]),
+        lane=np.concatenate([shifted(t.lane, t.town) for t in pool.tables]),
+        left=np.concatenate([shifted(g.left, g.name) for g in graphs]),
+        right=np.concatenate([shifted(g.right, g.name) for g in graphs]),
+    )
 
 
 def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
@@ -265,10 +325,3 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
             joined = np.zeros((1, *joined.shape[1:]), joined.dtype)
         setattr(roads, name, wp.array(np.ascontiguousarray(joined), dtype=array.dtype, device=device))
     return roads
-
-
-def agent_kinds(bank: EpisodeArrays) -> npt.NDArray[np.int32]:
-    """[E, A] AgentKind of every slot."""
-    models = bank.model.numpy()
-    kinds = bank.kind.numpy()
-    return np.where(models < 0, int(AgentKind.NONE), kinds[np.maximum(models, 0)]).astype(np.int32)

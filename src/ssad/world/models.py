@@ -15,6 +15,8 @@ GRIP = 7.0
 STEER_TIME = 0.5
 # Reverse gear: top speed, m/s.
 REVERSE_SPEED = 5.0
+# A walker that a driver steers turns at up to this, rad/s.
+WALKER_RATE = math.pi
 
 
 def _vehicle(  # noqa: PLR0917

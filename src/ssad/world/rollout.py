@@ -1,121 +1,252 @@
-"""Run a batch of episodes to their ends with a driving system, and keep what happened."""
+"""The one loop of all that drives: drivers act for agents of a simulator, step by step, and what happens is kept."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.driving import Driver, Perturbation, Scenes, Selector, Sensor, Simulator, WorldState
 from ssad.core.errors import ConfigError
-from ssad.core.lane_graph import LaneGraph
-from ssad.core.protocols import DrivingSystem
-from ssad.core.types import Controller, Episode, EpisodeTrace
-from ssad.world.kernels.data import End, Presence
-from ssad.world.observation import make_observation
-from ssad.world.world import ENDS, World, signal_states
+from ssad.core.seeding import generator
+from ssad.core.types import ENDS, F32, I32, AgentKind, Controller, End, EpisodeTrace
+from ssad.world.observation import observe
+from ssad.world.sensors import SENSORS
 
+Drivers = Mapping[int | Selector, Driver]
 _AGENT = ("x", "y", "yaw", "speed", "active")
 
 
-def _row(world: World) -> dict[str, npt.NDArray[np.generic]]:
-    """One step of all scenes, in the terms and types of `EpisodeTrace`: first what all agents have, then the ego's."""
-    pose = world.array("pose")
-    control = world.array("control")[:, 0]
-    return {
-        "x": pose[..., 0].copy(),
-        "y": pose[..., 1].copy(),
-        "yaw": pose[..., 2].copy(),
-        "speed": world.array("speed").copy(),
-        "active": world.array("active") != Presence.ABSENT,
-        "accel": world.array("ego.accel").copy(),
-        "contact": world.array("ego.contact").astype(np.uint8),
-        "contact_agent": world.array("ego.contact_agent").copy(),
-        "off_road": world.array("ego.off_road") != 0,
-        "route_distance": world.array("ego.route_distance").copy(),
-        "route_complete": world.array("ego.complete").copy(),
-        "driven": world.array("ego.driven").copy(),
-        "lane_invasion": world.array("ego.invasion").astype(np.uint8),
-        # 2 marks a line already counted in the step before
-        "red_light": (world.array("ego.red_light") == 1).astype(np.uint8),
-        "throttle": control[:, 0].copy(),
-        "brake": control[:, 1].copy(),
-        "steer": control[:, 2].copy(),
-    }
+class Loop:
+    """Drivers at work in a simulator.
+
+    `drivers` says who acts for whom: an agent's number, or a selector that chooses at every step whom its driver takes
+    over (those it no longer chooses are given back). Agents that nobody is named for are driven by what their episode
+    says. All that changes lies in the simulator, so that a snapshot of it continues to the bit if its drivers do.
+    `sensors` adds to those of `ssad.world.sensors`; only what a driver asks for is computed. `perturbation` changes
+    the pictures ([N, C, H, W]) that drivers get.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        drivers: Drivers,
+        *,
+        sensors: Mapping[str, Sensor] | None = None,
+        perturbation: Perturbation | None = None,
+    ) -> None:
+        self.simulator = simulator
+        self.drivers = list(drivers.items())
+        self.sensors = SENSORS | dict(sensors or {})
+        self.perturbation = perturbation
+        shape = (simulator.batch, simulator.agents)
+        for who, driver in self.drivers:
+            if isinstance(who, int) and not 0 <= who < simulator.agents:
+                raise ConfigError(f"driver {driver.name}: there is no agent {who}; scenes have {simulator.agents}")
+            for name in getattr(driver, "sensors", ()):
+                if name not in self.sensors:
+                    known = ", ".join(self.sensors)
+                    raise ConfigError(f"driver {driver.name} asks for sensor '{name}'; known: {known}")
+        self._controls = np.zeros((*shape, 4), np.float32)
+        self._fixed = [
+            np.stack([np.arange(shape[0]), np.full(shape[0], who)], 1).astype(np.int32)
+            if isinstance(who, int)
+            else None
+            for who, _ in self.drivers
+        ]
+
+    def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
+        """Start scenes again (default: all), as `Simulator.reset`; drivers take their seats there.
+
+        Drivers forget the past only when all scenes start again.
+        """
+        simulator = self.simulator
+        simulator.reset(scenes, episodes=episodes)
+        started = np.full(simulator.batch, scenes is None)
+        if scenes is not None:
+            started[np.asarray(scenes)] = True
+        running = [simulator.episodes[k] for k in simulator.assigned] if scenes is None else []
+        for policy, (who, driver) in enumerate(self.drivers):
+            if isinstance(who, int):
+                self._seat(policy, (np.arange(simulator.agents) == who) & started[:, None])
+            if driver.controller == Controller.EXTERNAL and scenes is None:
+                driver.reset(running)
+
+    def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
+        driver = self.drivers[policy][1]
+        speed = getattr(driver, "target_speed", None)
+        self.simulator.take(mask, driver.controller, policy=policy, target_speed=speed)
+
+    def step(self, controls: npt.ArrayLike | None = None) -> None:
+        """Advance all scenes by one step.
+
+        `controls` [B, A, 3|4] are for agents that no driver here acts for. Raises ConfigError if a driver returns
+        controls of a wrong shape or not finite; what it raises passes.
+        """
+        if not self.drivers:
+            self.simulator.step(controls)
+            return
+        self._controls[:] = 0.0
+        if controls is not None:
+            given = np.asarray(controls, np.float32)
+            self._controls[..., : given.shape[-1]] = given
+        asked = controls is not None
+        state: WorldState | None = None
+        for policy, (who, driver) in enumerate(self.drivers):
+            agents = self._fixed[policy]
+            external = driver.controller == Controller.EXTERNAL
+            if agents is None or external:
+                state = self.simulator.state() if state is None else state
+            if agents is None and not isinstance(who, int):
+                assert state is not None
+                chosen = np.asarray(who(state), bool) & (self.simulator.ended() == End.RUNNING)[:, None]
+                had = state.policy == policy
+                if (chosen != had).any():
+                    if (had & ~chosen).any():
+                        self.simulator.take(had & ~chosen, None)
+                    if (chosen & ~had).any():
+                        self._seat(policy, chosen & ~had)
+                    state = self.simulator.state()
+                agents = np.argwhere(chosen).astype(np.int32)
+            if external and agents is not None and len(agents):
+                assert state is not None
+                asked = True
+                given = self._act(driver, state, agents)
+                self._controls[agents[:, 0], agents[:, 1], : given.shape[1]] = given
+        self.simulator.step(self._controls if asked else None)
+
+    def _act(self, driver: Driver, state: WorldState, agents: I32) -> F32:
+        """Controls [N, 3|4] of the agents; 0 where the episode has ended."""
+        ended = self.simulator.ended() != End.RUNNING
+        readings = {name: self._read(name, driver, state, agents) for name in getattr(driver, "sensors", ())}
+        given = np.asarray(driver.act(observe(state, agents, ended, readings)), np.float32)
+        if given.ndim != 2 or given.shape[0] != len(agents) or given.shape[1] not in (3, 4):
+            raise ConfigError(
+                f"system {driver.name}: act returned shape {given.shape}, expected ({len(agents)}, 3): "
+                "throttle, brake, steer"
+            )
+        running = ~ended[agents[:, 0]]
+        if not np.isfinite(given[running]).all():
+            raise ConfigError(f"system {driver.name}: act returned a control that is not finite")
+        return np.where(running[:, None], given, np.float32(0.0))
+
+    def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> npt.NDArray[Any]:
+        reading = self.sensors[name](self.simulator, agents)
+        if self.perturbation is None or reading.ndim != 4:
+            return reading
+        episodes, assigned = self.simulator.episodes, self.simulator.assigned
+        generators = []
+        for scene, agent in agents.tolist():
+            episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
+            generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
+        return self.perturbation.apply(reading, driver, state, generators)
+
+
+def run(loop: Loop) -> None:
+    """Start all scenes again and step them to their ends."""
+    loop.reset()
+    for _ in range(step_limit(loop.simulator)):
+        loop.step()
+        if (loop.simulator.ended() != End.RUNNING).all():
+            break
+
+
+def step_limit(simulator: Simulator) -> int:
+    """Steps after which every episode has ended."""
+    limits = [simulator.episodes[k].limits for k in simulator.assigned]
+    most = max(int(limit.max_steps) for limit in limits)
+    return min(most, int(max(limit.max_time for limit in limits) / simulator.dt) + 1)
 
 
 def rollout(
-    episodes: Sequence[Episode],
-    graphs: Mapping[str, LaneGraph],
-    system: DrivingSystem,
+    simulator: Simulator,
+    drivers: Drivers | Driver,
     *,
-    device: str = "cpu",
+    sensors: Mapping[str, Sensor] | None = None,
+    perturbation: Perturbation | None = None,
 ) -> list[EpisodeTrace]:
-    """Traces of the episodes, in order, driven by `system`.
+    """Drive all scenes of a simulator from their starts to their ends.
 
-    Raises ConfigError if the system returns controls of a wrong shape or not finite; what the system raises passes.
+    Args:
+        simulator: Where: `World(episodes, graphs)`, or another simulator.
+        drivers: Who drives whom, as `Loop` takes it; a driver alone drives the egos.
+        sensors: What drivers may ask for besides `ssad.world.sensors.SENSORS`.
+        perturbation: What changes the pictures that drivers get.
+
+    Returns:
+        A trace of each scene.
+
+    Raises:
+        ConfigError: A driver returns controls of a wrong shape or not finite, or asks for what is not there.
     """
-    speed = getattr(system, "target_speed", None)
-    world = World(episodes, graphs, device=device, ego=system.controller, ego_speed=speed)
-    external = system.controller == Controller.EXTERNAL
-    if external:
-        system.reset(episodes)
-    rows = [_row(world)]
-    lengths = np.zeros(world.batch, np.int64)
-    most = max(e.limits.max_steps for e in episodes)
-    limit = min(most, int(max(e.limits.max_time for e in episodes) / world.dt) + 1)
-    for step in range(1, limit + 1):
-        if external:
-            given = np.asarray(system.act(make_observation(world)), np.float32)
-            if given.ndim != 2 or given.shape[0] != world.batch or given.shape[1] not in (3, 4):
-                raise ConfigError(
-                    f"system {system.name}: act returned shape {given.shape}, expected ({world.batch}, 3): "
-                    "throttle, brake, steer"
-                )
-            running = world.ended() == End.RUNNING
-            if not np.isfinite(given[running]).all():
-                raise ConfigError(f"system {system.name}: act returned a control that is not finite")
-            world.set_actions(np.where(running[:, None], given, 0.0))
-        running = world.ended() == End.RUNNING
-        world.step()
-        rows.append(_row(world))
+    by_agent: Drivers = drivers if isinstance(drivers, Mapping) else {0: drivers}
+    loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation)
+    loop.reset()
+    rows = [_row(simulator.state())]
+    lengths = np.zeros(simulator.batch, np.int64)
+    for step in range(1, step_limit(simulator) + 1):
+        running = simulator.ended() == End.RUNNING
+        loop.step()
+        rows.append(_row(simulator.state()))
         lengths[running] = step
-        if (world.ended() != 0).all():
+        if (simulator.ended() != End.RUNNING).all():
             break
-    return [_trace(world, rows, b, int(lengths[b]) + 1) for b in range(world.batch)]
+    return [_trace(simulator, rows, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
 
 
-def _trace(world: World, rows: list[dict[str, npt.NDArray[np.generic]]], b: int, steps: int) -> EpisodeTrace:
-    episode = world.episodes[b]
-    graph = world.graphs[episode.town]
-    n = len(episode.agents)
-    kinds = world.kind[b, :n]
-    models = world.bank.model.numpy()[b, :n]
-    body = world.bank.body.numpy()[models]
+def _row(state: WorldState) -> dict[str, npt.NDArray[np.generic]]:
+    """One step of all scenes, in the terms and types of `EpisodeTrace`: first what all agents have, then the ego's."""
+    return {
+        "x": state.pose[..., 0].copy(),
+        "y": state.pose[..., 1].copy(),
+        "yaw": state.pose[..., 2].copy(),
+        "speed": state.speed.copy(),
+        "active": state.active.copy(),
+        "accel": state.accel[:, 0].copy(),
+        "contact": state.contact.copy(),
+        "contact_agent": state.contact_agent.copy(),
+        "off_road": state.off_road.copy(),
+        "route_distance": state.route_distance.copy(),
+        "route_complete": state.route_complete.copy(),
+        "driven": state.driven.copy(),
+        "lane_invasion": state.lane_invasion.copy(),
+        "red_light": state.red_light.copy(),
+        "throttle": state.control[:, 0, 0].copy(),
+        "brake": state.control[:, 0, 1].copy(),
+        "steer": state.control[:, 0, 2].copy(),
+        "signal": state.signal.copy(),
+    }
+
+
+def _trace(simulator: Simulator, rows: list[dict[str, npt.NDArray[np.generic]]], b: int, steps: int) -> EpisodeTrace:
+    episode = simulator.episodes[simulator.assigned[b]]
+    graph = simulator.graphs[episode.town]
+    state = simulator.state()
+    n = int((state.kind[b] != AgentKind.NONE).sum())
     agent: dict[str, Any] = {name: np.stack([row[name][b, :n] for row in rows[:steps]]) for name in _AGENT}
     ego: dict[str, Any] = {
         name: np.stack([row[name][b] for row in rows[:steps]]) for name in rows[0] if name not in _AGENT
     }
-    times = np.arange(steps) * world.dt
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
     junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
     near = np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
+    ego["signal"] = ego["signal"][:, near]
     return EpisodeTrace(
         key=episode.key,
         town=episode.town,
-        dt=world.dt,
+        dt=simulator.dt,
         names=tuple(a.name for a in episode.agents),
         models=tuple(a.model for a in episode.agents),
-        kind=kinds.astype(np.uint8),
-        length=(2 * body[:, 0]).astype(np.float32),
-        width=(2 * body[:, 1]).astype(np.float32),
+        kind=state.kind[b, :n].astype(np.uint8),
+        length=state.size[b, :n, 0].astype(np.float32),
+        width=state.size[b, :n, 1].astype(np.float32),
         stop_sign=np.zeros(steps, np.uint8),
         signal_ids=near,
-        signal=signal_states(episode, graph, times)[:, near],
         route=route.xy,
-        end=ENDS[int(world.ended()[b])] or "max_steps",
+        end=ENDS[int(simulator.ended()[b])] or "max_steps",
         **agent,
         **ego,
     )

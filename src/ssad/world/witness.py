@@ -16,8 +16,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import Condition, Controller, Episode, EpisodeAgent, Phase, Route
-from ssad.world.kernels.data import End
+from ssad.core.types import Condition, Controller, End, Episode, EpisodeAgent, Phase, Route
+from ssad.world.rollout import Loop, run
 from ssad.world.world import World
 
 Verdict = Literal["harmless", "avoidable", "anticipation", "autopilot", "unavoidable"]
@@ -101,11 +101,8 @@ def _run(
     """Why each driver's episode ended (`End`) and its route completion in percent."""
     bank = [replace(episode, agents=(d, *episode.agents[1:])) for d in drivers]
     world = World(bank, graphs, device=device)
-    for _ in range(episode.limits.max_steps):
-        world.step()
-        if world.ended().all():
-            break
-    return world.ended().copy(), world.array("ego.complete").copy()
+    run(Loop(world, {}))
+    return world.ended().copy(), world.state().route_complete.copy()
 
 
 def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> Witness:
@@ -113,18 +110,19 @@ def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> 
     graphs = {episode.town: graph}
     ego = replace(episode.agents[0], controller=Controller.FOLLOW, phases=())
     blind = World([replace(episode, agents=(ego, *episode.agents[1:]))], graphs, device=device)
+    loop = Loop(blind, {})
     trigger = float("nan")
     place: list[float] = []
     scripted = [i for i, a in enumerate(episode.agents) if a.controller == Controller.SCRIPT and a.phases]
     for step in range(episode.limits.max_steps):
         place.append(float(blind.array("progress")[0, 0]))
-        blind.step()
+        loop.step()
         if np.isnan(trigger) and any(blind.array("phase")[0, i] > 0 for i in scripted):
             trigger = step * blind.dt
         if blind.ended()[0]:
             break
     if blind.ended()[0] != End.COLLISION:
-        return Witness("harmless", trigger, None, float(blind.array("ego.complete")[0]), 1, 1)
+        return Witness("harmless", trigger, None, float(blind.state().route_complete[0]), 1, 1)
     tried = 1
     crash = len(place) * blind.dt
     begin = 0.0 if np.isnan(trigger) else trigger

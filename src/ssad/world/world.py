@@ -5,25 +5,24 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from ssad.core.driving import Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import AgentKind, Controller, Episode, SignalState
-from ssad.world.episode_arrays import agent_kinds, build, signal_programs
-from ssad.world.kernels.data import HORIZON, Ego, End, State, Work, array_types
+from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, SignalState
+from ssad.world.episode_arrays import build
+from ssad.world.kernels.data import HORIZON, Ego, Presence, State, Work, array_types
 from ssad.world.kernels.drive import drive
-from ssad.world.kernels.look import OBSERVATION, look
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 
-# names of `End` in traces; "" while the episode runs
-ENDS = tuple("" if end == End.RUNNING else end.name.lower() for end in End)
 VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _EGO = array_types(State), array_types(Ego)
@@ -37,12 +36,11 @@ class Snapshot:
 
 
 class World:
-    """Episodes run side by side.
+    """Episodes run side by side: the `Simulator` of `ssad.core.driving`, and `Reproducible`.
 
     `episodes` are the bank; scene b runs episode `assign[b]` (default: one scene an episode). `graphs` maps each
-    town named by them to its lane graph. `ego` and `ego_speed` replace every ego's
-    controller and target speed. With `autoreset` a scene whose
-    episode has ended starts it again at the next step. A scene's bits depend on its episode and actions alone: not on
+    town named by them to its lane graph. `ego` replaces every ego's controller. With `autoreset` a scene whose
+    episode has ended starts it again at the next step. A scene's bits depend on its episode and controls alone: not on
     the batch, its order, or what the other scenes do. Raises ConfigError for an episode that cannot be built.
     """
 
@@ -51,37 +49,39 @@ class World:
         episodes: Sequence[Episode],
         graphs: Mapping[str, LaneGraph],
         *,
-        assign: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
+        assign: Scenes | None = None,
         device: str = "cpu",
         dt: float = 0.1,
         substeps: int = 2,
         ego: Controller | None = None,
-        ego_speed: float | None = None,
         autoreset: bool = False,
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
         wp.init()
         self.episodes = tuple(episodes)
-        self.graphs = dict(graphs)
+        self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt
         self.device = device
-        self.bank, self.roads, self.agents = build(self.episodes, graphs, device, ego, ego_speed)
+        self.bank = build(self.episodes, graphs, device, ego)
+        self.agents = self.bank.agents
         order = np.arange(len(self.episodes)) if assign is None else np.asarray(assign)
         if len(order) == 0 or order.min() < 0 or order.max() >= len(self.episodes):
             raise ConfigError(f"scenes must be assigned episodes 0 to {len(self.episodes) - 1}")
         self.batch = len(order)
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
-        self.state = State()
+        self._views: dict[str, npt.NDArray[Any]] = {}
+        self.arrays = State()
         shape = (self.batch, self.agents, HORIZON)
         for name, array in _STATE.items():
-            setattr(self.state, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
+            setattr(self.arrays, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
         self.ego = Ego()
         for name, array in _EGO.items():
             setattr(self.ego, name, wp.zeros(self.batch, dtype=array.dtype, device=device))
-        self.actions = wp.zeros((self.batch, self.agents), dtype=wp.vec4, device=device)
-        self.observation = wp.zeros((self.batch, OBSERVATION), dtype=wp.float32, device=device)
+        flat = (self.batch, self.agents)
+        self.controls = wp.zeros(flat, dtype=wp.vec4, device=device)
+        self.places = wp.zeros(flat, dtype=wp.vec4, device=device)
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
@@ -89,53 +89,81 @@ class World:
         self.work.pair = wp.zeros(pairs, dtype=wp.int32, device=device)
         # one thread walks the list on CPU; on CUDA enough to fill the device
         workers = 1 if device == "cpu" else min(pairs, 1 << 21)
-        self._kinds = agent_kinds(self.bank)
         self._assign(order.astype(np.int32))
-        flat = (self.batch, self.agents)
-        again = [self.bank, self.roads, self.state, self.ego, self._mask]
+        bank, roads, state = self.bank.episodes, self.bank.roads, self.arrays
+        again = [bank, roads, state, self.ego, self._mask]
         restarts = ((restart, flat), (restart_record, self.batch))
-        self._restart = [self._launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
-        self._step = [self._launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
-        self._step += [
-            self._launch(sight, flat, [self.bank, self.roads, self.state, self.work, self.agents, dt]),
-            self._launch(meet, workers, [self.bank, self.roads, self.state, self.work, self.agents, workers]),
-            self._launch(drive, flat, [self.bank, self.roads, self.state, dt]),
-            self._launch(move, flat, [self.bank, self.roads, self.state, self.actions, dt, substeps]),
-            self._launch(contact, flat, [self.bank, self.state, self.work, self.agents]),
-            self._launch(record, self.batch, [self.bank, self.roads, self.state, self.ego, self.agents, dt]),
+        self._restart = [self.launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
+        self._plan = [self.launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
+        self._plan += [
+            self.launch(sight, flat, [bank, roads, state, self.work, self.agents, dt]),
+            self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers]),
+            self.launch(drive, flat, [bank, roads, state, dt]),
         ]
-        self._look = self._launch(
-            look, self.batch, [self.bank, self.roads, self.state, self.ego, self.agents, self.observation]
-        )
+        self._advance = [
+            self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),
+            self.launch(contact, flat, [bank, state, self.work, self.agents]),
+            self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
+        ]
         self._graph: Any = None
         self.reset()
 
-    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
+    def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """A recorded launch: its arguments are packed once."""
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:
-        self.state.episode.assign(order)
-        self.kind = self._kinds[order]
+        self._put("episode", order)
+        self._forget()
+
+    def _forget(self) -> None:
+        """What was looked up by episode holds no longer."""
+        self.__dict__.pop("_fixed", None)
+        self.__dict__.pop("_lamps", None)
+
+    @cached_property
+    def _fixed(self) -> dict[str, npt.NDArray[Any]]:
+        """What the scenes' episodes say and a step does not change."""
+        order = self.array("episode")
+        return {"kind": self.bank.kind[order], "size": self.bank.size[order], "route": self.bank.route[order]}
+
+    @cached_property
+    def _lamps(self) -> tuple[npt.NDArray[np.float64], I32, F32]:
+        """The signals of each scene's town: programmes, forced states, and until when."""
+        order = self.array("episode")
+        return self.bank.program[order], self.bank.forced[order], self.bank.until[order]
+
+    @property
+    def assigned(self) -> I32:
+        """[B] number of the episode that each scene runs."""
+        return self.array("episode").copy()
 
     def array(self, name: str) -> npt.NDArray[Any]:
         """A state or ego array by name as numpy: a view on CPU, a copy on CUDA. Ego's come as `ego.<name>`."""
-        out: npt.NDArray[Any] = self._source(name).numpy()
-        return out
+        view = self._views.get(name)
+        if view is None:
+            view = self._source(name).numpy()
+            if self.device == "cpu":
+                self._views[name] = view
+        return view
 
     def _source(self, name: str) -> Any:
-        return getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.state, name)
+        if name in ("controls", "places"):
+            return getattr(self, name)
+        return getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.arrays, name)
 
-    def reset(
-        self,
-        scenes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
-        *,
-        episodes: Sequence[int] | npt.NDArray[np.integer[Any]] | None = None,
-    ) -> None:
+    def _put(self, name: str, value: npt.NDArray[Any]) -> None:
+        """Fill the array that `array` reads."""
+        if self.device == "cpu":
+            self.array(name)[...] = value
+        else:
+            self._source(name).assign(value)
+
+    def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
         """Start the given scenes (default: all) again, with other episodes of the bank if given."""
         which = np.arange(self.batch) if scenes is None else np.asarray(scenes, np.int64)
         if episodes is not None:
-            order = self.state.episode.numpy().copy()
+            order = self.assigned
             order[which] = episodes
             if len(order) and (order.min() < 0 or order.max() >= len(self.episodes)):
                 raise ConfigError(f"no such episode; the bank holds {len(self.episodes)}")
@@ -146,12 +174,12 @@ class World:
         for command in self._restart:
             command.launch()
 
-    def set_actions(self, actions: npt.ArrayLike) -> None:
+    def set_controls(self, controls: npt.ArrayLike) -> None:
         """Controls of external agents: [B, 3|4] for the egos or [B, A, 3|4] for all; throttle, brake, steer, reverse.
 
         Raises ConfigError for a wrong shape or a number that is not finite.
         """
-        given = np.asarray(actions, np.float32)
+        given = np.asarray(controls, np.float32)
         full = np.zeros((self.batch, self.agents, 4), np.float32)
         if given.ndim == 2 and given.shape[0] == self.batch and given.shape[1] in (3, 4):
             full[:, 0, : given.shape[1]] = given
@@ -159,48 +187,130 @@ class World:
             full[..., : given.shape[2]] = given
         else:
             raise ConfigError(
-                f"actions have shape {given.shape}; expected ({self.batch}, 3) or "
+                f"controls have shape {given.shape}; expected ({self.batch}, 3) or "
                 f"({self.batch}, {self.agents}, 3): throttle, brake, steer"
             )
         if not np.isfinite(full).all():
-            raise ConfigError("actions hold a number that is not finite")
-        self.actions.assign(full)
+            raise ConfigError("controls hold a number that is not finite")
+        self._put("controls", full)
 
-    def step(self, actions: npt.ArrayLike | None = None) -> None:
+    def step(self, controls: npt.ArrayLike | None = None) -> None:
         """Advance every running scene by dt; ended scenes stand still (or start again, with `autoreset`)."""
-        if actions is not None:
-            self.set_actions(actions)
+        if controls is not None:
+            self.set_controls(controls)
         if self._graph is not None:
             wp.capture_launch(self._graph)
             return
-        for command in self._step:
+        self.plan()
+        self.advance()
+
+    def plan(self) -> None:
+        """First half of a step: what everybody does whom the world drives."""
+        for command in self._plan:
             command.launch()
 
-    def capture(self, *, observe: bool = False, steps: int = 1) -> None:
-        """Record `steps` steps (and the observation) as one CUDA graph that `step` replays; CUDA only."""
+    def advance(self) -> None:
+        """Second half of a step: motion, contacts, the record of the egos."""
+        for command in self._advance:
+            command.launch()
+
+    def capture(self, *, more: Sequence[Any] = (), steps: int = 1) -> None:
+        """Record `steps` steps (and `more` launches after each) as one CUDA graph that `step` replays; CUDA only."""
         with wp.ScopedCapture(device=self.device) as recorded:
             for _ in range(steps):
-                for command in self._step:
+                for command in [*self._plan, *self._advance, *more]:
                     command.launch()
-                if observe:
-                    self._look.launch()
         self._graph = recorded.graph
 
-    def observe(self) -> npt.NDArray[np.float32]:
-        """Observation rows [B, 28] of the egos: see kernels.look."""
-        self._look.launch()
-        out: npt.NDArray[np.float32] = self.observation.numpy()
-        return out
+    def take(
+        self, agents: Bool, controller: Controller | None, *, policy: int = -1, target_speed: float | None = None
+    ) -> None:
+        """Let somebody else drive agents [B, A] from now on, or (None) give them back to what their episode says.
+
+        Who is given back looks for its place on its route anew, since it may have been driven past it. Raises
+        ConfigError for a mask of another shape.
+        """
+        mask = np.asarray(agents, bool)
+        if mask.shape != (self.batch, self.agents):
+            raise ConfigError(f"a mask of agents has shape {mask.shape}; expected ({self.batch}, {self.agents})")
+        mask = mask & (self._fixed["kind"] != AgentKind.NONE)
+        order = self.assigned
+        new: dict[str, Any] = {"controller": controller, "policy": policy, "cruise": target_speed}
+        if controller is None:
+            start = self.bank.episodes
+            new = {"controller": start.controller.numpy()[order], "cruise": start.cruise.numpy()[order][..., 0]}
+            new |= {"policy": -1, "progress": self._places_on_routes(mask)}
+        active = self.array("active")
+        new["active"] = np.where(active == Presence.ASLEEP, int(Presence.AWAKE), active)
+        for name, value in new.items():
+            if value is not None:
+                self._put(name, np.where(mask, value, self.array(name)).astype(self.array(name).dtype))
+
+    def _places_on_routes(self, mask: Bool) -> I32:
+        """`progress` [B, A], for the agents of the mask the nearest point of all the rest of their routes."""
+        progress: I32 = self.array("progress").copy()
+        pose, route = self.array("pose"), self._fixed["route"]
+        for b, i in np.argwhere(mask).tolist():
+            first, count = route[b, i].tolist()
+            if count > 1:
+                here = int(progress[b, i])
+                rest = self.bank.tables.path[first + here : first + count, :2]
+                progress[b, i] = here + int(np.argmin(((rest - pose[b, i, :2]) ** 2).sum(1)))
+        return progress
+
+    def remove(self, agents: Bool) -> None:
+        """Take agents [B, A] out of their scenes, until these start again."""
+        active = self.array("active")
+        gone = np.where(np.asarray(agents, bool), int(Presence.ABSENT), active)
+        self._put("active", gone.astype(active.dtype))
+
+    def place(self, places: npt.ArrayLike) -> None:
+        """Where agents whose controller is PLACED are at the end of the next step: [B, A, 4] x, y, yaw, speed.
+
+        Raises ConfigError for a wrong shape or a number that is not finite.
+        """
+        given = np.asarray(places, np.float32)
+        if given.shape != (self.batch, self.agents, 4) or not np.isfinite(given).all():
+            raise ConfigError(f"places must be ({self.batch}, {self.agents}, 4) finite numbers: x, y, yaw, speed")
+        self._put("places", given)
+
+    def state(self) -> WorldState:
+        """Where everybody is; see `WorldState`. On CPU most arrays are views that hold until the next step."""
+        fixed = self._fixed
+        time = self.array("step") * self.dt
+        return WorldState(
+            time=time,
+            pose=self.array("pose"),
+            speed=self.array("speed"),
+            accel=self.array("accel"),
+            active=self.array("active") != Presence.ABSENT,
+            kind=fixed["kind"],
+            size=fixed["size"],
+            control=self.array("control"),
+            controller=self.array("controller"),
+            policy=self.array("policy"),
+            target_speed=self.array("cruise"),
+            touch=self.array("touch"),
+            lane=self.array("lane"),
+            route=fixed["route"],
+            progress=self.array("progress"),
+            roads=self.bank.tables,
+            signals=lambda: signal_states(*self._lamps, time),
+            contact=self.array("ego.contact").astype(np.uint8),
+            contact_agent=self.array("ego.contact_agent"),
+            off_road=self.array("ego.off_road") != 0,
+            route_distance=self.array("ego.route_distance"),
+            route_point=self.array("ego.route_point"),
+            route_complete=self.array("ego.complete"),
+            driven=self.array("ego.driven"),
+            lane_invasion=self.array("ego.invasion").astype(np.uint8),
+            # 2 marks a line already counted in the step before
+            red_light=(self.array("ego.red_light") == 1).astype(np.uint8),
+        )
 
     def ended(self) -> npt.NDArray[np.int32]:
         """[B] `End`, index into ENDS."""
         return self.array("end")
-
-    def signals(self, scene: int) -> npt.NDArray[np.uint8]:
-        """`SignalState` of every signal of the scene's town at its present time, [S]."""
-        episode = self.episodes[int(self.array("episode")[scene])]
-        time = float(self.array("step")[scene]) * self.dt
-        return signal_states(episode, self.graphs[episode.town], np.array([time])).reshape(-1)
 
     def snapshot(self) -> Snapshot:
         """Copy of all that changes."""
@@ -211,11 +321,10 @@ class World:
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world; raises ConfigError if it is of another shape."""
         for name, value in snapshot.arrays.items():
-            target = self._source(name)
-            if tuple(target.numpy().shape) != value.shape:
+            if self.array(name).shape != value.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
-            target.assign(value)
-        self.kind = self._kinds[self.array("episode")]
+            self._put(name, value)
+        self._forget()
 
     def hashes(self) -> list[str]:
         """One hash a scene over all that changes (but its place in the batch and bank)."""
@@ -223,7 +332,7 @@ class World:
         arrays += [self.array(f"ego.{name}") for name in _EGO]
         out = []
         for b in range(self.batch):
-            live = self.kind[b] != AgentKind.NONE
+            live = self._fixed["kind"][b] != AgentKind.NONE
             h = hashlib.sha256()
             for a in arrays:
                 row = a[b]
@@ -233,15 +342,14 @@ class World:
         return out
 
 
-def signal_states(episode: Episode, graph: LaneGraph, times: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """`SignalState` [T, S] of a town's signals at `times` [T] s: the host's twin of kernels.shared.signal_state."""
-    programs = signal_programs(graph)
-    out = np.zeros((len(times), len(programs)), np.uint8)
-    for s, (cycle, begin, green, yellow) in enumerate(programs):
-        if cycle > 0:
-            t = (times - begin) % cycle
-            then = np.where(t < green + yellow, SignalState.YELLOW, SignalState.RED)
-            out[:, s] = np.where(t < green, SignalState.GREEN, then)
-    for s, state in episode.signal_override.items():
-        out[times < episode.override_until, s] = int(state)
-    return out
+def signal_states(program: npt.NDArray[np.float64], forced: I32, until: F32, time: npt.NDArray[np.float64]) -> U8:
+    """`SignalState` [B, S] at `time` [B] s: the host's twin of kernels.shared.signal_state.
+
+    program [B, S, 4], forced [B, S] and until [B] as in `Bank`.
+    """
+    cycle, begin, green, yellow = (program[..., k] for k in range(4))
+    phase = (time[:, None] - begin) % np.maximum(cycle, 1e-9)
+    state = np.where(phase < green + yellow, SignalState.YELLOW, SignalState.RED)
+    state = np.where(phase < green, SignalState.GREEN, state)
+    state = np.where(cycle > 0, state, SignalState.OFF)
+    return np.where((forced >= 0) & (time < until)[:, None], forced, state).astype(np.uint8)

@@ -23,7 +23,7 @@ from ssad.core.safeio import home
 from ssad.core.seeding import generator
 from ssad.roads.library import load_town
 
-REVISION = 2  # of what is built: a cached street of another revision is not used
+REVISION = 3  # of what is built: a cached street of another revision is not used
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:

@@ -114,8 +114,9 @@ def furnish(soup: TriangleBuilder, site: FreeGround, look: Look, sides: list[Sid
                     soup.place(kind, [(x, y, EARTH, rng.uniform(0, 6.28))], scale=size[None])
                     site.take([(x + u, y + v) for u in (-0.8, 0.0, 0.8) for v in (-0.8, 0.0, 0.8)])
         signs: list[tuple[str, float]] = [("limit", 8.0)] if side.length > 60.0 and rng.random() < 0.4 else []
-        signs += [("crossing", side.length - 7.0)] if rng.random() < 0.5 else []
-        signs += [("parking", 0.5 * side.length)] if rng.random() < 0.12 else []
+        if side.frontage:
+            signs += [("crossing", side.length - 7.0)] if rng.random() < 0.5 else []
+            signs += [("parking", 0.5 * side.length)] if rng.random() < 0.12 else []
         for name, s in signs:
             x, y, yaw = side.pose(s, _kerb(side))
             if site.clear((x, y), size=0.5, crossing=0.6):

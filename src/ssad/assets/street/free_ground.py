@@ -79,11 +79,13 @@ def polygon_distance(xy: F64, corners: F64) -> F64:
 class Side:
     """One side of a street outside junctions: the outer edge of its outermost lane, and where its kerb is.
 
-    kerb: m from the outer edge to the kerb (the sidewalk's width, 0 without one).
+    kerb: m from the outer edge to the kerb (the sidewalk's width, 0 without one). frontage: buildings face it; not so a
+    motorway and its ramps.
     """
 
     edge: Edge
     kerb: float
+    frontage: bool = True
 
     @property
     def length(self) -> float:
@@ -109,7 +111,7 @@ def sides(graph: LaneGraph) -> list[Side]:
         kerb = float(graph.width[graph.points(lane)].min()) if walk else 0.0
         edge = lane_edge(graph, lane, 0.0)
         if edge.s[-1] > 4.0:
-            found.append(Side(edge, kerb))
+            found.append(Side(edge, kerb, walk or not graph.divided(lane)))
     return found
 
 

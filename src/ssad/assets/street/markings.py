@@ -37,9 +37,12 @@ def paint(soup: TriangleBuilder, graph: LaneGraph, look: Look) -> None:
         _lines(soup, graph, lane, look)
         _worn(soup, graph, lane, look)
     stopped = set(graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP].tolist())
+    ruled = set(graph.rule_lane.tolist())
     for signal, lane, s in zip(
         graph.stop_signal.tolist(), graph.stop_lane.tolist(), graph.stop_s.tolist(), strict=True
     ):
+        if graph.signal_virtual[signal] and lane not in ruled and graph.divided(lane):
+            continue  # the ring of a roundabout, a motorway
         if graph.kind[lane] == LaneType.DRIVING:
             give_way = bool(graph.signal_virtual[signal]) and lane not in stopped
             _stop(soup, graph, lane, s, give_way=give_way, look=look)

@@ -64,6 +64,7 @@ STYLES: Mapping[str, TownStyle] = {
 }  # fmt: skip
 OF_TOWN = {
     "Twinford": "town", "Crossgate": "city", "Oldmarket": "old", "Larkhill": "suburb", "ProvingGround": "outskirts",
+    "Ringmere": "town", "Longreach": "outskirts",
 }  # fmt: skip
 
 

@@ -49,6 +49,8 @@ def line_streets(soup: TriangleBuilder, site: FreeGround, look: Look, sides: lis
     fences = [fence(kind, look) for kind in ("pickets", "wall", "planks", "rail")]
     works, plots = _Works(soup, site, look, hedges, fences, wheelie_bin(look)), Plots()
     for side in sides:
+        if not side.frontage:
+            continue
         s, end = -7.0, side.length + 7.0
         while s < end - 4.0:
             kind = _draw(style.buildings, look)

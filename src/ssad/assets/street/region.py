@@ -85,6 +85,9 @@ def survey(graph: LaneGraph) -> Ground:
     road[hole], drive[hole] = -0.5, -0.5
     outer = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
     inner = (label > 0) & ~np.isin(label, outer) & ~hole
+    # nobody can walk to the island of a roundabout, or to ground between carriageways and ramps: nothing is built there
+    walkable = np.unique(label[cv2.dilate((walk < 0.5).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0])
+    inner &= np.isin(label, walkable)
     return Ground((float(low[0]), float(low[1])), road, walk, drive, np.minimum(road, walk), inner)
 
 

@@ -17,10 +17,10 @@ from pydantic import Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.source import source_version
 from ssad.core import safeio
+from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import LaneGraph, load_graph, save_graph
-from ssad.core.protocols import DrivingSystem
 from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -182,7 +182,7 @@ def town(name: str) -> LaneGraph:
 
 
 @lru_cache(maxsize=4)
-def system_of(name: str) -> DrivingSystem:
+def system_of(name: str) -> Driver:
     """A driving system, made once a process."""
     from ssad.drivers import make_system
 
@@ -263,10 +263,11 @@ def _check(cell: Cell) -> None:
 def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
     """Episodes and traces of cells that share a system, run as one batch."""
     from ssad.world.rollout import rollout
+    from ssad.world.world import World
 
     episodes = [episode_of(cell) for cell in cells]
     graphs = {episode.town: town(episode.town) for episode in episodes}
-    return episodes, rollout(episodes, graphs, system_of(cells[0].system), device=device)
+    return episodes, rollout(World(episodes, graphs, device=device), system_of(cells[0].system))
 
 
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:

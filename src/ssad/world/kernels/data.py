@@ -6,6 +6,8 @@ from typing import Any
 
 import warp as wp
 
+from ssad.core.types import End  # noqa: F401  kernels take all their codes from here
+
 HORIZON = wp.constant(8)  # forecast points
 STRIDE = wp.constant(0.5)  # seconds between forecast points
 FAR = wp.constant(1.0e6)
@@ -29,23 +31,21 @@ class Presence(IntEnum):
     AWAKE = 2
 
 
+class ContactPolicy(IntEnum):
+    """What a contact of the ego does: the words of `ssad.core.types.Limits.contact`."""
+
+    END = 0
+    COUNT = 1
+    REMOVE = 2
+
+
 class TurnRank(IntEnum):
     """Where a route turns at a junction, in the order of who goes first."""
 
     STRAIGHT = 0
     RIGHT = 1
     LEFT = 2
-
-
-class End(IntEnum):
-    """Why an episode ended."""
-
-    RUNNING = 0
-    COLLISION = 1
-    COMPLETE = 2
-    MAX_STEPS = 3
-    MAX_DISTANCE = 4
-    MAX_TIME = 5
+    YIELD = 3  # added to the others on an approach with a stop or yield sign: whoever has none goes first
 
 
 @wp.struct
@@ -53,9 +53,9 @@ class EpisodeArrays:
     """What does not change while an episode runs; scenes refer to it by episode number."""
 
     model: wp.array2d(dtype=wp.int32)  # [E, A] row of `body`, -1 empty slot
-    controller: wp.array2d(dtype=wp.int32)  # [E, A] Controller
+    controller: wp.array2d(dtype=wp.int32)  # [E, A] Controller at the start
     start: wp.array2d(dtype=wp.vec4)  # [E, A] x, y, yaw, speed
-    cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s, wake distance m (0: awake at once)
+    cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
     phase_count: wp.array2d(dtype=wp.int32)  # [E, A]
     phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] When, value, agent
@@ -63,6 +63,7 @@ class EpisodeArrays:
     town: wp.array(dtype=wp.int32)  # [E]
     signal: wp.array2d(dtype=wp.int32)  # [E, S] forced SignalState, -1 none
     limits: wp.array(dtype=wp.vec4)  # [E] max steps, max time s, max distance m, override until s
+    contact: wp.array(dtype=wp.int32)  # [E] ContactPolicy
     kind: wp.array(dtype=wp.int32)  # [models] AgentKind
     body: wp.array(dtype=wp.vec4)  # [models] half length, half width, wheelbase, max steer
     power: wp.array(dtype=wp.vec4)  # [models] max accel, max brake, max speed, unused
@@ -95,9 +96,13 @@ class State:
     episode: wp.array(dtype=wp.int32)  # [B]
     step: wp.array(dtype=wp.int32)  # [B]
     end: wp.array(dtype=wp.int32)  # [B] End
+    controller: wp.array2d(dtype=wp.int32)  # [B, A] Controller
+    policy: wp.array2d(dtype=wp.int32)  # [B, A] number of the driver that acts for it, -1 none
+    cruise: wp.array2d(dtype=wp.float32)  # [B, A] target speed m/s
     pose: wp.array2d(dtype=wp.vec3)  # [B, A]
     previous: wp.array2d(dtype=wp.vec3)  # [B, A]
     speed: wp.array2d(dtype=wp.float32)  # [B, A]
+    accel: wp.array2d(dtype=wp.float32)  # [B, A] m/s^2 along the heading
     wheel: wp.array2d(dtype=wp.float32)  # [B, A] front-wheel angle, rad
     active: wp.array2d(dtype=wp.int32)  # [B, A] Presence
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
@@ -128,10 +133,8 @@ class Ego:
     complete: wp.array(dtype=wp.float32)  # percent
     mark: wp.array(dtype=wp.int32)  # last route point passed
     route_distance: wp.array(dtype=wp.float32)
+    route_point: wp.array(dtype=wp.int32)  # the route's point that it is measured from
     driven: wp.array(dtype=wp.float32)
-    accel: wp.array(dtype=wp.float32)
-    speed: wp.array(dtype=wp.float32)  # in the step before
-    reward: wp.array(dtype=wp.float32)
 
 
 @wp.struct

@@ -73,14 +73,14 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
         return
     e = state.episode[b]
     m = bank.model[e, i]
-    who = bank.controller[e, i]
+    who = state.controller[b, i]
     time = float(state.step[b]) * dt
     v = state.speed[b, i]
     if state.active[b, i] == Presence.ASLEEP:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
         return
     power = bank.power[m]
-    target = bank.cruise[e, i][0]
+    target = state.cruise[b, i]
     count = bank.phase_count[e, i]
     if count > 0:
         n = state.phase[b, i]

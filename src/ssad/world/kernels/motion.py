@@ -5,12 +5,13 @@ import warp as wp
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State
 from ssad.world.kernels.shared import lane_under, route_at, wrap
-from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME
+from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 GRIP_LIMIT = wp.constant(GRIP)
 STEER_SECONDS = wp.constant(STEER_TIME)
 REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
+WALKER_TURN = wp.constant(WALKER_RATE)
 
 
 @wp.func
@@ -71,8 +72,19 @@ def bicycle(
 
 
 @wp.kernel(enable_backward=False)
-def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dtype=wp.vec4), dt: float, substeps: int):
-    """Advance every agent by dt with its control (external ones with the action) and look where it is now."""
+def move(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    action: wp.array2d(dtype=wp.vec4),
+    place: wp.array2d(dtype=wp.vec4),
+    dt: float,
+    substeps: int,
+):
+    """Advance every agent by dt with its control (external ones with the action) and look where it is now.
+
+    Agents that are placed are put at `place`: x, y, yaw, speed.
+    """
     b, i = wp.tid()
     if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
         return
@@ -81,18 +93,28 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
     pose = state.pose[b, i]
     state.previous[b, i] = pose
     control = state.control[b, i]
-    if bank.controller[e, i] == Controller.EXTERNAL:
+    who = state.controller[b, i]
+    if who == Controller.EXTERNAL:
         control = action[b, i]
         state.control[b, i] = control
     speed = state.speed[b, i]
     kind = bank.kind[m]
     power = bank.power[m]
-    if kind == AgentKind.WALKER:
+    if who == Controller.PLACED:
+        put = place[b, i]
+        d = wp.length(wp.vec2(put[0] - pose[0], put[1] - pose[1]))
+        state.travelled[b, i] = state.travelled[b, i] + d
+        pose = wp.vec3(put[0], put[1], wrap(put[2]))
+        speed = put[3]
+    elif kind == AgentKind.WALKER:
         # throttle is the wanted speed over the model's top speed; a walker turns and stops at once
         aim = wp.clamp(control[0], 0.0, 1.0) * power[2]
         change = power[0] * dt
         after = speed + wp.clamp(aim - speed, -change, change)
         go = 0.5 * (speed + after) * dt
+        if who == Controller.EXTERNAL:
+            turned = pose[2] + wp.clamp(control[2], -1.0, 1.0) * WALKER_TURN * dt
+            pose = wp.vec3(pose[0], pose[1], wrap(turned))
         pose = wp.vec3(pose[0] + go * wp.cos(pose[2]), pose[1] + go * wp.sin(pose[2]), pose[2])
         state.travelled[b, i] = state.travelled[b, i] + wp.abs(go)
         speed = after
@@ -106,6 +128,7 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
             speed = out[3]
             state.wheel[b, i] = out[4]
     state.pose[b, i] = pose
+    state.accel[b, i] = (speed - state.speed[b, i]) / dt
     state.speed[b, i] = speed
 
     # nearest route point within 12 m ahead of the last one
@@ -129,7 +152,7 @@ def move(bank: EpisodeArrays, roads: Roads, state: State, action: wp.array2d(dty
             k = k + 1
         at = found
         state.progress[b, i] = at
-        if i > 0 and bank.controller[e, i] == Controller.AUTOPILOT and at >= route[1] - 3:
+        if i > 0 and who == Controller.AUTOPILOT and at >= route[1] - 3:
             state.active[b, i] = Presence.ABSENT  # background traffic leaves at the end of its route
 
     under = lane_under(roads, bank.town[e], pose[0], pose[1])

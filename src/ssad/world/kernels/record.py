@@ -7,6 +7,7 @@ from ssad.world.kernels.data import (
     FAR,
     HORIZON,
     STRIDE,
+    ContactPolicy,
     Ego,
     End,
     EpisodeArrays,
@@ -76,7 +77,7 @@ def contact_kind(kind: int) -> int:
 
 @wp.kernel(enable_backward=False)
 def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: int, dt: float):
-    """One row of the ego's record, the SafeBench reward, and the end of the episode; one thread a scene."""
+    """One row of the ego's record, what its contacts do, and the end of the episode; one thread a scene."""
     b = wp.tid()
     if state.end[b] != End.RUNNING:
         return
@@ -86,9 +87,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     time = float(step) * dt
     pose = state.pose[b, 0]
     before = state.previous[b, 0]
-    v = state.speed[b, 0]
     body = bank.body[bank.model[e, 0]]
-    control = state.control[b, 0]
 
     # contacts that began in this step
     now = state.touch[b, 0]
@@ -104,6 +103,11 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
                     other = j
     ego.contact[b] = kinds
     ego.contact_agent[b] = other
+    policy = bank.contact[e]
+    if policy == ContactPolicy.REMOVE:
+        for j in range(1, agents):
+            if ((fresh >> wp.int64(j)) & wp.int64(1)) == wp.int64(1):
+                state.active[b, j] = Presence.ABSENT
 
     # road
     lane = state.lane[b, 0]
@@ -128,8 +132,6 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     # motion
     gone = wp.length(wp.vec2(pose[0] - before[0], pose[1] - before[1]))
     ego.driven[b] = ego.driven[b] + gone
-    ego.accel[b] = (v - ego.speed[b]) / dt
-    ego.speed[b] = v
 
     # route: a point is passed once the ego is beyond it, looking two points ahead (as SafeBench's route criterion)
     route = bank.route[e, 0]
@@ -161,6 +163,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
             least = d2
             near = k
     ego.route_distance[b] = wp.sqrt(least)
+    ego.route_point[b] = near
 
     # red light: the tail crosses the stop line on red; a right turn after a stop is allowed
     p = roads.path[route[0] + near]
@@ -184,20 +187,9 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     else:
         ego.red_light[b] = 0
 
-    # SafeBench's reward
-    along = v * wp.cos(wrap(pose[2] - p[2]))
-    reward = along
-    if kinds != Contact.NONE:
-        reward = reward - 1.0
-    if along > 8.0:
-        reward = reward - 10.0
-    if wp.abs(left) > 4.0:
-        reward = reward - 1.0
-    ego.reward[b] = reward - 5.0 * control[2] * control[2] - 0.2 * wp.abs(control[2]) * along * along
-
     limits = bank.limits[e]
     end = int(End.RUNNING)
-    if kinds != Contact.NONE:
+    if kinds != Contact.NONE and policy == ContactPolicy.END:
         end = End.COLLISION
     elif ego.complete[b] >= 100.0:
         end = End.COMPLETE
@@ -222,9 +214,13 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     e = state.episode[b]
     start = bank.start[e, i]
     pose = wp.vec3(start[0], start[1], start[2])
+    state.controller[b, i] = bank.controller[e, i]
+    state.policy[b, i] = -1
+    state.cruise[b, i] = bank.cruise[e, i][0]
     state.pose[b, i] = pose
     state.previous[b, i] = pose
     state.speed[b, i] = start[3]
+    state.accel[b, i] = 0.0
     state.wheel[b, i] = 0.0
     state.control[b, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     state.progress[b, i] = 0
@@ -276,7 +272,5 @@ def restart_record(
     ego.complete[b] = 0.0
     ego.mark[b] = 0
     ego.route_distance[b] = 0.0
+    ego.route_point[b] = 0
     ego.driven[b] = 0.0
-    ego.accel[b] = 0.0
-    ego.reward[b] = 0.0
-    ego.speed[b] = bank.start[state.episode[b], 0][3]

@@ -97,7 +97,7 @@ def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int
     test. Scripted actors and walkers are not. Straight goes before right before left, then whoever is inside the
     junction, then whoever is nearer to it, then the lower number.
     """
-    if j != 0 and (bank.controller[e, j] != Controller.AUTOPILOT or state.active[b, j] != Presence.AWAKE):
+    if j != 0 and (state.controller[b, j] != Controller.AUTOPILOT or state.active[b, j] != Presence.AWAKE):
         return False
     ri = bank.route[e, i]
     rj = bank.route[e, j]
@@ -204,7 +204,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
         return
     e = state.episode[b]
     route = bank.route[e, i]
-    if bank.controller[e, i] != Controller.AUTOPILOT or route[1] < 2:
+    if state.controller[b, i] != Controller.AUTOPILOT or route[1] < 2:
         return
     at = state.progress[b, i]
     first = route[0] + at
@@ -215,7 +215,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     p = roads.path[first]
     part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
-    target = wp.min(bank.cruise[e, i][0], cap)
+    target = wp.min(state.cruise[b, i], cap)
     state.aim[b, i] = wp.vec2(float(at) + part, target)
     react = float(0.0)
 

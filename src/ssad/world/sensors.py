@@ -1,0 +1,80 @@
+"""What a driver may ask for besides the list of objects, by name; computed on the device for all rows at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ssad.core.driving import Sensor
+from ssad.core.errors import ConfigError
+from ssad.core.types import F32, I32
+from ssad.world.kernels.look import CHANNELS, OBSERVATION, look, look_as_adversary, look_from_above
+from ssad.world.world import World
+
+ABOVE = 64  # pixels a side of the view from above
+PIXELS = 2.0  # a metre
+BEHIND = 8.0  # m
+
+
+def launcher(world: World, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> tuple[Any, Any]:
+    """A recorded launch of an observation kernel for `agents` [N, 2], and the array that it fills."""
+    who = wp.array(np.ascontiguousarray(agents, np.int32), dtype=wp.vec2i, device=world.device)
+    out = wp.zeros(shape, dtype=wp.float32, device=world.device)
+    bank = world.bank
+    return world.launch(kernel, dim, [bank.episodes, bank.roads, world.arrays, bank.agents, who, *more, out]), out
+
+
+def _rows(kernel: Any, width: int, part: slice) -> Sensor:
+    def read(simulator: Any, agents: I32) -> F32:
+        found = _read(simulator, kernel, agents, (len(agents), width), len(agents))
+        return found[:, part].copy()
+
+    return read
+
+
+def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> F32:
+    if not isinstance(simulator, World):
+        raise ConfigError(f"{type(simulator).__name__} has no such sensor; give your own to rollout(sensors=...)")
+    # drivers look through the same eyes at every step: keep the last launch
+    key = (kernel, shape, more)
+    kept: dict[Any, Any] = simulator.__dict__.setdefault("_looks", {})
+    if key not in kept or not np.array_equal(kept[key][0], agents):
+        command, out = launcher(simulator, kernel, agents, shape, dim, *more)
+        kept[key] = (np.array(agents), command, out, out.numpy())
+    _, command, out, found = kept[key]
+    command.launch()
+    if simulator.device != "cpu":
+        found = out.numpy()
+    return np.asarray(found)
+
+
+def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND) -> Sensor:
+    """A rasterised view from above, [N, 4, side, side] in the agent's frame, forward up.
+
+    Channels: road; the agent's route, 2 m wide; agents (1, the agent itself 0.5); their speed as a share of 20 m/s.
+
+    Args:
+        side: Pixels a side.
+        pixels: Pixels a metre.
+        behind: Metres that are seen behind the agent's centre.
+    """
+
+    def read(simulator: Any, agents: I32) -> F32:
+        n = len(agents)
+        shape = (n, CHANNELS, side, side)
+        return _read(simulator, look_from_above, agents, shape, (n, side, side), side, pixels, behind).copy()
+
+    return read
+
+
+SENSORS: dict[str, Sensor] = {
+    "safebench": _rows(look, OBSERVATION, slice(0, 4)),
+    "frea": _rows(look, OBSERVATION, slice(4, OBSERVATION)),
+    "adversary": _rows(look_as_adversary, 24, slice(0, 24)),
+    "above": from_above(),
+}
+"""`safebench` [N, 4]: lateral offset m, heading error rad, speed m/s, 1 if a vehicle is in the same lane within 15 m
+ahead. `frea` [N, 24]: 4 rows of 6, the agent, the two nearest vehicles and the route. `adversary` [N, 24]: FREA's
+adversary, the ego, the nearest other vehicle and the goal. `above`: see `from_above`."""
