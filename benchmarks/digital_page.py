@@ -1,0 +1,54 @@
+"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py
+
+benchmarks/results/digital holds what that run wrote: DIR/tables/*.md, and run.json without its cells.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from ssad.bench.kinds.detection import state_hash
+from ssad.evaluation.scene_boxes import detector_of
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results" / "digital"
+PAGE = ROOT / "docs" / "digital.md"
+TABLES = ("digital", "lost", "halving", "transfer", "defences", "targets", "distances", "classes", "audit")
+
+
+def outdated() -> list[str]:
+    """Detectors whose shipped weights are others than those that were attacked."""
+    weights = json.loads((RESULTS / "run.json").read_text())["weights"]
+    return [name for name, known in weights.items() if state_hash(detector_of(name, "", "cpu")) != known]
+
+
+def page() -> str:
+    """The page."""
+    about = json.loads((RESULTS / "run.json").read_text())
+    data, versions, weights = about["data"], about["versions"], about["weights"]
+    old = outdated()
+    towns = " and ".join(data["towns"])
+    lines = ["# The shipped 3D detectors under digital attacks", ""]
+    if old:
+        lines += [f"> **Measured with earlier weights of {' and '.join(old)}.** Compare these numbers with each other,"]
+        lines += ["> not with a new run.", ""]
+    lines += [
+        "`benchmarks/digital_page.py` makes this page from `benchmarks/results/digital`, which has the tables that one",
+        "command wrote:",
+        "```",
+        "ssad run digital --device cuda",
+        "```",
+        f"Data: {data['scenes']} drives of {data['seconds']:g} s each in {towns}, which were not used for training;",
+        f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
+        ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
+        "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
+        "",
+    ]
+    for name in TABLES:
+        lines += [(RESULTS / f"{name}.md").read_text().strip(), ""]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page())
