@@ -27,7 +27,7 @@ from ssad.evaluation.attacked_scenes import AttackedScene
 from ssad.evaluation.detection import SampleBoxes
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
 from ssad.report import write_report
-from ssad.report.digital_run import Resampling
+from ssad.report.digital_run import Resampling, setting_of
 from ssad.report.digital_tables import defence_table, halving, halving_table, target_table, transfer_table
 from ssad.report.kinds.detection import interval_note
 from ssad.report.kinds.digital import attempts_of, load_digital_run, main_table
@@ -273,6 +273,12 @@ def test_a_failed_attack_fails_what_needs_its_pictures(root: Path, tmp_path: Pat
 def test_a_page_with_one_scene_says_so_in_the_singular() -> None:
     assert interval_note(Resampling(1)) == "no intervals, since one scene is too few (five are the least)."
     assert interval_note(Resampling(2)).startswith("no intervals, since 2 scenes are too few")
+
+
+def test_records_of_older_versions_can_be_read(folder: Path) -> None:
+    told = one(folder)
+    older = {key: told[key] for key in ("attack", "loss", "norm", "radius", "steps", "options")}
+    assert setting_of(older) == setting_of(told)
 
 
 def test_pictures_against_different_systems_lie_apart(tmp_path: Path) -> None:

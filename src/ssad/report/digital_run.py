@@ -107,11 +107,11 @@ def load_digital_run(run: Run) -> DigitalRun:
 
 
 def setting_of(record: Mapping[str, Any]) -> Setting:
-    """What tells the attack of a record from others."""
+    """What tells the attack of a record from others; records of older versions say less."""
     return Setting(
         record["attack"] or "", record["loss"] or "", record["norm"] or "", float(record["radius"]),
-        int(record["steps"]), record["options"], record["source"], record["defence"], bool(record["aware"]),
-        record["target"], int(record["subset"]),
+        int(record["steps"]), record["options"], record.get("source", ""), record.get("defence", ""),
+        bool(record.get("aware")), record.get("target", ""), int(record.get("subset", 0)),
     )  # fmt: skip
 
 

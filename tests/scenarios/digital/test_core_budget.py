@@ -113,3 +113,18 @@ def test_a_norm_that_there_is_not() -> None:
 def test_clean_images_have_8_bits(value: float) -> None:
     with pytest.raises(ConfigError, match="8 bits"):
         codes_of(torch.full((1, 3, 2, 2), value))
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_a_step_is_ascent_and_projection_and_leaves_its_input_alone(norm: str) -> None:
+    chance = torch.Generator().manual_seed(0)
+    clean = torch.randint(0, 256, SHAPE, generator=chance) / 255
+    budget = Budget(px(5) if norm == "linf" else px(100), norm)  # type: ignore[arg-type]
+    images = budget.project(clean + 0.1 * torch.randn(SHAPE, generator=chance), clean)
+    gradient = torch.randn(SHAPE, generator=chance)
+    before = [one.clone() for one in (images, gradient, clean)]
+    found = budget.ascend(images, gradient, clean, 0.5 * budget.radius)
+    expected = budget.project(images + 0.5 * budget.radius * budget.steepest(gradient), clean)
+    assert torch.allclose(found, expected, atol=1e-6)
+    assert (found - images).abs().max() > px(1) / 10
+    assert all(torch.equal(one, kept) for one, kept in zip((images, gradient, clean), before, strict=True))

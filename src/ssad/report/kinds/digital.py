@@ -223,10 +223,11 @@ def _at(setting: Setting, what: Literal["radius", "steps"], value: float) -> Set
 
 
 def _rest(setting: Setting, what: str) -> str:
-    """What a curve holds fixed: steps, or radius."""
+    """What a curve holds fixed: steps, or radius; and on which scenes it ran."""
     steps = setting.steps
     fixed = f"{steps} step{'s' if steps != 1 else ''}" if what == "radius" else f"{setting.radius:g} px"
-    return ", ".join(part for part in [fixed, "L2" if setting.norm == "l2" else "", setting.options] if part)
+    few = f"scenes: {scenes_of(setting)}" if setting.subset else ""
+    return ", ".join(part for part in [fixed, "L2" if setting.norm == "l2" else "", setting.options, few] if part)
 
 
 def _apart(values: Sequence[float]) -> list[float]:
