@@ -58,8 +58,7 @@ def test_every_body_moves_as_in_the_world(seed: int, dtype: torch.dtype) -> None
     for control in given_:
         actions = np.zeros((len(names), world.agents, 4), np.float32)
         actions[:, 0] = control
-        world.actions.assign(actions)
-        world.step()
+        world.step(actions)
         poses.append(world.array("pose")[:, 0].copy())
         wheels.append(world.array("wheel")[:, 0].copy())
     assert not world.ended().any()

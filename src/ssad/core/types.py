@@ -85,7 +85,8 @@ class Controller(IntEnum):
 
     NONE stands still; EXTERNAL takes the action given to `World.step`; AUTOPILOT follows its route, sees everything
     and yields; FOLLOW keeps its route and target speed and sees nothing; SCRIPT runs its phases; PLACED is put where
-    `World.place` says: how a log is replayed, or another simulator mirrored.
+    `World.place` says: how another simulator is mirrored; TRAJECTORY is where its rows of time and place have it: how a
+    log is replayed.
     """
 
     NONE = 0
@@ -94,6 +95,7 @@ class Controller(IntEnum):
     FOLLOW = 3
     SCRIPT = 4
     PLACED = 5
+    TRAJECTORY = 6
 
 
 class End(IntEnum):
@@ -164,6 +166,9 @@ class Actor:
 
     Without `path` it goes straight along its heading; with it, it follows the polyline (x, y) in metres. Without
     phases it stands still. Vehicles reach their speed by full throttle or full brake, walkers at once.
+
+    With `trajectory`, rows of time s, x, y m and yaw rad, it is where these have it, straight on between them, whatever
+    happens around it; before the first and after the last it is not there.
     """
 
     name: str
@@ -171,6 +176,7 @@ class Actor:
     pose: Pose
     phases: tuple[Phase, ...] = ()
     path: tuple[tuple[float, float], ...] = ()
+    trajectory: tuple[tuple[float, float, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -255,7 +261,7 @@ class Route:
 
 @dataclass(frozen=True)
 class EpisodeAgent:
-    """One agent of a concrete episode: where it starts and how it is driven."""
+    """One agent of a concrete episode: where it starts and how it is driven; trajectory: see `Actor`."""
 
     name: str
     model: str
@@ -266,6 +272,7 @@ class EpisodeAgent:
     phases: tuple[Phase, ...] = ()
     route: Route | None = None
     wake_distance: float = 0.0
+    trajectory: tuple[tuple[float, float, float, float], ...] = ()
 
 
 @dataclass(frozen=True)

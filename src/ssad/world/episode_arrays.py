@@ -139,6 +139,7 @@ class _Pool:
     tables: list[PathTable] = field(default_factory=list)
     size: int = 0
     where: dict[tuple[str, bytes], tuple[int, int]] = field(default_factory=dict)
+    tracks: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def add(self, route: Route, graph: LaneGraph) -> tuple[int, int]:
         key = (graph.name, route.xy.tobytes() + route.speed_limit.tobytes())
@@ -148,6 +149,12 @@ class _Pool:
             self.where[key] = (self.size, len(table.path))
             self.size += len(table.path)
         return self.where[key]
+
+    def follow(self, agent: EpisodeAgent) -> tuple[int, int]:
+        """First row and number of rows of an agent's trajectory."""
+        first = len(self.tracks)
+        self.tracks += agent.trajectory
+        return first, len(agent.trajectory)
 
 
 def _check(episode: Episode) -> None:
@@ -167,6 +174,7 @@ def _put_agent(  # noqa: PLR0917
     agent: EpisodeAgent,
     names: dict[str, int],
     route: tuple[int, int],
+    track: tuple[int, int],
 ) -> None:
     model(agent.model)  # raises with the closest names
     a["model"][e, i] = names[agent.model]
@@ -174,6 +182,7 @@ def _put_agent(  # noqa: PLR0917
     a["start"][e, i] = agent.pose.x, agent.pose.y, agent.pose.yaw, agent.speed
     a["cruise"][e, i] = agent.target_speed, agent.wake_distance
     a["route"][e, i] = route
+    a["track"][e, i] = track
     a["phase_count"][e, i] = len(agent.phases)
     for k, phase in enumerate(agent.phases):
         a["phase_when"][e, i, k] = When[phase.when.kind.upper()], phase.when.value, phase.when.actor + 1
@@ -226,6 +235,7 @@ def build(
         "start": np.zeros((*shape, 4), np.float32),
         "cruise": np.zeros((*shape, 2), np.float32),
         "route": np.zeros((*shape, 2), np.int32),
+        "track": np.zeros((*shape, 2), np.int32),
         "phase_count": np.zeros(shape, np.int32),
         "phase_when": np.zeros((*shape, phases, 3), np.float32),
         "phase_speed": np.zeros((*shape, phases), np.float32),
@@ -241,7 +251,7 @@ def build(
             route = (0, 0)
             if agent.route is not None and len(agent.route.xy) > 1:
                 route = pool.add(agent.route, graph)
-            _put_agent(a, e, i, agent, names, route)
+            _put_agent(a, e, i, agent, names, route, pool.follow(agent))
         if ego is not None:
             a["controller"][e, 0] = int(ego)
         a["town"][e] = towns.index(episode.town)
@@ -319,6 +329,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["rule"] = [t.rule for t in pool.tables]
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
+    parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]
     for name, array in array_types(Roads).items():
         joined = np.concatenate(parts[name])
         if len(joined) == 0:  # a town without signals

@@ -19,7 +19,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, LaneType
 from ssad.roads.query import DRIVABLE, LaneQuery
-from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, model
+from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE, model
 
 SUBSTEPS = 2  # of a step, as in the world
 _ROWS = 1 << 22  # pairs of point and segment looked at in one go
@@ -29,7 +29,7 @@ class Bodies(NamedTuple):
     """Bodies and limits of agents; every field has the shape of the agents, such as [A] or [B, A].
 
     Attributes:
-        walker: Whether it is a walker, who turns and stops at once.
+        walker: Whether it is a walker.
         length, width: Of the box, m.
         wheelbase: m; at least 0.1.
         max_steer: Angle of the front wheels at steer = 1, rad.
@@ -97,7 +97,8 @@ def advance(
     Args:
         state: Of agents of any shape.
         control: [..., 4] throttle, brake in [0, 1], steer in [-1, 1] (left positive), reverse (above 0.5: yes); for a
-            walker the throttle is the wanted speed over the top speed. What lies outside is cut, and has no gradient.
+            walker the throttle is the wanted speed over the top speed, and steer how fast it turns. What lies
+            outside is cut, and has no gradient.
         bodies: Of the agents; broadcast against their shape.
         dt: Length of the step, s.
         substeps: Parts in which the bicycle is integrated.
@@ -112,7 +113,7 @@ def advance(
         raise ConfigError(f"a step needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
     throttle, brake = control[..., 0].clamp(0.0, 1.0), control[..., 1].clamp(0.0, 1.0)
     driven = _bicycle(state, throttle, brake, control, bodies, dt / substeps, substeps)
-    walked = _walk(state, throttle, bodies, dt)
+    walked = _walk(state, throttle, control[..., 2].clamp(-1.0, 1.0), bodies, dt)
     # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
     drives = (bodies.max_speed > 0.0) & ((state.speed != 0.0) | (control[..., 0] > 0.0))
     parts = []
@@ -234,13 +235,13 @@ def _bicycle(  # noqa: PLR0917
         x = x + mean * torch.cos(heading) * h
         y = y + mean * torch.sin(heading) * h
         yaw = yaw + rate * h
-    yaw = yaw - 2 * math.pi * torch.floor((yaw.detach() + math.pi) / (2 * math.pi))
-    return MotionState(torch.stack(_alike(x, y, yaw), -1), v, wheel)
+    return MotionState(torch.stack(_alike(x, y, _wrapped(yaw)), -1), v, wheel)
 
 
-def _walk(state: MotionState, throttle: Tensor, bodies: Bodies, dt: float) -> MotionState:
-    """Straight ahead; the speed follows the wanted one as fast as the model can."""
+def _walk(state: MotionState, throttle: Tensor, steer: Tensor, bodies: Bodies, dt: float) -> MotionState:
+    """It turns, then goes straight ahead; the speed follows the wanted one as fast as the model can."""
     (x, y, yaw), speed = state.pose.unbind(-1), state.speed
+    yaw = _wrapped(yaw + steer * (WALKER_RATE * dt))
     change = bodies.max_accel * dt
     after = speed + torch.minimum(torch.maximum(throttle * bodies.max_speed - speed, -change), change)
     go = 0.5 * (speed + after) * dt
@@ -251,6 +252,11 @@ def _walk(state: MotionState, throttle: Tensor, bodies: Bodies, dt: float) -> Mo
 def _alike(*tensors: Tensor) -> list[Tensor]:
     """Tensors broadcast to one shape."""
     return list(torch.broadcast_tensors(*tensors))  # type: ignore[no-untyped-call]
+
+
+def _wrapped(angle: Tensor) -> Tensor:
+    """Angles in [-pi, pi), with the gradient of the angle itself."""
+    return angle - 2 * math.pi * torch.floor((angle.detach() + math.pi) / (2 * math.pi))
 
 
 def _turned(points: Tensor, yaw: Tensor) -> Tensor:

@@ -202,6 +202,7 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
             yield (*place, "pose"), f"beyond {_MAX_COORDINATE:g} m or not a number"
         if len(actor.path) == 1:
             yield (*place, "path"), "a path needs at least two points"
+        yield from _trajectory(actor, place)
         for j, phase in enumerate(actor.phases):
             here = (*place, "phases", j)
             if not 0.0 <= phase.speed <= fastest:
@@ -210,6 +211,24 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
                 yield (*here, "when", "actor"), f"there are actors 0 to {len(scenario.actors) - 1}"
             if phase.when.value < 0.0:
                 yield (*here, "when", "value"), "must not be negative"
+
+
+def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    rows = actor.trajectory
+    if not rows:
+        return
+    here = (*place, "trajectory")
+    if len(rows) < 2:
+        yield here, "a trajectory needs at least two rows: time, x, y, yaw"
+    if actor.phases or actor.path:
+        yield here, "an actor with a trajectory has neither phases nor a path"
+    if max(abs(a - b) for a, b in zip(rows[0][1:], dataclasses.astuple(actor.pose), strict=True)) > 0.01:
+        yield (*place, "pose"), "differs from the first row of the trajectory"
+    for j, (time, x, y, yaw) in enumerate(rows):
+        if not _finite(Pose(x, y, yaw)):
+            yield (*here, j), f"beyond {_MAX_COORDINATE:g} m or not a number"
+        if not (rows[j - 1][0] if j else -1.0e6) < time < 1.0e6:
+            yield (*here, j, 0), "times must increase from row to row"
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:

@@ -57,6 +57,7 @@ class EpisodeArrays:
     start: wp.array2d(dtype=wp.vec4)  # [E, A] x, y, yaw, speed
     cruise: wp.array2d(dtype=wp.vec2)  # [E, A] target speed m/s at the start, wake distance m (0: awake at once)
     route: wp.array2d(dtype=wp.vec2i)  # [E, A] first point in the pool, number of points
+    track: wp.array2d(dtype=wp.vec2i)  # [E, A] first row in the pool of trajectories, number of rows
     phase_count: wp.array2d(dtype=wp.int32)  # [E, A]
     phase_when: wp.array3d(dtype=wp.vec3)  # [E, A, K] When, value, agent
     phase_speed: wp.array3d(dtype=wp.float32)  # [E, A, K]
@@ -77,6 +78,7 @@ class Roads:
     rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, TurnRank there
     bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
+    track: wp.array(dtype=wp.vec4)  # [N] s, x, y, yaw: trajectories
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
     segment_half: wp.array(dtype=wp.vec2)  # [M] half widths at both ends
     segment_lane: wp.array(dtype=wp.int32)  # [M] lane, counted over all towns

@@ -4,7 +4,7 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State
-from ssad.world.kernels.shared import lane_under, route_at, wrap
+from ssad.world.kernels.shared import lane_under, on_track, route_at, track_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -83,25 +83,39 @@ def move(
 ):
     """Advance every agent by dt with its control (external ones with the action) and look where it is now.
 
-    Agents that are placed are put at `place`: x, y, yaw, speed.
+    Agents that are placed are put at `place`: x, y, yaw, speed; those with a trajectory where it has them.
     """
     b, i = wp.tid()
-    if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
+    if state.end[b] != End.RUNNING:
         return
     e = state.episode[b]
+    who = state.controller[b, i]
+    put = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if who == Controller.TRAJECTORY:
+        time = float(state.step[b] + 1) * dt
+        track = bank.track[e, i]
+        if on_track(roads, track, time):
+            put = track_at(roads, track, time)
+            if state.active[b, i] == Presence.ABSENT:
+                state.pose[b, i] = wp.vec3(put[0], put[1], put[2])
+            state.active[b, i] = Presence.AWAKE
+        else:
+            state.active[b, i] = Presence.ABSENT
+    if state.active[b, i] == Presence.ABSENT:
+        return
     m = bank.model[e, i]
     pose = state.pose[b, i]
     state.previous[b, i] = pose
     control = state.control[b, i]
-    who = state.controller[b, i]
     if who == Controller.EXTERNAL:
         control = action[b, i]
         state.control[b, i] = control
     speed = state.speed[b, i]
     kind = bank.kind[m]
     power = bank.power[m]
-    if who == Controller.PLACED:
-        put = place[b, i]
+    if who == Controller.PLACED or who == Controller.TRAJECTORY:
+        if who == Controller.PLACED:
+            put = place[b, i]
         d = wp.length(wp.vec2(put[0] - pose[0], put[1] - pose[1]))
         state.travelled[b, i] = state.travelled[b, i] + d
         pose = wp.vec3(put[0], put[1], wrap(put[2]))

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ssad.core.types import AgentKind, Contact, SignalState
+from ssad.core.types import AgentKind, Contact, Controller, SignalState
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
@@ -17,7 +17,7 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
-from ssad.world.kernels.shared import boxes_touch, signal_state, wrap
+from ssad.world.kernels.shared import boxes_touch, on_track, signal_state, wrap
 
 
 @wp.func
@@ -108,6 +108,8 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
         for j in range(1, agents):
             if ((fresh >> wp.int64(j)) & wp.int64(1)) == wp.int64(1):
                 state.active[b, j] = Presence.ABSENT
+                if state.controller[b, j] == Controller.TRAJECTORY:
+                    state.controller[b, j] = Controller.NONE  # or it would be back in the next step
 
     # road
     lane = state.lane[b, 0]
@@ -234,6 +236,8 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     state.react[b, i] = 0.0
     awake = int(Presence.AWAKE)
     if bank.model[e, i] < 0:
+        awake = Presence.ABSENT
+    elif bank.controller[e, i] == Controller.TRAJECTORY and not on_track(roads, bank.track[e, i], 0.0):
         awake = Presence.ABSENT
     elif bank.cruise[e, i][1] > 0.0:
         awake = Presence.ASLEEP

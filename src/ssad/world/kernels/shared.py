@@ -40,6 +40,36 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
 
 
 @wp.func
+def on_track(roads: Roads, track: wp.vec2i, time: float) -> bool:
+    """Whether a trajectory has its agent anywhere at `time`."""
+    if track[1] < 1:
+        return False
+    return time >= roads.track[track[0]][0] - 1.0e-4 and time <= roads.track[track[0] + track[1] - 1][0] + 1.0e-4
+
+
+@wp.func
+def track_at(roads: Roads, track: wp.vec2i, time: float) -> wp.vec4:
+    """x, y, yaw and speed along the heading (negative: backwards) on a trajectory of two rows or more at `time`."""
+    low = int(0)
+    high = track[1] - 1
+    while high - low > 1:
+        middle = (low + high) / 2
+        if roads.track[track[0] + middle][0] <= time:
+            low = middle
+        else:
+            high = middle
+    p = roads.track[track[0] + low]
+    q = roads.track[track[0] + high]
+    span = wp.max(q[0] - p[0], 1.0e-6)
+    f = wp.clamp((time - p[0]) / span, 0.0, 1.0)
+    yaw = p[3] + f * wrap(q[3] - p[3])
+    dx = q[1] - p[1]
+    dy = q[2] - p[2]
+    speed = (dx * wp.cos(yaw) + dy * wp.sin(yaw)) / span
+    return wp.vec4(p[1] + f * dx, p[2] + f * dy, wrap(yaw), speed)
+
+
+@wp.func
 def signal_state(bank: EpisodeArrays, roads: Roads, e: int, index: int, time: float) -> int:
     """State of signal `index` of the episode's town at `time`: forced by the episode, else its fixed programme."""
     forced = bank.signal[e, index]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import AgentKind, Controller, EpisodeAgent, Route, Scenario
+from ssad.core.rotations import wrap_angle
+from ssad.core.types import Actor, AgentKind, Controller, EpisodeAgent, Pose, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route
 from ssad.world.models import model
@@ -16,6 +17,9 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
     agents = []
     for actor in scenario.actors:
         moves = bool(actor.phases) and model(actor.model).kind != AgentKind.PROP
+        if actor.trajectory:
+            agents.append(_recorded(actor))
+            continue
         agents.append(
             EpisodeAgent(
                 name=actor.name,
@@ -28,6 +32,21 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
             )
         )
     return agents
+
+
+def _recorded(actor: Actor) -> EpisodeAgent:
+    """An actor with a trajectory, where it is and how fast at the start of the episode, or when it appears."""
+    rows = np.array(actor.trajectory)
+    now = float(np.clip(0.0, rows[0, 0], rows[-1, 0]))
+    k = int(np.clip(np.searchsorted(rows[:, 0], now, side="right") - 1, 0, len(rows) - 2))
+    (t, x, y, yaw), (t1, x1, y1, yaw1) = rows[k].tolist(), rows[k + 1].tolist()
+    part = (now - t) / (t1 - t)
+    turned = yaw + part * float(wrap_angle(yaw1 - yaw))
+    pose = Pose(x + part * (x1 - x), y + part * (y1 - y), turned)
+    speed = ((x1 - x) * np.cos(turned) + (y1 - y) * np.sin(turned)) / (t1 - t)
+    return EpisodeAgent(
+        actor.name, actor.model, Controller.TRAJECTORY, pose, speed=float(speed), trajectory=actor.trajectory
+    )
 
 
 SCENARIO = ScenarioType(
