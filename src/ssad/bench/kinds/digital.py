@@ -79,10 +79,9 @@ class Digital(DetectorKind):
             f"{one.source}/{one.name}": one.spec.passes * images[one.scene]
             for cell in plan.cells for one in self.scenes(cell, job) if isinstance(one, AttackedScene)
         }  # fmt: skip
-        resources.console.print(
-            f"{sum(passes.values()):,} forward and backward passes for {len(plan.details)} detectors at most",
-            highlight=False,
-        )
+        count = len(plan.details)
+        text = f"{sum(passes.values()):,} forward and backward passes for {count} detector{'s' if count != 1 else ''}"
+        resources.console.print(f"{text} in all", highlight=False)
         return settings
 
     def order(self, cell: Cell) -> float:
