@@ -17,7 +17,7 @@ WIDTH, TOP, PITCH, HEIGHT = 1200, 78, 50, 34  # pixels: picture, first row, from
 GREY = "#7d8590"
 COLOURS = {  # fill and border, by what a package is for
     "#d7e7fb": ("#3b76c4", ("cli", "doctor", "bench", "report")),
-    "#ddf0dc": ("#4a9150", ("recording", "toolbox", "training", "envs", "evaluation")),
+    "#ddf0dc": ("#4a9150", ("recording", "toolbox", "training", "interchange", "envs", "evaluation")),
     "#fdebd0": ("#c98a2b", ("scenarios", "drivers", "detectors", "datasets")),
     "#e6def5": ("#7d5fb5", ("world", "camera", "assets", "roads")),
     "#e3e7eb": ("#768390", ("metrics", "jobs", "core")),

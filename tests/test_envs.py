@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ssad.core.errors import UnknownNameError
+from ssad.envs import episodes_of, make_sb3
 
 ID = "ssad.envs:SSAD/Driving-v0"
 
@@ -38,3 +39,45 @@ def test_make_vec_runs_the_scenarios_in_one_batch() -> None:
 def test_unknown_scenarios_are_named() -> None:
     with pytest.raises(UnknownNameError, match="RightTurn"):
         gymnasium.make(ID, scenarios="RightTurm")
+
+
+def test_episodes_of_a_set_are_built_once() -> None:
+    first, graphs = episodes_of("RightTurn")
+    again, same = episodes_of(["RightTurn/01", "RightTurn/00"])
+    assert again == [first[1], first[0]]
+    assert again[0] is first[1]
+    assert graphs["ProvingGround"] is same["ProvingGround"]
+    assert episodes_of("RightTurn", seed=1)[0][0] is not first[0]
+
+
+def test_stable_baselines3_trains_on_the_scenes_of_one_batch() -> None:
+    sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra train")
+    from stable_baselines3.common.vec_env import VecEnv
+
+    env = make_sb3(num_envs=8, scenarios=["LaneChanging", "RightTurn"], observation="frea")
+    assert isinstance(env, VecEnv)
+    env.seed(5)
+    plain = gymnasium.make_vec(ID, num_envs=8, scenarios=["LaneChanging", "RightTurn"], observation="frea")
+    np.testing.assert_array_equal(env.reset(), plain.reset(seed=5)[0])
+    total, length, ended = np.zeros(8), np.zeros(8, int), np.zeros(8, int)
+    actions = np.tile(np.array([1.0, 0.0], np.float32), (8, 1))
+    for _ in range(220):
+        observation, reward, done, infos = env.step(actions)
+        expected = plain.step(actions)
+        np.testing.assert_array_equal(observation, expected[0])
+        np.testing.assert_allclose(reward, expected[1], rtol=1e-6)
+        np.testing.assert_array_equal(done, expected[2] | expected[3])
+        total, length = total + expected[1], length + 1
+        for b in np.flatnonzero(done):
+            ended[b] += 1
+            np.testing.assert_array_equal(infos[b]["terminal_observation"], expected[4]["final_obs"][b])
+            assert infos[b]["TimeLimit.truncated"] == expected[3][b]
+            assert infos[b]["episode"]["r"] == pytest.approx(total[b])
+            assert infos[b]["episode"]["l"] == length[b]
+            assert infos[b]["end"] == expected[4]["end"][b]
+            total[b], length[b] = 0.0, 0
+        assert all(infos[b] == {} for b in np.flatnonzero(~done))
+    assert ended.max() >= 2
+    model = sb3.PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, seed=0)
+    model.learn(256)
+    assert model.num_timesteps == 256

@@ -4,23 +4,34 @@
     env = gymnasium.make("ssad.envs:SSAD/Driving-v0", scenarios="precrash")
     envs = gymnasium.make_vec("ssad.envs:SSAD/Driving-v0", num_envs=64, scenarios="natural")
 
-The vector environment runs all scenes in one batch (`ssad.world.env.VectorEnv`), not one process a scene.
+The vector environment runs all scenes in one batch (`ssad.world.env.VectorEnv`), not one process a scene. For
+stable-baselines3 (the extra `train`):
+
+    from stable_baselines3 import PPO
+    from ssad.envs import make_sb3
+    PPO("MlpPolicy", make_sb3(num_envs=64, scenarios="natural")).learn(1_000_000)
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import digest
 from ssad.roads import LaneGraph, load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 
 if TYPE_CHECKING:
-    from ssad.core.types import Episode
+    from ssad.core.types import Episode, Scenario
     from ssad.world.env import SingleEnv, VectorEnv
+    from ssad.world.sb3 import SB3VecEnv
 
 ID = "SSAD/Driving-v0"
 
@@ -34,8 +45,27 @@ def episodes_of(
     """
     refs = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
     found = [scenario for ref in refs for scenario in load_scenarios(ref)]
-    graphs = {town: load_town(town) for town in sorted({s.town for s in found})}
-    return [build_episode(s, graphs[s.town], seed=seed) for s in found], graphs
+    graphs = {town: _town(town) for town in sorted({s.town for s in found})}
+    return [_built(s, graphs[s.town], seed) for s in found], graphs
+
+
+MOST_EPISODES = 5000  # kept in a process
+_episodes: dict[str, Episode] = {}
+
+
+def _built(scenario: Scenario, graph: LaneGraph, seed: int) -> Episode:
+    """The episode of a scenario, built once a process."""
+    key = digest("episode", safeio.dump_json(asdict(scenario)), seed, id(graph))
+    if key not in _episodes:
+        if len(_episodes) >= MOST_EPISODES:
+            _episodes.clear()
+        _episodes[key] = build_episode(scenario, graph, seed=seed)
+    return _episodes[key]
+
+
+@lru_cache(maxsize=16)
+def _town(name: str) -> LaneGraph:
+    return load_town(name)
 
 
 def make(*, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, **options: Any) -> SingleEnv:
@@ -53,6 +83,17 @@ def make_vec(
 
     options.pop("vectorization_mode", None)
     return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **options)
+
+
+def make_sb3(
+    *, num_envs: int = 1, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, **options: Any
+) -> SB3VecEnv:
+    """`num_envs` scenes as a `VecEnv` of stable-baselines3; `options` as for `make_vec`. ConfigError without it."""
+    try:
+        from ssad.world.sb3 import SB3VecEnv
+    except ImportError as error:
+        raise ConfigError(f"stable-baselines3 is not installed ({error}); install the extra 'train'") from None
+    return SB3VecEnv(make_vec(num_envs=num_envs, scenarios=scenarios, episode_seed=episode_seed, **options))
 
 
 gymnasium.register(ID, entry_point="ssad.envs:make", vector_entry_point="ssad.envs:make_vec")

@@ -162,6 +162,32 @@ def test_who_is_given_back_goes_on_with_its_own_route() -> None:
     assert abs(float(world.array("pose")[0, 1, 1]) - 3.5) < 0.3
 
 
+def test_who_is_given_back_far_ahead_finds_its_place() -> None:
+    """Placed 60 m down its route, further than a step's search reaches."""
+    car = EpisodeAgent("c", "car", Controller.AUTOPILOT, Pose(30.0, 0.0), 5.0, 5.0, route=line_route(30.0, 230.0))
+    world = World([episode(ego(controller=Controller.NONE), car)], GRAPHS)
+    mask = np.array([[False, True]])
+    world.take(mask, Controller.PLACED)
+    world.place(np.array([[[0, 0, 0, 0], [90.0, 0.0, 0.0, 5.0]]], np.float32))
+    world.step()
+    np.testing.assert_allclose(world.array("pose")[0, 1], [90.0, 0.0, 0.0])
+    assert world.array("travelled")[0, 1] == pytest.approx(60.0)
+    world.take(mask, None)
+    assert world.array("progress")[0, 1] == 60
+    with pytest.raises(ConfigError, match="places"):
+        world.place(np.full((1, 2, 4), np.nan))
+
+
+def test_an_agent_can_be_removed() -> None:
+    world = World(bank(), GRAPHS)
+    mask = np.zeros((world.batch, world.agents), bool)
+    mask[2, 1] = True
+    world.remove(mask)
+    assert world.state().active[:, 1].tolist() == [False, True, False, True]
+    world.reset([2])
+    assert world.state().active[2, 1]
+
+
 def test_a_walker_can_be_steered() -> None:
     walker = EpisodeAgent("w", "walker", Controller.NONE, Pose(40.0, -6.0, 0.0))
 
@@ -312,6 +338,10 @@ def test_sensors_are_read_for_who_asks_and_pictures_are_perturbed() -> None:
     assert len(np.unique(together)) == together.size
     rollout(World(short[1:2], GRAPHS), Watcher(), sensors={"camera": camera}, perturbation=Darker())
     np.testing.assert_array_equal(np.array(shown)[:, 0], together[:, 1])
+    shown[:] = []
+    everybody = lambda state: state.active  # noqa: E731
+    rollout(World(short[1:2], GRAPHS), {everybody: Watcher()}, sensors={"camera": camera}, perturbation=Darker())
+    assert len(np.unique(np.concatenate(shown))) == 2 * 3  # a number of its own for every agent and step
 
 
 def make_world(assign):

@@ -12,7 +12,11 @@ from ssad.metrics import FAMILIES, Estimate, Outcome, aggregate_groups
 from ssad.report.load import Run
 from ssad.report.paper import SCENARIOS
 
-TYPES = {"NaturalJunction": "Natural", "Custom": "Own"}
+TYPES = {
+    "NaturalJunction": "Natural",
+    "Custom": "Own",
+    "ssad.interchange.highway_env:SCENARIO": "highway-env",
+}
 FAMILY_TITLES = {"pre-crash": "pre-crash", "natural": "natural traffic", "other": "other routes"}
 
 

@@ -10,12 +10,11 @@ import numpy.typing as npt
 import warp as wp
 
 from ssad.core.driving import RoadTables
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, Route
+from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, Model, Route
 from ssad.roads.query import CELL, DRIVABLE, build_grid
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
-from ssad.world.models import MODELS, model
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
@@ -176,7 +175,8 @@ def _put_agent(  # noqa: PLR0917
     route: tuple[int, int],
     track: tuple[int, int],
 ) -> None:
-    model(agent.model)  # raises with the closest names
+    if agent.model not in names:
+        raise unknown_name("model", agent.model, names)
     a["model"][e, i] = names[agent.model]
     a["controller"][e, i] = int(agent.controller)
     a["start"][e, i] = agent.pose.x, agent.pose.y, agent.pose.yaw, agent.speed
@@ -214,6 +214,7 @@ def build(
     graphs: Mapping[str, LaneGraph],
     device: str,
     ego: Controller | None,
+    models: Mapping[str, Model],
 ) -> Bank:
     """Arrays of all episodes on `device`.
 
@@ -227,7 +228,7 @@ def build(
     count = max(len(e.agents) for e in episodes)
     phases = max(1, *(len(a.phases) for e in episodes for a in e.agents))
     signals = max(1, *(len(graphs[t].signal_phase) for t in towns))
-    names = {name: k for k, name in enumerate(MODELS)}
+    names = {name: k for k, name in enumerate(models)}
     shape = (len(episodes), count)
     a: dict[str, npt.NDArray[np.generic]] = {
         "model": np.full(shape, -1, np.int32),
@@ -260,9 +261,9 @@ def build(
         limits = episode.limits
         a["contact"][e] = ContactPolicy[limits.contact.upper()]
         a["limits"][e] = limits.max_steps, limits.max_time, limits.max_distance, episode.override_until
-    body = [(m.length / 2, m.width / 2, max(m.wheelbase, 0.1), m.max_steer) for m in MODELS.values()]
-    power = [(m.max_accel, m.max_brake, m.max_speed, 0.0) for m in MODELS.values()]
-    a["kind"] = np.array([int(m.kind) for m in MODELS.values()], np.int32)
+    body = [(m.length / 2, m.width / 2, max(m.wheelbase, 0.1), m.max_steer) for m in models.values()]
+    power = [(m.max_accel, m.max_brake, m.max_speed, 0.0) for m in models.values()]
+    a["kind"] = np.array([int(m.kind) for m in models.values()], np.int32)
     a["body"] = np.array(body, np.float32)
     a["power"] = np.array(power, np.float32)
     bank = EpisodeArrays()
@@ -272,14 +273,14 @@ def build(
     program = np.zeros((len(towns), signals, 4))
     for k, graph in enumerate(found):
         program[k, : len(graph.signal_phase)] = signal_programs(graph)
-    models = np.asarray(a["model"])
+    rows = np.asarray(a["model"])
     return Bank(
         bank,
         _roads(found, pool, device),
         _tables(found, pool),
         count,
-        np.where(models < 0, int(AgentKind.NONE), np.asarray(a["kind"])[np.maximum(models, 0)]).astype(np.int32),
-        (2 * np.asarray(a["body"])[np.maximum(models, 0), :2]).astype(np.float32),
+        np.where(rows < 0, int(AgentKind.NONE), np.asarray(a["kind"])[np.maximum(rows, 0)]).astype(np.int32),
+        (2 * np.asarray(a["body"])[np.maximum(rows, 0), :2]).astype(np.float32),
         np.asarray(a["route"]),
         program[np.asarray(a["town"])],
         np.asarray(a["signal"]),

@@ -36,7 +36,9 @@ def _rows(kernel: Any, width: int, part: slice) -> Sensor:
 
 def _read(simulator: Any, kernel: Any, agents: I32, shape: tuple[int, ...], dim: Any, *more: Any) -> F32:
     if not isinstance(simulator, World):
-        raise ConfigError(f"{type(simulator).__name__} has no such sensor; give your own to rollout(sensors=...)")
+        simulator = getattr(simulator, "mirror", None)
+    if not isinstance(simulator, World):
+        raise ConfigError("this simulator mirrors nothing in a World: give your own sensors to rollout(sensors=...)")
     # drivers look through the same eyes at every step: keep the last launch
     key = (kernel, shape, more)
     kept: dict[Any, Any] = simulator.__dict__.setdefault("_looks", {})

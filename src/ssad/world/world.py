@@ -15,13 +15,14 @@ import warp as wp
 from ssad.core.driving import Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, SignalState
+from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.data import HORIZON, Ego, Presence, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
+from ssad.world.models import MODELS
 
 VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
@@ -39,9 +40,11 @@ class World:
     """Episodes run side by side: the `Simulator` of `ssad.core.driving`, and `Reproducible`.
 
     `episodes` are the bank; scene b runs episode `assign[b]` (default: one scene an episode). `graphs` maps each
-    town named by them to its lane graph. `ego` replaces every ego's controller. With `autoreset` a scene whose
-    episode has ended starts it again at the next step. A scene's bits depend on its episode and controls alone: not on
-    the batch, its order, or what the other scenes do. Raises ConfigError for an episode that cannot be built.
+    town named by them to its lane graph. `ego` replaces every ego's controller; `models` are the bodies. With
+    `autoreset` a scene whose episode has ended starts it again at the next step. A scene's bits depend on its episode
+    and controls alone: not on the batch, its order, or what the other scenes do.
+
+    Raises ConfigError for an episode that cannot be built.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class World:
         dt: float = 0.1,
         substeps: int = 2,
         ego: Controller | None = None,
+        models: Mapping[str, Model] = MODELS,
         autoreset: bool = False,
     ) -> None:
         if dt <= 0.0 or substeps < 1:
@@ -63,7 +67,7 @@ class World:
         self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt
         self.device = device
-        self.bank = build(self.episodes, graphs, device, ego)
+        self.bank = build(self.episodes, graphs, device, ego, models)
         self.agents = self.bank.agents
         order = np.arange(len(self.episodes)) if assign is None else np.asarray(assign)
         if len(order) == 0 or order.min() < 0 or order.max() >= len(self.episodes):
@@ -113,7 +117,7 @@ class World:
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:
-        self._put("episode", order)
+        self.put("episode", order)
         self._forget()
 
     def _forget(self) -> None:
@@ -152,7 +156,7 @@ class World:
             return getattr(self, name)
         return getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.arrays, name)
 
-    def _put(self, name: str, value: npt.NDArray[Any]) -> None:
+    def put(self, name: str, value: npt.NDArray[Any]) -> None:
         """Fill the array that `array` reads."""
         if self.device == "cpu":
             self.array(name)[...] = value
@@ -192,7 +196,7 @@ class World:
             )
         if not np.isfinite(full).all():
             raise ConfigError("controls hold a number that is not finite")
-        self._put("controls", full)
+        self.put("controls", full)
 
     def step(self, controls: npt.ArrayLike | None = None) -> None:
         """Advance every running scene by dt; ended scenes stand still (or start again, with `autoreset`)."""
@@ -244,7 +248,7 @@ class World:
         new["active"] = np.where(active == Presence.ASLEEP, int(Presence.AWAKE), active)
         for name, value in new.items():
             if value is not None:
-                self._put(name, np.where(mask, value, self.array(name)).astype(self.array(name).dtype))
+                self.put(name, np.where(mask, value, self.array(name)).astype(self.array(name).dtype))
 
     def _places_on_routes(self, mask: Bool) -> I32:
         """`progress` [B, A], for the agents of the mask the nearest point of all the rest of their routes."""
@@ -262,7 +266,7 @@ class World:
         """Take agents [B, A] out of their scenes, until these start again."""
         active = self.array("active")
         gone = np.where(np.asarray(agents, bool), int(Presence.ABSENT), active)
-        self._put("active", gone.astype(active.dtype))
+        self.put("active", gone.astype(active.dtype))
 
     def place(self, places: npt.ArrayLike) -> None:
         """Where agents whose controller is PLACED are at the end of the next step: [B, A, 4] x, y, yaw, speed.
@@ -272,7 +276,7 @@ class World:
         given = np.asarray(places, np.float32)
         if given.shape != (self.batch, self.agents, 4) or not np.isfinite(given).all():
             raise ConfigError(f"places must be ({self.batch}, {self.agents}, 4) finite numbers: x, y, yaw, speed")
-        self._put("places", given)
+        self.put("places", given)
 
     def state(self) -> WorldState:
         """Where everybody is; see `WorldState`. On CPU most arrays are views that hold until the next step."""
@@ -323,7 +327,7 @@ class World:
         for name, value in snapshot.arrays.items():
             if self.array(name).shape != value.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
-            self._put(name, value)
+            self.put(name, value)
         self._forget()
 
     def hashes(self) -> list[str]:

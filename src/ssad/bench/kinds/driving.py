@@ -9,6 +9,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -28,13 +29,17 @@ from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import METRICS, episode_metrics
 
+HIGHWAY = "highway-env"  # as a set of scenarios
+HIGHWAY_TYPE = "ssad.interchange.highway_env:SCENARIO"
+
 
 class DrivingSuite(SuiteBase):
     """One table: systems x scenarios x repetitions.
 
     Attributes:
         systems: names, or module:object.
-        scenarios: what `load_scenarios` understands (sets, types, names, YAML files).
+        scenarios: what `load_scenarios` understands (sets, types, names, YAML files), or highway-env: that simulator's
+            intersection and highway.
         repetitions: episodes of each pair; the first is the nominal case.
         spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
             not at all, then scenarios without traffic of their own give copies, which count once.
@@ -120,11 +125,11 @@ class Driving(Kind):
         return {"witness": plan.suite.witness}
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
-        """Cells that share a system; with few cells a smaller batch keeps all workers busy."""
+        """Cells that share a system and a simulator; with few cells a smaller batch keeps all workers busy."""
         size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
-        groups: dict[str, list[Cell]] = {}
+        groups: dict[tuple[str, bool], list[Cell]] = {}
         for cell in cells:
-            groups.setdefault(cell.system, []).append(cell)
+            groups.setdefault((cell.system, in_highway(cell)), []).append(cell)
         return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
 
     def start(self, job: Job) -> None:
@@ -155,7 +160,7 @@ class Driving(Kind):
                 "episode": about,
                 "case": motion_hash(trace),
             }
-            if job.settings["witness"] and trace.end == "collision":
+            if job.settings["witness"] and trace.end == "collision" and not in_highway(cell):
                 speed = getattr(system_of(cell.system), "target_speed", None)
                 result["witness"] = witness(job.folder, episode, speed, job.device)
             results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
@@ -176,9 +181,10 @@ class Driving(Kind):
 @lru_cache(maxsize=8)
 def town(name: str) -> LaneGraph:
     """A town, read once a process."""
+    from ssad.interchange.highway_env import PLACES, highway_town
     from ssad.roads import load_town
 
-    return load_town(name)
+    return highway_town(name) if name in PLACES else load_town(name)
 
 
 @lru_cache(maxsize=4)
@@ -204,8 +210,17 @@ def system_version(name: str) -> str:
 
 
 def type_version(name: str) -> str:
-    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one."""
-    return source_version(name.partition(":")[0]) if ":" in name else ""
+    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one.
+
+    For the type that highway-env runs, with its version.
+    """
+    found = source_version(name.partition(":")[0]) if ":" in name else ""
+    return f"{found} {version('highway-env')}" if name == HIGHWAY_TYPE else found
+
+
+def in_highway(cell: Cell) -> bool:
+    """Whether highway-env runs a cell, and not the embedded world."""
+    return bool(cell.spec["scenario"]["type"] == HIGHWAY_TYPE)
 
 
 def town_version(graph: LaneGraph) -> str:
@@ -225,12 +240,13 @@ def scenario_json(scenario: Scenario) -> dict[str, Any]:
 
 def suite_scenarios(suite: DrivingSuite) -> tuple[Scenario, ...]:
     """All scenarios of a suite, in order, each once. ConfigError when two differ but share a name."""
+    from ssad.interchange.highway_env import highway_scenarios
     from ssad.scenarios.dynamic import load_scenarios
 
     found: dict[str, Scenario] = {}
     for ref in suite.scenarios:
         try:
-            loaded = load_scenarios(ref)
+            loaded = highway_scenarios() if ref == HIGHWAY else load_scenarios(ref)
         except UnknownNameError as error:
             raise UnknownNameError(f"suite {suite.name}: {error}") from None
         for scenario in loaded:
@@ -244,9 +260,13 @@ def suite_scenarios(suite: DrivingSuite) -> tuple[Scenario, ...]:
 
 def episode_of(cell: Cell) -> Episode:
     """The concrete episode of a cell. RouteError, MapError or ConfigError when it cannot be built."""
+    from ssad.interchange.highway_env import highway_episode
     from ssad.scenarios.dynamic import build_episode, scenario_from
 
     scenario = scenario_from(cell.spec["scenario"])
+    if in_highway(cell):
+        seed = cell.seed if cell.spec["repetition"] else scenario.seed
+        return replace(highway_episode(scenario, seed), key=cell.key)
     return replace(
         build_episode(scenario, town(scenario.town), seed=cell.seed, spread=cell.spec["spread"]), key=cell.key
     )
@@ -261,13 +281,15 @@ def _check(cell: Cell) -> None:
 
 
 def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
-    """Episodes and traces of cells that share a system, run as one batch."""
+    """Episodes and traces of cells that share a system and a simulator, run as one batch."""
+    from ssad.interchange.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
     episodes = [episode_of(cell) for cell in cells]
     graphs = {episode.town: town(episode.town) for episode in episodes}
-    return episodes, rollout(World(episodes, graphs, device=device), system_of(cells[0].system))
+    simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
+    return episodes, rollout(simulator, system_of(cells[0].system))
 
 
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:

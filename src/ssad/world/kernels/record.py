@@ -139,7 +139,8 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     route = bank.route[e, 0]
     mark = ego.mark[b]
     passed = mark
-    for k in range(3):
+    reach = wp.max(3, int(gone) + 2)  # beyond 20 m/s an ego passes more than two points a step
+    for k in range(reach):
         n = mark + k
         if n < route[1]:
             p = roads.path[route[0] + n]

@@ -1,0 +1,1 @@
+"""Other simulators and formats, behind the protocols of SSAD."""

@@ -1,0 +1,92 @@
+"""The world as a vector environment of stable-baselines3; needs the extra `train`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from stable_baselines3.common.vec_env import VecEnv
+
+from ssad.world.env import VectorEnv
+
+
+class SB3VecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
+    """All scenes of a `VectorEnv` as stable-baselines3 wants them, without a process or a wrapper a scene.
+
+    An ended scene starts another episode in the same step. `infos` of its row then hold `terminal_observation`,
+    `TimeLimit.truncated`, `episode` (return `r`, length `l`, seconds `t`) and `end`, why it ended; other rows are
+    empty.
+    """
+
+    def __init__(self, environment: VectorEnv) -> None:
+        self.environment = environment
+        self.render_mode = None
+        self._actions: npt.NDArray[Any] = np.zeros(0, np.float32)
+        self._returns = np.zeros(environment.num_envs)
+        self._lengths = np.zeros(environment.num_envs, np.int64)
+        self._began = time.time()
+        super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
+
+    def reset(self) -> npt.NDArray[np.float32]:
+        """Start all scenes; draws their episodes by the seed given to `seed`, if any."""
+        observation, _ = self.environment.reset(seed=self._seeds[0])
+        self._reset_seeds()
+        self._reset_options()
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        return observation
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """Keep the actions of the next step."""
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.bool_], list[dict[str, Any]]]:
+        """One step of 0.1 s in every scene."""
+        observation, reward, terminated, truncated, info = self.environment.step(self._actions)
+        done = terminated | truncated
+        self._returns += reward
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for b in np.flatnonzero(done).tolist():
+            episode = {
+                "r": float(self._returns[b]),
+                "l": int(self._lengths[b]),
+                "t": round(time.time() - self._began, 6),
+            }
+            infos[b] = {
+                "terminal_observation": info["final_obs"][b],
+                "TimeLimit.truncated": bool(truncated[b]),
+                "episode": episode,
+                "end": info["end"][b],
+            }
+        self._returns[done] = 0.0
+        self._lengths[done] = 0
+        return observation, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Nothing to close: no process, no window."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of this environment, once for each scene."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of this environment: the scenes have none of their own."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+        """Call a method of this environment, once for each scene."""
+        return [getattr(self, method_name)(*args, **options) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Scenes are never wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _get_indices(self, indices: Any) -> Sequence[int]:
+        found: Sequence[int] = range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()
+        return found
