@@ -6,6 +6,7 @@ from ssad.core.types import SignalState
 from ssad.world.kernels.data import FAR, EpisodeArrays, Roads
 
 IDM_ACCEL = wp.constant(2.5)
+NO_LINE = wp.constant(1 << 30)
 
 
 @wp.func
@@ -37,6 +38,16 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
     dy = b[1] - a[1]
     r = 1.0 / wp.sqrt(wp.max(dx * dx + dy * dy, 1.0e-12))
     return wp.vec4(a[0] + f * dx, a[1] + f * dy, dx * r, dy * r)
+
+
+@wp.func
+def sign_line(roads: Roads, first: int, at: int) -> int:
+    """Route point of the line of the next stop sign from point `at` of a route on, or NO_LINE."""
+    halt = roads.halt[first + at]
+    line = int(NO_LINE)
+    if halt[0] < FAR:
+        line = int(halt[1])
+    return line
 
 
 @wp.func
