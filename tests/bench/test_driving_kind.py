@@ -43,7 +43,7 @@ def scenario(name: str, **changes: Any) -> Scenario:
 @pytest.fixture(autouse=True)
 def nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Towns of that name, and scenarios that the suite seems to name."""
-    monkeypatch.setattr(driving, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3)))
+    monkeypatch.setattr(driving, "town", lambda name: SimpleNamespace(name=name, xy=np.zeros(3), sign_kind=np.zeros(0)))
 
 
 def plan_of(monkeypatch: pytest.MonkeyPatch, *scenarios: Scenario, check: bool = False, **changes: Any) -> Plan:
@@ -302,7 +302,7 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     monkeypatch.setattr(driving, "motion_hash", lambda trace: f"motion {trace.end}")
     monkeypatch.setattr(driving, "system_of", lambda name: SimpleNamespace(target_speed=7.5))
     measured = SimpleNamespace(as_dict=lambda: {"speed": math.inf})
-    monkeypatch.setattr(driving, "episode_metrics", lambda trace: measured)
+    monkeypatch.setattr(driving, "episode_metrics", lambda trace, stop_signs: measured)
 
     def witness(*given: Any) -> dict[str, bool]:
         asked.append(given)

@@ -89,6 +89,7 @@ class WorldState:
         driven: [B] m.
         lane_invasion: [B] lane markings crossed in this step.
         red_light: [B] red lights run in this step.
+        stop_sign: [B] stop signs run in this step; None in a world without stop signs.
     """
 
     time: F64
@@ -117,6 +118,7 @@ class WorldState:
     driven: F32
     lane_invasion: U8
     red_light: U8
+    stop_sign: U8 | None = None
 
     @cached_property
     def signal(self) -> U8:

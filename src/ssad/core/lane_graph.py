@@ -53,8 +53,7 @@ class LaneGraph:
     the map, off unless forced. stop_signal, stop_lane, stop_s [K]: signal that controls a lane at arc length
     stop_s (near the lane's end). crosswalk_offset [C+1], crosswalk_xy [., 2]: corners of the crosswalks.
     sign_kind [G]: `SignKind`; sign_xy [G, 2], sign_yaw [G] (direction of the traffic it faces); rule_sign, rule_lane,
-    rule_s [R]: sign that rules a lane, whose stop line is at arc length rule_s. Signs are only seen so far: nobody
-    obeys them.
+    rule_s [R]: sign that rules a lane, whose stop line is at arc length rule_s.
     """
 
     name: str

@@ -104,7 +104,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
 
     Args:
         trace: what happened.
-        stop_signs: whether the world that the trace is from has stop signs (the embedded one has none yet).
+        stop_signs: whether the town that the trace is from has stop signs.
 
     Raises:
         ValueError: the trace has no row.

@@ -87,7 +87,7 @@ def full_table(run: DrivingRun) -> Table:
     ]
     note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
     if not run.measures("SS"):
-        note += " SS is not measured, since the world has no stop signs yet; the driving score is without them."
+        note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
     return Table("metrics", "All metrics", ("System", "Group"), tuple(METRICS), tuple(rows), note)
 
 

@@ -11,8 +11,8 @@ import warp as wp
 
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, AgentKind, Controller, Episode, EpisodeAgent, Model, Route
+from ssad.core.lane_graph import LaneGraph, SignKind
+from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, Model, Route
 from ssad.roads.query import CELL, DRIVABLE, build_grid
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
 
@@ -26,13 +26,15 @@ TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 @dataclass(frozen=True)
 class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
-    line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m
-    that the next 64 m leave the straight line along the point's heading; lane [N] of the town, -1 none."""
+    line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m that the next 64 m leave the
+    straight line along the point's heading; halt [N, 2] m to the line of the next stop sign, and the route point there,
+    FAR none; lane [N] of the town, -1 none."""
 
     path: F32
     rule: F32
     signal: npt.NDArray[np.int32]
     bend: F32
+    halt: F32
     lane: npt.NDArray[np.int32]
     town: str
 
@@ -58,9 +60,11 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     # v^2 may fall by 2 a a metre: the least over all points ahead, in one sweep
     fall = 2.0 * SLOW_DOWN * route.spacing * np.arange(n)
     cap = np.sqrt(np.minimum.accumulate((cap.astype(np.float64) ** 2 + fall)[::-1])[::-1] - fall)
-    stop = np.full(n, FAR)
-    signal = np.full(n, -1, np.int32)
-    _stop_lines(route, graph, stop, signal)
+    stop, signal = _next_line(route, graph, graph.stop_lane, graph.stop_s, graph.stop_signal)
+    signs = graph.sign_kind[graph.rule_sign] == SignKind.STOP
+    distance, _ = _next_line(route, graph, graph.rule_lane[signs], graph.rule_s[signs], graph.rule_sign[signs])
+    line = np.floor(np.arange(n) * route.spacing + distance + 0.5)
+    halt = np.stack([distance, line], 1)
     entry, rank = _junctions(route, graph, yaw)
     path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
     return PathTable(
@@ -68,28 +72,37 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
         np.stack([cap, stop, entry, rank], 1).astype(np.float32),
         signal,
         _bend(route),
+        halt.astype(np.float32),
         route.lane.astype(np.int32),
         graph.name,
     )
 
 
-def _stop_lines(route: Route, graph: LaneGraph, stop: npt.NDArray[np.float64], signal: npt.NDArray[np.int32]) -> None:
-    """Fill `stop` (m ahead) and `signal` for every route point from the graph's stop lines on the route's lanes."""
+def _next_line(
+    route: Route, graph: LaneGraph, lanes: I32, along: F32, what: I32
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
+    """m from every route point to the next line (FAR: none) and what stands there (-1: nothing).
+
+    Lines lie across `lanes` at the arc lengths `along`; a route may come past one more than once.
+    """
+    distance, found = np.full(len(route.xy), FAR), np.full(len(route.xy), -1, np.int32)
     marks: list[tuple[float, int]] = []
-    for k in np.flatnonzero(np.isin(graph.stop_lane, route.lane)).tolist():
-        lane = int(graph.stop_lane[k])
+    for k in np.flatnonzero(np.isin(lanes, route.lane)).tolist():
+        lane = int(lanes[k])
         on = np.flatnonzero(route.lane == lane)
         a, b = int(graph.offset[lane]), int(graph.offset[lane + 1])
-        at = [np.interp(graph.stop_s[k], graph.s[a:b], graph.xy[a:b, d]) for d in (0, 1)]
-        i = int(on[np.argmin(np.hypot(*(route.xy[on] - at).T))])
-        c, s = np.cos(route.yaw[i]), np.sin(route.yaw[i])
-        ahead = (at[0] - route.xy[i, 0]) * c + (at[1] - route.xy[i, 1]) * s
-        marks.append((i * route.spacing + float(ahead), int(graph.stop_signal[k])))
-    u = np.arange(len(stop)) * route.spacing
+        at = [np.interp(along[k], graph.s[a:b], graph.xy[a:b, d]) for d in (0, 1)]
+        for visit in np.split(on, np.flatnonzero(np.diff(on) > 1) + 1):
+            i = int(visit[np.argmin(np.hypot(*(route.xy[visit] - at).T))])
+            c, s = np.cos(route.yaw[i]), np.sin(route.yaw[i])
+            ahead = (at[0] - route.xy[i, 0]) * c + (at[1] - route.xy[i, 1]) * s
+            marks.append((i * route.spacing + float(ahead), int(what[k])))
+    u = np.arange(len(route.xy)) * route.spacing
     for position, index in sorted(marks, reverse=True):
         before = u <= position + 0.75
-        stop[before] = position - u[before]
-        signal[before] = index
+        distance[before] = position - u[before]
+        found[before] = index
+    return distance, found
 
 
 def _junctions(
@@ -331,6 +344,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
     parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]
+    parts["halt"] = [t.halt for t in pool.tables]
     for name, array in array_types(Roads).items():
         joined = np.concatenate(parts[name])
         if len(joined) == 0:  # a town without signals

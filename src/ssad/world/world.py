@@ -24,7 +24,7 @@ from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 
-VERSION = "1"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "2"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _EGO = array_types(State), array_types(Ego)
 
@@ -310,6 +310,7 @@ class World:
             lane_invasion=self.array("ego.invasion").astype(np.uint8),
             # 2 marks a line already counted in the step before
             red_light=(self.array("ego.red_light") == 1).astype(np.uint8),
+            stop_sign=self.array("ego.stop_sign").astype(np.uint8),
         )
 
     def ended(self) -> npt.NDArray[np.int32]:

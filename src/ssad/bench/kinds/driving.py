@@ -21,7 +21,7 @@ from ssad.core import safeio
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
-from ssad.core.lane_graph import LaneGraph, load_graph, save_graph
+from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph
 from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -151,7 +151,8 @@ class Driving(Kind):
             began = time.perf_counter()
             artefact = f"traces/{cell.key}.npz"
             save_trace(job.folder / artefact, trace)
-            metrics = plain(episode_metrics(trace).as_dict())
+            signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
+            metrics = plain(episode_metrics(trace, stop_signs=signs).as_dict())
             about = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
             about |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
             result = {

@@ -77,6 +77,7 @@ class Roads:
     path: wp.array(dtype=wp.vec4)  # [N] x, y, yaw, curvature
     rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, TurnRank there
     bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
+    halt: wp.array(dtype=wp.vec2)  # [N] m to the line of the next stop sign, its route point; FAR none
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     track: wp.array(dtype=wp.vec4)  # [N] s, x, y, yaw: trajectories
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
@@ -110,6 +111,7 @@ class State:
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
     travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
+    halted: wp.array2d(dtype=wp.int32)  # [B, A] route point at whose stop sign it has stopped, -1 none
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
@@ -132,6 +134,8 @@ class Ego:
     over_line: wp.array(dtype=wp.int32)
     invasion: wp.array(dtype=wp.int32)
     red_light: wp.array(dtype=wp.int32)
+    stop_sign: wp.array(dtype=wp.int32)  # 1 if its tail crossed the line of a stop sign at which it had not stopped
+    sign_line: wp.array(dtype=wp.int32)  # route point of the next stop sign's line
     complete: wp.array(dtype=wp.float32)  # percent
     mark: wp.array(dtype=wp.int32)  # last route point passed
     route_distance: wp.array(dtype=wp.float32)

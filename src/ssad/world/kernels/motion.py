@@ -4,13 +4,15 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State
-from ssad.world.kernels.shared import lane_under, on_track, route_at, track_at, wrap
+from ssad.world.kernels.shared import lane_under, on_track, route_at, sign_line, track_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 GRIP_LIMIT = wp.constant(GRIP)
 STEER_SECONDS = wp.constant(STEER_TIME)
 REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
+STOPPED = wp.constant(0.3)  # m/s: slower, a vehicle has stopped
+BEFORE_LINE = wp.constant(4.0)  # m from the front to the line within which a stop at a stop sign counts
 WALKER_TURN = wp.constant(WALKER_RATE)
 
 
@@ -166,6 +168,8 @@ def move(
             k = k + 1
         at = found
         state.progress[b, i] = at
+        if wp.abs(speed) < STOPPED and roads.halt[route[0] + at][0] < BEFORE_LINE + bank.body[m][0]:
+            state.halted[b, i] = sign_line(roads, route[0], at)
         if i > 0 and who == Controller.AUTOPILOT and at >= route[1] - 3:
             state.active[b, i] = Presence.ABSENT  # background traffic leaves at the end of its route
 

@@ -17,7 +17,7 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
-from ssad.world.kernels.shared import boxes_touch, on_track, signal_state, wrap
+from ssad.world.kernels.shared import boxes_touch, on_track, sign_line, signal_state, wrap
 
 
 @wp.func
@@ -190,6 +190,20 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     else:
         ego.red_light[b] = 0
 
+    # stop sign: the same, where no signal is lit and the ego has not stopped before the line
+    missed = int(0)
+    if back >= 0 and wp.abs(left) < 4.0:
+        line = sign_line(roads, route[0], back)
+        passed_line = ego.sign_line[b]
+        if line > passed_line:
+            ego.sign_line[b] = line
+            if passed_line >= 0 and state.halted[b, 0] < passed_line:
+                missed = 1
+                index = roads.path_signal[route[0] + wp.min(passed_line, back)]
+                if index >= 0 and signal_state(bank, roads, e, index, time) != SignalState.OFF:
+                    missed = 0
+    ego.stop_sign[b] = missed
+
     limits = bank.limits[e]
     end = int(End.RUNNING)
     if kinds != Contact.NONE and policy == ContactPolicy.END:
@@ -230,6 +244,7 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     state.phase[b, i] = 0
     state.travelled[b, i] = 0.0
     state.waited[b, i] = 0.0
+    state.halted[b, i] = -1
     state.touch[b, i] = wp.int64(0)
     state.lateral[b, i] = wp.vec2(0.0, 0.0)
     state.lane[b, i] = -1
@@ -274,6 +289,8 @@ def restart_record(
     ego.over_line[b] = 0
     ego.invasion[b] = 0
     ego.red_light[b] = 0
+    ego.stop_sign[b] = 0
+    ego.sign_line[b] = -1
     ego.complete[b] = 0.0
     ego.mark[b] = 0
     ego.route_distance[b] = 0.0

@@ -6,6 +6,7 @@ from ssad.core.types import SignalState
 from ssad.world.kernels.data import FAR, EpisodeArrays, Roads
 
 IDM_ACCEL = wp.constant(2.5)
+NO_LINE = wp.constant(1 << 30)
 
 
 @wp.func
@@ -53,7 +54,7 @@ def track_at(roads: Roads, track: wp.vec2i, time: float) -> wp.vec4:
     low = int(0)
     high = track[1] - 1
     while high - low > 1:
-        middle = (low + high) / 2
+        middle = (low + high) // 2
         if roads.track[track[0] + middle][0] <= time:
             low = middle
         else:
@@ -67,6 +68,16 @@ def track_at(roads: Roads, track: wp.vec2i, time: float) -> wp.vec4:
     dy = q[2] - p[2]
     speed = (dx * wp.cos(yaw) + dy * wp.sin(yaw)) / span
     return wp.vec4(p[1] + f * dx, p[2] + f * dy, wrap(yaw), speed)
+
+
+@wp.func
+def sign_line(roads: Roads, first: int, at: int) -> int:
+    """Route point of the line of the next stop sign from point `at` of a route on, or NO_LINE."""
+    halt = roads.halt[first + at]
+    line = int(NO_LINE)
+    if halt[0] < FAR:
+        line = int(halt[1])
+    return line
 
 
 @wp.func

@@ -13,6 +13,7 @@ from ssad.world.kernels.shared import (
     IDM_ACCEL,
     boxes_touch,
     route_frame,
+    sign_line,
     signal_state,
 )
 
@@ -220,17 +221,23 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     react = float(0.0)
 
     index = roads.path_signal[first]
+    lit = int(SignalState.OFF)
+    if index >= 0:
+        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+    if lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
+        ahead = roads.halt[first][0] - part - own[0]
+        if ahead > -0.5 and ahead < SIGHT + 20.0:
+            react = idm_gap(v, 0.0, ahead + 1.0)
     if index >= 0:
         ahead = rule[1] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
-            light = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
-            stop = light == SignalState.RED
-            if light == SignalState.YELLOW:
+            stop = lit == SignalState.RED
+            if lit == SignalState.YELLOW:
                 stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
-            if light == SignalState.RED and int(rule[3]) == TurnRank.RIGHT and state.waited[b, i] >= 1.0:
+            if lit == SignalState.RED and int(rule[3]) == TurnRank.RIGHT and state.waited[b, i] >= 1.0:
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
-                react = idm_gap(v, 0.0, ahead + 1.0)
+                react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
     state.react[b, i] = react
 
     c = wp.cos(pose[2])
