@@ -30,7 +30,7 @@ from ssad.core.types import (
         (LaneType, "NONE DRIVING SHOULDER SIDEWALK PARKING BIKING MEDIAN"),
         (AgentKind, "NONE CAR TRUCK BUS MOTORCYCLE BICYCLE WALKER PROP"),
         (SignalState, "OFF RED YELLOW GREEN"),
-        (Controller, "NONE EXTERNAL AUTOPILOT FOLLOW SCRIPT"),
+        (Controller, "NONE EXTERNAL AUTOPILOT FOLLOW SCRIPT PLACED TRAJECTORY"),
     ],
 )
 def test_numbers_of_kinds(kind: type[IntEnum], names: str) -> None:
