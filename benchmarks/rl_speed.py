@@ -3,7 +3,8 @@
     uv run --extra train --group bench python benchmarks/rl_speed.py
 
 64 scenes, 4 epochs, batches of 1,024, two layers of 64. highway-env runs 8 environments in one process (DummyVecEnv),
-as its users do; its step is one decision, as ours. Wall clock, medians over interleaved repeats.
+as its users do; its step is one decision, as ours. torch takes one thread: networks this small lose by a second one.
+Wall clock, medians over interleaved repeats.
 """
 
 from __future__ import annotations
@@ -47,10 +48,11 @@ def main() -> None:
     """Print the rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenarios", default="natural")
-    parser.add_argument("--steps", type=int, default=64 * 128 * 4)
+    parser.add_argument("--steps", type=int, default=64 * 128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--no-highway", action="store_true")
     args = parser.parse_args()
+    torch.set_num_threads(1)
     began = time.perf_counter()
     ours = train(lambda: make_sb3(num_envs=64, scenarios=args.scenarios), args.steps, n_steps=128, batch=1024)
     print(f"first start, episodes and kernels included: {time.perf_counter() - began:.1f} s")
