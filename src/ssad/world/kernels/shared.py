@@ -43,7 +43,7 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
 @wp.func
 def sign_line(roads: Roads, first: int, at: int) -> int:
     """Route point of the line of the next stop sign from point `at` of a route on, or NO_LINE."""
-    halt = roads.halt[first + at]
+    halt = roads.ahead[first + at]
     line = int(NO_LINE)
     if halt[0] < FAR:
         line = int(halt[1])
