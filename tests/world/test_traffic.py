@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.traffic import ROUTES, measure, town_routes, traffic, upper_limit
 from ssad.core.types import ENDS, Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -42,3 +43,22 @@ def test_natural_traffic_hurts_nobody_and_gets_through() -> None:
     assert world.array("ego.complete").mean() >= 95.0
     moved = world.array("travelled")[world.state().kind > 0]
     assert np.median(moved) > 20.0  # not by standing still
+
+
+@pytest.mark.parametrize(("name", "green"), [("Oldmarket", False), ("Twinford", True), ("Crossgate", False)])
+def test_no_queue_stands_for_ever(name: str, green: bool) -> None:
+    """Dense traffic of 40 vehicles for four minutes: every queue clears, nobody leaves the road."""
+    graph = load_town(name)
+    routes = town_routes(graph, ROUTES // 4, 2000.0)
+    episodes = [traffic(graph, routes, 40, key=k, green=green) for k in range(3)]
+    found = measure(graph, episodes, seconds=240.0)
+    assert found["hours"] > 5.0
+    assert not found["stuck"]
+    assert not found["off_road"]
+    assert len(found["contacts"]) <= 1
+
+
+def test_upper_limit_of_a_count() -> None:
+    """Values of the chi-squared tables."""
+    for count, limit in ((0, 2.996), (1, 4.744), (10, 16.962), (25, 34.916)):
+        assert upper_limit(count) == pytest.approx(limit, abs=2e-3)

@@ -15,6 +15,7 @@ from ssad.roads.xodr import Network
 
 ARMS = 3  # a junction with fewer arms needs no signal
 TOUCHING = 2.5  # m between the middles of two ways at which they meet
+FACING = -0.7  # cosine: two arms face each other below it, and go the same way above its opposite
 SETBACK = 1.0  # m from the stop line to a crosswalk
 _TAIL = 15.0  # m before the end of a lane in which a crosswalk moves its stop line
 
@@ -191,21 +192,32 @@ def _facing(data: Approaches, arm: _Approach, inner: list[int]) -> str | None:
 
 
 def _phases(data: Approaches, arms: list[_Approach]) -> list[int]:
-    """Phase of each arm."""
+    """Phase of each arm: the map's, unless it shows green to arms that cross."""
     given = [data.network.phase.get(arm.light or "") for arm in arms]
     if all(phase is not None for phase in given) and len(set(given)) > 1:
         order = sorted({phase for phase in given if phase is not None})
-        return [order.index(phase) for phase in given if phase is not None]
+        mapped = [order.index(phase) for phase in given if phase is not None]
+        pairs = ((k, m) for k in range(len(arms)) for m in range(k) if mapped[k] == mapped[m])
+        if not any(_cross(data, arms[k], arms[m]) for k, m in pairs):
+            return mapped
     phases: list[int] = []
     for k, arm in enumerate(arms):
-        yaw = data.end[arm.lanes[0], 2]
         same = -1
         for m in range(k):
-            other = data.end[arms[m].lanes[0], 2]
-            if np.cos(yaw - other) < -0.7 and same < 0:
+            if _heading(data, arm, arms[m]) < FACING and same < 0:
                 same = phases[m]
         phases.append(same if same >= 0 else max(phases, default=-1) + 1)
     return phases
+
+
+def _heading(data: Approaches, one: _Approach, other: _Approach) -> float:
+    """Cosine of the angle between the traffic of two arms: -1 if they face each other."""
+    return float(np.cos(data.end[one.lanes[0], 2] - data.end[other.lanes[0], 2]))
+
+
+def _cross(data: Approaches, one: _Approach, other: _Approach) -> bool:
+    """Whether the traffic of two arms comes neither from opposite sides nor from the same one."""
+    return FACING <= _heading(data, one, other) <= -FACING
 
 
 def _stop(data: Approaches, lane: int) -> float:

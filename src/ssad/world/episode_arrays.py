@@ -27,14 +27,14 @@ TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
     line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m that the next 64 m leave the
-    straight line along the point's heading; halt [N, 2] m to the line of the next stop sign, and the route point there,
-    FAR none; lane [N] of the town, -1 none."""
+    straight line along the point's heading; ahead [N, 3] m to the line of the next stop sign and the route point there
+    (FAR: none), m to the end of the next junction; lane [N] of the town, -1 none."""
 
     path: F32
     rule: F32
     signal: npt.NDArray[np.int32]
     bend: F32
-    halt: F32
+    ahead: F32
     lane: npt.NDArray[np.int32]
     town: str
 
@@ -64,15 +64,14 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     signs = graph.sign_kind[graph.rule_sign] == SignKind.STOP
     distance, _ = _next_line(route, graph, graph.rule_lane[signs], graph.rule_s[signs], graph.rule_sign[signs])
     line = np.floor(np.arange(n) * route.spacing + distance + 0.5)
-    halt = np.stack([distance, line], 1)
-    entry, rank = _junctions(route, graph, yaw)
+    entry, leave, rank = _junctions(route, graph, yaw)
     path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
     return PathTable(
         path.astype(np.float32),
         np.stack([cap, stop, entry, rank], 1).astype(np.float32),
         signal,
         _bend(route),
-        halt.astype(np.float32),
+        np.stack([distance, line, leave], 1).astype(np.float32),
         route.lane.astype(np.int32),
         graph.name,
     )
@@ -107,14 +106,14 @@ def _next_line(
 
 def _junctions(
     route: Route, graph: LaneGraph, yaw: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Distance to the next junction and turn rank there, for every route point."""
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Distances to the next junction and to its end, and turn rank there, for every route point."""
     ruled = set(graph.rule_lane.tolist())
     n = len(route.xy)
     inside = np.zeros(n, bool)
     known = route.lane >= 0
     inside[known] = graph.junction[route.lane[known]] >= 0
-    entry = np.full(n, FAR)
+    entry, leave = np.full(n, FAR), np.full(n, FAR)
     rank = np.zeros(n)
     edge = np.diff(np.concatenate([[0], inside.astype(np.int8), [0]]))
     runs = zip(np.flatnonzero(edge == 1).tolist(), np.flatnonzero(edge == -1).tolist(), strict=True)
@@ -124,10 +123,11 @@ def _junctions(
         if start > 0 and int(route.lane[start - 1]) in ruled:
             kind += TurnRank.YIELD
         entry[: start + 1] = (start - np.arange(start + 1)) * route.spacing
+        leave[:stop] = (stop - np.arange(stop)) * route.spacing
         rank[: start + 1] = kind
         entry[start:stop] = 0.0
         rank[start:stop] = kind
-    return entry, rank
+    return entry, leave, rank
 
 
 def signal_programs(graph: LaneGraph) -> F32:
@@ -344,7 +344,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
     parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]
-    parts["halt"] = [t.halt for t in pool.tables]
+    parts["ahead"] = [t.ahead for t in pool.tables]
     for name, array in array_types(Roads).items():
         joined = np.concatenate(parts[name])
         if len(joined) == 0:  # a town without signals

@@ -101,7 +101,7 @@ class World:
         self._plan = [self.launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
         self._plan += [
             self.launch(sight, flat, [bank, roads, state, self.work, self.agents, dt]),
-            self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers]),
+            self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers, dt]),
             self.launch(drive, flat, [bank, roads, state, dt]),
         ]
         self._advance = [

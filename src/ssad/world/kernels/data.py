@@ -77,7 +77,7 @@ class Roads:
     path: wp.array(dtype=wp.vec4)  # [N] x, y, yaw, curvature
     rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, TurnRank there
     bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
-    halt: wp.array(dtype=wp.vec2)  # [N] m to the line of the next stop sign, its route point; FAR none
+    ahead: wp.array(dtype=wp.vec3)  # [N] m to the next stop sign's line, its route point, m to the next junction's end
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     track: wp.array(dtype=wp.vec4)  # [N] s, x, y, yaw: trajectories
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1

@@ -12,6 +12,7 @@ GRIP_LIMIT = wp.constant(GRIP)
 STEER_SECONDS = wp.constant(STEER_TIME)
 REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
 STOPPED = wp.constant(0.3)  # m/s: slower, a vehicle has stopped
+CLEARING = wp.constant(3.0)  # m/s
 BEFORE_LINE = wp.constant(4.0)  # m from the front to the line within which a stop at a stop sign counts
 WALKER_TURN = wp.constant(WALKER_RATE)
 
@@ -168,7 +169,7 @@ def move(
             k = k + 1
         at = found
         state.progress[b, i] = at
-        if wp.abs(speed) < STOPPED and roads.halt[route[0] + at][0] < BEFORE_LINE + bank.body[m][0]:
+        if wp.abs(speed) < STOPPED and roads.ahead[route[0] + at][0] < BEFORE_LINE + bank.body[m][0]:
             state.halted[b, i] = sign_line(roads, route[0], at)
         if i > 0 and who == Controller.AUTOPILOT and at >= route[1] - 3:
             state.active[b, i] = Presence.ABSENT  # background traffic leaves at the end of its route
@@ -185,9 +186,12 @@ def move(
             follows = False  # far from its route: nothing says where it goes
     low = wp.vec2(pose[0], pose[1])
     high = low
-    if wp.abs(speed) > 0.1:
+    goes = speed
+    if follows and who == Controller.AUTOPILOT and roads.rule[route[0] + at][2] < bank.body[m][0] - 1.0:
+        goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
+    if wp.abs(goes) > 0.1:
         for k in range(HORIZON):
-            ahead = speed * STRIDE * float(k + 1)
+            ahead = goes * STRIDE * float(k + 1)
             q = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
             if follows:
                 q = route_at(roads, route[0], route[1], float(at) + ahead)

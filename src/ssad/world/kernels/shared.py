@@ -73,7 +73,7 @@ def track_at(roads: Roads, track: wp.vec2i, time: float) -> wp.vec4:
 @wp.func
 def sign_line(roads: Roads, first: int, at: int) -> int:
     """Route point of the line of the next stop sign from point `at` of a route on, or NO_LINE."""
-    halt = roads.halt[first + at]
+    halt = roads.ahead[first + at]
     line = int(NO_LINE)
     if halt[0] < FAR:
         line = int(halt[1])

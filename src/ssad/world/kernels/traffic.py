@@ -21,6 +21,7 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+STANDS = wp.constant(0.2)  # m/s
 LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
 
@@ -91,12 +92,47 @@ def lead_gap(
 
 
 @wp.func
-def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int) -> bool:
-    """Whether i goes before j where their paths cross; a total order, so that exactly one of two goes first.
+def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
+    """Metres from a front to where it would wait before the next junction: its stop line, or the junction itself.
+
+    first: the route point in the pool; part: metres beyond it; half: half length of the body.
+    """
+    rule = roads.rule[first]
+    return wp.min(rule[1], rule[2]) - part - half
+
+
+@wp.func
+def inside(roads: Roads, first: int, half: float) -> bool:
+    """Whether the front of a body at a route point has entered the junction."""
+    return roads.rule[first][2] < half - 1.0
+
+
+@wp.func
+def waits(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int, dt: float) -> bool:
+    """Whether i, who is still before the junction, lets j go first, who is inside.
+
+    Not if it can no longer stop with 4 m/s^2, nor on green for someone who turns left from the other side.
+    """
+    first = bank.route[e, i][0] + state.progress[b, i]
+    rule = roads.rule[first]
+    v = state.speed[b, i]
+    line = line_ahead(roads, first, 0.0, bank.body[bank.model[e, i]][0])
+    lets = v * v < 8.0 * (wp.max(line, 0.0) + 1.5)
+    index = roads.path_signal[first]
+    turns = roads.rule[bank.route[e, j][0] + state.progress[b, j]][3] > rule[3]
+    if turns and index >= 0 and wp.cos(state.pose[b, i][2] - state.pose[b, j][2]) < -0.5:
+        if signal_state(bank, roads, e, index, float(state.step[b]) * dt) == SignalState.GREEN:
+            lets = False
+    return lets
+
+
+@wp.func
+def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int, dt: float) -> bool:
+    """Whether i goes before j where their paths cross; of each two exactly one goes first.
 
     Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
-    test. Scripted actors and walkers are not. Straight goes before right before left, then whoever is inside the
-    junction, then whoever is nearer to it, then the lower number.
+    test. Scripted actors and walkers are not. Whoever is inside the junction goes first (see `waits`), then whoever has
+    no stop or yield sign, straight before right before left, then whoever is nearer to it, then the lower number.
     """
     if j != 0 and (state.controller[b, j] != Controller.AUTOPILOT or state.active[b, j] != Presence.AWAKE):
         return False
@@ -104,12 +140,14 @@ def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int
     rj = bank.route[e, j]
     a = roads.rule[ri[0] + state.progress[b, i]]
     c = roads.rule[rj[0] + state.progress[b, j]]
-    inside_i = a[2] <= 0.0
-    inside_j = c[2] <= 0.0
+    inside_i = inside(roads, ri[0] + state.progress[b, i], bank.body[bank.model[e, i]][0])
+    inside_j = inside(roads, rj[0] + state.progress[b, j], bank.body[bank.model[e, j]][0])
+    if inside_i and not inside_j and waits(bank, roads, state, b, j, i, e, dt):
+        return True
+    if inside_j and not inside_i and waits(bank, roads, state, b, i, j, e, dt):
+        return False
     if a[3] != c[3]:
         return a[3] < c[3]
-    if inside_i != inside_j:
-        return inside_i
     if wp.abs(a[2] - c[2]) > 1.0:
         return a[2] < c[2]
     return i < j
@@ -222,10 +260,10 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
 
     index = roads.path_signal[first]
     lit = int(SignalState.OFF)
-    if index >= 0:
+    if index >= 0 and rule[1] - part < SIGHT + 40.0:
         lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
     if lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
-        ahead = roads.halt[first][0] - part - own[0]
+        ahead = roads.ahead[first][0] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
             react = idm_gap(v, 0.0, ahead + 1.0)
     if index >= 0:
@@ -291,7 +329,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
 
 
 @wp.kernel(enable_backward=False)
-def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, workers: int):
+def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, workers: int, dt: float):
     """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
     tid = wp.tid()
     total = work.count[0]
@@ -315,6 +353,9 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
+        first = route[0] + state.progress[b, i]
+        part = aim[0] - float(state.progress[b, i])
+        line = line_ahead(roads, first, part, own[0])
         if flags != 2:
             c = wp.cos(pose[2])
             s = wp.sin(pose[2])
@@ -329,13 +370,31 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
                 react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
+                # a junction is entered only where there is room behind it
+                room = roads.ahead[first][2] - part - own[0] + 2.0 * own[0] + 2.0
+                if line > -1.0 and lead[0] > line + 3.0 and lead[0] < room and lead[1] < 1.5:
+                    react = wp.min(react, idm_gap(v, 0.0, wp.max(line, 0.0) + 1.0))
         if flags >= 2 and leads == 0:
             margin = 0.4
             if walks:
                 margin = 1.0
             gap = conflict_gap(roads, state, b, j, route, aim[0], v, aim[1], own, other, margin)
             if gap < FAR:
-                if gap < 0.5 * v or not has_priority(bank, roads, state, b, i, j, e):
+                goes_first = has_priority(bank, roads, state, b, i, j, e, dt)
+                if not goes_first and line > -1.0 and not walks and v * v < 8.0 * (line + 1.5):
+                    # it is waited before the junction, not in it, but to turn left on green
+                    index = roads.path_signal[first]
+                    lit = int(SignalState.OFF)
+                    if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
+                        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+                    entered = False
+                    if bank.route[e, j][1] > 1:
+                        entered = inside(roads, bank.route[e, j][0] + state.progress[b, j], other[0])
+                    crosses = wp.abs(wp.cos(q[2] - pose[2])) < 0.7
+                    if lit == SignalState.OFF or lit == SignalState.RED or entered or crosses:
+                        gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
+                # whoever stands and has to wait is not expected to go after all
+                if not goes_first or (gap < 0.5 * v and wp.abs(state.speed[b, j]) > STANDS):
                     react = wp.min(react, idm_gap(v, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)

@@ -1,0 +1,213 @@
+"""How well background traffic drives: contacts between vehicles, vehicles off the road, queues that do not clear.
+
+`python benchmarks/traffic.py --hours 50` drives 50 vehicle-hours in every town; `--towns` takes names and files
+(.xodr, .npz), `--signals green` switches all real signals to green, as in recorded drives, so that priority alone
+decides. Prints a table and where it happened; `--json FILE` writes both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.seeding import generator
+from ssad.core.types import (
+    Controller,
+    Episode,
+    EpisodeAgent,
+    LaneType,
+    Limits,
+    Pose,
+    Route,
+    Scenario,
+    SignalState,
+)
+from ssad.jobs.machine import quiet_warp
+from ssad.roads import load_town, random_route
+from ssad.roads.library import BUILT_IN
+from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.world.episode_arrays import signal_programs
+from ssad.world.kernels.data import Presence
+from ssad.world.world import World
+
+BODIES = {"car": 0.30, "suv": 0.20, "coupe": 0.10, "compact": 0.14, "van": 0.07, "motorcycle": 0.07, "truck": 0.07,
+          "bus": 0.05}  # fmt: skip
+APART = 16.0  # m between two vehicles at the start
+ROUTES = 500  # of a town, from which each vehicle takes one
+LENGTH = 3500.0  # m of a route
+SETTLE = 10.0  # s at the start that do not count: vehicles begin where no traffic has put them
+CYCLES = 3.0  # signal cycles after which a vehicle that stood all the time is in a queue that does not clear
+LEAST_CYCLE = 32.0  # s, where a town has no signals
+
+
+def upper_limit(count: int, share: float = 0.95) -> float:
+    """Upper limit of the mean of a Poisson distribution of which `count` events were seen (one-sided)."""
+    low, high = float(count), count + 10.0 * math.sqrt(count + 1.0) + 10.0
+    for _ in range(80):
+        mean = 0.5 * (low + high)
+        below = sum(math.exp(k * math.log(mean) - mean - math.lgamma(k + 1)) for k in range(count + 1))
+        low, high = (mean, high) if below > 1.0 - share else (low, mean)
+    return high
+
+
+def town_routes(graph: LaneGraph, count: int, length: float) -> list[Route]:
+    """Random ways through a town; their starts are spread over all driving lanes outside junctions."""
+    draws = generator("traffic routes", graph.name)
+    lanes = np.flatnonzero((graph.kind == LaneType.DRIVING) & (graph.junction < 0) & (graph.length > 14.0))
+    share = graph.length[lanes] / graph.length[lanes].sum()
+    routes = []
+    for lane in draws.choice(lanes, count, p=share).tolist():
+        s = float(draws.uniform(6.0, graph.length[lane] - 6.0))
+        routes.append(random_route(graph, lane, s, length, draws))
+    return routes
+
+
+def traffic(graph: LaneGraph, routes: Sequence[Route], vehicles: int, *, key: int, green: bool) -> Episode:
+    """Vehicles on ways drawn from `routes`, each as fast as it likes, up to the limit of its roads."""
+    draws = generator("traffic", graph.name, key)
+    agents: list[EpisodeAgent] = []
+    for number in draws.permutation(len(routes)).tolist():
+        if len(agents) == vehicles:
+            break
+        route = routes[number]
+        x, y = (float(v) for v in route.xy[0])
+        if any(math.hypot(a.pose.x - x, a.pose.y - y) < APART for a in agents):
+            continue
+        body = str(draws.choice(list(BODIES), p=list(BODIES.values())))
+        body = body if fits(body, route) else "compact"
+        wish = float(draws.uniform(0.75, 1.05)) * float(route.speed_limit.max())
+        start = 0.6 * min(wish, float(route.speed_limit[0]))
+        pose = Pose(x, y, float(route.yaw[0]))
+        agents.append(EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, start, wish, route=route))
+    limits = Limits(max_steps=10**6, max_time=1e6, max_distance=1e9, contact="count")
+    scenario = Scenario(f"traffic/{key}", "Custom", graph.name, (agents[0].pose, agents[0].pose), limits=limits)
+    real = np.flatnonzero(~graph.signal_virtual).tolist()
+    forced = dict.fromkeys(real, SignalState.GREEN) if green else {}
+    return Episode(f"traffic/{graph.name}/{key}", scenario, graph.name, tuple(agents), forced, 1e6, limits)
+
+
+def patience(graph: LaneGraph) -> float:
+    """Seconds that a vehicle may stand in a queue."""
+    return CYCLES * max(float(signal_programs(graph)[:, 0].max(initial=0.0)), LEAST_CYCLE)
+
+
+def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, device: str = "cpu") -> dict[str, Any]:
+    """Drive the episodes side by side for some seconds; vehicle-hours, and where who touched whom, left, or stood."""
+    world = World(episodes, {graph.name: graph}, device=device)
+    shape = (world.batch, world.agents)
+    before, stood = np.zeros(shape, np.int64), np.zeros(shape)
+    left, stuck = np.zeros(shape, bool), np.zeros(shape, bool)
+    found: dict[str, list[dict[str, Any]]] = {"contacts": [], "off_road": [], "stuck": []}
+    steps, longest = 0, patience(graph)
+
+    def about(scene: int, agent: int) -> dict[str, Any]:
+        x, y, yaw = world.array("pose")[scene, agent].tolist()
+        return {"scene": episodes[scene].key, "agent": agent, "body": episodes[scene].agents[agent].model, "time": now,
+                "x": round(x, 1), "y": round(y, 1), "yaw": round(yaw, 2),
+                "speed": round(float(world.array("speed")[scene, agent]), 1)}  # fmt: skip
+
+    for step in range(1, int(seconds / world.dt) + 1):
+        world.step()
+        now = round(step * world.dt, 1)
+        touch = world.array("touch").copy()
+        fresh, before = touch & ~before, touch
+        if now <= SETTLE:
+            continue
+        here = world.array("active") != Presence.ABSENT
+        steps += int(here.sum())
+        for scene, agent in np.argwhere(fresh != 0).tolist():
+            for other in range(agent + 1, world.agents):
+                if int(fresh[scene, agent]) >> other & 1:
+                    found["contacts"].append(about(scene, agent) | {"other": about(scene, other)})
+        out = here & (world.array("lane") < 0)
+        for scene, agent in np.argwhere(out & ~left).tolist():
+            found["off_road"].append(about(scene, agent))
+        left |= out
+        stood = np.where(here & (world.array("speed") < 0.2), stood + world.dt, 0.0)
+        for scene, agent in np.argwhere((stood > longest) & ~stuck).tolist():
+            found["stuck"].append(about(scene, agent))
+        stuck |= stood > longest
+    return {"hours": steps * world.dt / 3600.0, "vehicles": int((world.state().kind > 0).sum()), **found}
+
+
+def drive_town(
+    name: str, *, hours: float, vehicles: int, minutes: float, scenes: int, green: bool, device: str, first: int = 0
+) -> dict[str, Any]:
+    """One row of the table: as many batches of `scenes` as the hours need."""
+    graph = load_town(name)
+    routes = town_routes(graph, ROUTES, LENGTH)
+    total: dict[str, Any] = {"town": graph.name, "hours": 0.0, "vehicles": 0, "contacts": [], "off_road": [],
+                             "stuck": []}  # fmt: skip
+    key = first
+    while total["hours"] < hours:
+        count = max(1, min(scenes, math.ceil((hours - total["hours"]) * 60.0 / (vehicles * minutes))))
+        episodes = [traffic(graph, routes, vehicles, key=key + k, green=green) for k in range(count)]
+        key += count
+        part = measure(graph, episodes, seconds=60.0 * minutes, device=device)
+        for name_, value in part.items():
+            total[name_] += value
+    return total
+
+
+def rate(row: dict[str, Any]) -> tuple[float, float]:
+    """Contacts per 100 vehicle-hours and their upper limit."""
+    hundred = row["hours"] / 100.0
+    return len(row["contacts"]) / hundred, upper_limit(len(row["contacts"])) / hundred
+
+
+def main() -> None:
+    """Drive, print, and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--towns", default=",".join(BUILT_IN), help="names or files, with commas")
+    parser.add_argument("--hours", type=float, default=20.0, help="vehicle-hours in each town")
+    parser.add_argument("--vehicles", type=int, default=40, help="in each scene")
+    parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
+    parser.add_argument("--scenes", type=int, default=32, help="side by side")
+    parser.add_argument("--signals", choices=("program", "green"), default="program")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene: others are other traffic")
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    quiet_warp()
+    rows = []
+    heads = ("town", "hours", "contacts", "per 100 h", "95 % up", "off road", "stuck", "s")
+    print("{:22} {:>7} {:>8} {:>9} {:>8} {:>8} {:>6} {:>6}".format(*heads))
+    for name in given.towns.split(","):
+        began = time.process_time()
+        row = drive_town(
+            name, hours=given.hours, vehicles=given.vehicles, minutes=given.minutes, scenes=given.scenes,
+            green=given.signals == "green", device=given.device, first=given.first,
+        )  # fmt: skip
+        rows.append(row)
+        print(_line(row), f"{time.process_time() - began:6.0f}", flush=True)
+        for kind in ("contacts", "off_road", "stuck"):
+            for one in row[kind][: given.show]:
+                print("   ", kind, json.dumps(one), flush=True)
+    total = {"town": "all", "hours": sum(row["hours"] for row in rows)} | {
+        kind: [one for row in rows for one in row[kind]] for kind in ("contacts", "off_road", "stuck")
+    }
+    print(_line(total))
+    if given.json:
+        about = {"vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
+        given.json.write_text(json.dumps(about | {"towns": rows}, indent=1) + "\n", encoding="utf-8")
+
+
+def _line(row: dict[str, Any]) -> str:
+    mean, most = rate(row)
+    return (
+        f"{row['town']:22} {row['hours']:7.1f} {len(row['contacts']):8} {mean:9.2f} {most:8.2f} "
+        f"{len(row['off_road']):8} {len(row['stuck']):6}"
+    )
+
+
+if __name__ == "__main__":
+    main()
