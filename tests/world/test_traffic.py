@@ -62,3 +62,14 @@ def test_upper_limit_of_a_count() -> None:
     """Values of the chi-squared tables."""
     for count, limit in ((0, 2.996), (1, 4.744), (10, 16.962), (25, 34.916)):
         assert upper_limit(count) == pytest.approx(limit, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["StraightObstacle", "RedlightRunning", "UnprotectedLeftTurn", "RightTurn"])
+def test_the_autopilot_gets_through_what_needs_no_lane_change(kind: str) -> None:
+    """A right turn on red works past a stop sign too, of which nothing is heard while a signal is lit."""
+    episodes = [build_episode(s, load_town(s.town), seed=0) for s in load_scenarios(kind)]
+    graphs = {e.town: load_town(e.town) for e in episodes}
+    world = World(episodes, graphs, ego=Controller.AUTOPILOT)
+    while not world.ended().all():
+        world.step()
+    assert [ENDS[end] for end in world.ended()] == ["complete"] * len(episodes)

@@ -179,7 +179,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
         rule = roads.rule[route[0] + back]
         index = roads.path_signal[route[0] + back]
         if index >= 0 and rule[1] <= wp.max(gone, 0.0) + 0.5 and rule[1] > -0.5:
-            stopped_right = int(rule[3]) == TurnRank.RIGHT and state.waited[b, 0] >= 1.0
+            stopped_right = int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT and state.waited[b, 0] >= 1.0
             if signal_state(bank, roads, e, index, time) == SignalState.RED and not stopped_right:
                 ran = 1
     # rule[1] is whole metres: count a line once
