@@ -102,7 +102,7 @@ class World:
         self._plan += [
             self.launch(sight, flat, [bank, roads, state, self.work, self.agents, dt]),
             self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers, dt]),
-            self.launch(drive, flat, [bank, roads, state, dt]),
+            self.launch(drive, flat, [bank, roads, state, self.agents, dt]),
         ]
         self._advance = [
             self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),

@@ -112,6 +112,7 @@ class State:
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
     travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
     halted: wp.array2d(dtype=wp.int32)  # [B, A] route point at whose stop sign it has stopped, -1 none
+    stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed

@@ -7,7 +7,7 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, State, When
-from ssad.world.kernels.shared import IDM_ACCEL, wrap
+from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, wrap
 
 
 @wp.func
@@ -65,8 +65,26 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     return wp.clamp(wheel / wp.max(body[3], 1.0e-3), -1.0, 1.0)
 
 
+@wp.func
+def room_behind(bank: EpisodeArrays, state: State, b: int, i: int, e: int, agents: int) -> bool:
+    """Whether nobody is within a metre and a half behind a vehicle."""
+    pose = state.pose[b, i]
+    own = bank.body[bank.model[e, i]]
+    back = wp.vec3(pose[0] - 1.5 * wp.cos(pose[2]), pose[1] - 1.5 * wp.sin(pose[2]), pose[2])
+    free = int(1)
+    for j in range(agents):
+        if j != i and state.active[b, j] != Presence.ABSENT:
+            q = state.pose[b, j]
+            other = bank.body[bank.model[e, j]]
+            near = wp.length(wp.vec2(q[0] - back[0], q[1] - back[1])) < own[0] + other[0] + 3.0
+            ahead = (q[0] - pose[0]) * wp.cos(pose[2]) + (q[1] - pose[1]) * wp.sin(pose[2])
+            if near and ahead < 0.5 * own[0] and boxes_touch(back, own[0] + 0.3, own[1] + 0.3, q, other[0], other[1]):
+                free = 0
+    return free == 1
+
+
 @wp.kernel(enable_backward=False)
-def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
+def drive(bank: EpisodeArrays, roads: Roads, state: State, agents: int, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, i = wp.tid()
     if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
@@ -131,6 +149,12 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, dt: float):
         if v < 0.2 and accel <= 0.0:
             brake = 1.0
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
+        if who == Controller.AUTOPILOT and state.stalled[b, i] == 1 and v < 0.3:
+            if room_behind(bank, state, b, i, e, agents):
+                throttle = 0.0
+                if v > -1.0:
+                    throttle = 0.4
+                state.control[b, i] = wp.vec4(throttle, 0.0, 0.0, 1.0)
     if v < 0.3:
         state.waited[b, i] = state.waited[b, i] + dt
     elif v > 3.0:

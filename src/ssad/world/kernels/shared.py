@@ -28,8 +28,8 @@ def route_at(roads: Roads, first: int, count: int, u: float) -> wp.vec3:
 
 @wp.func
 def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
-    """Point and unit heading (x, y, tx, ty) at `u` metres along a route; held at both ends."""
-    t = wp.clamp(u, 0.0, float(count - 1))
+    """Point and unit heading (x, y, tx, ty) at `u` metres along a route; held at its start, straight on at its end."""
+    t = wp.max(u, 0.0)
     i = wp.min(int(t), count - 2)
     f = t - float(i)
     a = roads.path[first + i]

@@ -21,6 +21,8 @@ IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
+BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
+NOSE_TO_NOSE = wp.constant(3.5)  # m
 STANDS = wp.constant(0.2)  # m/s
 LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
@@ -277,6 +279,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
             if stop:
                 react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
     state.react[b, i] = react
+    state.stalled[b, i] = 0
 
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
@@ -313,8 +316,8 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
                 near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
                 if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
                     flags = 1
-                if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5):
-                    # who is behind and goes my way keeps its distance itself
+                if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5 or wp.abs(lat) > wide):
+                    # who is behind me in my lane and goes my way keeps its distance itself
                     bend_j = float(0.0)
                     reach = wide
                     if bank.route[e, j][1] > 1:
@@ -361,6 +364,7 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
             s = wp.sin(pose[2])
             heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
             lon = (q[0] - pose[0]) * c + (q[1] - pose[1]) * s
+            stands = wp.abs(state.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
             margin = 0.3
             if walks:
                 margin = 0.6
@@ -370,6 +374,14 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
                 react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
+                if (
+                    stands
+                    and lead[0] < NOSE_TO_NOSE
+                    and state.waited[b, i] > BACK_OUT
+                    and state.waited[b, j] > BACK_OUT
+                ):
+                    if not has_priority(bank, roads, state, b, i, j, e, dt):
+                        state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 room = roads.ahead[first][2] - part - own[0] + 2.0 * own[0] + 2.0
                 if line > -1.0 and lead[0] > line + 3.0 and lead[0] < room and lead[1] < 1.5:
