@@ -274,7 +274,11 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
             stop = lit == SignalState.RED
             if lit == SignalState.YELLOW:
                 stop = v * v < 2.0 * 3.5 * wp.max(ahead, 0.0)
-            if lit == SignalState.RED and int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT and state.waited[b, i] >= 1.0:
+            if (
+                lit == SignalState.RED
+                and int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT
+                and state.waited[b, i] >= 1.0
+            ):
                 stop = False  # right turn on red, after a stop; it yields below
             if stop:
                 react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
