@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from world.worlds import GRAPHS, ego, episode, line_route
 
-from benchmarks.traffic import ROUTES, measure, town_routes, traffic, upper_limit
+from benchmarks.traffic import LENGTH, ROUTES, measure, town_routes, traffic, upper_limit
 from ssad.core.types import ENDS, Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -56,6 +57,26 @@ def test_no_queue_stands_for_ever(name: str, green: bool) -> None:
     assert not found["stuck"]
     assert not found["off_road"]
     assert len(found["contacts"]) <= 1
+
+
+def test_one_of_two_that_stand_nose_to_nose_backs_out() -> None:
+    """A scene in which two vehicles come to stand in each other's way; without the rule they stand for good."""
+    graph = load_town("Oldmarket")
+    scene = traffic(graph, town_routes(graph, ROUTES, LENGTH), 40, key=1001, green=False)
+    found = measure(graph, [scene], seconds=150.0)
+    assert not found["stuck"]
+    assert not found["contacts"]
+
+
+def test_a_vehicle_beyond_the_end_of_a_route_is_seen() -> None:
+    parked = ego(x=300.0, controller=Controller.NONE)
+    coming = ego(x=40.0, speed=8.0, controller=Controller.AUTOPILOT, name="coming", route=line_route(40.0, 120.0))
+    stands = ego(x=123.0, controller=Controller.NONE, name="stands", model="bus", route=None)
+    world = World([episode(parked, coming, stands)], GRAPHS)
+    for _ in range(200):
+        world.step()
+        assert not world.array("touch").any()
+    assert world.array("pose")[0, 1, 0] > 110.0
 
 
 def test_upper_limit_of_a_count() -> None:
