@@ -83,6 +83,18 @@ def test_who_is_removed_after_a_contact_does_not_come_back() -> None:
     assert not any(there[-20:])
 
 
+def test_who_is_removed_by_hand_does_not_come_back_until_the_scene_starts_again() -> None:
+    world = World([episode(ego(), follower(curve()), limits=FAR)], GRAPHS)
+    world.step(np.zeros((1, 2, 3), np.float32))
+    world.remove(np.array([[False, True]]))
+    for _ in range(3):
+        world.step(np.zeros((1, 2, 3), np.float32))
+        assert not world.array("active")[0, 1]
+    world.reset()
+    world.step(np.zeros((1, 2, 3), np.float32))
+    assert world.array("active")[0, 1]
+
+
 def test_a_snapshot_continues_to_the_bit() -> None:
     world = World([episode(ego(speed=5.0), follower(curve(begin=0.25)), limits=FAR)], GRAPHS)
     for _ in range(10):

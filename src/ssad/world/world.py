@@ -263,10 +263,12 @@ class World:
         return progress
 
     def remove(self, agents: Bool) -> None:
-        """Take agents [B, A] out of their scenes, until these start again."""
-        active = self.array("active")
-        gone = np.where(np.asarray(agents, bool), int(Presence.ABSENT), active)
-        self.put("active", gone.astype(active.dtype))
+        """Take agents [B, A] out of their scenes, until these start again; also those that follow a trajectory."""
+        gone, controller = np.asarray(agents, bool), self.array("controller")
+        follows = gone & (controller == Controller.TRAJECTORY)  # would be back in the next step
+        for name, where, value in (("active", gone, Presence.ABSENT), ("controller", follows, Controller.NONE)):
+            old = self.array(name)
+            self.put(name, np.where(where, int(value), old).astype(old.dtype))
 
     def place(self, places: npt.ArrayLike) -> None:
         """Where agents whose controller is PLACED are at the end of the next step: [B, A, 4] x, y, yaw, speed.
