@@ -123,7 +123,9 @@ def test_lanes_lie_on_one_sheet_of_road(name: str) -> None:
     p = corners(scene)
     top = p[..., 2].max(axis=1)
     upright = np.abs(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2]) > 1e-6
-    in_reach = upright & (top > -0.01) & (top < 4.5)  # what lies below the road is not seen
+    in_reach = upright & (p[..., 2].min(axis=1) > -0.2) & (top < 4.5)
+    if name == "Ringmere":  # beside its rings grass reaches under the asphalt, 3 cm deep at most
+        in_reach &= (top > -0.01) | of(scene, ("asphalt",))
     p, road, base = p[in_reach], of(scene, GROUND)[in_reach], of(scene, ("asphalt",))[in_reach]
     low, high = p[..., :2].min(axis=1), p[..., :2].max(axis=1)
     for spot in np.array(spots):
