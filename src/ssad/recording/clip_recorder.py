@@ -196,18 +196,18 @@ def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
     style = draw_style("car", generator=draws)
     drawn = draw_size("car", style, generator=draws)
     size = min(drawn[0], 4.9), min(drawn[1], 2.06), drawn[2]
-    mesh = cast.mesh(make_body("car", style=style, size=size, generator=draws))
+    mesh = cast.meshes.add(make_body("car", style=style, size=size, generator=draws))
     return _body(mesh, style, size, draw_paint(draws))
 
 
 def _named(cast: SceneObjects, target: TargetCar) -> ObjectBody:
     """The target car in the place of the ego, with its mesh in the cast."""
-    return _body(cast.mesh(target.mesh()), target.style, target.full_size, target.colour)
+    return _body(cast.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
 
 
 def _sign(cast: SceneObjects, target: TargetSign) -> ObjectBody:
     """The target sign: its plate, which is labelled, and its post."""
-    meshes = tuple(cast.mesh(part) for part in plate_and_post(target.mesh()))
+    meshes = tuple(cast.meshes.add(part) for part in plate_and_post(target.mesh()))
     size, still = target.full_size, (np.zeros((1, 4)), np.ones(1, bool), np.zeros(1))
     return ObjectBody(TARGET, target.kind, target.style, size, (0.5, 0.5, 0.5), meshes, *still)
 

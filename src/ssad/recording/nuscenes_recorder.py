@@ -48,6 +48,7 @@ HELD_OUT: Final = ("Oldmarket", "Larkhill")
 KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
 REACH: Final = 80.0  # m within which things are annotated
+DRAWN: Final = 140.0  # m within which things are drawn
 PART: Final = "part.json"
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
@@ -156,7 +157,6 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive(episode, graph)
     cast = place_objects(trace, graph, street, key=key, streets=streets, many_signs=streets == "any")
-    stage = Scene(street, cast.meshes, device=recording.device)
     weather = draw_weather(key)
     cameras = [rig_camera(channel, recording.width) for channel in RIG]
     samples: list[dict[str, Any]] = []
@@ -167,13 +167,14 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
         for step in range(min(int(recording.seconds / trace.dt), len(trace.x) - 2) + 1)
         if step % KEY == 0 or (step % spacing == 0 and step % KEY <= spacing * recording.sweeps)
     ]
+    stage = Scene(street, cast.meshes.only(_meshes_near(cast, trace, steps)), device=recording.device)
     at_once = GPU_STEPS if recording.device != "cpu" else 1
     for start in range(0, len(steps), at_once):
         moments = [_Moment.of(step, cast, trace, cameras, weather, key) for step in steps[start : start + at_once]]
         for moment, shares in _look(stage, moments, files, number, together=recording.device != "cpu"):
             now = moment.now
             ego = ego_at(trace, now)
-            around = cast.at(now, ego[:2, 3], 140.0)
+            around = cast.at(now, ego[:2, 3], DRAWN)
             points, _ = sweep(stage, HDL32E, ego, [s.thing for s in around], key=("lidar", *key, moment.step))
             files.cloud(points, sweep=moment.step, moment=moment_of(number, now), on_key=moment.on_key, ego=ego)
             if moment.on_key:
@@ -185,6 +186,16 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
     }  # fmt: skip
     safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
     return name
+
+
+def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
+    """The meshes of all that is drawn at these steps."""
+    found = set()
+    for step in steps:
+        now = FIRST + step * trace.dt
+        for time in [now, *(now - ahead for ahead in AHEAD.values())]:
+            found |= {one.thing.mesh for one in cast.at(time, ego_at(trace, time)[:2, 3], DRAWN)}
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +228,7 @@ class _Moment:
         for c, camera in enumerate(cameras):
             fired = now - AHEAD[camera.channel]
             ego = ego_at(trace, fired)
-            things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], 140.0))
+            things = tuple(s.thing for s in cast.at(fired, ego[:2, 3], DRAWN))
             noise = int(digest("noise", *key, step, c)[:7], 16)
             lamps = own_lamps(ego, weather)
             views.append(View(camera, ego @ camera.to_ego, things, weather, SENSOR, noise, lamps))

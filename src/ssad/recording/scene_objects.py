@@ -3,9 +3,10 @@ at any moment."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import overload
 
 import numpy as np
 
@@ -40,6 +41,10 @@ PARKED = {
     "motorcycle": (1.4, 3.0), "bicycle": (1.6, 2.6),
 }  # fmt: skip
 AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
+NOTHING = Mesh(
+    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3, 3), np.float32),
+    np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32), (),
+)  # fmt: skip
 LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
@@ -71,6 +76,43 @@ class PlacedObject:
     thing: Thing
 
 
+class LazyMeshes(Sequence[Mesh]):
+    """Meshes by number, each built when it is first asked for: most bodies of a town are never in view."""
+
+    def __init__(self) -> None:
+        self._made: list[Mesh | Callable[[], Mesh]] = []
+
+    def add(self, mesh: Mesh | Callable[[], Mesh]) -> int:
+        """Add a mesh, or what builds it.
+
+        Returns:
+            Its number.
+        """
+        self._made.append(mesh)
+        return len(self._made) - 1
+
+    def only(self, wanted: Collection[int]) -> list[Mesh]:
+        """All meshes under their numbers, with one without faces in place of those that are not wanted."""
+        return [self[number] if number in wanted else NOTHING for number in range(len(self))]
+
+    def __len__(self) -> int:
+        return len(self._made)
+
+    @overload
+    def __getitem__(self, number: int) -> Mesh: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[Mesh]: ...
+
+    def __getitem__(self, number: int | slice) -> Mesh | list[Mesh]:
+        if isinstance(number, slice):
+            return [self[k] for k in range(len(self))[number]]
+        made = self._made[number]
+        if not isinstance(made, Mesh):
+            made = self._made[number] = made()
+        return made
+
+
 @dataclass(slots=True)
 class SceneObjects:
     """All meshes and bodies of a drive. dt: a step of the tracks, s; key: of what is drawn; detail: of the meshes."""
@@ -78,7 +120,7 @@ class SceneObjects:
     dt: float
     key: tuple[object, ...] = ()
     detail: int = 1
-    meshes: list[Mesh] = field(default_factory=list)
+    meshes: LazyMeshes = field(default_factory=LazyMeshes)
     bodies: list[ObjectBody] = field(default_factory=list)
 
     def at(self, time: float, around: F64, reach: float) -> list[PlacedObject]:
@@ -120,20 +162,14 @@ class SceneObjects:
         self, kind: str, style: str, size: Size, *, name: tuple[object, ...] = (), phases: int = 1
     ) -> tuple[str, str, Size, tuple[int, ...]]:
         """New meshes of one body in `phases` places of its cycle; what `add` wants to know of it."""
-        name = name or (len(self.meshes),)
-        numbers = []
-        for k in range(phases):
-            draws = generator("record mesh", *self.key, *name)
-            phase = 2 * np.pi * k / phases if phases > 1 else None
-            numbers.append(
-                self.mesh(make_body(kind, style=style, size=size, generator=draws, detail=self.detail, phase=phase))
-            )
-        return kind, style, size, tuple(numbers)
+        key = (*self.key, *(name or (len(self.meshes),)))
 
-    def mesh(self, made: Mesh) -> int:
-        """The number of a new mesh."""
-        self.meshes.append(made)
-        return len(self.meshes) - 1
+        def build(phase: float | None) -> Mesh:
+            draws = generator("record mesh", *key)
+            return make_body(kind, style=style, size=size, generator=draws, detail=self.detail, phase=phase)
+
+        cycle = [2 * np.pi * k / phases if phases > 1 else None for k in range(phases)]
+        return kind, style, size, tuple(self.meshes.add(partial(build, phase)) for phase in cycle)
 
 
 class Clear:
@@ -184,7 +220,7 @@ def _agents(cast: SceneObjects, trace: EpisodeTrace) -> None:
         active = trace.active[:, a]
         full = model.length, model.width, model.height
         if trace.models[a] not in ACTOR_BODIES:
-            cast.add(("", "", full, (cast.mesh(plain_body(full)),)), track, active=active)
+            cast.add(("", "", full, (cast.meshes.add(plain_body(full)),)), track, active=active)
             continue
         kind, styles = ACTOR_BODIES[trace.models[a]]
         style = styles[int(own.integers(len(styles)))]
@@ -401,7 +437,7 @@ def _signs(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, *, many
     take_still(cast, clear)
     for one in street_signs(graph, way, clear, key=cast.key, many=many, detail=cast.detail):
         for kind, mesh in ((one.kind, one.plate), ("", one.post)):
-            cast.add((kind, one.style, one.size, (cast.mesh(mesh),)), _still(*one.pose))
+            cast.add((kind, one.style, one.size, (cast.meshes.add(mesh),)), _still(*one.pose))
 
 
 def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float, steps: int, dt: float) -> F64:
