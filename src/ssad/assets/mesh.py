@@ -306,12 +306,16 @@ def triangulate(outline: npt.ArrayLike) -> I32:
 
     slack = 1e-12 * max(1.0, abs(area))
     while len(left) > 3:
+        rest = p[left]
         for i in range(len(left)):
             a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
             if turn(a, b, c) < -slack:
                 continue
-            others = (k for k in left if not (p[k] == p[[a, b, c]]).all(axis=1).any())
-            if any(min(turn(a, b, k), turn(b, c, k), turn(c, a, k)) >= -slack for k in others):
+            corners = p[[a, b, c]]
+            along = np.roll(corners, -1, axis=0) - corners
+            away = rest[:, None] - corners
+            inside = (along[:, 0] * away[..., 1] - along[:, 1] * away[..., 0] >= -slack).all(axis=1)
+            if (inside & (away != 0.0).any(axis=2).all(axis=1)).any():
                 continue
             faces.append((a, b, c))
             del left[i]
