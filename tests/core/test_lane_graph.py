@@ -50,6 +50,23 @@ def test_headings_turn_the_short_way() -> None:
     assert graph.at(0, 2.5)[2] == pytest.approx(-3.0 - 0.25 * turn)
 
 
+@pytest.mark.parametrize("name", ["Oldmarket", "Ringmere"])
+def test_many_places_at_once_are_those_one_by_one_to_the_bit(name: str) -> None:
+    graph, draws = load_town(name), np.random.default_rng(0)
+    for lane in draws.choice(graph.lanes, 60):
+        length = float(graph.length[lane])
+        places = [
+            -1.0,
+            0.0,
+            length,
+            length + 1.0,
+            float(graph.s[graph.points(lane)][1]),
+            *draws.uniform(0, length, 5).tolist(),
+        ]
+        one_by_one = np.array([graph.at(int(lane), s) for s in places])
+        np.testing.assert_array_equal(graph.along(int(lane), places), one_by_one)
+
+
 def test_lanes_of_one_road_and_one_sign_run_the_same_way() -> None:
     graph = LaneGraph(**(parts(straight_graph()) | {"lane_id": [-1, 1, -2]}))
     assert graph.same_direction(0, 2)

@@ -14,16 +14,21 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.bodies import plain_bodies
 
 from ssad.assets.actor_bodies import BODY_CATEGORIES
+from ssad.assets.bodies import make_body
+from ssad.assets.mesh import Mesh
 from ssad.assets.street import cached_street
+from ssad.assets.street.model import Street
 from ssad.core.errors import ConfigError, MapError, StoreError
 from ssad.core.geometry import obb_distance
 from ssad.core.images import read_image
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, CLASSES
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
@@ -33,7 +38,7 @@ from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
-from ssad.recording.scene_objects import RACK, place_objects
+from ssad.recording.scene_objects import RACK, SceneObjects, place_objects
 from ssad.roads import load_town, save_graph
 from ssad.scenarios.static.shifts import ShiftSpec
 
@@ -191,7 +196,53 @@ def test_wrong_use_is_refused_in_one_line(tmp_path: Path) -> None:
         record_nuscenes(Recording(blocked / "out", **SMALL), workers=0)
 
 
-def test_streets_are_the_towns_own_or_built_anew_for_each_drive() -> None:
+def test_only_what_is_drawn_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[str] = []
+
+    def counting(kind: str, **options: Any) -> Mesh:
+        built.append(kind)
+        return make_body(kind, **options)
+
+    monkeypatch.setattr("ssad.recording.scene_objects.make_body", counting)
+    objects = SceneObjects(0.1, ("lazy",))
+    car = objects.make("car", "sedan", (4.5, 1.8, 1.5))
+    objects.make("pedestrian", "adult", (0.6, 0.6, 1.8), phases=3)
+    assert not built
+    assert len(objects.meshes) == 4
+    some = objects.meshes.only({0})
+    assert built == ["car"]
+    assert some[0] is objects.meshes[0]
+    assert [len(mesh.faces) for mesh in some[1:]] == [0, 0, 0]
+    assert car[3] == (0,)
+    assert [len(mesh.faces) > 0 for mesh in objects.meshes[1:3]] == [True, True]
+    assert built == ["car", "pedestrian", "pedestrian"], "none is built twice"
+
+
+def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[object, ...]] = []
+
+    def street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> Street:
+        asked.append(key)
+        raise ConfigError("seen enough")
+
+    def tried(out: Path, identity: dict[str, Any], record: Any, tasks: list[Any], **options: Any) -> None:
+        for task in tasks:
+            numbers = list(task[2])
+            for number in numbers:
+                with pytest.raises(ConfigError, match="seen enough"):
+                    record((*task[:2], [number]))
+            asked.append(("together", *numbers))
+
+    monkeypatch.setattr("ssad.recording.nuscenes_recorder.drive_street", street)
+    monkeypatch.setattr("ssad.recording.nuscenes_recorder.run_parts", tried)
+    monkeypatch.setattr("ssad.recording.nuscenes_recorder._merge", lambda *what: None)
+    small = {"scenes": 5, "seconds": 0.5, "width": 64, "streets": "any", "seed": 7}
+    record_nuscenes(Recording(tmp_path, ("Twinford",), (), **small), workers=0)  # type: ignore[arg-type]
+    first, second = (7, "Twinford", 0), (7, "Twinford", 1)
+    assert asked == [*[first] * 4, ("together", 0, 1, 2, 3), second, ("together", 4)]
+
+
+def test_streets_are_the_towns_own_or_built_anew_for_each_key() -> None:
     graph = load_town("Twinford")
     own = cached_street(graph)
     assert drive_street(graph, "town", key=(0, "Twinford", 3)).vertices.tobytes() == own.vertices.tobytes()

@@ -7,10 +7,11 @@ from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from ssad.core.errors import FormatError, MapError
 from ssad.core.safeio import load_npz, save_npz
-from ssad.core.types import F32, I32, U8, Bool, LaneType, array_dtypes
+from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
@@ -144,6 +145,21 @@ class LaneGraph:
         turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi
         width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
         return float(x), float(y), float(self.yaw[i]) + t * turn, width
+
+    def along(self, lane: int, s: npt.ArrayLike) -> F64:
+        """Rows [n, 4] of x, y, yaw and width at arc lengths s [n] of a lane: what `at` gives for each, to the bit."""
+        part = self.points(lane)
+        along = self.s[part]
+        place = np.asarray(s, np.float32)
+        i = np.clip(np.searchsorted(along, place, side="right") - 1, 0, len(along) - 2)
+        step = np.maximum(along[i + 1] - along[i], np.float32(1e-9))
+        t = np.clip((place - along[i]) / step, 0.0, 1.0).astype(np.float64)
+        i += part.start
+        before, after = ((1.0 - t).astype(np.float32)[:, None], t.astype(np.float32)[:, None])
+        xy = before * self.xy[i] + after * self.xy[i + 1]
+        turn = ((self.yaw[i + 1] - self.yaw[i]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
+        width = (1.0 - t) * self.width[i].astype(np.float64) + t * self.width[i + 1].astype(np.float64)
+        return np.column_stack([xy, self.yaw[i].astype(np.float64) + t * turn, width])
 
     def divided(self, lane: int) -> bool:
         """Whether no lane of the other way lies beside those of a lane's own way: a one-way road, or a median."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 
 from ssad.assets.actor_bodies import BODY_CATEGORIES
+from ssad.assets.street.model import Street
 from ssad.camera.labels import visible_share
 from ssad.camera.lamps import own_lamps
 from ssad.camera.lidar import HDL32E, points_in_boxes, sweep
@@ -58,6 +60,7 @@ AHEAD: Final = {
 SENSOR: Final = Sensor(noise=0.012)
 FIRST: Final = 0.1  # s, when the first sweep ends
 PART_S: Final = 7200.0  # s that a part may take
+SHARED: Final = 4  # drives along one street where each street is built for the recording
 GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 
@@ -141,18 +144,35 @@ def ego_at(trace: EpisodeTrace, time: float) -> F64:
     return upright_pose(x, y, float(trace.yaw[low, 0]) + part * turn)
 
 
-def _scene(task: tuple[Recording, str, int, str]) -> str:
-    """Records one scene into its part; its name. What is there already is left alone."""
-    recording, town, number, name = task
+@lru_cache(maxsize=1)
+def _street(town: str, streets: str, key: tuple[object, ...]) -> Street:
+    """The street of a drive, kept for the next one along it."""
+    return drive_street(load_town(town), streets, key=key)
+
+
+def _scenes(task: tuple[Recording, str, Sequence[int]]) -> None:
+    """Records scenes of a town, which share a street."""
+    recording, town, numbers = task
+    for number in numbers:
+        _scene(recording, town, number)
+
+
+def _name(town: str, number: int) -> str:
+    return f"scene-{town.lower()}-{number:03d}"
+
+
+def _scene(recording: Recording, town: str, number: int) -> None:
+    """Records one scene into its part. What is there already is left alone."""
+    name = _name(town, number)
     folder = recording.out / ".parts" / name
     if (folder / PART).is_file():
-        return name
+        return
     shutil.rmtree(folder, ignore_errors=True)
     quiet_warp()
     cv2.setNumThreads(1)
     key = (recording.seed, town, number)
     graph = load_town(town)
-    street = drive_street(graph, recording.streets, key=key)
+    street = _street(town, recording.streets, (recording.seed, town, number // SHARED))
     seconds, streets = recording.seconds + 0.2, recording.streets
     episode = make_drive(graph, key=(recording.seed, number), seconds=seconds, streets=streets)
     trace = drive(episode, graph)
@@ -185,7 +205,6 @@ def _scene(task: tuple[Recording, str, int, str]) -> str:
         "weather": repr(weather), "sensors": _sensors(cameras),
     }  # fmt: skip
     safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
-    return name
 
 
 def _meshes_near(cast: SceneObjects, trace: EpisodeTrace, steps: Sequence[int]) -> set[int]:
@@ -347,10 +366,11 @@ def record_nuscenes(
 ) -> Path:
     """Records all scenes and writes the tables; the root of the data set. Run again to go on. StoreError."""
     out = recording.out
+    together = SHARED if recording.streets == "any" else 1
     tasks = [
-        (recording, town, number, f"scene-{town.lower()}-{number:03d}")
+        (recording, town, range(first, min(first + together, recording.scenes)))
         for town in recording.towns
-        for number in range(recording.scenes)
+        for first in range(0, recording.scenes, together)
     ]
     if (out / recording.version / "splits.json").is_file():  # written last
         if not (out / ".parts" / "recording.json").is_file():
@@ -359,8 +379,8 @@ def record_nuscenes(
         return out
     pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
     with locked(out, "ssad record"):
-        run_parts(out, recording.identity(), _scene, tasks, pool=pool, progress=progress)
-        _merge(recording, [task[3] for task in tasks])
+        run_parts(out, recording.identity(), _scenes, tasks, pool=pool, progress=progress)
+        _merge(recording, [_name(town, number) for _, town, numbers in tasks for number in numbers])
     return out
 
 
@@ -377,7 +397,7 @@ def _check_page(out: Path, identity: dict[str, Any]) -> None:
 def run_parts(
     out: Path,
     identity: dict[str, Any],
-    record: Callable[[Any], str],
+    record: Callable[[Any], Any],
     tasks: Sequence[Any],
     *,
     pool: Pool,

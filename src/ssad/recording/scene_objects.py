@@ -446,7 +446,7 @@ def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float,
     along = np.abs((s0 - 1.0 + speed * dt * np.arange(steps)) % (2 * length))
     there = along <= length
     places = 1.0 + np.where(there, along, 2 * length - along)
-    rows = np.array([graph.at(lane, float(q))[:3] for q in places], np.float64)
+    rows = graph.along(lane, places)
     back = there == (speed < 0)
     return np.stack([rows[:, 0] - aside * np.sin(rows[:, 2]), rows[:, 1] + aside * np.cos(rows[:, 2]),
                      rows[:, 2] + np.pi * back, np.full(steps, KERB)], -1)  # fmt: skip

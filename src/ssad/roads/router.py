@@ -225,11 +225,13 @@ def _line(graph: LaneGraph, leg: _Leg, step: float = math.inf) -> tuple[F64, I32
         along = graph.s[graph.points(lane)]
         inner = along if math.isinf(step) else np.arange(s0, s1, step)
         inner = inner[(inner > s0 + 0.02) & (inner < s1 - 0.02)]
-        for s in [s0, *inner.tolist(), s1]:
-            x, y, yaw, width = graph.at(lane, s)
-            rows.append((x, y, math.cos(yaw), math.sin(yaw), float(graph.speed_limit[lane]), width))
-            lanes.append(lane)
-    return np.array(rows, np.float64), np.array(lanes, np.int32)
+        found = graph.along(lane, [s0, *inner.tolist(), s1])
+        limit = np.full(len(found), float(graph.speed_limit[lane]))
+        heading = found[:, 2].tolist()  # numpy's own sines differ from those of libm in the last digit
+        cos, sin = [math.cos(yaw) for yaw in heading], [math.sin(yaw) for yaw in heading]
+        rows.append(np.column_stack([found[:, :2], cos, sin, limit, found[:, 3]]))
+        lanes.append(np.full(len(found), lane, np.int32))
+    return np.concatenate(rows), np.concatenate(lanes)
 
 
 def _change(graph: LaneGraph, leg: _Leg, old: tuple[int, float]) -> tuple[F64, I32]:
