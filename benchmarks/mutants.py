@@ -60,8 +60,8 @@ TESTS: dict[str, tuple[str, ...]] = {
     "bench": tuple(
         f"tests/bench/test_{name}.py"
         for name in (
-            *("kind", "source", "run", "suite", "driving_kind", "detection_kind"),
-            *("pictures", "driving", "engine", "detection"),
+            *("kind", "source", "run", "suite", "driving_kind", "detection_kind", "digital"),
+            *("pictures", "digital_rows", "driving", "engine", "detection"),
         )
     ),
     "drivers": ("tests/world",),
