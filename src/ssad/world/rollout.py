@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from ssad.core.driving import Driver, Perturbation, Scenes, Selector, Sensor, Simulator, WorldState
 from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import ENDS, F32, I32, AgentKind, Controller, End, EpisodeTrace
+from ssad.core.types import ENDS, F32, I32, AgentKind, Controller, End, EpisodeTrace, Route
 from ssad.world.observation import observe
 from ssad.world.sensors import SENSORS
 
@@ -49,6 +50,10 @@ class Loop:
                 if name not in self.sensors:
                     known = ", ".join(self.sensors)
                     raise ConfigError(f"driver {driver.name} asks for sensor '{name}'; known: {known}")
+        # sensors that remember follow every step, also while nobody looks
+        asked = {name for _, driver in self.drivers for name in getattr(driver, "sensors", ())}
+        following = (getattr(self.sensors[name], "follow", None) for name in sorted(asked))
+        self._following = [follow for follow in following if follow is not None]
         self._controls = np.zeros((*shape, 4), np.float32)
         self._fixed = [
             np.stack([np.arange(shape[0]), np.full(shape[0], who)], 1).astype(np.int32)
@@ -93,6 +98,8 @@ class Loop:
             given = np.asarray(controls, np.float32)
             self._controls[..., : given.shape[-1]] = given
         asked = controls is not None
+        for follow in self._following:
+            follow(self.simulator)
         state: WorldState | None = None
         for policy, (who, driver) in enumerate(self.drivers):
             agents = self._fixed[policy]
@@ -196,6 +203,12 @@ def rollout(
     return [_trace(simulator, rows, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
 
 
+def route_signals(graph: LaneGraph, route: Route) -> I32:
+    """The signals at the junctions that a route passes: those whose states a trace keeps."""
+    junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
+    return np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
+
+
 def _row(state: WorldState) -> dict[str, npt.NDArray[np.generic]]:
     """One step of all scenes, in the terms and types of `EpisodeTrace`: first what all agents have, then the ego's."""
     return {
@@ -232,8 +245,7 @@ def _trace(simulator: Simulator, rows: list[dict[str, npt.NDArray[np.generic]]],
     }
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
-    junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
-    near = np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
+    near = route_signals(graph, route)
     ego["signal"] = ego["signal"][:, near]
     return EpisodeTrace(
         key=episode.key,
