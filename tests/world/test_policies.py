@@ -121,9 +121,13 @@ def test_without_policies_it_is_said_what_to_give() -> None:
 
 
 def test_the_search_for_a_way_out_drives_them_too() -> None:
-    ahead = replace(built(path=(), target_speed=1.0), limits=Limits(max_steps=120))  # without a way: straight on
+    class Stay(Straight):
+        def act(self, view):
+            return 0.0 * super().act(view)
+
+    ahead = replace(built(path=()), limits=Limits(max_steps=80))
     assert find_witness(ahead, TOWN, policies=lambda name: Straight()).verdict == "harmless"
-    assert find_witness(ahead, TOWN, policies=lambda name: make_system("blind")).verdict != "harmless"
+    assert find_witness(ahead, TOWN, policies=lambda name: Stay()).verdict == "avoidable"
 
 
 def test_a_scenario_with_a_policy_round_trips(tmp_path: Path) -> None:
