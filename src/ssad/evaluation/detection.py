@@ -218,6 +218,7 @@ class Annotated(Protocol):
     @property
     def pictures(self) -> Any:
         """Pictures, uint8 [N, H, W, 3], by slices."""
+
     @property
     def truth(self) -> Sequence[Truth]:
         """The truth of each picture."""

@@ -97,6 +97,7 @@ class Condition(Protocol):
     @property
     def scene(self) -> str:
         """Name of the scene."""
+
     @property
     def name(self) -> str:
         """Its place below the folder of a detector's boxes: CONDITION/SCENE."""
