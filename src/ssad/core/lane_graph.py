@@ -218,13 +218,21 @@ def _check(graph: LaneGraph) -> None:
 
 
 def save_graph(graph: LaneGraph, path: Path | str) -> None:
-    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes. StoreError."""
+    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
     save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
 
 
 def load_graph(path: Path | str) -> LaneGraph:
-    """Read what `save_graph` wrote. MapError: missing, broken, too large, or not a lane graph."""
+    """Read what `save_graph` wrote.
+
+    Raises:
+        MapError: The file is missing, broken, too large, or not a lane graph.
+    """
     source, mend = Path(path), "bake the map again with ssad import map"
     try:
         arrays = load_npz(source, limit=MAX_FILE)

@@ -171,9 +171,17 @@ def match(
     config: DetectionConfig = CVPR_2019,
     names: Sequence[str] | None = None,
 ) -> Matches:
-    """Match predictions with ground truth, both filtered; samples: how many there are; names: their tokens.
+    """Match predictions with ground truth, both filtered.
 
-    FormatError: too many predictions in a sample, a matched box without a size.
+    Args:
+        truth: True boxes.
+        predictions: Predicted boxes.
+        samples: Number of samples.
+        config: Settings of the task.
+        names: Tokens of the samples, for messages.
+
+    Raises:
+        FormatError: A sample has too many predictions, or a matched box has no size.
     """
     check_counts(predictions, config=config, names=names)
     counts = np.bincount(truth.label.astype(np.int64) * samples + truth.sample, minlength=len(config.classes) * samples)

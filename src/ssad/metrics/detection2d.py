@@ -56,8 +56,15 @@ def match_2d(
 ) -> Matched2D:
     """Match detections and ground truth of the same image and label whose IoU reaches the threshold.
 
-    labels: number of them; max_detections: the best ones of an image and label that are looked at. ValueError:
-    detections without scores.
+    Args:
+        truth: True boxes.
+        detections: Detected boxes, with scores.
+        labels: Number of labels.
+        threshold: Least IoU of a match.
+        max_detections: How many detections of an image and label are considered, best first.
+
+    Raises:
+        ValueError: The detections have no scores.
     """
     if detections.score is None:
         raise ValueError("detections need scores")

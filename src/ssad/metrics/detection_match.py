@@ -27,9 +27,13 @@ PAIRS = 1 << 16  # pairs looked at together: bounds the memory
 class ClassMatches:
     """The predictions of a class from best to worst, and which of them are matched.
 
-    sample [n], score [n]; hits: for each threshold the places [T] in that order of the matched ones, ascending;
-    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of
-    equal scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
+    Attributes:
+        sample: Sample of each [n].
+        score: Score of each [n].
+        hits: For each threshold, the ranks [T] of the matched ones, ascending.
+        errors: Errors of the matches at the TP threshold [5, T], in the order of TP_METRICS (NaN: unknown).
+        runs: For each prediction, where the run of equal scores of one sample that it belongs to begins [n], and the
+            length of the run [n]; None if there are no ties.
     """
 
     sample: I32
@@ -48,7 +52,19 @@ def match_class(
     config: DetectionConfig,
     names: Sequence[str] | None = None,
 ) -> ClassMatches:
-    """Match the boxes of one class. FormatError: a matched box without a size (names: tokens of the samples)."""
+    """Match the boxes of one class.
+
+    Args:
+        truth: True boxes.
+        predictions: Predicted boxes.
+        label: The class.
+        samples: Number of samples.
+        config: Settings of the task.
+        names: Tokens of the samples, for messages.
+
+    Raises:
+        FormatError: A matched box has no size.
+    """
     own = np.flatnonzero(predictions.label == label)
     rank = own[np.argsort(predictions.score[own], kind="stable")[::-1]]
     real = np.flatnonzero(truth.label == label)

@@ -80,11 +80,18 @@ class Results:
 def read_results(
     path: str | Path, samples: Sequence[str] | None = None, *, subset: bool = False, max_boxes: int = MAX_BOXES
 ) -> Results:
-    """Read a results file.
+    """Read a results file. Velocities may be NaN (also written null).
 
-    samples: the tokens that it must have, no more and no less; `BoxTable.sample` indexes them. None: as the file has
-    them. subset: the file may have more, which are passed over, and the rows follow the order of `samples` (what the
-    devkit does for a custom split). Velocities may be NaN (also written null). FormatError.
+    Args:
+        path: The file.
+        samples: Tokens that it must have, no more and no less; `BoxTable.sample` indexes them. None: as the file has
+            them.
+        subset: The file may have more samples, which are ignored, and the rows follow the order of `samples` (as in the
+            devkit for a custom split).
+        max_boxes: Maximum number of boxes in a sample.
+
+    Raises:
+        FormatError: The file is broken, or has other samples.
     """
     file = _decode(path)
     found, meta = file.results, file.meta

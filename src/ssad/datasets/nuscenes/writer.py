@@ -67,8 +67,8 @@ class _Frame:
 class NuScenesWriter:
     """Collects the records of a version; sensor files are written at once, the tables by `close`.
 
-    As a context manager it closes when the block ends well, and writes no tables otherwise. Wrong use (an unknown
-    token, a time given twice) is a ValueError; a folder that cannot be written is a StoreError.
+    As a context manager it closes when the block ends well, and writes no tables otherwise. Its methods raise
+    ValueError for wrong use (an unknown token, a time given twice), and StoreError where a folder cannot be written.
     """
 
     def __init__(self, root: Path, version: str = "v1.0-mini") -> None:
