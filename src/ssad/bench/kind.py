@@ -129,7 +129,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Replay:
-    """A cell run again. difference: None when equal to the bit, else where the two part; trace, graph: of a drive."""
+    """A cell run again.
+
+    Attributes:
+        cell: The cell.
+        difference: None if the result is equal to the bit, else where the two differ.
+        trace: What happened in the drive.
+        graph: The town of the drive.
+    """
 
     cell: Cell
     difference: str | None

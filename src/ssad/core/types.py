@@ -194,7 +194,14 @@ class SignalPlan:
 
 @dataclass(frozen=True)
 class TrafficPlan:
-    """Random background vehicles: share of the spawn points near the route, and least and most vehicles (FREA)."""
+    """Random background vehicles (FREA).
+
+    Attributes:
+        intensity: Share of the spawn points near the route that get a vehicle.
+        minimum: Least number of vehicles.
+        maximum: Largest number of vehicles.
+        wake_distance: Distance of the ego at which a vehicle wakes, m; 0: it is awake from the start.
+    """
 
     intensity: float = 0.3
     minimum: int = 5

@@ -20,7 +20,11 @@ NEAR = 0.1  # m in front of the camera at which boxes are cut
 
 
 def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
-    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
+    """Scenes of a split that the data set has.
+
+    Raises:
+        ConfigError: There is none, or no such split.
+    """
     there = {scene.name for scene in data.scenes()}
     found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
     if not found:

@@ -51,7 +51,11 @@ def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tenso
 
 
 def to_host(found: Sequence[Detections]) -> list[Detections]:
-    """Detections of a batch on the CPU: a copy a column, as each copy waits for the device. ConfigError: no tensors."""
+    """Detections of a batch on the CPU, in one copy for each column, since each copy waits for the device.
+
+    Raises:
+        ConfigError: They are not tensors.
+    """
     flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
     solids = [one.solid for one in found if one.solid is not None]
     names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
