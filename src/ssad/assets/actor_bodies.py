@@ -31,7 +31,11 @@ PLAIN_CLASSES: Final = ("stop_sign",)
 
 
 def class_of(kind: str) -> str:
-    """The nuScenes class of a kind of body. KeyError: it has none."""
+    """The nuScenes class of a kind of body.
+
+    Raises:
+        KeyError: It has none.
+    """
     return CATEGORY_TO_CLASS[BODY_CATEGORIES[kind]]
 
 

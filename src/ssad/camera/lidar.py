@@ -33,10 +33,17 @@ ON_ROOF: F64 = np.array([[0.0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 
 class Lidar:
     """A spinning LiDAR.
 
-    beams: elevations, rad, lowest first; azimuths: columns a turn; to_ego [4, 4]; reach: m; noise: standard deviation
-    of the range, m; period: s a turn; blind: m within which nothing returns; lost: share of returns that are lost
-    whatever they hit; faint: share of light (albedo times cosine of incidence over squared metres) at which a return
-    is lost with probability 1/e; 0: none is lost for being faint.
+    Attributes:
+        beams: Elevations, lowest first, rad.
+        azimuths: Columns in a turn.
+        to_ego: Sensor to ego [4, 4].
+        reach: m.
+        noise: Standard deviation of the range, m.
+        period: Time of a turn, s.
+        blind: Distance within which nothing returns, m.
+        lost: Share of returns that are lost whatever they hit.
+        faint: Share of light (albedo times cosine of incidence over squared metres) at which a return is lost with
+            probability 1/e; 0: none is lost for being faint.
     """
 
     beams: F64

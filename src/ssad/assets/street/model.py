@@ -118,7 +118,11 @@ _ARRAYS = array_dtypes(Street)
 
 
 def save_street(street: Street, path: Path | str) -> None:
-    """Write a street as .npz, whole or not at all; equal streets give equal bytes. StoreError."""
+    """Write a street as .npz, whole or not at all; equal streets give equal bytes.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     table = street.materials
     head = [f"ssad-street {FORMAT}", street.name, street.style]
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -131,7 +135,11 @@ def save_street(street: Street, path: Path | str) -> None:
 
 
 def load_street(path: Path | str) -> Street:
-    """Read what `save_street` wrote. FormatError: missing, broken, or not a street."""
+    """Read what `save_street` wrote.
+
+    Raises:
+        FormatError: The file is missing, broken, or not a street.
+    """
     arrays = load_npz(path)
     header = arrays.get("header")
     wanted = {"header", "size", "material_name", "material_value", *_ARRAYS}
