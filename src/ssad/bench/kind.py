@@ -168,10 +168,16 @@ class Kind(ABC):
 
     @abstractmethod
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Resolve a suite. check: look at all input, so that what is wrong with it ends here and not in a record.
+        """Resolve a suite.
+
+        Args:
+            suite: The suite.
+            device: Where its cells run.
+            check: Whether to check all input, so that errors show up here and not in a record.
 
         Raises:
-            ConfigError, FormatError: the input is wrong.
+            ConfigError: The input is wrong.
+            FormatError: The input is wrong.
         """
 
     @abstractmethod

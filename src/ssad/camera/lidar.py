@@ -142,12 +142,26 @@ def sweep(
     motion: bool = False,
     before: tuple[F64, Sequence[Thing]] | None = None,
 ) -> tuple[F32, I32]:
-    """One turn: points [P, 5] (x, y, z in the sensor frame, m; intensity 0..255; ring) and tags [P] (0: street).
+    """One turn of a LiDAR.
 
-    ego_to_world [4, 4]; key: of the noise, e.g. (seed, scene, sample). With `motion` the turn ends at the moment given
-    and began one period earlier at `before` (pose of the ego, and things, known by their tags; that they turn is left
-    out). Its points are given in the sensor frame at the end: the motion of the ego is taken out, that of others not.
-    ConfigError for a LiDAR, poses or things that do not fit.
+    With `motion`, the turn ends at the moment given and began one period earlier. Its points are given in the sensor
+    frame at the end: the motion of the ego is compensated, that of others is not.
+
+    Args:
+        stage: The scene.
+        lidar: The LiDAR.
+        ego_to_world: [4, 4].
+        things: What stands there.
+        key: Key of the noise, e.g. (seed, scene, sample).
+        motion: Whether the sensor and the things move during the turn.
+        before: Pose of the ego [4, 4], and things (identified by their tags; their rotation is ignored), one period
+            earlier.
+
+    Returns:
+        Points [P, 5] (x, y, z in the sensor frame, m; intensity 0..255; ring) and tags [P] (0: street).
+
+    Raises:
+        ConfigError: The LiDAR, poses or things do not fit.
     """
     _check(stage, lidar, ego_to_world, things)
     things = [t for t in things if stage.count[t.mesh]]

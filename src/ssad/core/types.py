@@ -316,8 +316,17 @@ class EpisodeAgent:
 class Episode:
     """A scenario made concrete on a lane graph: everything a world needs to run it. Agent 0 is the ego.
 
-    signal_override: signal index of the town -> forced state, until `override_until` seconds.
     `Condition.actor` counts the agents after the ego, in order: actor 0 is agent 1.
+
+    Attributes:
+        key: Key of the episode.
+        scenario: The scenario.
+        town: Name of the town.
+        agents: The ego and all others.
+        signal_override: Index of a signal of the town -> forced state, until `override_until`.
+        override_until: s.
+        limits: When the episode ends.
+        seed: Varies what is random in it.
     """
 
     key: str

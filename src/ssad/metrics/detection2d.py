@@ -19,10 +19,14 @@ RECALL = np.linspace(0.0, 1.0, 101)
 
 @dataclass(frozen=True)
 class Boxes2D:
-    """2D boxes of a set, one row a box.
+    """2D boxes of a set, one in each row.
 
-    image [N], label [N]: indices; box [N, 4]: x1, y1, x2, y2 in pixels; score [N], None for ground truth; ignore [N]:
-    crowd regions of the ground truth, in which detections count neither as right nor as wrong.
+    Attributes:
+        image: Index of the image [N].
+        label: Index of the class [N].
+        box: x1, y1, x2, y2 in pixels [N, 4].
+        score: [N]; None for ground truth.
+        ignore: Crowd regions of the ground truth, in which detections count neither as right nor as wrong [N].
     """
 
     image: I32

@@ -141,8 +141,14 @@ def pairs_of(count: I64, start: I64) -> Iterator[tuple[I64, I64]]:
 def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequence[float]) -> list[tuple[I64, I64]]:
     """For each threshold the matched predictions, ascending, and the boxes that they take.
 
-    pred, box, distance [K]: the near pairs, sorted as `_near_pairs` gives them. A proposer is a prediction at a
-    threshold; its choices are the first ones of its pairs, up to the threshold.
+    A proposer is a prediction at a threshold; its choices are the first ones of its pairs, up to the threshold.
+
+    Args:
+        pred: Prediction of each near pair [K], sorted as `_near_pairs` gives them.
+        box: True box of each pair [K].
+        distance: Distance of each pair [K], m.
+        boxes: Number of true boxes.
+        thresholds: Thresholds of a match, m.
     """
     n = len(thresholds)
     head = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)

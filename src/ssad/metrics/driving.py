@@ -227,7 +227,10 @@ def in_route_failure(trace: EpisodeTrace) -> bool:
 def driving_score(completion: float, infractions: Mapping[str, int], off_road_fraction: float) -> float:
     """CARLA leaderboard 1.0 driving score in [0, 100]: route completion times a factor for each infraction.
 
-    completion in [0, 1]; infractions: counts by the names of `PENALTIES`; off_road_fraction of the metres driven.
+    Args:
+        completion: Route completion in [0, 1].
+        infractions: Counts by the names of `PENALTIES`.
+        off_road_fraction: Share of the distance driven.
     """
     factor = math.prod(PENALTIES[name] ** count for name, count in infractions.items())
     return 100.0 * completion * factor * (1.0 - off_road_fraction)

@@ -239,7 +239,13 @@ def fill_way(
 ) -> None:
     """Lanes of a connecting road: those of the movement, and shoulder and sidewalk where it runs along a kerb.
 
-    eased: the lanes' widths leave and arrive without a kink.
+    Args:
+        road: The connecting road.
+        start: Arm that it comes from.
+        end: Arm that it leads to.
+        pairs: Numbers of the incoming and of the outgoing lane of each.
+        kerb: Whether it runs along a kerb.
+        eased: Whether the widths of the lanes change without a kink at both ends.
     """
     length = float(road.get("length", "0"))
     lanes = lane_section(road)

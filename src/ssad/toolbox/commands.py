@@ -161,7 +161,24 @@ def write_contact_sheets(
     seed: int,
     calibration: str,
 ) -> None:
-    """Write two contact sheets of an image, or of one camera of a dataset. ConfigError, SSADError."""
+    """Write two contact sheets of an image, or of one camera of a dataset.
+
+    Args:
+        source: The image, or a nuScenes root.
+        out: Where the sheets are written.
+        version: Version of the dataset; None: the only one.
+        channel: Name of the camera.
+        split: Must be None: a contact sheet is not of a split.
+        scenes: Name of the scene, at most one, for a dataset; none: the first.
+        boxes: Boxes in the image, see `parse_box`.
+        severity: See `severities`; the first one is used.
+        seed: Seed of the shifts.
+        calibration: Calibration of the shifts.
+
+    Raises:
+        ConfigError: The arguments do not fit together.
+        SSADError: The image or the dataset cannot be read, or a sheet cannot be written.
+    """
     if split is not None or (scenes and source.is_file()):
         raise ConfigError(
             f"{'--split' if split is not None else '--scenes'} cannot be used for a contact sheet of {source}"

@@ -235,9 +235,14 @@ def _wrong_boxes(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
 
 
 def verify(root: Path) -> tuple[int, list[str]]:
-    """Hashes every file and table of a root: the number of files, and a line for each that is not as in the manifest.
+    """Compare every file and table of a root with the manifest, by their hashes.
 
-    StoreError for a root without a manifest; FormatError when that is broken.
+    Returns:
+        Number of files; and a line for each that differs from the manifest.
+
+    Raises:
+        StoreError: The root has no manifest.
+        FormatError: The manifest is broken.
     """
     root = Path(root)
     manifest = read_manifest(root)

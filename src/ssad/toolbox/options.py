@@ -85,7 +85,14 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """One scene under one shift: what a worker is given. severity as asked for."""
+    """One scene under one shift: what a worker is given.
+
+    Attributes:
+        options: What to write.
+        shift: Name of the shift.
+        severity: As asked for.
+        scene: Name of the scene.
+    """
 
     options: Options = field(repr=False)
     shift: str

@@ -42,7 +42,12 @@ _DATA: dict[object, NuScenes] = {}
 
 
 class SceneLabels(msgspec.Struct):
-    """The boxes of a scene after the shift, by token; lines: hash of the manifest lines they were made with."""
+    """The boxes of a scene after the shift.
+
+    Attributes:
+        lines: Hash of the manifest lines that they were made with.
+        boxes: Boxes by token.
+    """
 
     lines: str
     boxes: dict[str, msgspec.Raw]

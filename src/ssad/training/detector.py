@@ -86,7 +86,12 @@ def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
 
 
 def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
-    """The truth of each picture; target: only the object that the set is about counts, all others are crowd."""
+    """The truth of each picture.
+
+    Args:
+        data: The set.
+        target: Whether only the object that the set is about counts; all others are then crowd.
+    """
     return [
         Truth(
             torch.from_numpy(image.label.astype(np.int64)), torch.from_numpy(image.box.astype(np.float32)),

@@ -42,8 +42,15 @@ T = TypeVar("T")
 class GroundTruth:
     """What a results file is compared with.
 
-    samples: tokens [S]; scene [S] indexes scenes (names); ego [S, 3] global position, m; boxes (not filtered), points
-    [N] in a box (LiDAR and radar), visibility [N] 1 .. 4, 0 for not known; racks.
+    Attributes:
+        samples: Tokens [S].
+        scene: Index of each sample's scene in `scenes` [S].
+        scenes: Names of the scenes.
+        ego: Global position of the ego at each sample [S, 3], m.
+        boxes: All boxes, not filtered.
+        points: LiDAR and radar points in each box [N].
+        visibility: 1 to 4; 0 for unknown [N].
+        racks: Bicycle racks.
     """
 
     samples: tuple[str, ...]

@@ -36,7 +36,15 @@ class Air:
 
 @wp.struct
 class LensDrop:
-    """A drop on the lens of one image: centre and radius in pixels, height over width."""
+    """A drop on the lens.
+
+    Attributes:
+        image: The image that shows it.
+        x: Centre, pixels.
+        y: Centre, pixels.
+        radius: Pixels.
+        oval: Height over width.
+    """
 
     image: int
     x: float
