@@ -64,7 +64,7 @@ def rotated_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float) -> Tensor:
-    """Greedy suppression of rotated rectangles within groups. Of two that score the same, the earlier one is the better.
+    """Greedy suppression of rotated rectangles within groups; of two with the same score, the earlier one is better.
 
     Args:
         boxes: Rectangles [N, 5].
