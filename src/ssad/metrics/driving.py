@@ -71,7 +71,7 @@ class EpisodeMetrics:
         acceleration: m/s^2.
         yaw_velocity: rad/s.
         lane_invasions: Number of them.
-        in_route_failure: Whether the ego failed to keep to its route.
+        in_route_failure: Whether the ego left its route too far or for too long (see the function of this name).
         driving_score: 0 to 100.
         min_ttc: Least time to collision, s (10: none).
         pet: Post-encroachment time, s (10: none).
