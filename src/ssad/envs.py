@@ -39,9 +39,19 @@ ID = "SSAD/Driving-v0"
 def episodes_of(
     scenarios: str | Path | Sequence[str | Path], *, seed: int = 0
 ) -> tuple[list[Episode], Mapping[str, LaneGraph]]:
-    """Concrete episodes of scenario sets, names or files, and the lane graphs of their towns.
+    """Concrete episodes of scenario sets, and the lane graphs of their towns.
 
-    UnknownNameError, ConfigError, RouteError for what cannot be found or built.
+    Args:
+        scenarios: Names of sets or files.
+        seed: Seed of the episodes.
+
+    Returns:
+        The episodes; and lane graphs by the name of the town.
+
+    Raises:
+        UnknownNameError: There is no such set, file or town.
+        ConfigError: A scenario is not valid.
+        RouteError: An episode cannot be built.
     """
     refs = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
     found = [scenario for ref in refs for scenario in load_scenarios(ref)]

@@ -50,11 +50,17 @@ class _Leg:
 
 
 def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]], *, spacing: float = 1.0) -> Route:
-    """The shortest drive through key points [n >= 2], in their order, along lanes and lane changes.
+    """The shortest drive through key points, in their order, along lanes and lane changes.
 
-    A `Pose` selects among lanes that run its way; a bare (x, y) only by distance. Ends are the projections of the
-    first and last key point; one between may be passed in the lane beside it. RouteError: too few points, one that
-    is off the road, or no way between two of them.
+    The ends are the projections of the first and last key point; one between them may be passed in the lane beside it.
+
+    Args:
+        graph: The town.
+        keypoints: Two or more. A `Pose` selects among lanes that run in its direction, a bare (x, y) only by distance.
+        spacing: Distance between two points of the route, m.
+
+    Raises:
+        RouteError: There are too few points, one is off the road, or no way leads from one to the next.
     """
     if len(keypoints) < 2:
         raise RouteError(f"town '{graph.name}': a route needs at least two key points, not {len(keypoints)}")
@@ -79,9 +85,17 @@ def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]
 
 
 def random_route(graph: LaneGraph, lane: int, s: float, length: float, rng: np.random.Generator) -> Route:
-    """A drive of `length` m from arc length s of a lane, taking a random driving successor at every lane's end.
+    """A drive that takes a random driving successor at the end of every lane.
 
-    It ends early where the road does. RouteError: nothing of the road is left.
+    Args:
+        graph: The town.
+        lane: Lane that it starts on.
+        s: Arc length on that lane, m.
+        length: Length of the drive, m; it ends early where the road does.
+        rng: Source of randomness.
+
+    Raises:
+        RouteError: Nothing of the road is left.
     """
     legs, rest = [], length
     while True:
