@@ -5,13 +5,15 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ssad.core.errors import FormatError, MapError
 from ssad.core.safeio import load_npz, save_npz
-from ssad.core.types import F32, I32, U8, Bool, LaneType, array_dtypes
+from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
@@ -118,6 +120,11 @@ class LaneGraph:
         """Number of lanes L."""
         return len(self.kind)
 
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What was worked out from these lanes and is asked for again."""
+        return {}
+
     def points(self, lane: int) -> slice:
         """The slice of the point arrays that holds a lane's centre line."""
         return slice(int(self.offset[lane]), int(self.offset[lane + 1]))
@@ -145,6 +152,21 @@ class LaneGraph:
         turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi
         width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
         return float(x), float(y), float(self.yaw[i]) + t * turn, width
+
+    def at_many(self, lane: int, s: F64) -> F64:
+        """What `at` says [N, 4] for arc lengths s [N] of a lane, to the bit."""
+        part = self.points(lane)
+        along = self.s[part]
+        i = np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(along) - 2)
+        # shares are single precision, as those of `at` are
+        span = np.maximum(along[i + 1] - along[i], np.float32(1e-9))
+        share = np.clip((s.astype(np.float32) - along[i]) / span, 0.0, 1.0)
+        t, rest = share.astype(np.float64), 1.0 - share.astype(np.float64)
+        i += part.start
+        xy = rest.astype(np.float32)[:, None] * self.xy[i] + share[:, None] * self.xy[i + 1]
+        turn = ((self.yaw[i + 1] - self.yaw[i]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
+        width = rest * self.width[i].astype(np.float64) + t * self.width[i + 1].astype(np.float64)
+        return np.column_stack([xy.astype(np.float64), self.yaw[i].astype(np.float64) + t * turn, width])
 
     def divided(self, lane: int) -> bool:
         """Whether no lane of the other way lies beside those of a lane's own way: a one-way road, or a median."""
