@@ -25,6 +25,7 @@ import gymnasium
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
+from ssad.drivers import make_system
 from ssad.roads import LaneGraph, load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 
@@ -82,7 +83,7 @@ def make(*, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, 
     """One scene; `options` go to `ssad.world.env.SingleEnv` (observation, action, device)."""
     from ssad.world.env import SingleEnv
 
-    return SingleEnv(*episodes_of(scenarios, seed=episode_seed), **options)
+    return SingleEnv(*episodes_of(scenarios, seed=episode_seed), **{"policies": make_system} | options)
 
 
 def make_vec(
@@ -92,7 +93,7 @@ def make_vec(
     from ssad.world.env import VectorEnv
 
     options.pop("vectorization_mode", None)
-    return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **options)
+    return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **{"policies": make_system} | options)
 
 
 def make_sb3(

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -145,6 +147,11 @@ class LaneGraph:
     def lanes(self) -> int:
         """Number of lanes L."""
         return len(self.kind)
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What was worked out from these lanes and is asked for again."""
+        return {}
 
     def points(self, lane: int) -> slice:
         """The slice of the point arrays that holds a lane's centre line."""
