@@ -22,6 +22,16 @@ def parts(graph: LaneGraph) -> dict[str, Any]:
     return {f.name: getattr(graph, f.name) for f in dataclasses.fields(graph) if f.init}
 
 
+def test_many_places_are_those_of_one_at_a_time_to_the_bit() -> None:
+    graph = load_town("Larkhill")
+    rng = np.random.default_rng(3)
+    for lane in rng.choice(graph.lanes, 25).tolist():
+        at = np.concatenate([rng.uniform(-1.0, graph.length[lane] + 1.0, 40), graph.s[graph.points(lane)]])
+        together = np.stack(graph.at_each(lane, at), axis=1)
+        assert np.array_equal(together, [graph.at(lane, s) for s in at.tolist()])
+    assert [len(part) for part in graph.at_each(0, np.zeros(0))] == [0] * 4
+
+
 def test_a_place_on_a_lane_by_hand() -> None:
     """Eastwards along y = 0, westwards along y = 3.5; a point every 2 m."""
     graph = straight_graph(100.0)

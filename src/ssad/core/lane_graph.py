@@ -10,7 +10,7 @@ import numpy as np
 
 from ssad.core.errors import FormatError, MapError
 from ssad.core.safeio import load_npz, save_npz
-from ssad.core.types import F32, I32, U8, Bool, LaneType, array_dtypes
+from ssad.core.types import F32, F64, I32, U8, Bool, LaneType, array_dtypes
 
 FORMAT = 1  # of the .npz file
 MAX_FILE = 64 * 2**20  # bytes, unpacked; the largest town here has about 3 MB
@@ -137,13 +137,37 @@ class LaneGraph:
         """x, y, yaw and width at arc length s of a lane (s is held inside the lane)."""
         part = self.points(lane)
         along = self.s[part]
-        i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(along) - 2))
-        t = float(np.clip((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0, 1.0))
+        i = min(max(int(along.searchsorted(s, side="right")) - 1, 0), len(along) - 2)
+        t = float(min(max((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0), 1.0))
         i += part.start
         x, y = (1.0 - t) * self.xy[i] + t * self.xy[i + 1]
         turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi
         width = (1.0 - t) * float(self.width[i]) + t * float(self.width[i + 1])
         return float(x), float(y), float(self.yaw[i]) + t * turn, width
+
+    def at_each(self, lane: int, s: F64) -> tuple[F64, F64, F64, F64]:
+        """As `at` for many arc lengths of one lane, to the bit.
+
+        Args:
+            lane: Index of the lane.
+            s: Arc lengths [n], m; held inside the lane.
+
+        Returns:
+            x, y (m), yaw (rad) and width (m), [n] each.
+        """
+        part = self.points(lane)
+        along, xy = self.s[part], self.xy[part]
+        yaw, width = self.yaw[part].astype(np.float64), self.width[part].astype(np.float64)
+        i = np.clip(along.searchsorted(s, side="right") - 1, 0, len(along) - 2)
+        # in single precision, as a Python number with an array of it
+        share = ((s.astype(np.float32) - along[i]) / np.maximum(along[i + 1] - along[i], np.float32(1e-9))).clip(
+            0.0, 1.0
+        )
+        t = share.astype(np.float64)
+        place = (1.0 - t).astype(np.float32)[:, None] * xy[i] + share[:, None] * xy[i + 1]
+        x, y = place.astype(np.float64).T
+        turn = ((self.yaw[part][i + 1] - self.yaw[part][i]).astype(np.float64) + np.pi) % (2 * np.pi) - np.pi
+        return x, y, yaw[i] + t * turn, (1.0 - t) * width[i] + t * width[i + 1]
 
     def divided(self, lane: int) -> bool:
         """Whether no lane of the other way lies beside those of a lane's own way: a one-way road, or a median."""

@@ -224,12 +224,15 @@ def _line(graph: LaneGraph, leg: _Leg, step: float = math.inf) -> tuple[F64, I32
     for lane, s0, s1 in leg.parts:
         along = graph.s[graph.points(lane)]
         inner = along if math.isinf(step) else np.arange(s0, s1, step)
-        inner = inner[(inner > s0 + 0.02) & (inner < s1 - 0.02)]
-        for s in [s0, *inner.tolist(), s1]:
-            x, y, yaw, width = graph.at(lane, s)
-            rows.append((x, y, math.cos(yaw), math.sin(yaw), float(graph.speed_limit[lane]), width))
-            lanes.append(lane)
-    return np.array(rows, np.float64), np.array(lanes, np.int32)
+        inner = inner[(inner > s0 + 0.02) & (inner < s1 - 0.02)].astype(np.float64)
+        ends = zip(graph.at(lane, s0), graph.at_each(lane, inner), graph.at(lane, s1), strict=True)
+        x, y, yaw, width = (np.concatenate([[first], between, [last]]) for first, between, last in ends)
+        # math's, whose last digit is that of routes that are stored; numpy's may differ
+        cos, sin = [math.cos(angle) for angle in yaw.tolist()], [math.sin(angle) for angle in yaw.tolist()]
+        part = np.stack([x, y, cos, sin, np.full(len(x), graph.speed_limit[lane]), width], axis=1)
+        rows.append(part)
+        lanes.append(np.full(len(part), lane, np.int32))
+    return np.concatenate(rows), np.concatenate(lanes)
 
 
 def _change(graph: LaneGraph, leg: _Leg, old: tuple[int, float]) -> tuple[F64, I32]:
