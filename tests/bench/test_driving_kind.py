@@ -268,16 +268,17 @@ def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_witness_is_looked_for_once_for_an_episode_and_speed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     speeds = []
 
-    def find(episode: Any, graph: Any, *, device: str, policies: Any) -> Any:
+    def find(episode: Any, graph: Any, *, device: str, policies: Any, sensors: Any) -> Any:
         assert policies is make_system
+        assert sensors == {}
         speeds.append((episode.agents[0].target_speed, episode.agents[1:], graph.name, device))
         return SimpleNamespace(as_dict=lambda: {"found": True, "margin": math.inf, "speed": np.float64(2.5)})
 
     monkeypatch.setattr("ssad.world.witness.find_witness", find)
     monkeypatch.setattr(driving, "replace", lambda old, **new: SimpleNamespace(**(vars(old) | new)))
-    monkeypatch.setattr(driving, "scenario_json", lambda scenario: {"name": scenario})
+    monkeypatch.setattr(driving, "scenario_json", lambda scenario: {"name": "s"})
     ego, other = SimpleNamespace(target_speed=8.0), SimpleNamespace(target_speed=1.0)
-    episode: Any = SimpleNamespace(agents=(ego, other), scenario="s", seed=3, town="Nowhere")
+    episode: Any = SimpleNamespace(agents=(ego, other), scenario=SimpleNamespace(actors=()), seed=3, town="Nowhere")
     expected = {"found": True, "margin": None, "speed": 2.5}
     for speed in (None, 9.5, 9.5, None):
         assert driving.witness(tmp_path, episode, speed, "cpu") == expected

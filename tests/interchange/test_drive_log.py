@@ -120,36 +120,38 @@ def east(time: float) -> tuple[float, float]:
     return 100.0 + 8.0 * time, 50.0
 
 
-def write(root: Path, things: list[tuple[str, tuple[float, float, float], Place, list[int]]], ego: Place = east):
-    """A drive of 6 s; things: category, size (width, length, height), place at a time, key frames."""
+Thing = tuple[str, tuple[float, float, float], Place, list[int]]
+"""Category, size (width, length, height), place at a time, key frames."""
+
+
+def turned(yaw: float) -> tuple[float, ...]:
+    return tuple(yaw_to_quaternion(yaw).tolist())
+
+
+def write(root: Path, things: list[Thing], ego: Place = east, yaw: float = 0.0) -> Path:
+    """A drive of 6 s, the ego always turned by a yaw."""
     with NuScenesWriter(root) as writer:
         scene = writer.add_scene("scene-1")
-        writer.add_sensor(scene, "LIDAR_TOP", modality="lidar", translation=(0.0, 0.0, 1.8), rotation=(1, 0, 0, 0))
+        writer.add_sensor(scene, "LIDAR_TOP", modality="lidar", translation=(0.0, 0.0, 1.8), rotation=turned(0.0))
         samples = []
         for k in range(13):
             time = 5_000_000 + 500_000 * k
             samples.append(writer.add_sample(scene, time))
-            place = (*ego(0.5 * k), 0.0)
             writer.add_sensor_frame(
-                scene, "LIDAR_TOP", timestamp_us=time, data=b"", ego_translation=place, sample=samples[-1]
-            )
+                scene, "LIDAR_TOP", timestamp_us=time, data=b"", ego_translation=(*ego(0.5 * k), 0.0),
+                ego_rotation=turned(yaw), sample=samples[-1],
+            )  # fmt: skip
         for number, (category, size, place, frames) in enumerate(things):
             instance = writer.add_instance(scene, f"thing-{number}", category=category)
             for k in frames:
-                x, y = place(0.5 * k)
-                writer.add_annotation(
-                    samples[k],
-                    instance,
-                    translation=(x, y, 0.8),
-                    size=size,
-                    rotation=tuple(yaw_to_quaternion(0.3).tolist()),
-                )
+                centre = (*place(0.5 * k), 0.8)
+                writer.add_annotation(samples[k], instance, translation=centre, size=size, rotation=turned(0.3))
     return root
 
 
-def opened(root: Path):
+def opened(root: Path, **more: str):
     with NuScenes(root) as data:
-        return scenario_of_drive(data, "scene-1", town="Logged")
+        return scenario_of_drive(data, "scene-1", town="Logged", **more)
 
 
 CAR = (1.9, 4.6, 1.6)
@@ -182,6 +184,17 @@ def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
     assert (first.x, first.y) == (100.0, 50.0)
     assert (last.x, last.y) == (148.0, 50.0)
     assert drive.scenario.limits.max_steps == 220
+
+
+def test_the_ego_starts_where_and_as_fast_as_in_the_log(tmp_path: Path) -> None:
+    cone = ("movable_object.trafficcone", (0.4, 0.4, 0.8), still(240.0, -12.0), [3])
+    root = write(tmp_path, [cone], lambda t: (217.0 + 6.0 * t, -4.65), yaw=0.1)
+    drive = opened(root, map_name="ProvingGround")
+    assert drive.known
+    ego = build_episode(drive.scenario, drive.graph, seed=0).agents[0]
+    assert (ego.pose.x, ego.pose.y, ego.pose.yaw) == pytest.approx((217.0, -4.65, 0.1), abs=0.01)
+    assert ego.speed == pytest.approx(6.0)
+    assert ego.route.xy[-1] == pytest.approx([253.0, -5.25], abs=1.01)
 
 
 def test_the_nearest_are_kept_where_there_are_too_many(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from ssad.recording.loop_sensors import Onboard
 from ssad.recording.scene_objects import PHASES
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.check import check_driver
 from ssad.world.rollout import Loop, rollout
 from ssad.world.world import World
 
@@ -257,3 +259,31 @@ def test_a_trace_has_no_further_agents_or_steps(driven) -> None:
         with pytest.raises(ConfigError, match="steps 0 to 8, not agent"):
             camera.of_trace(traces[0], town(), **wrong)
     assert set(Onboard().rig(320)) >= {"CAM_FRONT", "CAM_BACK"}
+
+
+def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ssad.bench.kinds import driving
+
+    watcher = Watcher("CAM_BACK")
+    short = replace(episodes()[0], limits=Limits(max_steps=2))
+    monkeypatch.setattr(driving, "episode_of", lambda cell: short)
+    monkeypatch.setattr(driving, "system_of", lambda name: watcher)
+    cell = SimpleNamespace(system="watcher", spec={"scenario": {"type": short.scenario.type}})
+    _, (trace,) = driving.drive([cell], device="cpu")
+    camera = Onboard().rig()["CAM_BACK"]
+    assert np.array_equal(watcher.shown["CAM_BACK", 0, 0, 1], camera.of_trace(trace, town(), steps=[1])[0])
+    found = driving.onboard_sensors([Watcher("above"), Watcher("LIDAR_TOP")], "cpu")
+    assert {"CAM_FRONT", "CAM_BACK_LEFT", "LIDAR_TOP"} <= set(found)
+    assert driving.onboard_sensors([Watcher("above"), Watcher()], "cpu") == {}
+
+
+def test_a_driver_with_a_camera_can_be_checked() -> None:
+    onboard = Onboard()
+
+    class Shy(Watcher):
+        def act(self, view):
+            dark = view.readings["front"].mean((1, 2, 3)) < 60
+            return np.stack([~dark, dark, 0.0 * dark], 1).astype(np.float32)
+
+    make = lambda order: world(*order)  # noqa: E731
+    check_driver(lambda: Shy("front"), make, episodes=2, steps=3, sensors=both(onboard))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Driver, Reproducible, Simulator
+from ssad.core.driving import Driver, Reproducible, Sensor, Simulator
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
 from ssad.core.types import ENDS, AgentKind, Controller, End
@@ -200,7 +201,14 @@ def _check_bad_controls(world: Simulator) -> None:
         raise WorldCheckError("controls of a wrong shape or not finite are refused with ConfigError")
 
 
-def check_driver(make: Callable[[], Driver], simulator: MakeSimulator, *, episodes: int, steps: int = 40) -> None:
+def check_driver(
+    make: Callable[[], Driver],
+    simulator: MakeSimulator,
+    *,
+    episodes: int,
+    steps: int = 40,
+    sensors: Mapping[str, Sensor] | None = None,
+) -> None:
     """Hold a driver to its protocol, as the ego of a simulator and as another agent of it.
 
     Args:
@@ -208,25 +216,28 @@ def check_driver(make: Callable[[], Driver], simulator: MakeSimulator, *, episod
         simulator: As for `check_simulator`.
         episodes: How many there are.
         steps: How long to drive.
+        sensors: What it may ask for besides `ssad.world.sensors.SENSORS`.
 
     Raises:
         WorldCheckError: A promise is broken; names it.
     """
+    known = SENSORS | dict(sensors or {})
     driver = make()
     _need(isinstance(driver, Driver), "it has the methods and attributes of ssad.core.driving.Driver")
     _need(isinstance(driver.controller, Controller), "its controller is a ssad.core.types.Controller")
     order = list(range(min(episodes, 4)))
-    told = _driven(driver, simulator(order), steps)
-    _need(_driven(driver, simulator(order), steps) == told, "reset makes it forget: the same again is driven the same")
-    _need(_driven(make(), simulator(order[::-1]), steps)[::-1] == told, "the order of scenes does not matter")
-    _need(_driven(make(), simulator(order[:1]), steps) == told[:1], "a scene alone is driven as it is in a batch")
+    drive = partial(_driven, steps=steps, sensors=known)
+    told = drive(driver, simulator(order))
+    _need(drive(driver, simulator(order)) == told, "reset makes it forget: the same again is driven the same")
+    _need(drive(make(), simulator(order[::-1]))[::-1] == told, "the order of scenes does not matter")
+    _need(drive(make(), simulator(order[:1])) == told[:1], "a scene alone is driven as it is in a batch")
     if driver.controller == Controller.EXTERNAL:
-        _check_controls(make(), simulator(order), steps)
+        _check_controls(make(), simulator(order), steps, known)
 
 
-def _driven(driver: Driver, world: Simulator, steps: int) -> list[bytes]:
+def _driven(driver: Driver, world: Simulator, *, steps: int, sensors: Mapping[str, Sensor]) -> list[bytes]:
     """How the ego of each scene moves."""
-    loop = Loop(world, {0: driver})
+    loop = Loop(world, {0: driver}, sensors=sensors)
     loop.reset()
     poses = []
     for _ in range(min(steps, step_limit(world))):
@@ -235,9 +246,9 @@ def _driven(driver: Driver, world: Simulator, steps: int) -> list[bytes]:
     return [np.stack(poses)[:, b].tobytes() for b in range(world.batch)]
 
 
-def _check_controls(driver: Driver, world: Simulator, steps: int) -> None:
+def _check_controls(driver: Driver, world: Simulator, steps: int, known: Mapping[str, Sensor]) -> None:
     """What it returns is in range, for agents of any number, and it changes nothing."""
-    sensors = {name: SENSORS[name] for name in getattr(driver, "sensors", ()) if name in SENSORS}
+    sensors = {name: known[name] for name in getattr(driver, "sensors", ())}
     everybody = np.argwhere(_ready(world).state().active).astype(np.int32)
     driver.reset([world.episodes[k] for k in world.assigned])
     for step in range(min(steps, 5)):

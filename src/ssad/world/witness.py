@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ssad.core.driving import Policies
+from ssad.core.driving import Policies, Sensor
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Condition, Controller, End, Episode, EpisodeAgent, Phase, Route
 from ssad.world.rollout import Loop, run
@@ -101,26 +101,32 @@ def _run(
     graphs: Mapping[str, LaneGraph],
     drivers: list[EpisodeAgent],
     device: str,
-    policies: Policies | None,
+    others: Mapping[str, Any],
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Why each driver's episode ended (`End`) and its route completion in percent."""
     bank = [replace(episode, agents=(d, *episode.agents[1:])) for d in drivers]
     world = World(bank, graphs, device=device)
-    run(Loop(world, {}, policies=policies))
+    run(Loop(world, {}, **others))
     return world.ended().copy(), world.state().route_complete.copy()
 
 
 def find_witness(
-    episode: Episode, graph: LaneGraph, *, device: str = "cpu", policies: Policies | None = None
+    episode: Episode,
+    graph: LaneGraph,
+    *,
+    device: str = "cpu",
+    policies: Policies | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
 ) -> Witness:
     """Search for a driver that stays clear; see `Witness`. Deterministic; some hundred scenes run side by side.
 
-    policies: makes the drivers that the episode names for other agents, as in `rollout`.
+    policies: makes the drivers that the episode names for other agents, as in `rollout`; sensors: what these ask for.
     """
+    others: dict[str, Any] = {"policies": policies, "sensors": sensors}
     graphs = {episode.town: graph}
     ego = replace(episode.agents[0], controller=Controller.FOLLOW, phases=())
     blind = World([replace(episode, agents=(ego, *episode.agents[1:]))], graphs, device=device)
-    loop = Loop(blind, {}, policies=policies)
+    loop = Loop(blind, {}, policies=policies, sensors=sensors)
     loop.reset()
     trigger = float("nan")
     place: list[float] = []
@@ -142,13 +148,13 @@ def find_witness(
     for verdict, start in stages:
         options = [m for m in _manoeuvres(start, ego.target_speed) if m.start < crash]
         drivers = [_drive(ego, m, place[min(int(m.start / blind.dt), len(place) - 1)]) for m in options]
-        ends, complete = _run(episode, graphs, drivers, device, policies)
+        ends, complete = _run(episode, graphs, drivers, device, others)
         tried += len(options)
         clear = np.flatnonzero(ends != End.COLLISION)
         if len(clear):
             best = max(clear, key=lambda k: (complete[k] >= 100.0, -abs(options[k].offset), complete[k], -k))
             return Witness(verdict, trigger, options[best], float(complete[best]), len(clear), tried)
-    ends, complete = _run(episode, graphs, [replace(ego, controller=Controller.AUTOPILOT)], device, policies)
+    ends, complete = _run(episode, graphs, [replace(ego, controller=Controller.AUTOPILOT)], device, others)
     tried += 1
     if ends[0] != End.COLLISION:
         return Witness("autopilot", trigger, None, float(complete[0]), 1, tried)

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -18,10 +18,11 @@ from pydantic import Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.source import source_version
 from ssad.core import safeio
-from ssad.core.driving import Driver
+from ssad.core.driving import Driver, Sensor
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph, town_file
+from ssad.core.nuscenes_names import CAMERAS, LIDAR
 from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -303,7 +304,21 @@ def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[Ep
     episodes = [episode_of(cell) for cell in cells]
     graphs = {episode.town: town(episode.town) for episode in episodes}
     simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
-    return episodes, rollout(simulator, system_of(cells[0].system), policies=make_system)
+    system = system_of(cells[0].system)
+    policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
+    sensors = onboard_sensors([system, *policies.values()], device)
+    return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
+
+
+def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
+    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one."""
+    asked = {name for driver in drivers for name in getattr(driver, "sensors", ())}
+    if not asked & {*CAMERAS, LIDAR}:
+        return {}
+    from ssad.recording.loop_sensors import Onboard
+
+    onboard = Onboard(device=device)
+    return {**onboard.rig(), LIDAR: onboard.lidar()}
 
 
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
@@ -322,7 +337,9 @@ def witness(folder: Path, episode: Episode, speed: float | None, device: str) ->
     if path.exists():
         found: dict[str, Any] = safeio.read_json(path)
         return found
-    found = plain(find_witness(episode, town(episode.town), device=device, policies=make_system).as_dict())
+    made = [make_system(name) for name in policies_of(episode.scenario)]
+    find = partial(find_witness, device=device, policies=make_system, sensors=onboard_sensors(made, device))
+    found = plain(find(episode, town(episode.town)).as_dict())
     safeio.write_atomic(path, safeio.dump_json(found) + "\n")
     return found
 
