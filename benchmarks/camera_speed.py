@@ -3,6 +3,12 @@
 A street of Twinford, 640 x 640, 30 vehicles, 2 x 2 samples a pixel: by day, by day without shadows, contact shadows and
 lamps (`PLAIN`), by night with the lamps of vehicles and street; medians, on the CPU of the process's own time.
 Re-texturing: a car 20 m ahead wears a texture of 256 x 256; picture and gradient, once the frame has been seen.
+
+    python benchmarks/camera_speed.py --scenes 64 [--device cpu|cuda] [--steps N] [--out FILE]
+
+The closed loop: so many natural episodes at once at 10 Hz, each ego on its way with a camera of 640 x 384; how many
+times as fast as real time they run together, and what a step takes with pictures of 8 x 8 instead. Compiling and making
+bodies do not count.
 """
 
 from __future__ import annotations
@@ -31,9 +37,15 @@ from ssad.camera.lamps import own_lamps
 from ssad.camera.render import PLAIN, Quality, View, Weather, render
 from ssad.camera.scene import Layer, Scene, Thing
 from ssad.camera.texture import retexture, taps_of
+from ssad.core.driving import Observation
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
+from ssad.core.types import Controller, Limits
+from ssad.recording.loop_sensors import Onboard
 from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.rollout import Loop
+from ssad.world.world import World
 
 
 def place(x: float, y: float, yaw: float) -> Any:
@@ -84,15 +96,62 @@ def median(run: Callable[[], object], device: str, repeats: int) -> float:
     return statistics.median(times)
 
 
+class Driver:
+    """Drives ahead and looks."""
+
+    name, controller, sensors = "driver", Controller.EXTERNAL, ("front",)
+
+    def reset(self, episodes: object) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: Observation) -> Any:
+        """Slowly along the route."""
+        steer = np.clip(1.5 * np.arctan2(view.route[:, 6, 1], view.route[:, 6, 0]), -1, 1)
+        throttle = 0.5 * (view.speed < 4.0)
+        return np.stack([throttle, 0.0 * throttle, steer], 1).astype(np.float32)
+
+
+def in_the_loop(scenes: int, device: str, steps: int) -> dict[str, Any]:
+    """Seconds a step of scenes with a camera each, as medians."""
+    chosen = load_scenarios("natural")[:scenes]
+    graphs = {name: load_town(name) for name in {scenario.town for scenario in chosen}}
+    endless = Limits(max_steps=10**6, max_time=1e6, contact="count")
+    episodes = [replace(build_episode(s, graphs[s.town], seed=0), limits=endless) for s in chosen]
+    found: dict[str, Any] = {"scenes": scenes, "towns": len(graphs), "steps": steps}
+    for name, camera in (("loop", Camera.typical(640, 384)), ("host", Camera.typical(8, 8))):
+        world = World(episodes, graphs, device=device)
+        loop = Loop(world, {0: Driver()}, sensors={"front": Onboard(device=device).camera(camera)})
+        loop.reset()
+        loop.step()
+        seconds = median(loop.step, device, steps)
+        found[f"{name}_ms_per_step"] = 1e3 * seconds
+    found["times_real_time"] = 100.0 / found["loop_ms_per_step"]
+    found["frames_per_s"] = 1e3 * scenes / found["loop_ms_per_step"]
+    return found
+
+
 def main() -> None:
     """Measures, prints, writes JSON."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--scenes", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     device = "cuda:0" if options.device == "cuda" else "cpu"
+    if options.scenes:
+        found = in_the_loop(options.scenes, device, options.steps)
+        found["device"] = wp.get_device(device).name if device != "cpu" else platform.machine()
+        print(
+            f"{options.scenes} scenes, a camera each: {found['loop_ms_per_step']:.0f} ms a step of 100 ms "
+            f"({found['times_real_time']:.2f} x real time), {found['frames_per_s']:.0f} frames/s; "
+            f"{found['host_ms_per_step']:.0f} ms with pictures of 8 x 8"
+        )
+        if options.out:
+            options.out.write_text(json.dumps(found, indent=1) + "\n")
+        return
     stage, view = scene(640, device)
     seconds = median(lambda: render(stage, [view] * options.batch, download=False), device, options.repeats)
     result: dict[str, Any] = {

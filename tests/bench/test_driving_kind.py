@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,9 @@ from ssad.bench.kinds.driving import (
     type_version,
 )
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
-from ssad.core.types import Pose, Scenario
+from ssad.core.lane_graph import town_file
+from ssad.core.types import Actor, Pose, Scenario
+from ssad.drivers import make_system
 
 GOOD: dict[str, Any] = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"]}
 
@@ -147,10 +150,26 @@ def test_copies_of_towns_lie_beside_the_results(monkeypatch: pytest.MonkeyPatch,
     (tmp_path / "towns").mkdir()
     (tmp_path / "towns" / "Old.npz").write_text("")
     assert plan.kind.prepare(plan, tmp_path, Resources()) == {"witness": True}
-    assert saved == [("Nowhere", tmp_path / "towns" / "Nowhere.npz")]
+    file = town_file("dir/own.npz")
+    assert file.startswith("own-")
+    assert saved == [("Nowhere", tmp_path / "towns" / "Nowhere.npz"), ("dir/own.npz", tmp_path / "towns" / file)]
     assert (tmp_path / "traces").is_dir()
     no = plan_of(monkeypatch, scenario("a"), witness=False)
     assert no.kind.prepare(no, tmp_path, Resources()) == {"witness": False}
+
+
+def test_the_drivers_of_actors_count_in_the_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = Actor("car", "car", Pose(0.0, 0.0))
+    told = scenario("a", type="Custom", actors=(replace(plain, policy="mine"), plain, replace(plain, policy="mine")))
+    keys = []
+    for version in ("1", "1", "2"):
+        versions = {"mine": version, "autopilot": "0", "blind": "0"}
+        monkeypatch.setattr(driving, "system_version", versions.__getitem__)
+        plan = plan_of(monkeypatch, told, scenario("b"))
+        keys.append([cell.key for cell in plan.cells if cell.system == "blind"])
+    assert keys[0] == keys[1]
+    assert keys[0][0] != keys[2][0]
+    assert keys[0][1] == keys[2][1], "a scenario without them stays"
 
 
 @pytest.mark.parametrize(
@@ -249,7 +268,8 @@ def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_witness_is_looked_for_once_for_an_episode_and_speed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     speeds = []
 
-    def find(episode: Any, graph: Any, *, device: str) -> Any:
+    def find(episode: Any, graph: Any, *, device: str, policies: Any) -> Any:
+        assert policies is make_system
         speeds.append((episode.agents[0].target_speed, episode.agents[1:], graph.name, device))
         return SimpleNamespace(as_dict=lambda: {"found": True, "margin": math.inf, "speed": np.float64(2.5)})
 

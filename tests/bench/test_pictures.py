@@ -15,7 +15,8 @@ from ssad.camera.rig import RIG, rig_camera
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import SHOWN, class_sheet
-from ssad.recording.onboard import above, body_of, moments, onboard_sheet, pick_trace, things_at
+from ssad.recording.episode_scene import EpisodeScene, body_of, moments_of
+from ssad.recording.onboard import above, moments, onboard_sheet, pick_trace
 from ssad.roads import load_town
 from ssad.world.models import MODELS
 from ssad.world.rollout import rollout
@@ -61,7 +62,10 @@ def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
     episode = build_episode(scenario, graph, seed=0)
     trace = rollout(World([episode], {graph.name: graph}), make_system("blind"))[0]
     assert len(moments(trace)) == 3
-    people = things_at(trace, 0, ego=False)
+    town = EpisodeScene(graph)
+    looks = town.looks_of_trace(trace)
+    town.cast(looks.bodies())
+    people = [thing for thing in town.things(looks, moments_of(trace)[0], without=0) if thing.tag]
     assert {t.tag for t in people} == {a + 1 for a in range(1, len(trace.models)) if trace.active[0, a]}
     camera, pose = above(np.eye(4), 40.0, 64, 36)
     assert pose[:3, 2] == pytest.approx([0, 0, -1])

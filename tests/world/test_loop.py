@@ -387,6 +387,8 @@ def test_the_examples_of_the_page_run() -> None:
         exec(block, names)
         assert len(names["traces"]) == 4
     assert all(trace.driven[-1] > 20.0 for trace in names["traces"])
+    assert names["seen"].driven[-1] > 2.0  # neither is it dark nor has the ego come close to anything
+    assert names["frames"].shape == (2, 3, 192, 320)
 
 
 def test_traces_do_not_depend_on_what_else_is_in_the_batch() -> None:

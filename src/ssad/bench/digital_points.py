@@ -42,8 +42,13 @@ class Method(BaseModel):
 
 
 class Row(Method):
-    """An attack with its settings: radius (8-bit code values) and steps, where they are not the suite's; scenes: the
-    first of each town, where it does not run on all."""
+    """An attack with its settings.
+
+    Attributes:
+        radius: Radius in 8-bit code values, where it is not the suite's.
+        steps: Number of steps, where it is not the suite's.
+        scenes: The attack runs on this many first scenes of each town; None: on all.
+    """
 
     radius: Radius | None = None
     steps: Steps | None = None
@@ -209,8 +214,14 @@ def rows_of(suite: DigitalSuite) -> list[Point]:
 
 
 def points_of(suite: DigitalSuite) -> list[Point]:
-    """All that every detector is shown, without transfer: the clean data first, then noise, rows and curves, each once;
-    clean data on fewer scenes, and behind a defence, where something else is compared with them. ConfigError."""
+    """All conditions that every detector is shown, each once, without the transfer of attacks to other detectors.
+
+    The clean data come first, then noise, rows and curves. Clean data on fewer scenes, or behind a defence, are
+    included where something else is compared with them.
+
+    Raises:
+        ConfigError: An attack does not exist or refuses a setting, or an attack appears twice.
+    """
     rows, curves, moved = rows_of(suite), _swept(suite), transfers_of(suite)
     bare = [
         replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)

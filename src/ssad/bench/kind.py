@@ -181,8 +181,17 @@ class Kind(ABC):
         """In a worker, once: what no cell's time-out shall pay for."""
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """In the main process, before cells run: make data; the settings of the `Job`, plain data. retry: cells that
-        failed before and are tried again."""
+        """In the main process, before cells run: make data.
+
+        Args:
+            plan: The cells of the run.
+            folder: Results folder.
+            resources: What the run may use.
+            retry: Cells that failed before and are tried again.
+
+        Returns:
+            Settings of the `Job`, plain data.
+        """
         return {}
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
@@ -194,13 +203,29 @@ class Kind(ABC):
         return 0.0
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Work that cells of different systems can share, done before them: name -> plain data. What is there already
-        need not be named."""
+        """Work that cells of different systems can share and that is done before them.
+
+        Args:
+            cell: A cell that needs the work.
+            job: What the workers of the run know.
+
+        Returns:
+            Name -> plain data; what already exists may be left out.
+        """
         return {}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
-        """In a worker: do a piece for some systems, leaving its result in the folder. If this fails, nothing is lost
-        but time: `execute` must do without, and its failure counts."""
+        """In a worker: do a piece of shared work for some systems, and leave its result in the folder.
+
+        If this fails, only time is lost: `execute` must be able to do without it, and it is the failure of `execute`
+        that counts.
+
+        Args:
+            name: Name of the piece.
+            data: Its data; see `pieces`.
+            systems: Systems to do it for.
+            job: What the workers of the run know.
+        """
         raise CellError(f"the kind {self.name} names pieces of work, but not how they are made")
 
     def finish(self, plan: Plan, folder: Path) -> None:  # noqa: B027  nothing to do by default

@@ -19,9 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Solids:
-    """3D boxes in the camera frame: centre [N, 3] (of gravity), size_lhw [N, 3] (length, height, width), yaw [N],
-    velocity [N, 2] (x, z; NaN where unknown), attribute [N] index into
-    `MMDET3D_ATTRIBUTES`."""
+    """3D boxes in the camera frame.
+
+    Attributes:
+        centre: Centre of gravity [N, 3], m.
+        size_lhw: Length, height and width [N, 3], m.
+        yaw: Rotation about the y axis [N], rad.
+        velocity: Velocity along x and z [N, 2], m/s; NaN where unknown.
+        attribute: Index into `MMDET3D_ATTRIBUTES` [N].
+    """
 
     centre: Tensor
     size_lhw: Tensor
@@ -32,8 +38,15 @@ class Solids:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is in one image: label [Q] index into the detector's classes, box [Q, 4], solid for 3D; intrinsic [3, 3] of
-    the camera for 3D; crowd [Q] bool: objects that count neither as found nor as missed (too small, too hidden)."""
+    """The true objects in one image.
+
+    Attributes:
+        label: Index into the detector's classes [Q].
+        box: 2D boxes [Q, 4].
+        solid: 3D boxes; None for 2D detection.
+        intrinsic: Camera matrix [3, 3]; None for 2D detection.
+        crowd: Objects that count neither as found nor as missed because they are too small or too hidden [Q] bool.
+    """
 
     label: Tensor
     box: Tensor
@@ -44,8 +57,14 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """What was found in one image, best first: score [N] in 0..1, label [N], box [N, 4] (for 3D: the hull of the
-    projected corners, unless the detector predicts it), solid for 3D."""
+    """The objects found in one image, best first.
+
+    Attributes:
+        score: Confidence in 0..1 [N].
+        label: Index into the detector's classes [N].
+        box: 2D boxes [N, 4]; for 3D, the hull of the projected corners unless the detector predicts 2D boxes itself.
+        solid: 3D boxes; None for 2D detection.
+    """
 
     score: Tensor
     label: Tensor

@@ -344,8 +344,13 @@ class Reproducible(Protocol):
 Selector = Callable[[WorldState], Bool]
 """Whom a driver drives at the next step: from the state to [B, A]. It decides from the state alone."""
 
+Policies = Callable[[str], Driver]
+"""The driver of a name that an episode gives to an agent (`ssad.core.types.Actor.policy`), a new one at each call."""
+
 Sensor = Callable[[Any, I32], npt.NDArray[Any]]
-"""From a simulator and agents [N, 2] (scene, agent) to readings [N, ...]; pictures are [N, C, H, W]."""
+"""From a simulator and agents [N, 2] (scene, agent) to readings [N, ...]; pictures are [N, C, H, W].
+
+One that also has a method `follow`, which takes the simulator, is told of every step, also where nobody looks."""
 
 
 class Perturbation(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from pathlib import Path
@@ -231,6 +232,12 @@ def _check(graph: LaneGraph) -> None:
     inner[graph.offset[1:-1] - 1] = False
     require(bool((np.diff(graph.s)[inner] > 0).all()), "s does not grow along a lane")
     require(bool((graph.kind == LaneType.DRIVING).any()), "it has no drivable lane")
+
+
+def town_file(town: str) -> str:
+    """The name of the file that a results folder keeps a town in: a town that is itself a file lies anywhere."""
+    plain = Path(town).name == town
+    return f"{town}.npz" if plain else f"{Path(town).stem}-{hashlib.sha256(town.encode()).hexdigest()[:8]}.npz"
 
 
 def save_graph(graph: LaneGraph, path: Path | str) -> None:

@@ -169,6 +169,9 @@ class Actor:
 
     With `trajectory`, rows of time s, x, y m and yaw rad, it is where these have it, straight on between them, whatever
     happens around it; before the first and after the last it is not there.
+
+    With `policy`, the name of a driver, that driver acts for it; `path` is then where it wants to go (key points along
+    lanes; a walker's own line), at `target_speed` m/s where nothing hinders it.
     """
 
     name: str
@@ -177,6 +180,8 @@ class Actor:
     phases: tuple[Phase, ...] = ()
     path: tuple[tuple[float, float], ...] = ()
     trajectory: tuple[tuple[float, float, float, float], ...] = ()
+    policy: str = ""
+    target_speed: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -261,7 +266,7 @@ class Route:
 
 @dataclass(frozen=True)
 class EpisodeAgent:
-    """One agent of a concrete episode: where it starts and how it is driven; trajectory: see `Actor`."""
+    """One agent of a concrete episode: where it starts and how it is driven; trajectory, policy: see `Actor`."""
 
     name: str
     model: str
@@ -273,6 +278,7 @@ class EpisodeAgent:
     route: Route | None = None
     wake_distance: float = 0.0
     trajectory: tuple[tuple[float, float, float, float], ...] = ()
+    policy: str = ""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,18 @@ LARGEST: Final = 1 << 30  # bytes of an annotation file
 
 @dataclass(frozen=True, slots=True)
 class CocoImage:
-    """One picture: its file, width and height, what is known about it, and its N boxes (x1, y1, x2, y2 pixels) with
-    labels (index into the set's classes), crowd (counts neither way), and target (the object that the set is about)."""
+    """One picture with its N boxes.
+
+    Attributes:
+        file: The picture.
+        width: Pixels.
+        height: Pixels.
+        about: Everything else that the file says about the picture.
+        box: x1, y1, x2, y2 in pixels [N, 4].
+        label: Index into the set's classes [N].
+        crowd: Boxes that count neither as found nor as missed [N].
+        target: Boxes of the object that the set is about [N].
+    """
 
     file: Path
     width: int
@@ -40,8 +50,17 @@ class CocoSet:
 
 
 def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> dict[str, Any]:
-    """The content of an annotation file. Each image: file_name, width, height, anything else, and `objects`, each
-    with label (index), box (x1, y1, x2, y2), pixels, crowd and anything else."""
+    """The content of an annotation file.
+
+    Args:
+        classes: Names, in the order of the labels.
+        images: For each image file_name, width, height, anything else, and `objects`, each with label (index), box (x1,
+            y1, x2, y2), pixels (area), crowd and anything else.
+        about: The `info` of the file.
+
+    Returns:
+        What is to be written as JSON; ids start at 1.
+    """
     rows: list[dict[str, Any]] = []
     boxes: list[dict[str, Any]] = []
     for number, image in enumerate(images, 1):
@@ -58,8 +77,19 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
 
 
 def read_coco(path: Path, *, images: Path | None = None) -> CocoSet:
-    """An annotation file; images: folder of the pictures (default: `images` beside the file's folder, else the file's
-    own folder). FormatError: something is missing, out of order, or points into nowhere."""
+    """Read an annotation file.
+
+    Args:
+        path: The file.
+        images: Folder of the pictures; by default `images` beside the file's folder if there is one, else the file's
+            own folder.
+
+    Returns:
+        The pictures with their boxes.
+
+    Raises:
+        FormatError: Something is missing, malformed, or refers to an image or category that does not exist.
+    """
     data = safeio.read_json(path, limit=LARGEST)
     lists = ("images", "annotations", "categories")
     if not isinstance(data, dict) or any(not isinstance(data.get(k), list) for k in lists):

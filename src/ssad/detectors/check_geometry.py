@@ -86,8 +86,13 @@ def _cut(box: Tensor, size: tuple[int, int]) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Solids as another convention has them. yaw: a key of `YAWS`; size: the columns that hold
-    length, height and width; up: the centre's height above the documented one, in heights of the object."""
+    """Another convention that 3D boxes may follow.
+
+    Attributes:
+        yaw: A key of `YAWS`; "": the documented convention.
+        size: Columns that hold length, height and width.
+        up: Height of the centre above the documented one, as a share of the object's height.
+    """
 
     yaw: str = ""
     size: tuple[int, ...] = (0, 1, 2)

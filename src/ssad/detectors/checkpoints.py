@@ -35,9 +35,18 @@ COUNTER = "num_batches_tracked"  # of BatchNorm; it counts steps of training, an
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """What weights are. data: what they were trained on; command: that makes them again; metrics: measured where the
-    data say; classes: in the order of the logits; config: options of the builder; hash: SHA-256 of the tensors as
-    stored (`hash_state`); version: of SSAD. `save_weights` fills in hash and version."""
+    """What weights are and where they come from.
+
+    Attributes:
+        data: What they were trained on.
+        command: Command that reproduces them.
+        seed: Seed of the training.
+        classes: In the order of the logits.
+        metrics: Measured on the data named in `data`.
+        config: Options of the builder.
+        hash: SHA-256 of the tensors as stored (`hash_state`); `save_weights` fills it in.
+        version: Version of SSAD; `save_weights` fills it in.
+    """
 
     data: str
     command: str

@@ -29,8 +29,13 @@ HINTS = {
 
 @dataclass(frozen=True, slots=True)
 class Images:
-    """tensor: [B, 3, H, W] float32 (float64 stays) in [0, 1], RGB; notes: what was done that a user may want to know,
-    each once: "greyscale repeated to three channels", "alpha left out", "16 bit", ..."""
+    """Pictures as detectors take them.
+
+    Attributes:
+        tensor: [B, 3, H, W] float32 (float64 stays) in [0, 1], RGB.
+        notes: Conversions that a user may want to know about, each once: "greyscale repeated to three channels", "alpha
+            left out", "16 bit", ...
+    """
 
     tensor: Tensor
     notes: tuple[str, ...] = ()

@@ -53,6 +53,16 @@ def yolov3_tiny(
     input_width: int | None = None,
     seed: int = 0,
 ) -> Yolo:
-    """YOLOv3-tiny with fresh weights, or with those of a darknet `.weights` file (FormatError); the official file
-    needs `spec=YOLOV3_TINY_OFFICIAL`."""
+    """YOLOv3-tiny with fresh weights, or with those of a darknet `.weights` file.
+
+    Args:
+        classes: Names of the classes.
+        spec: Architecture and anchors; the official weights need `YOLOV3_TINY_OFFICIAL`.
+        weights: A darknet `.weights` file; None: fresh weights.
+        input_width: Width to which pictures are resized inside; None: they are not.
+        seed: Of fresh weights.
+
+    Raises:
+        FormatError: The file is broken or does not fit.
+    """
     return yolov3(classes, spec=spec, weights=weights, input_width=input_width, seed=seed)

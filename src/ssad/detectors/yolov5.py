@@ -50,10 +50,20 @@ def yolov5s(classes: Sequence[str] = COCO, *, input_width: int | None = None, se
 
 
 def from_yolov5_keys(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The state dict of `Yolo` from one with YOLOv5's names (model.0.conv.weight, model.2.cv1.conv.weight,
-    model.24.m.0.weight), in float32. The anchors come along, in pixels. FormatError: a name that is not of 6.0 n or s.
+    """Convert a state dict with YOLOv5's names to one of `Yolo`, in float32.
 
-    Also takes names with `model.model.` before the number. Shapes and missing names are `load_state_dict`'s to check.
+    The names are such as model.0.conv.weight, model.2.cv1.conv.weight and model.24.m.0.weight, also with `model.model.`
+    before the number. The anchors are converted to pixels. Shapes and missing names are left to `load_state_dict` to
+    check.
+
+    Args:
+        state: Tensors by name, of YOLOv5 6.0 n or s.
+
+    Returns:
+        Tensors by the names of `Yolo`.
+
+    Raises:
+        FormatError: A name does not belong to YOLOv5 6.0 n or s.
     """
     result: dict[str, Tensor] = {}
     for key, value in state.items():

@@ -1,5 +1,7 @@
-"""What boxes under an attack tell besides mAP and NDS: scores by distance, success of a targeted attack, and the worst
-of several attacks at each moment."""
+"""What boxes under an attack tell besides mAP and NDS.
+
+Scores by distance, the success of a targeted attack, and the worst of several attacks at each moment.
+"""
 
 from __future__ import annotations
 
@@ -139,7 +141,7 @@ def worst_of(candidates: Mapping[str, Sequence[SampleBoxes]], truth: GroundTruth
 
 
 def _by_sample(matches: Matches) -> F64:
-    """mAP of each sample alone [S], of the classes that are in it."""
+    """Mean AP of each sample alone [S], over the classes that are in it."""
     found = np.zeros(matches.samples)
     for k in range(matches.samples):
         there = matches.truth_counts[:, k] > 0

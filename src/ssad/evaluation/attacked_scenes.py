@@ -152,8 +152,11 @@ class AttackedScene:
         return f"{self.spec.name}{f'@{file_name(self.source)}' if self.source else ''}/{self.scene}"
 
     def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
-        """See `Condition`: all systems are shown the same pictures, which are made once, against the source. Its
-        gradient, missing or wrong, is a failure of all cells that need the pictures, with its reason."""
+        """See `Condition`: all systems are shown the same pictures, which are made once, against the source.
+
+        A missing or wrong gradient of the source is recorded, with its reason, as a failure of all cells that need the
+        pictures.
+        """
         source = next((one for one in detectors if one.name == self.source), None)
         if source is None:
             source = Watched(system_of(examination, self.source), self.source)
@@ -172,15 +175,19 @@ class AttackedScene:
 
 @dataclass(slots=True)
 class SceneAttacker:
-    """Attacks the camera images of a scene, against one detector. An image's random numbers come from the seed of the
-    suite and its own token: what comes out depends on no other image.
+    """Attacks the camera images of a scene, against one detector.
+
+    An image's random numbers come from the seed of the suite and its own token, so the result depends on no other
+    image.
 
     Attributes:
-        view: the scene and its attack.
-        examination: data, device, seed.
-        scene: the data.
-        watched: the system that is attacked; what it raises is kept there.
-        tally: what was done.
+        view: The scene and its attack.
+        examination: Data, device, seed.
+        scene: The data.
+        watched: The attacked system; what it raises is kept there.
+        attack: The attack with its settings.
+        tally: What was done.
+        batch: Images at once; it shrinks when memory does not suffice.
     """
 
     view: AttackedScene
@@ -284,9 +291,12 @@ class SceneAttacker:
         return [k for k, any_ in enumerate(places.any(1).tolist()) if any_]
 
     def _inspect(self) -> None:
-        """Before the first attack on a scene: the gradient of the loss against finite differences, on the image with
-        most objects to attack, and whether this image's loss changes with what else is in the batch. Attacks on one
-        loss of one system share what was found."""
+        """Check the gradient and the batch before the first attack on a scene.
+
+        The gradient of the loss is compared with finite differences, on the image with most objects to attack; the
+        coupling is how much this image's loss changes with what else is in the batch. Attacks on the same loss of the
+        same system share the results.
+        """
         if tuple(getattr(self.watched.detector, "classes", ())) != MMDET3D_CLASSES:
             raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
         frames = [frame for frame in self.scene.frames if frame.modality == "camera" and frame.key_frame]

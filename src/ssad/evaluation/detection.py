@@ -216,9 +216,12 @@ class Annotated(Protocol):
     """Pictures, uint8 [N, H, W, 3], by slices, and the truth of each."""
 
     @property
-    def pictures(self) -> Any: ...
+    def pictures(self) -> Any:
+        """Pictures, uint8 [N, H, W, 3], by slices."""
+
     @property
-    def truth(self) -> Sequence[Truth]: ...
+    def truth(self) -> Sequence[Truth]:
+        """The truth of each picture."""
 
 
 def detect_2d(detector: Detector, batches: Iterable[torch.Tensor], *, device: str = "cpu") -> Boxes2D:

@@ -95,9 +95,12 @@ class Condition(Protocol):
     """
 
     @property
-    def scene(self) -> str: ...
+    def scene(self) -> str:
+        """Name of the scene."""
+
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Its place below the folder of a detector's boxes: CONDITION/SCENE."""
 
     def shown(self, examination: Examination, data: NuScenes, detectors: Sequence[Watched]) -> Shown:
         """How these detectors are shown the scene."""
@@ -418,8 +421,14 @@ def score_found(
 
 
 def distinct_scenes(truth: GroundTruth) -> Any:
-    """Number [scenes] of the case that each scene shows: scenes whose true boxes are equal, sample by sample, are
-    copies of one drive."""
+    """Which scenes are copies of one drive: those whose true boxes are equal, sample by sample.
+
+    Args:
+        truth: True boxes of all scenes.
+
+    Returns:
+        Number of the drive that each scene shows [scenes].
+    """
     names: dict[str, int] = {}
     found = []
     boxes = truth.boxes

@@ -205,8 +205,11 @@ class SceneShifter:
         ]
 
     def _sun(self, sample_token: str) -> tuple[str, float | None]:
-        """The picture of a sample that the sun stands in most centrally, and the share of it that is free there; "" and
-        None when it stands in none that can be read."""
+        """The picture of a sample that shows the sun most centrally, and the share of the sun that is visible in it.
+
+        Returns:
+            File name and share; "" and None when the sun stands in no picture that can be read.
+        """
         if sample_token not in self._suns:
             toward = sun_direction(self.base, self.context)
             views = [(f, self._frame(f, TrackedBoxes.empty())) for f in self._cameras(sample_token) if _has_lens(f)]

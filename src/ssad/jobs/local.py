@@ -121,7 +121,12 @@ class Worker:
         return next((line for line in reversed(lines) if line), "")[:300]
 
     def how_it_ended(self) -> str:
-        """ "the process ended (killed by SIGSEGV)" or "(exit code 3)", with its last words."""
+        """Wait for the process, and say how it ended.
+
+        Returns:
+            Text such as "the process ended (killed by SIGSEGV)" or "the process ended (exit code 3)", with its last
+            words.
+        """
         code = self.process.wait()
         try:
             text = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -243,8 +248,11 @@ class LocalProcesses:
 
 
 def memory_left() -> tuple[int, int]:
-    """Bytes of memory of this machine (or of the container that this process is in), and how many are free to use; 0,
-    0 where that cannot be told."""
+    """Memory of this machine, or of the container that this process runs in.
+
+    Returns:
+        Total memory and the part that is free to use, bytes; (0, 0) where that is unknown.
+    """
     try:
         rows = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         total, free = (int(rows[name].split()[0]) * 1024 for name in ("MemTotal", "MemAvailable"))

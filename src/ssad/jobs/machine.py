@@ -39,9 +39,14 @@ def quiet_warp() -> None:
 
 
 def keep_memory(size: int = 1 << 30) -> None:
-    """Let this process keep the memory that tensors on the CPU come and go in, up to some bytes, where the C library is
-    glibc: it hands large blocks back to the system otherwise, and takes them anew, page by page, in each pass of a
-    network."""
+    """Let this process keep the memory of freed CPU tensors for reuse; takes effect only with glibc.
+
+    By default, glibc returns large blocks to the system and requests them again, page by page, in each pass of a
+    network.
+
+    Args:
+        size: Largest block, and most free memory at the end of the heap, that the process keeps, bytes.
+    """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
         library.mallopt(-3, size)  # M_MMAP_THRESHOLD

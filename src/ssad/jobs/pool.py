@@ -102,16 +102,21 @@ def run_all(
     timeout_s: float = float("inf"),
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[Any]:
-    """`function` of each argument, in order, for work that is of use only as a whole; what is done is on disk.
+    """Call a function on each argument, for work that is of use only as a whole; finished results are on disk.
 
     Args:
-        pool: where; it is used up.
-        function, arguments, timeout_s: see `Task`.
-        progress: called with how many are done, and of how many.
+        pool: Where the calls run; the pool is used up.
+        function: See `Task`.
+        arguments: What the function is called with, one task each; see `Task`.
+        timeout_s: Time limit of a task, s; see `Task`.
+        progress: Called with the number of finished tasks and the number of all tasks.
+
+    Returns:
+        The results, in the order of the arguments.
 
     Raises:
-        SSADError: what the function raised first; nothing more is begun then.
-        StoreError: some crashed or took too long, when all others are done.
+        SSADError: The first error that the function raised; no further task is started then.
+        StoreError: Some tasks crashed or took too long; raised once all others are done.
     """
     results: list[Any] = [None] * len(arguments)
     lost: list[str] = []

@@ -119,10 +119,17 @@ class GroupRow:
 
 
 def aggregate(outcomes: Sequence[Outcome]) -> dict[str, Estimate]:
-    """symbol of `METRICS` -> Estimate of one system; the order does not matter.
+    """Estimates of all metrics of one system, by their symbols in `METRICS`; the order of the outcomes does not matter.
 
-    Over one group, the mean of its distinct episodes; over several, the unweighted mean of the groups' means. This is
-    the one place where numbers of driving come from: tables, cards, figures and files all show what it gives.
+    Within one group, the estimate is the mean over its distinct episodes; over several groups, it is the unweighted
+    mean of the groups' means. All driving figures come from here: tables, cards, figures and files show these
+    estimates.
+
+    Args:
+        outcomes: The episodes of one system.
+
+    Returns:
+        Symbol of `METRICS` -> its estimate.
     """
     result = {}
     for symbol, metric in METRICS.items():

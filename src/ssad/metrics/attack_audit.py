@@ -148,8 +148,18 @@ def audit(attempts: Iterable[Attempt]) -> Verdict:
 
 
 def weaker(one: Attempt, other: Attempt) -> bool:
-    """Whether `one` leaves a higher score than `other`, beyond noise: two standard errors of the paired difference,
-    and a share of the clean score."""
+    """Whether one attempt leaves a higher score than another, beyond noise.
+
+    The margin for noise is a share (`NOISE`) of the clean score or two standard errors of the paired difference,
+    whichever is larger.
+
+    Args:
+        one: The attempt that may be the weaker attack.
+        other: The attempt to compare it with.
+
+    Returns:
+        True if `one` is the weaker attack.
+    """
     slack = NOISE * max(one.clean, 0.0)
     if len(one.draws) == len(other.draws) > 1:
         pairs = zip(one.draws, other.draws, strict=True)
@@ -251,8 +261,11 @@ def _restarts(attempts: Sequence[Attempt]) -> Iterator[Finding]:
 
 
 def _above_noise(attempts: Sequence[Attempt]) -> Iterator[Finding]:
-    """A budget may be too small for anything to change, so that an attack must beat noise at its largest one only; at
-    none may it be beaten by noise."""
+    """Attacks that do no better than random noise of the same size.
+
+    A small budget may be too small to change anything, so an attack must beat noise only at its largest budget; at no
+    budget may noise beat the attack.
+    """
     pairs = [
         (noise, one)
         for noise, group in _sizes(attempts)

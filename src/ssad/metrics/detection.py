@@ -71,7 +71,7 @@ class DetectionScores:
 
     @property
     def label_aps(self) -> dict[str, dict[str, float]]:
-        """class -> threshold as text -> AP."""
+        """AP by class and threshold: class -> threshold as text -> AP."""
         names = [str(t) for t in self.config.dist_ths]
         return {
             c: dict(zip(names, row, strict=True)) for c, row in zip(self.config.classes, self.ap.tolist(), strict=True)
@@ -79,28 +79,28 @@ class DetectionScores:
 
     @property
     def mean_dist_aps(self) -> dict[str, float]:
-        """class -> mean AP over the thresholds."""
+        """Mean AP over the thresholds, by class."""
         return {c: float(np.mean(row)) for c, row in zip(self.config.classes, self.ap, strict=True)}
 
     @property
     def mean_ap(self) -> float:
-        """mAP."""
+        """Mean average precision (mAP) over the classes."""
         return float(np.mean(list(self.mean_dist_aps.values())))
 
     @property
     def label_tp_errors(self) -> dict[str, dict[str, float]]:
-        """class -> error -> value, NaN where it has no meaning."""
+        """TP errors by class: class -> error -> value, NaN where it has no meaning."""
         rows = self.errors.tolist()
         return {c: dict(zip(TP_METRICS, row, strict=True)) for c, row in zip(self.config.classes, rows, strict=True)}
 
     @property
     def tp_errors(self) -> dict[str, float]:
-        """error -> mean over the classes for which it has a meaning."""
+        """TP errors: error -> mean over the classes for which it has a meaning."""
         return {name: float(np.nanmean(column)) for name, column in zip(TP_METRICS, self.errors.T, strict=True)}
 
     @property
     def tp_scores(self) -> dict[str, float]:
-        """error -> 1 - error, at least 0."""
+        """TP scores: error -> 1 - error, at least 0."""
         return {name: max(0.0, 1.0 - error) for name, error in self.tp_errors.items()}
 
     @property

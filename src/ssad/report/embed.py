@@ -42,8 +42,16 @@ def origin(graph: LaneGraph) -> tuple[float, float]:
 
 
 def episode_data(trace: EpisodeTrace, graph: LaneGraph) -> dict[str, Any]:
-    """One episode: agents' bodies, packed motion [3 A + 1 rows of T] x, y, yaw per agent, then presence, and the ego's
-    record, packed too. Events are (step, what)."""
+    """Data of one episode for the page.
+
+    Args:
+        trace: The episode.
+        graph: Its town.
+
+    Returns:
+        The agents' bodies; the packed motion: [3 A + 1 rows of T] x, y, yaw per agent, then presence (bits of 15 agents
+        a row); the packed record of the ego; its route; and the events.
+    """
     ox, oy = origin(graph)
     agents = len(trace.names)
     rows = []

@@ -1,8 +1,8 @@
-"""The paper's own tables (Li et al., "Towards Benchmarking and Assessing the Safety and
-Robustness of Autonomous Driving on Safety-critical Scenarios"), to be shown beside ours.
+"""The paper's own tables, to be shown beside ours.
 
-They were measured in CARLA 0.9.13 with SafeBench's agents; ours are another simulator. A test holds them against the
-paper's source.
+Source: Li et al., "Towards Benchmarking and Assessing the Safety and Robustness of Autonomous Driving on
+Safety-critical Scenarios". They were measured in CARLA 0.9.13 with SafeBench's agents; ours come from another
+simulator. A test compares them with the source of the paper.
 """
 
 from __future__ import annotations

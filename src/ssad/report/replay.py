@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ssad.core.errors import SSADError, StoreError
-from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.lane_graph import LaneGraph, load_graph, town_file
 from ssad.core.traces import load_trace
 from ssad.core.types import EpisodeTrace
 from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
@@ -31,10 +31,10 @@ def outcome_class(record: EpisodeRecord) -> str:
 
 def _graph(run: DrivingRun, town: str) -> LaneGraph:
     """The town as the run saw it. StoreError: the folder has lost it."""
-    own = run.folder / "towns" / f"{town}.npz"
+    own = run.folder / "towns" / town_file(town)
     if own.is_file():
         return load_graph(own)
-    raise StoreError(f"towns/{town}.npz is missing: this run folder is not complete")
+    raise StoreError(f"towns/{own.name} is missing: this run folder is not complete")
 
 
 def replay_data(run: DrivingRun) -> dict[str, Any]:

@@ -124,7 +124,7 @@ def tex(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A booktabs tabular; needs \\usepackage{booktabs}."""
+    r"""A booktabs tabular; it needs \usepackage{booktabs}."""
     lines = [
         "\\begin{tabular}{" + "l" * len(table.heads) + "c" * len(table.columns) + "}",
         "\\toprule",

@@ -1,5 +1,7 @@
-"""OpenDRIVE to lane graph: the XML says what is linked to what, carla.Map (in a process of its own) where it
-is."""
+"""OpenDRIVE to lane graph.
+
+The XML says how lanes are linked; carla.Map, in a process of its own, says where they are.
+"""
 
 from __future__ import annotations
 

@@ -130,7 +130,16 @@ def _measure(grid: Grid, pick: npt.NDArray[np.int32], xy: F32) -> tuple[F32, F32
 
 
 def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32]:
-    """seg [M, 4], seg_half [M, 2], seg_lane [M], seg_s [M] of all lanes of the given types, lane by lane."""
+    """Segments of the centre lines of all lanes of the given types, lane by lane.
+
+    Args:
+        graph: The town.
+        types: `LaneType` values.
+
+    Returns:
+        seg [M, 4]: x0, y0, x1, y1, m; seg_half [M, 2]: half widths at both ends, m; seg_lane [M]: lane; seg_s [M]: arc
+        length at the first end, m.
+    """
     lane = np.repeat(np.arange(graph.lanes, dtype=np.int32), np.diff(graph.offset))
     keep = (lane[:-1] == lane[1:]) & np.isin(graph.kind[lane[:-1]], np.asarray(types, np.uint8))
     i = np.flatnonzero(keep)
@@ -181,8 +190,19 @@ def build_grid(graph: LaneGraph, types: Sequence[int]) -> Grid:
 
 
 def nearest_all(graph: LaneGraph, xy: tuple[float, float], types: Sequence[LaneType]) -> tuple[I32, F64, F64]:
-    """For one point, every lane of the given types: lane [n], arc length of its nearest place [n] m, and distance
-    from the lane's strip [n] m (negative inside). Looks at every segment; for a few points, at any distance."""
+    """Distance from one point to every lane of the given types, however far away.
+
+    It looks at every segment, so it is meant for a few points; see `LaneQuery` for many.
+
+    Args:
+        graph: The town.
+        xy: The point, m.
+        types: Types of lanes to look at.
+
+    Returns:
+        lane [n]; arc length of the nearest place on each lane [n], m; distance from each lane's strip [n], m, negative
+        inside.
+    """
     seg, half, lane, s = segments(graph, tuple(int(t) for t in types))
     a, d = seg[:, :2].astype(np.float64), (seg[:, 2:] - seg[:, :2]).astype(np.float64)
     p = np.asarray(xy, np.float64) - a

@@ -37,8 +37,13 @@ class _Spot:
 
 @dataclass(frozen=True)
 class _Leg:
-    """A stretch of lanes that follow one another: (lane, s0, s1) each. `old`, if given, is the lane beside, and the
-    place on it, from which the path comes over while it drives this stretch."""
+    """A stretch of lanes that follow one another.
+
+    Attributes:
+        parts: Lane, s0 and s1 of each.
+        old: Lane beside this stretch, and the place on it, from which the path changes lanes while it drives this
+            stretch.
+    """
 
     parts: tuple[tuple[int, float, float], ...]
     old: tuple[int, float] | None = None

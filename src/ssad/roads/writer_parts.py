@@ -75,8 +75,15 @@ class Interchange:
 
 @dataclass(frozen=True)
 class Town:
-    """Streets whose ends meet at junctions; arms leave a junction along the axes. signalled: junction places; all other
-    junctions of three arms or more get signs."""
+    """Streets whose ends meet at junctions; arms leave a junction along the axes.
+
+    Attributes:
+        name: Name of the town.
+        streets: All streets.
+        signalled: Places of the junctions with traffic lights; all others of three or more arms get signs.
+        roundabouts: All roundabouts.
+        interchanges: All interchanges.
+    """
 
     name: str
     streets: tuple[RoadSpec, ...]
@@ -122,8 +129,15 @@ class Arm:
 
 @dataclass
 class Junction:
-    """Arms that meet. ring: it is the place where one arm meets a roundabout; apart: m from the place to the ends of
-    its arms, if not as far as right turns ask for."""
+    """Arms that meet.
+
+    Attributes:
+        id: OpenDRIVE id.
+        place: x, y of the middle, m.
+        arms: Ends of the streets that meet here.
+        ring: The roundabout, if the junction is where one arm meets a roundabout.
+        apart: Distance from the place to the ends of the arms, m; None: as far as right turns need.
+    """
 
     id: int
     place: Point
@@ -248,6 +262,7 @@ def road_element(name: str, number: int, junction: int, pieces: list[Piece]) -> 
 
 
 def lane_section(road: Element) -> Element:
+    """Add a road's lanes with no offset and one section from its start; returns the section."""
     lanes = SubElement(road, "lanes")
     SubElement(lanes, "laneOffset", s="0", a="0", b="0", c="0", d="0")
     return SubElement(lanes, "laneSection", s="0")
@@ -266,16 +281,19 @@ def lane_element(
 
 
 def mark_lane(lane: Element, kind: str, color: str) -> None:
+    """Add the paint on the outer edge of a lane; lane changes across it are allowed where it is broken and white."""
     change = "both" if kind == "broken" and color == "white" else "none"
     SubElement(lane, "roadMark", sOffset="0", type=kind, weight="standard", color=color, width="0.12",
                laneChange=change)  # fmt: skip
 
 
 def ahead(point: Point, heading: float, distance: float) -> Point:
+    """The point at a distance (m) from a point along a heading (rad)."""
     return point[0] + distance * math.cos(heading), point[1] + distance * math.sin(heading)
 
 
 def wrap(angle: float) -> float:
+    """An angle in -pi..pi, rad."""
     return math.remainder(angle, 2.0 * math.pi)
 
 

@@ -99,8 +99,14 @@ class SignalPlace:
 
 @dataclass(frozen=True)
 class SignPlace:
-    """A stop or yield sign, or a reference to one, on a road: for traffic along the road (way 1), against it (-1) or
-    both (0), on the lanes from low to high (0, 0: all)."""
+    """A stop or yield sign on a road, or a reference to one.
+
+    Attributes:
+        sign: Id of the signal.
+        way: Traffic it applies to: along the road (1), against it (-1) or both (0).
+        low: Lowest id of the lanes it applies to; 0 with `high` 0: all lanes.
+        high: Highest id of those lanes.
+    """
 
     sign: str
     way: int
@@ -134,8 +140,15 @@ class Connection:
 
 @dataclass(frozen=True)
 class Network:
-    """What an OpenDRIVE file says besides geometry. phase: light id -> place of its controller in the
-    cycle; signs: id -> what the sign says."""
+    """What an OpenDRIVE file says besides geometry.
+
+    Attributes:
+        roads: By id.
+        junctions: Connections by id of the junction.
+        lights: Ids of the traffic lights.
+        phase: Id of a light -> place of its controller in the cycle.
+        signs: Id of a sign -> what it says.
+    """
 
     roads: dict[int, Road]
     junctions: dict[int, tuple[Connection, ...]]

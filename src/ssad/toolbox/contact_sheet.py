@@ -25,8 +25,20 @@ from ssad.scenarios.static.shifts.sun import choose_sun
 
 
 def box_at(camera: Camera, rectangle: Sequence[float]) -> TrackedBoxes:
-    """A 3D box for a rectangle (x0, y0, x1, y1) in the picture of a level camera: it stands on the road where the
-    rectangle ends, faces the camera, and is as deep as 1.6 of its width. ConfigError when it ends above the horizon."""
+    """A 3D box for a rectangle in the picture of a level camera.
+
+    The box stands on the road where the rectangle ends, faces the camera, and its depth is 1.6 times its width.
+
+    Args:
+        camera: The camera; it must look horizontally.
+        rectangle: x0, y0, x1, y1 in pixels.
+
+    Returns:
+        One box, which drives away slightly to the left.
+
+    Raises:
+        ConfigError: The rectangle is narrower or lower than 4 pixels, or does not end below the horizon.
+    """
     x0, y0, x1, y1 = map(float, rectangle)
     k = camera.intrinsic
     height = float(camera.to_ego[2, 3])

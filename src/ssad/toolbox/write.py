@@ -29,8 +29,16 @@ SHARD_S = 7200.0  # s that a scene under a shift may take
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A root as it stands: how many files were shifted, linked, failed; share of the images that changed; why files
-    failed. With a failed file it has no manifest.json and is not complete."""
+    """State of a written nuScenes root; with failed files it has no manifest.json and is incomplete.
+
+    Attributes:
+        root: The folder.
+        shifted: Number of images written with the shift.
+        linked: Number of files linked to the original.
+        failed: Number of files that failed.
+        applied: Share of the images that changed.
+        reasons: Why files failed.
+    """
 
     root: Path
     shifted: int

@@ -62,8 +62,21 @@ class PictureSet:
 
 
 def fill(items: Sequence[Item], *, device: str = "cpu", threads: int | None = None) -> PictureSet:
-    """Reads all pictures, in parallel, to the device; if it has no room for them, to the host; if that has none, they
-    stay on disk and are read when they are wanted. ConfigError: no picture, or pictures of different sizes."""
+    """Read all pictures, in parallel, into the fastest memory that has room for them.
+
+    That is the device, else the host; if neither has room, they stay on disk and are read when they are needed.
+
+    Args:
+        items: The pictures; at least one.
+        device: Where they should be.
+        threads: Threads that read; None: a quarter of the cores, at least 8.
+
+    Returns:
+        The pictures and their truth.
+
+    Raises:
+        ConfigError: There is no picture, or the pictures differ in size.
+    """
     if not items:
         raise ConfigError("no picture to train on")
     shape = items[0].read().shape
@@ -102,8 +115,20 @@ def free_memory(device: str) -> float:
 
 
 def repeats(truths: Sequence[Truth], least: float) -> F64 | None:
-    """How often each picture is shown an epoch, so that rare classes are seen: at least once; sqrt(least / share) times
-    if it shows a class whose share of the pictures is under `least` (Gupta et al., LVIS, CVPR 2019). None: all once."""
+    """How often to show each picture in an epoch, so that rare classes are seen.
+
+    A picture is shown at least once; it is shown sqrt(least / share) times if it shows a class whose share of the
+    pictures is below `least`.
+
+    Args:
+        truths: The truth of each picture [n]; crowd objects do not count.
+        least: Share of the pictures below which a class counts as rare; 0 or less: each picture is shown once.
+
+    Returns:
+        Times, not rounded [n]; None: all once.
+
+    Source: Gupta, Dollár and Girshick, LVIS: A Dataset for Large Vocabulary Instance Segmentation (CVPR 2019).
+    """
     if least <= 0:
         return None
     kinds = [torch.unique(t.label if t.crowd is None else t.label[~t.crowd]).tolist() for t in truths]
@@ -113,8 +138,19 @@ def repeats(truths: Sequence[Truth], least: float) -> F64 | None:
 
 
 def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = None) -> list[list[int]]:
-    """Indices of each batch of an epoch; the last one is dropped if it is short, unless it is the only one. often:
-    see `repeats`; what is left of a whole number is drawn, so that every epoch has as many batches."""
+    """Random batches of an epoch.
+
+    Args:
+        count: Number of pictures.
+        batch: Pictures in a batch; a short last batch is dropped unless it is the only one.
+        seed: Seed of the training.
+        epoch: Number of the epoch.
+        often: How often each picture is shown [count] (see `repeats`). Fractions are drawn at random such that every
+            epoch has the same number of batches.
+
+    Returns:
+        Indices of each batch.
+    """
     rng = np.random.default_rng([seed, epoch])
     shuffled = rng.permutation(count)
     if often is not None:
@@ -184,9 +220,20 @@ def draw_change(
 def change_truths(
     truths: Sequence[Truth], changes: Sequence[Change], size: tuple[int, int], *, keep: float
 ) -> list[Truth]:
-    """Truth of changed pictures of one size, all with or all without 3D boxes. Objects go whose visible share falls
-    under `keep` (2D) or whose middle leaves the picture (3D); those that go in 2D become crowd while a part of them is
-    in sight."""
+    """Truth of changed pictures.
+
+    In 2D, an object whose visible share falls below `keep` becomes crowd, and is removed once it is out of sight. In
+    3D, an object is removed when its middle leaves the picture.
+
+    Args:
+        truths: Truth before the change, all with or all without 3D boxes.
+        changes: What happened to each picture.
+        size: Height and width, the same for all pictures.
+        keep: Least visible share of an object that counts, in 2D.
+
+    Returns:
+        Truth after the change.
+    """
     height, width = size
     counts = torch.tensor([len(t.label) for t in truths])
     image = torch.repeat_interleave(torch.arange(len(truths)), counts)

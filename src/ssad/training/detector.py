@@ -40,8 +40,21 @@ VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the e
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A training: recipe by name, folders of data, where to write, splits, changed values of the recipe; val_data:
-    another data set in the nuScenes schema to validate on."""
+    """A training run.
+
+    Attributes:
+        recipe: Name of the recipe.
+        data: Folders of data.
+        out: Folder to write to.
+        split: Split to train on.
+        val: Split to validate on.
+        changes: Changed values of the recipe.
+        weights: First weights; None: fresh ones.
+        device: auto, cpu or cuda.
+        gpus: How many GPUs to train on.
+        seconds: Time limit, s; None: none.
+        val_data: Another data set in the nuScenes schema to validate on.
+    """
 
     recipe: str
     data: tuple[Path, ...]
@@ -189,8 +202,13 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
 
 
 def _before(weights: Path | None) -> dict[str, Any]:
-    """What the card of the first weights says about how they were made, and what they had been made of in turn; what
-    lies beside them may be no card of ours. FormatError: it is no JSON."""
+    """How the first weights were made, and what they were made from in turn, by the card beside them.
+
+    The file beside the weights may not be a card of ours; what it lacks is left out.
+
+    Raises:
+        FormatError: The card is not JSON.
+    """
     if weights is None:
         return {}
     path = weights.with_suffix(".json")

@@ -262,8 +262,20 @@ def write_row(out: Path, row: dict[str, Any]) -> None:
 
 
 def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
-    """What a training left to go on with, None if there is nothing. FormatError: broken, of another recipe, of other
-    data or first weights."""
+    """The state from which an interrupted training goes on.
+
+    Args:
+        path: The file that the training wrote.
+        recipe: The recipe of this training.
+        about: Data, first weights and number of GPUs of this training.
+
+    Returns:
+        The state; None if there is none.
+
+    Raises:
+        FormatError: The file is broken, or comes from another recipe, other data, other first weights or another number
+            of GPUs.
+    """
     if not path.is_file():
         return None
     try:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
+from ssad.core.driving import Policies
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import ENDS, Controller, End, Episode
@@ -75,7 +76,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """`num_envs` scenes, each an episode drawn from the bank; an ended scene starts another one in the same step.
 
     Observations [num_envs, 4 | 24] float32, actions as `action_space`, `reward` "safebench", "frea" or a function of
-    the state. `drivers` act for other agents than the ego, as in `rollout`. Without `restart` ended scenes stand still.
+    the state. `drivers` act for other agents than the ego, and `policies` makes those that episodes name, as in
+    `rollout`. Without `restart` ended scenes stand still.
     Terminated by collision or completion, truncated by the episode's limits. `info["end"]` names why.
     """
 
@@ -91,6 +93,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         action: Action = "safebench",
         reward: str | Reward = "safebench",
         drivers: Drivers | None = None,
+        policies: Policies | None = None,
         device: str = "cpu",
         restart: bool = True,
     ) -> None:
@@ -113,7 +116,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             device=device,
             ego=Controller.EXTERNAL,
         )
-        self._loop = Loop(self.world, drivers or {})
+        self._loop = Loop(self.world, drivers or {}, policies=policies)
         self._egos = np.stack([np.arange(num_envs), np.zeros(num_envs)], 1).astype(np.int32)
         self._controls = np.zeros((num_envs, self.world.agents, 3), np.float32)
 

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Driver, Perturbation, Scenes, Selector, Sensor, Simulator, WorldState
+from ssad.core.driving import Driver, Perturbation, Policies, Scenes, Selector, Sensor, Simulator, WorldState
 from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
-from ssad.core.types import ENDS, F32, I32, AgentKind, Controller, End, EpisodeTrace
+from ssad.core.types import ENDS, F32, I32, AgentKind, Bool, Controller, End, EpisodeTrace, Route
 from ssad.world.observation import observe
 from ssad.world.sensors import SENSORS
 
@@ -25,8 +26,9 @@ class Loop:
     `drivers` says who acts for whom: an agent's number, or a selector that chooses at every step whom its driver takes
     over (those it no longer chooses are given back). Agents that nobody is named for are driven by what their episode
     says. All that changes lies in the simulator, so that a snapshot of it continues to the bit if its drivers do.
-    `sensors` adds to those of `ssad.world.sensors`; only what a driver asks for is computed. `perturbation` changes
-    the pictures ([N, C, H, W]) that drivers get.
+    An episode may also name an agent's driver (`EpisodeAgent.policy`), which `policies` makes; whoever is in `drivers`
+    goes before it. `sensors` adds to those of `ssad.world.sensors`; only what a driver asks for is computed.
+    `perturbation` changes the pictures ([N, C, H, W]) that drivers get.
     """
 
     def __init__(
@@ -36,9 +38,16 @@ class Loop:
         *,
         sensors: Mapping[str, Sensor] | None = None,
         perturbation: Perturbation | None = None,
+        policies: Policies | None = None,
     ) -> None:
         self.simulator = simulator
         self.drivers = list(drivers.items())
+        for name in sorted({agent.policy for episode in simulator.episodes for agent in episode.agents} - {""}):
+            if policies is None:
+                raise ConfigError(
+                    f"an actor follows the policy '{name}': say who makes drivers, policies=ssad.make_system"
+                )
+            self.drivers.append((_told_to(simulator, name, len(self.drivers)), policies(name)))
         self.sensors = SENSORS | dict(sensors or {})
         self.perturbation = perturbation
         shape = (simulator.batch, simulator.agents)
@@ -49,6 +58,10 @@ class Loop:
                 if name not in self.sensors:
                     known = ", ".join(self.sensors)
                     raise ConfigError(f"driver {driver.name} asks for sensor '{name}'; known: {known}")
+        # sensors that remember follow every step, also while nobody looks
+        asked = {name for _, driver in self.drivers for name in getattr(driver, "sensors", ())}
+        following = (getattr(self.sensors[name], "follow", None) for name in sorted(asked))
+        self._following = [follow for follow in following if follow is not None]
         self._controls = np.zeros((*shape, 4), np.float32)
         self._fixed = [
             np.stack([np.arange(shape[0]), np.full(shape[0], who)], 1).astype(np.int32)
@@ -93,6 +106,8 @@ class Loop:
             given = np.asarray(controls, np.float32)
             self._controls[..., : given.shape[-1]] = given
         asked = controls is not None
+        for follow in self._following:
+            follow(self.simulator)
         state: WorldState | None = None
         for policy, (who, driver) in enumerate(self.drivers):
             agents = self._fixed[policy]
@@ -144,6 +159,19 @@ class Loop:
         return self.perturbation.apply(reading, driver, state, generators)
 
 
+def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
+    """The agents that their episodes give to a policy, driver `number`, and that nobody else has taken over."""
+    told = np.zeros((len(simulator.episodes), simulator.agents), bool)
+    for row, episode in zip(told, simulator.episodes, strict=True):
+        row[: len(episode.agents)] = [agent.policy == policy for agent in episode.agents]
+
+    def choose(state: WorldState) -> Bool:
+        free = (state.policy < 0) | (state.policy == number)
+        return np.asarray(told[simulator.assigned] & free & state.active)
+
+    return choose
+
+
 def run(loop: Loop) -> None:
     """Start all scenes again and step them to their ends."""
     loop.reset()
@@ -166,6 +194,7 @@ def rollout(
     *,
     sensors: Mapping[str, Sensor] | None = None,
     perturbation: Perturbation | None = None,
+    policies: Policies | None = None,
 ) -> list[EpisodeTrace]:
     """Drive all scenes of a simulator from their starts to their ends.
 
@@ -174,15 +203,17 @@ def rollout(
         drivers: Who drives whom, as `Loop` takes it; a driver alone drives the egos.
         sensors: What drivers may ask for besides `ssad.world.sensors.SENSORS`.
         perturbation: What changes the pictures that drivers get.
+        policies: Makes the drivers that episodes name, such as `ssad.drivers.make_system`.
 
     Returns:
         A trace of each scene.
 
     Raises:
-        ConfigError: A driver returns controls of a wrong shape or not finite, or asks for what is not there.
+        ConfigError: A driver returns controls of a wrong shape or not finite, or asks for what is not there. Episodes
+            name drivers, and there is no `policies`.
     """
     by_agent: Drivers = drivers if isinstance(drivers, Mapping) else {0: drivers}
-    loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation)
+    loop = Loop(simulator, by_agent, sensors=sensors, perturbation=perturbation, policies=policies)
     loop.reset()
     rows = [_row(simulator.state())]
     lengths = np.zeros(simulator.batch, np.int64)
@@ -194,6 +225,12 @@ def rollout(
         if (simulator.ended() != End.RUNNING).all():
             break
     return [_trace(simulator, rows, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
+
+
+def route_signals(graph: LaneGraph, route: Route) -> I32:
+    """The signals at the junctions that a route passes: those whose states a trace keeps."""
+    junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
+    return np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
 
 
 def _row(state: WorldState) -> dict[str, npt.NDArray[np.generic]]:
@@ -232,8 +269,7 @@ def _trace(simulator: Simulator, rows: list[dict[str, npt.NDArray[np.generic]]],
     }
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
-    junctions = {int(graph.junction[k]) for k in np.unique(route.lane[route.lane >= 0])} - {-1}
-    near = np.flatnonzero(np.isin(graph.signal_junction, sorted(junctions))).astype(np.int32)
+    near = route_signals(graph, route)
     ego["signal"] = ego["signal"][:, near]
     return EpisodeTrace(
         key=episode.key,

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ssad.core.driving import Policies
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Condition, Controller, End, Episode, EpisodeAgent, Phase, Route
 from ssad.world.rollout import Loop, run
@@ -96,21 +97,31 @@ def _manoeuvres(start: float, target: float) -> Iterator[Manoeuvre]:
 
 
 def _run(
-    episode: Episode, graphs: Mapping[str, LaneGraph], drivers: list[EpisodeAgent], device: str
+    episode: Episode,
+    graphs: Mapping[str, LaneGraph],
+    drivers: list[EpisodeAgent],
+    device: str,
+    policies: Policies | None,
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Why each driver's episode ended (`End`) and its route completion in percent."""
     bank = [replace(episode, agents=(d, *episode.agents[1:])) for d in drivers]
     world = World(bank, graphs, device=device)
-    run(Loop(world, {}))
+    run(Loop(world, {}, policies=policies))
     return world.ended().copy(), world.state().route_complete.copy()
 
 
-def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> Witness:
-    """Search for a driver that stays clear; see `Witness`. Deterministic; some hundred scenes run side by side."""
+def find_witness(
+    episode: Episode, graph: LaneGraph, *, device: str = "cpu", policies: Policies | None = None
+) -> Witness:
+    """Search for a driver that stays clear; see `Witness`. Deterministic; some hundred scenes run side by side.
+
+    policies: makes the drivers that the episode names for other agents, as in `rollout`.
+    """
     graphs = {episode.town: graph}
     ego = replace(episode.agents[0], controller=Controller.FOLLOW, phases=())
     blind = World([replace(episode, agents=(ego, *episode.agents[1:]))], graphs, device=device)
-    loop = Loop(blind, {})
+    loop = Loop(blind, {}, policies=policies)
+    loop.reset()
     trigger = float("nan")
     place: list[float] = []
     scripted = [i for i, a in enumerate(episode.agents) if a.controller == Controller.SCRIPT and a.phases]
@@ -131,13 +142,13 @@ def find_witness(episode: Episode, graph: LaneGraph, *, device: str = "cpu") -> 
     for verdict, start in stages:
         options = [m for m in _manoeuvres(start, ego.target_speed) if m.start < crash]
         drivers = [_drive(ego, m, place[min(int(m.start / blind.dt), len(place) - 1)]) for m in options]
-        ends, complete = _run(episode, graphs, drivers, device)
+        ends, complete = _run(episode, graphs, drivers, device, policies)
         tried += len(options)
         clear = np.flatnonzero(ends != End.COLLISION)
         if len(clear):
             best = max(clear, key=lambda k: (complete[k] >= 100.0, -abs(options[k].offset), complete[k], -k))
             return Witness(verdict, trigger, options[best], float(complete[best]), len(clear), tried)
-    ends, complete = _run(episode, graphs, [replace(ego, controller=Controller.AUTOPILOT)], device)
+    ends, complete = _run(episode, graphs, [replace(ego, controller=Controller.AUTOPILOT)], device, policies)
     tried += 1
     if ends[0] != End.COLLISION:
         return Witness("autopilot", trigger, None, float(complete[0]), 1, tried)

@@ -1,5 +1,7 @@
-"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema; and what
-it has in common with other kinds that score 3D detectors under conditions."""
+"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema.
+
+It also has what other kinds that score 3D detectors under conditions need.
+"""
 
 from __future__ import annotations
 

@@ -102,8 +102,11 @@ class Digital(DetectorKind):
         return [AttackedScene(spec, scene, batch, source) for spec in specs for scene in scenes]
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """Scenes whose boxes are still to be found; clean ones, which every cell is compared with, for all systems at
-        once, and so are pictures that are made against one system and shown to several."""
+        """See `Kind`: the scenes whose boxes are still to be found.
+
+        Clean scenes, which every cell is compared with, are done for all systems at once; so are pictures that are made
+        against one system and shown to several.
+        """
         found: dict[str, Any] = {}
         for one in self.scenes(cell, job):
             clean = ShiftedScene(None, 0, one.scene)

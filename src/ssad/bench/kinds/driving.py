@@ -21,7 +21,7 @@ from ssad.core import safeio
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
-from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph
+from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph, town_file
 from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -105,7 +105,8 @@ class Driving(Kind):
                 data = scenario_json(scenario)
                 text = safeio.dump_json(data)
                 group = scenario.group or scenario.type
-                versions = systems[system], towns.get(scenario.town, ""), type_version(scenario.type)
+                versions = [systems[system], towns.get(scenario.town, ""), type_version(scenario.type)]
+                versions += [system_version(name) for name in policies_of(scenario)]
                 for repetition in range(suite.repetitions):
                     seed = seed32("episode", suite.seed, text, repetition)
                     name = f"{system}/{scenario.name}{f'#{repetition}' if repetition else ''}"
@@ -118,8 +119,8 @@ class Driving(Kind):
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
         for name in plan.inputs["towns"]:
-            path = folder / "towns" / f"{name}.npz"
-            if Path(name).name == name and not path.exists():
+            path = folder / "towns" / town_file(name)
+            if not path.exists():
                 save_graph(town(name), path)
         safeio.make_folder(folder / "traces")
         return {"witness": plan.suite.witness}
@@ -210,6 +211,11 @@ def system_version(name: str) -> str:
     return source_version((found if isinstance(found, type) else type(found)).__module__)
 
 
+def policies_of(scenario: Scenario) -> list[str]:
+    """The drivers that a scenario names for its actors, each once."""
+    return sorted({actor.policy for actor in scenario.actors} - {""})
+
+
 def type_version(name: str) -> str:
     """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one.
 
@@ -283,6 +289,7 @@ def _check(cell: Cell) -> None:
 
 def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
     """Episodes and traces of cells that share a system and a simulator, run as one batch."""
+    from ssad.drivers import make_system
     from ssad.interchange.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
     from ssad.world.world import World
@@ -290,7 +297,7 @@ def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[Ep
     episodes = [episode_of(cell) for cell in cells]
     graphs = {episode.town: town(episode.town) for episode in episodes}
     simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
-    return episodes, rollout(simulator, system_of(cells[0].system))
+    return episodes, rollout(simulator, system_of(cells[0].system), policies=make_system)
 
 
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
@@ -298,6 +305,7 @@ def witness(folder: Path, episode: Episode, speed: float | None, device: str) ->
 
     Searched once for an episode and speed, whichever systems collide in it.
     """
+    from ssad.drivers import make_system
     from ssad.world.witness import find_witness
 
     if speed is not None:
@@ -308,7 +316,7 @@ def witness(folder: Path, episode: Episode, speed: float | None, device: str) ->
     if path.exists():
         found: dict[str, Any] = safeio.read_json(path)
         return found
-    found = plain(find_witness(episode, town(episode.town), device=device).as_dict())
+    found = plain(find_witness(episode, town(episode.town), device=device, policies=make_system).as_dict())
     safeio.write_atomic(path, safeio.dump_json(found) + "\n")
     return found
 
@@ -347,7 +355,7 @@ def make_pictures(names: Sequence[str], folder: Path) -> None:
             captions["camera.jpg"] = f"An episode of this run ({chosen.stem}) from the ego's camera and from above."
             if not (target / "camera.jpg").is_file():
                 trace = load_trace(chosen)
-                graph = load_graph(folder / "towns" / f"{trace.town}.npz")
+                graph = load_graph(folder / "towns" / town_file(trace.town))
                 save_picture(target / "camera.jpg", onboard_sheet(trace, graph))
     if captions:
         safeio.write_atomic(target / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")

@@ -173,13 +173,16 @@ class MemoryIndex:
             self._rows[name] = table
 
     def rows(self, kind: type[R]) -> list[R]:
+        """A whole table."""
         return list(self._table(kind).values())
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
+        """Rows by token; absent tokens are left out."""
         table = self._table(kind)
         return {token: table[token] for token in tokens if token in table}
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
+        """Rows whose parent (`PARENT`) is one of the given tokens, parent by parent."""
         below: Any = self._children[_NAME[kind]]
         return [row for parent in dict.fromkeys(parents) for row in below.get(parent, ())]
 
@@ -199,16 +202,20 @@ class FileIndex:
         self._local = threading.local()
 
     def rows(self, kind: type[R]) -> list[R]:
+        """A whole table. Raises StoreError when the file cannot be read."""
         return [self._row(kind, body) for (body,) in self._ask(f"SELECT body FROM {_NAME[kind]} ORDER BY rowid", ())]
 
     def get(self, kind: type[R], tokens: Iterable[str]) -> dict[str, R]:
+        """Rows by token; absent tokens are left out. Raises StoreError when the file cannot be read."""
         found = self._in(kind, "token", list(dict.fromkeys(tokens)))
         return {row.token: row for row in found}
 
     def children(self, kind: type[R], parents: Sequence[str]) -> list[R]:
+        """Rows whose parent (`PARENT`) is one of the given tokens. Raises StoreError when the file cannot be read."""
         return self._in(kind, "parent", list(dict.fromkeys(parents)))
 
     def close(self) -> None:
+        """Close this thread's connection; the next query opens a new one."""
         connection = getattr(self._local, "connection", None)
         if connection is not None:
             connection.close()

@@ -239,7 +239,7 @@ def _quotes(text: bytearray) -> int:
 
 
 def _place(error: msgspec.MsgspecError) -> str:
-    """msgspec's message with its path `$[3].size` in words."""
+    """The message of a msgspec error, with its path `$[3].size` in words."""
     text = str(error)
     found = re.search(r" - at `\$(?:\[(\d+|\.\.\.)\])?\.?(.*?)`$", text)
     if found is None:

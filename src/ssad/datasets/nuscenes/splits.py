@@ -17,7 +17,7 @@ from ssad.datasets.nuscenes.tables import stream, table_path
 
 @cache
 def official_splits() -> Mapping[str, tuple[str, ...]]:
-    """name -> scene names: train, val, test, mini_train, mini_val, train_detect, train_track."""
+    """Scene names by name of the split: train, val, test, mini_train, mini_val, train_detect, train_track."""
     data = safeio.read_json(Path(__file__).with_name("splits.json"))
     return {name: tuple(f"scene-{number:04d}" for number in numbers) for name, numbers in data.items()}
 

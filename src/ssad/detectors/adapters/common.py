@@ -134,8 +134,16 @@ def log_odds(logit: Tensor) -> Tensor:
 
 
 def suppress(score: Tensor, label: Tensor, box: Tensor, *, iou: float, limit: int, size: tuple[int, int]) -> Detections:
-    """Detections from candidates [N] of one image, best first: boxes cut to the picture of `size`, suppression within
-    a class at more than `iou`, at most `limit`."""
+    """Detections of one image from candidates, best first, by suppression within each class.
+
+    Args:
+        score: Score of each candidate [N].
+        label: Class index [N].
+        box: Boxes [N, 4]; they are clipped to the picture.
+        iou: IoU above which the worse of two boxes of a class is dropped.
+        limit: Maximum number of detections.
+        size: Height and width of the picture.
+    """
     height, width = size
     edge = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
     cut = box.clamp(min=0).minimum(edge)

@@ -77,8 +77,11 @@ class OneStage(Adapter):
         )
 
     def choose(self, dense: Dense, least: float) -> list[Detections]:
-        """As the source: FCOS and RetinaNet the 1,000 best of each level, SSD the 400 best of each class; then
-        suppression within a class."""
+        """Detections above a score, chosen as in torchvision.
+
+        FCOS and RetinaNet keep the 1,000 best candidates of each level, SSD the 400 best of each class; then follows
+        suppression within each class.
+        """
         score = dense.logit.sigmoid()
         if dense.quality is not None:
             score = (score * dense.quality.sigmoid()[..., None]).sqrt()
@@ -108,8 +111,11 @@ class OneStage(Adapter):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """The source's: FCOS by centre sampling and size, the others by overlap with the anchors. Places that would
-        answer for a crowd object are ignored. extra: box [B, P, 4], the target in pixels of the picture."""
+        """Target assignment as in torchvision: FCOS by centre sampling and size, the others by overlap with anchors.
+
+        Places that would be assigned to a crowd object are ignored. extra: box [B, P, 4], the target in pixels of the
+        picture.
+        """
         scale = dense.maps["scale"][0]
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
         owner = torch.stack([self._match(targets, k, dense) for k in range(len(truth))])

@@ -144,9 +144,11 @@ class TwoStage(Adapter):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """By overlap of proposals, and of anchors for the first stage, with the objects. extra: box [B, K, 4] the
-        target in pixels of the picture; anchor_label [B, A] (1 object, 0 background, -2 ignored); anchor_box;
-        proposals [B, K, 4] for which it was made."""
+        """Target assignment by overlap of the objects with proposals, and with anchors for the first stage.
+
+        extra: box [B, K, 4], the target in pixels of the picture; anchor_label [B, A] (1 object, 0 background, -2
+        ignored); anchor_box [B, A, 4]; proposals [B, K, 4] that the assignment was made for.
+        """
         scale, anchors = dense.maps["scale"][0], dense.maps["anchors"][0]
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
         label, owner, target = self._second(dense, targets, targets.label)
@@ -191,9 +193,17 @@ class TwoStage(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """loss_classifier, loss_box_reg, loss_objectness, loss_rpn_box_reg, the expected values over the source's
-        random choice; see the module. Proposals that are not those of the assignment (the picture has changed) are
-        matched anew to the same objects, with the classes that the assignment gives to them."""
+        """Training losses: expected values over the random choices of the source; see the module.
+
+        If the proposals are not those of the assignment because the picture has changed, they are matched anew to the
+        same objects, with the classes that the assignment gives them.
+
+        Returns:
+            loss_classifier, loss_box_reg, loss_objectness and loss_rpn_box_reg.
+
+        Raises:
+            ConfigError: The assignment was made for pictures of another number or size.
+        """
         if assignment.label.shape != dense.box.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         rpn, roi, maps, scale = self.model.rpn, self.model.roi_heads, dense.maps, dense.maps["scale"][0]

@@ -140,8 +140,16 @@ class Ultralytics(Adapter):
         self.requires_grad_(False).eval()
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type,
-        or a head that answers in another way than those of YOLOv8 and YOLO11 do."""
+        """Raw outputs, differentiable with respect to the images.
+
+        Args:
+            images: [B, 3, H, W] in [0, 1].
+            intrinsic: Not used.
+
+        Raises:
+            ConfigError: The images have another shape or type, or the head's output does not have the form of YOLOv8's
+                and YOLO11's.
+        """
         size = check_images(self.name, images)
         inside, scale = size_inside(size, self.input_width), self._scale(size, images.device)
         images = images.to(next(self.network.parameters()).dtype)
@@ -172,9 +180,12 @@ class Ultralytics(Adapter):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """Task-aligned assignment (TOOD): of the cells inside an object the ten at which score^0.5 * CIoU^6 is largest;
-        a cell that several objects want goes to the one it overlaps most. It depends on what the network says. extra:
-        box [B, P, 4] in pixels of the picture, weight [B, P]: the score that a place is to have."""
+        """Task-aligned target assignment (TOOD), which depends on the predictions of the network.
+
+        Of the cells inside an object, the ten with the largest score^0.5 * CIoU^6 are assigned to it; a cell that
+        several objects claim goes to the one it overlaps most. extra: box [B, P, 4] in pixels of the picture; weight
+        [B, P]: target score of each place.
+        """
         scale = self._scale(dense.size, dense.box.device).to(dense.box)
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
         rows = [self._assign_one(dense, targets, k, scale) for k in range(len(truth))]
@@ -215,9 +226,17 @@ class Ultralytics(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """box (7.5 * (1 - CIoU)), cls (0.5 * cross-entropy) and dfl (1.5 * distribution focal loss), the first and last
-        weighted by the wanted scores, all over the sum of those, at least 1 (the source multiplies by the size of the
-        batch as well; this does not)."""
+        """Training losses with the gains of the source, each divided by the sum of the target scores (at least 1).
+
+        The source multiplies by the batch size as well; this does not.
+
+        Returns:
+            Three losses. box: 7.5 * (1 - CIoU), weighted by the target scores; cls: 0.5 * cross-entropy; dfl: 1.5 *
+            distribution focal loss, weighted by the target scores.
+
+        Raises:
+            ConfigError: The assignment was made for pictures of another number or size.
+        """
         if assignment.label.shape != dense.box.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         images = len(dense.box)

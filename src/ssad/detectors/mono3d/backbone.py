@@ -14,8 +14,10 @@ BLOCKS = {50: (3, 4, 6, 3), 101: (3, 4, 23, 3)}
 
 
 class DeformConv(nn.Module):
-    """Modulated deformable 3 x 3 convolution: `conv_offset` gives 9 vertical, 9 horizontal shifts (interleaved as
-    y, x) and 9 masks a place. Starts as an ordinary convolution at half weight."""
+    """Modulated deformable 3 x 3 convolution, which starts as an ordinary convolution with half the weights.
+
+    For each place, `conv_offset` predicts 9 vertical and 9 horizontal offsets (interleaved as y, x) and 9 masks.
+    """
 
     def __init__(self, inside: int, outside: int, *, stride: int = 1, bias: bool = False) -> None:
         super().__init__()

@@ -23,19 +23,35 @@ BASE_DIMS = (
 
 @dataclass(frozen=True, slots=True)
 class Mono3DConfig:
-    """A detector. trunk: ResNet depth (101 or 50, caffe style, deformable in its last two stages), or 18 for the light
-    one of basic blocks with `width` channels in its first stage; channels: of neck and heads; strides: one a level;
-    ranges: largest side distance (pixels) that a level answers for; deformable: in the heads' second convolutions;
-    pgd: 2D boxes, depth bins and their fusion with the regressed depth.
+    """Configuration of a monocular 3D detector.
 
-    code_weights: of offset, depth, size, yaw, velocity (and 2D box) in the loss; threshold, nms, before, most: least
-    score, IoU on the ground, places kept of each level, detections kept of an image; image_nms: IoU in the image above
-    which the worse of two of a class goes as well (None: none do, as in the source): two guesses of one object's depth
-    do not overlap on the ground. input_width: pictures are resized to it inside;
-    virtual_focal: depth is predicted as for a camera of this focal length (pixels, after resizing) and scaled.
-    mean, std: of B, G, R in 0..255; start: depth, length, height, width that fresh weights predict (None: 1, as the
-    source); rays: the regression also sees where each place looks (tangents to the right of and below the axis),
-    so that the line where an object meets the ground tells its distance whatever the lens.
+    Attributes:
+        name: Name of the detector.
+        trunk: Depth of the ResNet: 101 or 50 (caffe style, deformable in its last two stages), or 18 for the light one
+            of basic blocks.
+        width: Channels of the first stage of the light trunk.
+        channels: Channels of neck and heads.
+        strides: Stride of each level.
+        ranges: Largest distance from a place to a side of its box (pixels) that each level predicts.
+        deformable: Whether the second convolutions of the heads are deformable.
+        pgd: Whether to predict 2D boxes and depth bins, and to fuse the bins with the regressed depth (PGD).
+        code_weights: Weights in the loss of offset, depth, size, yaw, velocity (and 2D box).
+        threshold: Least score of a detection.
+        nms: IoU on the ground above which the worse of two boxes of a class is dropped.
+        image_nms: IoU in the image above which the worse of two boxes of a class is dropped as well: two guesses of one
+            object's depth do not overlap on the ground. None: not used, as in the source.
+        before: Places kept of each level before suppression.
+        most: Maximum number of detections in an image.
+        input_width: Width to which pictures are resized inside; None: they are not.
+        virtual_focal: Focal length (pixels, after resizing) of the camera for which depth is predicted; the depth is
+            then scaled to the real one. None: no scaling.
+        mean: Mean of B, G and R in 0..255.
+        std: Standard deviation of B, G and R.
+        start: Depth, length, height and width that fresh weights predict; None: 1, as in the source.
+        rays: Whether the regression also sees the viewing direction of each place (tangents to the right of and below
+            the optical axis), so that the line where an object meets the ground tells its distance for any lens.
+        radius: Radius of centre sampling, in strides.
+        dir_offset: Offset of the yaw's direction bins, rad.
     """
 
     name: str

@@ -12,8 +12,16 @@ NEAR = 0.1  # m in front of the camera at which corners are held
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """Maps of all levels as rows, levels one after the other, each row by row: logit [B, P, 10], reg [B, P, 9 or 13]
-    (see `Head.forward`), direction [B, P, 2], attribute [B, P, 9], centreness [B, P], bins [B, P, 6] or None."""
+    """Maps of all levels as rows: level after level, each row by row.
+
+    Attributes:
+        logit: Class logits [B, P, 10].
+        reg: Regression [B, P, 9 or 13]; see `Head.forward`.
+        direction: Logits of the direction bins [B, P, 2].
+        attribute: Logits of the attributes [B, P, 9].
+        centreness: Logits [B, P].
+        bins: Logits of the depth bins [B, P, 6]; None without them.
+    """
 
     logit: Tensor
     reg: Tensor
@@ -68,8 +76,16 @@ def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:
 
 
 def unproject(points: Tensor, lens: Tensor, image: Tensor | None = None) -> Tensor:
-    """Camera frame [..., 3] of u, v (pixels), depth (m) [..., 3]; lens [..., 3, 3] (broadcast), or one an image
-    [B, 3, 3] and image [N] that points [N, 3] lie in."""
+    """Points in the camera frame from pixels and depths.
+
+    Args:
+        points: u, v (pixels) and depth (m) [..., 3].
+        lens: Intrinsics [..., 3, 3], broadcast against the points; or one for each image [B, 3, 3].
+        image: Image that each of the points [N, 3] belongs to [N]; None: `lens` is broadcast.
+
+    Returns:
+        x, y, z [..., 3], m.
+    """
     u, v, d = points.unbind(-1)
     full = torch.stack([u * d, v * d, d], -1)
     inverse: Tensor = torch.linalg.inv_ex(lens.double())[0].to(points.dtype)

@@ -102,8 +102,14 @@ class Mono3D(nn.Module):
         return self._chosen(dense, least, best_first=True)
 
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
-        """Detections of each image in mmdetection3d's order: by class and falling score, or by score if some had to
-        go. Boxes that the source suppresses are gone."""
+        """Detections of each image in mmdetection3d's order, without the boxes that the source suppresses.
+
+        They are ordered by class and descending score, or by score alone if there were too many.
+
+        Args:
+            dense: Raw outputs.
+            threshold: Least score.
+        """
         return self._chosen(dense, threshold, best_first=False)
 
     def _chosen(self, dense: Dense, threshold: float, *, best_first: bool) -> list[Detections]:
@@ -159,8 +165,16 @@ class Mono3D(nn.Module):
         self, ground: Tensor, shown: Tensor | None, score: Tensor, label: Tensor, ends: Sequence[int], *,
         best_first: bool,
     ) -> list[Tensor]:  # fmt: skip
-        """Rows that stay of each image's candidates, which lie between `ends`; all on the host. ground, shown: their
-        rectangles on the ground and, if these count too, boxes in the image."""
+        """Rows of each image's candidates that survive suppression; all on the host.
+
+        Args:
+            ground: Rectangles of all candidates on the ground.
+            shown: Their boxes in the image; None: these do not count.
+            score: Their scores.
+            label: Their classes.
+            ends: Where each image's candidates begin, and where the last ones end.
+            best_first: Whether to order by score alone.
+        """
         stay = []
         for start, end in pairwise(ends):
             own = score[start:end]

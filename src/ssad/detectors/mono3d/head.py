@@ -145,10 +145,17 @@ class Head(nn.Module):
     def forward(
         self, maps: list[Tensor], lens: Tensor | None, rays: list[Tensor] | None = None
     ) -> dict[str, list[Tensor]]:
-        """Maps by mmdetection3d's names, one a level: cls_scores [B, 10, h, w], bbox_preds [B, 9 or 13, h, w] (offset
-        in pixels, depth m, size m, yaw, velocity, 2D distances in pixels), dir_cls_preds, attr_preds, centernesses,
-        and for PGD depth_cls_preds. lens [B]: factor of the depth, None for 1; rays: where each place looks
-        [B, 2, h, w], one a level, if the configuration wants them."""
+        """Maps by mmdetection3d's names, one for each level.
+
+        Args:
+            maps: Maps of the neck, one for each level.
+            lens: Factor of the depth [B]; None: 1.
+            rays: Viewing direction of each place [B, 2, h, w], one map for each level, if the configuration wants them.
+
+        Returns:
+            cls_scores [B, 10, h, w]; bbox_preds [B, 9 or 13, h, w] (offset in pixels, depth m, size m, yaw, velocity,
+            2D distances in pixels); dir_cls_preds; attr_preds; centernesses; and for PGD depth_cls_preds.
+        """
         found: dict[str, list[Tensor]] = {}
         for level, x in enumerate(maps):
             for name, value in self._level(level, x, lens, None if rays is None else rays[level]).items():

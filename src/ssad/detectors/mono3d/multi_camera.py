@@ -23,8 +23,14 @@ OVERLAP, LEAST, MOST = 0.05, 0.01, 500
 
 @dataclass(frozen=True, slots=True)
 class DetectedBoxes(WorldBoxes):
-    """What was found at one moment: velocity [N, 2]; score [N]; label [N] index into MMDET3D_CLASSES; attribute: names,
-    "" for none."""
+    """Detections of one moment.
+
+    Attributes:
+        velocity: [N, 2], m/s.
+        score: [N].
+        label: Index into MMDET3D_CLASSES [N].
+        attribute: Names [N]; "" for none.
+    """
 
     score: F64
     label: I32

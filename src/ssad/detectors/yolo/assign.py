@@ -33,8 +33,16 @@ class Targets:
 
 
 def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets:
-    """Truth of all images, boxes times scale [4], on its device and in its dtype. ConfigError: labels or boxes that
-    cannot be."""
+    """Truth of all images, padded to the same number of objects.
+
+    Args:
+        truth: Truth of each image.
+        scale: Factor of the boxes [4]; the result has its device and dtype.
+        classes: Number of classes.
+
+    Raises:
+        ConfigError: A label is out of range, a box is not finite or empty, or the shapes do not match.
+    """
     labels, boxes, crowds = [], [], []
     for image, one in enumerate(truth):
         count = len(one.label)
@@ -61,8 +69,19 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
 
 
 def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
-    """owner [B, P]: index of the object, -1 none. YOLOv3: of all anchors the one of the object's shape (by IoU of equal
-    middles), at the cell where the object's middle lies. Of two objects at one place the better shape stays."""
+    """Target assignment of YOLOv3: each object to the anchor of its shape, at the cell that contains its middle.
+
+    Of all anchors it is the one with the largest IoU when the middles coincide. Of two objects at one place, the one
+    with the better shape wins.
+
+    Args:
+        targets: Objects of all images.
+        grid: Places of the pictures.
+        places: Number of places P.
+
+    Returns:
+        Owner [B, P]: index of the object, -1 for none.
+    """
     size, middle = _size_and_middle(targets.box)
     shape = _shape_iou(size, grid.anchors.flatten(0, 1))
     quality, best = shape.max(-1)
@@ -77,9 +96,20 @@ def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
 
 
 def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
-    """owner [B, P]: index of the object, -1 none. YOLOv5: every anchor whose width and height are within four times the
-    object's, at the cell of the middle and at the nearest cell beside it and above or below it, within the map. Of
-    several objects at one place the one nearest to the anchor in shape stays."""
+    """Target assignment of YOLOv5: each object to all anchors that fit, at its own cell and two neighbouring ones.
+
+    An anchor fits if its width and height are within a factor of four of the object's. The cells are the one that
+    contains the middle, the nearest one beside it, and the nearest one above or below it, as far as they are on the
+    map. Of several objects at one place, the one closest to the anchor in shape wins.
+
+    Args:
+        targets: Objects of all images.
+        grid: Places of the pictures.
+        places: Number of places P.
+
+    Returns:
+        Owner [B, P]: index of the object, -1 for none.
+    """
     size, middle = _size_and_middle(targets.box)
     ratio = size[:, :, None, None] / grid.anchors
     fits = torch.maximum(ratio, 1 / ratio).amax(-1) < MAX_RATIO  # [B, Q, L, A]
@@ -107,10 +137,19 @@ def match_near(targets: Targets, grid: Grid, places: int) -> Tensor:
 def label_places(
     targets: Targets, owner: Tensor, predicted: Tensor, *, ignore_objects: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """label [B, P] (-1 background, -2 ignored), owner [B, P] and target box [B, P, 4] (zeros without an owner).
+    """Labels and target boxes of all places.
 
-    Ignored are places that belong to a crowd object, and background whose predicted box overlaps a crowd object, or,
-    with `ignore_objects` (YOLOv3), any object by more than half.
+    Places that belong to a crowd object are ignored, and so is background whose predicted box overlaps a crowd object
+    by an IoU of more than 0.5.
+
+    Args:
+        targets: Objects of all images.
+        owner: Index of the object that each place is assigned to [B, P], -1 for none.
+        predicted: Predicted boxes [B, P, 4].
+        ignore_objects: Whether background is ignored where its predicted box overlaps any object that much (YOLOv3).
+
+    Returns:
+        Label [B, P] (-1 background, -2 ignored), owner [B, P] and target box [B, P, 4] (zeros without an owner).
     """
     batch, places = owner.shape
     if targets.label.shape[1] == 0:
@@ -147,8 +186,11 @@ def _shape_iou(size: Tensor, anchors: Tensor) -> Tensor:
 
 
 def _settle(targets: Targets, place: Tensor, quality: Tensor, good: Tensor, places: int) -> Tensor:
-    """owner [B, P] from candidates [B, Q, K]: at each place the best quality wins, then the first object; objects that
-    count win over crowd objects. The order of the batch and the device do not matter."""
+    """Owner [B, P] of each place from candidates [B, Q, K].
+
+    At each place the best quality wins, then the first object; objects that count win over crowd objects. The result
+    does not depend on the order of the batch or on the device.
+    """
     batch = len(place)
     image, row, slot = good.nonzero(as_tuple=True)
     key = image * places + place[image, row, slot]

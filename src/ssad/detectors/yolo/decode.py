@@ -23,8 +23,18 @@ MAX_CANDIDATES = 30_000
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The places of a picture. cell [P, 2]: column, row; anchor [P, 2]: width, height in pixels; stride [P]; level [P];
-    shapes: rows, columns a level; start: first place of each level; anchors [L, A, 2]; strides of the levels."""
+    """The places of a picture.
+
+    Attributes:
+        cell: Column and row [P, 2].
+        anchor: Width and height in pixels [P, 2].
+        stride: Of each place [P], pixels.
+        level: Of each place [P].
+        shapes: Rows and columns of each level.
+        start: First place of each level.
+        anchors: Width and height in pixels [L, A, 2].
+        strides: Of each level, pixels.
+    """
 
     cell: Tensor
     anchor: Tensor
@@ -88,9 +98,19 @@ def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
 def select(
     score: Tensor, box: Tensor, *, threshold: float, iou: float, limit: int, size: tuple[int, int]
 ) -> Detections:
-    """Detections of one image from score [P, C] and box [P, 4]: every class of every place above the threshold, the
-    30,000 best of them, suppression within a class at more than `iou`, at most `limit`; boxes are cut to the picture
-    of `size` (height, width)."""
+    """Detections of one image, by suppression within each class.
+
+    Args:
+        score: Scores [P, C]; each class of each place above the threshold is a candidate, up to the 30,000 best.
+        box: Boxes [P, 4]; they are clipped to the picture.
+        threshold: Scores must be above it.
+        iou: IoU above which the worse of two boxes of a class is dropped.
+        limit: Maximum number of detections.
+        size: Height and width of the picture.
+
+    Returns:
+        The detections, best first.
+    """
     # NaN is above nothing, so broken weights give no detections instead of boxes that are none
     usable = (score > threshold) & box.isfinite().all(-1, keepdim=True)
     place, label = usable.nonzero(as_tuple=True)

@@ -23,8 +23,17 @@ BALANCE = (4.0, 1.0, 0.4)
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What the losses compare. raw [B, P, 4], box [B, P, 4], objectness [B, P], logit [B, P, C] of the network; label
-    [B, P] and target box [B, P, 4] of the assignment; size: height and width of the network's input."""
+    """Predictions and targets that the losses compare.
+
+    Attributes:
+        raw: Raw box outputs of the network [B, P, 4].
+        box: Predicted boxes [B, P, 4].
+        objectness: Logits [B, P].
+        logit: Class logits [B, P, C].
+        label: Labels of the assignment [B, P].
+        target: Target boxes of the assignment [B, P, 4].
+        size: Height and width of the network's input.
+    """
 
     raw: Tensor
     box: Tensor

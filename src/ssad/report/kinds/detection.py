@@ -80,7 +80,8 @@ class Resampled(Protocol):
     """
 
     @property
-    def scenes(self) -> int: ...
+    def scenes(self) -> int:
+        """Number of scenes."""
 
 
 def load_detection_run(run: Run) -> DetectionRun:
@@ -239,7 +240,11 @@ def class_table(run: DetectionRun) -> Table:
 
 
 def robustness_table(run: DetectionRun) -> Table | None:
-    """mCE and mRR of NDS and mAP; None where a number is missing. The first detector is the baseline of mCE."""
+    """Table of mCE and mRR, each of NDS and mAP; the first detector is the baseline of mCE.
+
+    Returns:
+        The table, or None where a number is missing.
+    """
     severities = run.numbers or ["random"]
     found: dict[tuple[str, str], dict[str, list[float]]] = {}
     draws: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
@@ -280,7 +285,7 @@ def _drawn(values: Mapping[str, Sequence[Sequence[float]]], k: int) -> dict[str,
 
 
 def _robustness(own: Mapping[str, Sequence[float]], base: Mapping[str, Sequence[float]]) -> tuple[float, float]:
-    """mRR and mCE of scores by shift, clean ones at ""; NaN where they are not defined."""
+    """Return mRR and mCE of scores by shift, with the clean ones at ""; NaN where they are not defined."""
     shifted = {s: v for s, v in own.items() if s}
     reference = {s: v for s, v in base.items() if s}
     try:

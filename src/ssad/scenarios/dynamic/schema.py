@@ -203,6 +203,7 @@ def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         if len(actor.path) == 1:
             yield (*place, "path"), "a path needs at least two points"
         yield from _trajectory(actor, place)
+        yield from _policy(actor, place, fastest)
         for j, phase in enumerate(actor.phases):
             here = (*place, "phases", j)
             if not 0.0 <= phase.speed <= fastest:
@@ -229,6 +230,19 @@ def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int
             yield (*here, j), f"beyond {_MAX_COORDINATE:g} m or not a number"
         if not (rows[j - 1][0] if j else -1.0e6) < time < 1.0e6:
             yield (*here, j, 0), "times must increase from row to row"
+
+
+def _policy(actor: Actor, place: Location, fastest: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    if not actor.policy:
+        if actor.target_speed != Actor.target_speed:
+            yield (*place, "target_speed"), "only an actor with a policy has one; the others have phases"
+        return
+    if actor.phases or actor.trajectory:
+        yield (*place, "policy"), "an actor with a policy has neither phases nor a trajectory"
+    if not fastest > 0.0:
+        yield (*place, "policy"), f"nobody drives a {actor.model}"
+    elif not 0.0 < actor.target_speed <= fastest:
+        yield (*place, "target_speed"), f"{actor.target_speed:g} is outside 0 to {fastest:g} m/s ({actor.model})"
 
 
 def scenario_data(scenario: Scenario) -> dict[str, Any]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import Actor, AgentKind, Controller, EpisodeAgent, Pose, Route, Scenario
+from ssad.roads import route_along
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route
 from ssad.world.models import model
@@ -20,6 +22,9 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         if actor.trajectory:
             agents.append(_recorded(actor))
             continue
+        if actor.policy:
+            agents.append(_with_policy(actor, graph))
+            continue
         agents.append(
             EpisodeAgent(
                 name=actor.name,
@@ -32,6 +37,22 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
             )
         )
     return agents
+
+
+def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
+    """An actor that a driver acts for, with the route that its path means. RouteError: there is no such route."""
+    route = None
+    if actor.path and model(actor.model).kind == AgentKind.WALKER:
+        route = polyline_route(np.asarray(actor.path, np.float64))
+    elif actor.path:
+        try:
+            route = route_along(graph, actor.path)
+        except RouteError as error:
+            raise RouteError(f"actor {actor.name}: {error}") from None
+    return EpisodeAgent(
+        actor.name, actor.model, Controller.EXTERNAL, actor.pose, target_speed=actor.target_speed, route=route,
+        policy=actor.policy,
+    )  # fmt: skip
 
 
 def _recorded(actor: Actor) -> EpisodeAgent:

@@ -1,0 +1,292 @@
+"""Cameras and LiDARs that agents carry in the closed loop; what they saw can be rendered again from a trace.
+
+    eyes = Onboard()
+    rollout(world, driver, sensors={"front": eyes.camera(Camera.typical(640, 384)), "lidar": eyes.lidar()})
+
+Nothing is rendered unless a driver names the sensor in its `sensors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from ssad.camera.lamps import NOSE, own_lamps
+from ssad.camera.lidar import HDL32E, Lidar, sweep
+from ssad.camera.render import View, Weather, render
+from ssad.camera.rig import RIG, rig_camera
+from ssad.camera.sensor import Sensor as Response
+from ssad.core.driving import Simulator, WorldState
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import upright_pose
+from ssad.core.seeding import digest
+from ssad.core.types import F32, F64, I32, U8, AgentKind, End, EpisodeTrace
+from ssad.recording.episode_scene import EpisodeScene, Looks, Moment, moments_of, walked_to
+from ssad.recording.nuscenes_recorder import SENSOR
+from ssad.world.models import MODELS
+
+DAY: Final = Weather(0.9, 2.2, 0.3)
+AT_ONCE, AT_ONCE_GPU = 1, 64  # views rendered in one call; on a CPU more do not pay
+WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
+
+
+@dataclass(slots=True)
+class _Track:
+    """Where the agents of a scene have been since its episode began: a row a step."""
+
+    episode: int
+    looks: Looks
+    pose: list[F32] = field(default_factory=list)
+    walked: list[F64] = field(default_factory=list)
+
+    def follow(self, step: int, pose: F32) -> None:
+        """Another step; an earlier one again goes on from there."""
+        if step < len(self.pose):
+            if np.array_equal(self.pose[step], pose):
+                return
+            del self.pose[step:], self.walked[step:]
+        before = self.pose[-1] if self.pose else pose
+        walked = self.walked[-1] if self.walked else np.zeros(len(pose))
+        # what happened before somebody looked is not known; it decides nothing but where feet are
+        missing = step + 1 - len(self.pose)
+        self.pose += [pose.copy()] * missing
+        self.walked += [walked_to(walked, before, pose)] * missing
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What an agent could see at a moment.
+
+    Attributes:
+        row: Which reading it belongs to.
+        town: Where it is.
+        looks: Of the episode.
+        moment: Who is where.
+        agent: Who looks.
+    """
+
+    row: int
+    town: EpisodeScene
+    looks: Looks
+    moment: Moment
+    agent: int
+
+    @property
+    def pose(self) -> F64:
+        """Where the agent is, [4, 4]."""
+        x, y, yaw = self.moment.pose[self.agent].astype(np.float64).tolist()
+        return upright_pose(x, y, yaw)
+
+
+class Onboard:
+    """What agents carry: makes sensors for `ssad.world.rollout.rollout`, and the same readings from traces.
+
+    Sensors of one Onboard share their scenes: street and bodies are made once for each town. A reading depends on the
+    episode, the step and the agent alone. It is black, or empty, where the episode has ended.
+
+    Args:
+        weather: Of all episodes, or a function from an episode's key to its weather.
+        response: What stands between lens and picture; as the recorder's.
+        device: Where it is rendered: cpu or cuda:0.
+    """
+
+    def __init__(
+        self, *, weather: Weather | Callable[[str], Weather] = DAY, response: Response = SENSOR, device: str = "cpu"
+    ) -> None:
+        self.weather, self.response, self.device = weather, response, device
+        self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
+        self._simulator: Simulator | None = None
+        self._tracks: dict[int, _Track] = {}
+
+    def camera(self, camera: Camera) -> OnboardCamera:
+        """A camera as a sensor: pictures uint8 [N, 3, height, width], RGB.
+
+        Args:
+            camera: Its lens, and its place on the agent: `to_ego` counts from the middle of its base, x forward.
+        """
+        return OnboardCamera(self, camera)
+
+    def rig(self, width: int = 640) -> dict[str, OnboardCamera]:
+        """The six cameras of nuScenes by channel, for pictures so many pixels wide (16:9)."""
+        return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
+
+    def lidar(self, lidar: Lidar = HDL32E) -> OnboardLidar:
+        """A LiDAR as a sensor: points float32 [N, P, 5]: x, y, z in the sensor's frame, intensity, ring.
+
+        P is the number of its beams times its azimuths; rows after the last point are 0, their ring -1.
+
+        Args:
+            lidar: The sensor, and its place on the agent.
+        """
+        return OnboardLidar(self, lidar)
+
+    def follow(self, simulator: Simulator) -> None:
+        """Take note of where everybody is now, whoever looks; the loop calls it at every step.
+
+        Args:
+            simulator: The one that runs. What was known of another one is forgotten.
+        """
+        if simulator is not self._simulator:
+            self._simulator, self._tracks = simulator, {}
+            self._cast(simulator)
+        state = simulator.state()
+        for scene, episode in enumerate(simulator.assigned.tolist()):
+            step = _step_of(simulator, state, scene)
+            track = self._tracks.get(scene)
+            if track is None or track.episode != episode:
+                one = simulator.episodes[episode]
+                looks = self.town(simulator.graphs[one.town]).looks(one)
+                track = self._tracks[scene] = _Track(episode, looks)
+            track.follow(step, state.pose[scene, : len(track.looks.models)])
+
+    def town(self, graph: LaneGraph) -> EpisodeScene:
+        """The scene of a town, with the bodies of all episodes that were seen there."""
+        known = self._towns.get(graph.name)
+        if known is None or known[0] is not graph:
+            known = self._towns[graph.name] = (graph, EpisodeScene(graph, device=self.device))
+        return known[1]
+
+    def _cast(self, simulator: Simulator) -> None:
+        """Have bodies for all episodes that a simulator can run."""
+        for episode in simulator.episodes:
+            town = self.town(simulator.graphs[episode.town])
+            town.cast(town.looks(episode).bodies())
+
+    def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
+        """What agents [N, 2] (scene, agent) could see now; without those whose episode has ended."""
+        self.follow(simulator)
+        state, ended = simulator.state(), simulator.ended()
+        found, moments = [], {}
+        for row, (scene, agent) in enumerate(agents.tolist()):
+            if ended[scene] != End.RUNNING:
+                continue
+            track = self._tracks[scene]
+            if scene not in moments:
+                step, n = _step_of(simulator, state, scene), len(track.looks.models)
+                signal = state.signal[scene][track.looks.signals]
+                moments[scene] = Moment(step, track.pose[step], state.active[scene, :n], track.walked[step], signal)
+            town = self.town(simulator.graphs[simulator.episodes[track.episode].town])
+            found.append(Sight(row, town, track.looks, moments[scene], agent))
+        return found
+
+    def sights_of_trace(
+        self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
+    ) -> list[Sight]:
+        """What an agent could see at steps of a trace.
+
+        Args:
+            trace: What happened.
+            graph: Its town.
+            agent: Who looks.
+            steps: Which steps; None: all T.
+
+        Raises:
+            ConfigError: There is no such agent or step.
+        """
+        moments = moments_of(trace)
+        chosen = range(len(moments)) if steps is None else steps
+        if not 0 <= agent < len(trace.models) or any(not 0 <= step < len(moments) for step in chosen):
+            raise ConfigError(
+                f"{trace.key}: has agents 0 to {len(trace.models) - 1} and steps 0 to {len(moments) - 1}, "
+                f"not agent {agent} at steps {list(chosen)}"
+            )
+        town = self.town(graph)
+        looks = town.looks_of_trace(trace)
+        town.cast(looks.bodies())
+        return [Sight(row, town, looks, moments[step], agent) for row, step in enumerate(chosen)]
+
+    def view(self, sight: Sight, camera: Camera) -> View:
+        """A view through a camera that the agent carries."""
+        looks, moment, agent = sight.looks, sight.moment, sight.agent
+        weather = self.weather if isinstance(self.weather, Weather) else self.weather(looks.key)
+        eye = sight.pose @ camera.to_ego
+        things = sight.town.things(looks, moment, without=agent)
+        lights = sight.town.lights(looks, moment, eye[:2, 3])
+        body = MODELS[looks.models[agent]]
+        nose = sight.pose @ upright_pose(0.5 * body.length - NOSE, 0.0, 0.0)
+        lamps = own_lamps(nose, weather) if body.kind in WITH_LAMPS else ()
+        noise = int(digest("onboard noise", looks.key, moment.step, agent, camera.channel)[:7], 16)
+        return View(camera, eye, (*things, *lights), weather, self.response, noise, lamps)
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardCamera:
+    """A camera that agents carry, see `Onboard.camera`."""
+
+    onboard: Onboard
+    camera: Camera
+
+    def follow(self, simulator: Simulator) -> None:
+        """See `Onboard.follow`."""
+        self.onboard.follow(simulator)
+
+    def __call__(self, simulator: Simulator, agents: I32) -> U8:
+        """Pictures [N, 3, H, W] of agents [N, 2] (scene, agent); black where the episode has ended."""
+        return self._read(self.onboard.sights(simulator, agents), len(agents))
+
+    def of_trace(
+        self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
+    ) -> U8:
+        """The pictures [T, 3, H, W] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
+        sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        return self._read(sights, len(sights))
+
+    def _read(self, sights: Sequence[Sight], count: int) -> U8:
+        """All pictures in as few calls as possible."""
+        found = np.zeros((count, self.camera.height, self.camera.width, 3), np.uint8)
+        by_town: dict[int, list[Sight]] = {}
+        for sight in sights:
+            by_town.setdefault(id(sight.town), []).append(sight)
+        at_once = AT_ONCE if self.onboard.device == "cpu" else AT_ONCE_GPU
+        for here in by_town.values():
+            for k in range(0, len(here), at_once):
+                part = here[k : k + at_once]
+                views = [self.onboard.view(sight, self.camera) for sight in part]
+                picture = render(part[0].town.scene, views, download=False)
+                found[[sight.row for sight in part]] = picture.image.numpy()  # type: ignore[attr-defined]
+        return np.moveaxis(found, -1, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class OnboardLidar:
+    """A LiDAR that agents carry, see `Onboard.lidar`."""
+
+    onboard: Onboard
+    lidar: Lidar
+
+    def follow(self, simulator: Simulator) -> None:
+        """See `Onboard.follow`."""
+        self.onboard.follow(simulator)
+
+    def __call__(self, simulator: Simulator, agents: I32) -> F32:
+        """Points [N, P, 5] of agents [N, 2] (scene, agent); none where the episode has ended."""
+        return self._read(self.onboard.sights(simulator, agents), len(agents))
+
+    def of_trace(
+        self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
+    ) -> F32:
+        """The points [T, P, 5] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
+        sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
+        return self._read(sights, len(sights))
+
+    def _read(self, sights: Sequence[Sight], count: int) -> F32:
+        """One turn for each."""
+        found = np.zeros((count, len(self.lidar.beams) * self.lidar.azimuths, 5), np.float32)
+        found[..., 4] = -1.0
+        for sight in sights:
+            looks, moment, agent = sight.looks, sight.moment, sight.agent
+            things = sight.town.things(looks, moment, without=agent)
+            key = ("onboard lidar", looks.key, moment.step, agent)
+            points, _ = sweep(sight.town.scene, self.lidar, sight.pose, things, key=key)
+            found[sight.row, : len(points)] = points
+        return found
+
+
+def _step_of(simulator: Simulator, state: WorldState, scene: int) -> int:
+    """Steps since the episode of a scene began."""
+    return round(float(state.time[scene]) / simulator.dt)

@@ -1,0 +1,259 @@
+"""Cameras and LiDARs in the closed loop: what drivers are shown is what is rendered from the trace afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ssad.camera.lidar import Lidar
+from ssad.camera.render import Weather, render
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
+from ssad.recording import loop_sensors
+from ssad.recording.episode_scene import LENSES, Moment, moments_of
+from ssad.recording.loop_sensors import Onboard
+from ssad.recording.scene_objects import PHASES
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.rollout import Loop, rollout
+from ssad.world.world import World
+
+FRONT = Camera.typical(96, 64, channel="FRONT")
+BEAMS = Lidar(np.deg2rad(np.linspace(-20.0, 5.0, 6)), 90)
+STEPS = 8
+
+
+@cache
+def town() -> LaneGraph:
+    return load_town("ProvingGround")
+
+
+@cache
+def episodes() -> tuple[Episode, ...]:
+    """A walker beside the road, a bicycle, a car at a crossing with signals; of different lengths."""
+    names = ("StraightObstacle/00", "TurningObstacle/00", "RedlightRunning/00")
+    by_name = {s.name: s for s in load_scenarios("precrash")}
+    built = [build_episode(by_name[name], town(), seed=0) for name in names]
+    return tuple(replace(e, limits=Limits(max_steps=STEPS - 2 * n)) for n, e in enumerate(built))
+
+
+def world(*numbers: int) -> World:
+    return World([episodes()[n] for n in numbers], {town().name: town()})
+
+
+class Watcher:
+    """Drives straight on and keeps what it is shown, by scene, agent and step."""
+
+    name, controller = "watcher", Controller.EXTERNAL
+
+    def __init__(self, *sensors: str) -> None:
+        self.sensors, self.throttle = sensors, 0.8
+        self.shown: dict[tuple[str, int, int, int], np.ndarray] = {}
+
+    def reset(self, episodes) -> None:
+        pass
+
+    def act(self, view):
+        for name in self.sensors:
+            for row, key in enumerate(zip(view.scene.tolist(), view.agent.tolist(), view.time.tolist(), strict=True)):
+                if not view.done[row]:
+                    scene, agent, time = key
+                    self.shown[name, scene, agent, round(time / 0.1)] = view.readings[name][row].copy()
+        return np.tile(np.array([self.throttle, 0.0, 0.1], np.float32), (len(view.scene), 1))
+
+
+def both(onboard: Onboard) -> dict:
+    return {"front": onboard.camera(FRONT), "lidar": onboard.lidar(BEAMS)}
+
+
+def late(state):
+    """The first other agent, from step 3 on."""
+    mask = np.zeros(state.active.shape, bool)
+    mask[:, 1] = state.active[:, 1] & (state.time > 0.25)
+    return mask
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[Watcher, list[EpisodeTrace]]:
+    """All episodes at once, seen by their egos, and from step 3 on by the first other agent as well."""
+    watcher = Watcher("front", "lidar")
+    return watcher, rollout(world(0, 1, 2), {0: watcher, late: watcher}, sensors=both(Onboard()))
+
+
+def test_what_was_shown_is_what_is_rendered_from_the_trace(driven) -> None:
+    watcher, traces = driven
+    again = both(Onboard())
+    assert {(name, scene) for name, scene, *_ in watcher.shown} == {(n, s) for n in again for s in range(3)}
+    assert {agent for _, _, agent, _ in watcher.shown} == {0, 1}
+    assert max(step for _, _, agent, step in watcher.shown if agent == 1) == STEPS - 1
+    for name, sensor in again.items():
+        for scene, trace in enumerate(traces):
+            for agent in (0, 1):
+                steps = sorted(k[3] for k in watcher.shown if k[:3] == (name, scene, agent))
+                recalled = sensor.of_trace(trace, town(), agent=agent, steps=steps)
+                for step, picture in zip(steps, recalled, strict=True):
+                    assert np.array_equal(watcher.shown[name, scene, agent, step], picture), (name, scene, agent, step)
+    pictures = [watcher.shown["front", scene, agent, 4] for scene in range(2) for agent in (0, 1)]
+    assert all(picture.std() > 10 for picture in pictures)
+    assert len({picture.tobytes() for picture in pictures}) == 4
+
+
+def test_a_reading_does_not_depend_on_who_else_is_in_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    together = Watcher("front", "lidar")
+    rollout(world(0, 1, 2), together, sensors=both(Onboard()))
+    monkeypatch.setattr(loop_sensors, "AT_ONCE", 64)
+    alone = Watcher("front", "lidar")
+    rollout(world(1, 0), alone, sensors=both(Onboard()))
+    assert len(alone.shown) == 2 * (STEPS + STEPS - 2)
+    for (name, scene, agent, step), reading in alone.shown.items():
+        assert np.array_equal(reading, together.shown[name, 1 - scene, agent, step]), (name, scene, step)
+
+
+def test_only_what_is_asked_for_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, turns = [], []
+    monkeypatch.setattr(loop_sensors, "render", lambda scene, asked, **more: views.append(len(asked)) or render(
+        scene, asked, **more))  # fmt: skip
+    sweep = loop_sensors.sweep
+    monkeypatch.setattr(loop_sensors, "sweep", lambda *a, **more: turns.append(1) or sweep(*a, **more))
+    monkeypatch.setattr(loop_sensors, "AT_ONCE", 64)
+    onboard = Onboard()
+    rollout(world(0, 1), Watcher(), sensors=both(onboard))
+    assert (views, turns, onboard._towns) == ([], [], {})
+    rollout(world(0, 2), Watcher("front"), sensors=both(onboard))
+    # one call a step for all scenes; the second episode is 4 steps shorter
+    assert views == [2] * (STEPS - 4) + [1] * 4
+    assert turns == []
+
+
+def test_legs_follow_the_way_that_was_walked_whoever_looks_and_after_a_restore(driven) -> None:
+    _, traces = driven
+    onboard = Onboard()
+    scene = onboard.town(town())
+    looks = scene.looks_of_trace(traces[0])
+    scene.cast(looks.bodies())
+    walker = next(a for a, model in enumerate(looks.models) if model == "walker")
+    moment = moments_of(traces[0])[0]
+    meshes = set()
+    for metres in np.arange(8) * 1.45 / 8:
+        later = replace(moment, walked=moment.walked + metres)
+        (body,) = [t for t in scene.things(looks, later) if t.tag == walker + 1]
+        meshes.add(body.mesh)
+    assert len(meshes) == PHASES
+
+    one = world(1)  # its cyclist rides from the start
+    watcher = Watcher("front")
+    loop = Loop(one, {1: watcher}, sensors={"front": onboard.camera(FRONT)})
+    loop.reset()
+    for step in range(5):
+        if step == 2:
+            kept = one.snapshot()
+        loop.step()
+    first, watcher.shown = watcher.shown, {}
+    one.restore(kept)
+    watcher.throttle = 0.0  # goes on in another way
+    there = []
+    for _ in range(4):
+        there.append(one.state().pose[0].copy())
+        loop.step()
+    assert np.array_equal(watcher.shown["front", 0, 1, 2], first["front", 0, 1, 2])
+    track = onboard._tracks[0]
+    poses = np.array(track.pose, np.float64)[:, 1, :2]
+    far = np.hypot(*np.diff(poses, axis=0).T).sum()
+    assert len(poses) == 6
+    assert np.array_equal(track.pose[2:], there)
+    assert track.walked[-1][1] == pytest.approx(far)
+    assert far > 0.0
+
+    (trace,) = rollout(world(1), {0: Watcher(), late: watcher}, sensors={"front": onboard.camera(FRONT)})
+    for known, moment in zip(onboard._tracks[0].walked, moments_of(trace), strict=False):
+        assert np.array_equal(known, moment.walked)
+    assert len(onboard._tracks[0].walked) >= STEPS - 2
+
+
+@pytest.mark.parametrize("lit", list(LENSES))
+def test_lit_signals_are_seen(lit: SignalState) -> None:
+    onboard = Onboard()
+    scene = onboard.town(town())
+    looks = scene.looks(episodes()[2])
+    assert len(looks.signals)
+    heads = scene.street.heads.astype(float)
+    head = next(n for n, s in enumerate(scene.street.head_signal.tolist()) if s == looks.signals[0])
+    x, y, z, yaw = heads[head].tolist()
+    camera = Camera.typical(96, 96)
+    camera.to_ego[:3, 3] = 0.0, 0.0, z
+    agents = len(looks.models)
+    pose = np.zeros((agents, 3), np.float32)
+    pose[0] = x + 4.0 * np.cos(yaw), y + 4.0 * np.sin(yaw), yaw + np.pi
+    off = np.zeros(len(looks.signals), np.uint8)
+    dark = Moment(0, pose, np.zeros(agents, bool), np.zeros(agents), off)
+    moment = replace(dark, signal=np.full(len(looks.signals), lit, np.uint8))
+    pictures = []
+    for now in (dark, moment):
+        view = onboard.view(loop_sensors.Sight(0, scene, looks, now, 0), camera)
+        pictures.append(render(scene.scene, [view]).image[0].astype(int))
+    change = np.abs(pictures[1] - pictures[0]).max(-1)
+    rows, columns = np.nonzero(change > 60)
+    assert len(rows) >= 9
+    height = 48 - (0.79 * 96) * LENSES[lit] / 4.0  # where the lens is in the picture
+    assert abs(rows.mean() - height) < 2.0
+    assert abs(columns.mean() - 48) < 2.0
+    red, green, _ = pictures[1][rows, columns].mean(0)
+    assert (red > 150) == (lit != SignalState.GREEN)
+    assert (green > 150) == (lit == SignalState.GREEN) or lit == SignalState.YELLOW
+
+
+def test_weather_goes_by_episode_and_lamps_are_on_by_night(driven) -> None:
+    watcher, traces = driven
+    night = Onboard(weather=lambda key: Weather(-0.2, 0.0) if key == traces[0].key else loop_sensors.DAY)
+    camera = night.camera(FRONT)
+    dark = camera.of_trace(traces[0], town(), steps=[0])[0]
+    day = camera.of_trace(traces[1], town(), steps=[0])[0]
+    assert np.array_equal(day, watcher.shown["front", 1, 0, 0])
+    assert not np.array_equal(dark, watcher.shown["front", 0, 0, 0])
+    (sight,) = night.sights_of_trace(traces[0], town(), steps=[0])
+    (lamp,) = night.view(sight, FRONT).lamps
+    nose = np.linalg.inv(sight.pose) @ lamp.pose[:, 3]
+    assert nose[:3] == pytest.approx([2.45, 0.0, 0.65])  # the bumper of a car of 4.9 m
+    walker = loop_sensors.MODELS["walker"]
+    assert walker.kind == AgentKind.WALKER
+    on_foot = next(a for a, model in enumerate(traces[0].models) if model == "walker")
+    (sight,) = night.sights_of_trace(traces[0], town(), agent=on_foot, steps=[0])
+    assert night.view(sight, FRONT).lamps == ()
+
+
+def test_perturbations_change_the_pictures_and_leave_the_points_alone() -> None:
+    class Dark:
+        def apply(self, frames, victim, truth, generators):
+            return frames // 2
+
+    plain, changed = Watcher("front", "lidar"), Watcher("front", "lidar")
+    onboard = Onboard()
+    rollout(world(2), plain, sensors=both(onboard))
+    rollout(world(2), changed, sensors=both(onboard), perturbation=Dark())
+    for key, reading in plain.shown.items():
+        expected = reading // 2 if key[0] == "front" else reading
+        assert np.array_equal(changed.shown[key], expected), key
+
+
+def test_points_end_where_their_rings_do(driven) -> None:
+    watcher, _ = driven
+    points = watcher.shown["lidar", 0, 0, 0]
+    assert points.shape == (6 * 90, 5)
+    count = int((points[:, 4] >= 0).sum())
+    assert 100 < count < 540
+    assert (points[:count, 4] >= 0).all()
+    assert (points[count:, :4] == 0).all()
+
+
+def test_a_trace_has_no_further_agents_or_steps(driven) -> None:
+    _, traces = driven
+    camera = Onboard().camera(FRONT)
+    for wrong in ({"agent": 99}, {"steps": [STEPS + 1]}):
+        with pytest.raises(ConfigError, match="steps 0 to 8, not agent"):
+            camera.of_trace(traces[0], town(), **wrong)
+    assert set(Onboard().rig(320)) >= {"CAM_FRONT", "CAM_BACK"}
