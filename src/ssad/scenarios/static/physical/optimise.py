@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -124,7 +124,8 @@ def train_texture(
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
         key: What all draws come from.
         device: Where the detector is.
-        checkpoint: Where the state is kept after each epoch; what is there already is continued, to the bit on the CPU.
+        checkpoint: Where the state is kept after each epoch; what is there already is continued, to the bit on the CPU,
+            also by more epochs than it was begun with.
         progress: Called with epochs done, and of how many.
 
     Raises:
@@ -146,7 +147,7 @@ def train_texture(
     else:
         optimiser = torch.optim.SGD([colour], lr=attack.rate, momentum=0.9)
     state = _State(colour, optimiser, np.zeros(len(views)), [], [])
-    name = digest("texture", attack, surface.size, surface.layer.rectangle, len(views), key)
+    name = digest("texture", replace(attack, epochs=1), surface.size, surface.layer.rectangle, len(views), key)
     if checkpoint is not None and checkpoint.is_file():
         state.load(checkpoint, name)
     mask = torch.as_tensor(surface.mask, device=device)
@@ -176,7 +177,7 @@ def train_texture(
                 state.hard[chosen] = losses.detach().cpu().double().numpy()
             state.losses.append(total / len(order))
             state.gradients.append(steepest)
-            if steepest == 0.0:
+            if not any(state.gradients):  # later it means that nothing is left to hide
                 raise ConfigError(
                     f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never in "
                     "view, or is not found even without it"
@@ -248,14 +249,14 @@ class _State:
             if arrays["name"].tobytes().decode() != name or arrays["colour"].shape != tuple(self.colour.shape):
                 raise FormatError(f"{path}: the checkpoint of another training; remove it, or choose another file")
             with torch.no_grad():
-                self.colour.copy_(torch.from_numpy(arrays["colour"]))
-            self.hard = arrays["hard"]
+                self.colour.copy_(torch.from_numpy(arrays["colour"].copy()))
+            self.hard = arrays["hard"].copy()
             self.losses = arrays["losses"].tolist()
             self.gradients = arrays["gradients"].tolist()
             kept = {}
             for key, value in arrays.items():
                 if key.startswith("optimiser."):
-                    tensor = torch.from_numpy(value)
+                    tensor = torch.from_numpy(value.copy())
                     kept[key.removeprefix("optimiser.")] = tensor if tensor.ndim == 0 else tensor.to(self.colour.device)
             self.optimiser.state[self.colour] = kept
         except KeyError as error:
