@@ -177,8 +177,12 @@ def _lamps(scene: Scene, views: Sequence[View], bodies: Bodies) -> Rows:
 
 
 def _of_meshes(mesh: I32, find: Callable[[int], Rows]) -> tuple[list[Rows], Any, Any]:
-    """What belongs to bodies of meshes [N]: rows of each mesh that occurs, one after the other; for each row of each
-    body its place among them, and whose it is."""
+    """What belongs to the bodies of meshes [N].
+
+    Returns:
+        Rows of each mesh that occurs, one after the other; for each row of each body, its place among them; and the
+        body it belongs to.
+    """
     kinds, kind = np.unique(mesh, return_inverse=True)
     found = [find(int(number)) for number in kinds]
     counts = np.array([len(rows) for rows, _ in found], np.int64)
@@ -276,8 +280,13 @@ def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
 
 
 def lit_circle(lamp: Lamp) -> tuple[F64, float]:
-    """A circle on the map, middle [2] and radius (m), that holds what a lamp lights: that of the smallest ball around
-    the sector of a ball which its spread and its reach bound."""
+    """A circle on the map that contains everything a lamp lights.
+
+    It is the circle of the smallest ball around the sector that the lamp's spread and reach bound.
+
+    Returns:
+        Middle [2] and radius, m.
+    """
     across, down = lamp.spread
     cosine = 1.0 / float(np.hypot(1.0, np.hypot(across, down) if lamp.is_square else max(across, down)))
     sine = float(np.sqrt(1.0 - cosine**2))

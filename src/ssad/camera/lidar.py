@@ -64,8 +64,10 @@ HDL32E = Lidar(np.deg2rad(np.linspace(-30.67, 10.67, 32)), 1084)
 
 
 class _Scene:
-    """Index of a stage for rays: the street at full detail once, each mesh at its first use. The faces of all are
-    numbered through; `material` holds the material of each."""
+    """Index of a stage for rays: the street at full detail, once, and each mesh at its first use.
+
+    The faces of all are numbered consecutively; `material` holds the material of each.
+    """
 
     def __init__(self, stage: Scene) -> None:
         self.device = stage.device

@@ -30,8 +30,17 @@ FINE_SIZE, FINE_REACH, FINE_AHEAD = 1024, 12.0, 9.0  # of the fine map; m before
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """Hour and air. sun_height, sun_heading: radians (heading counter-clockwise from east); clouds 0..1; fog:
-    extinction 1/m; wet 0..1; exposure in stops relative to what the light suggests; turn: moves the clouds."""
+    """Time of day and weather.
+
+    Attributes:
+        sun_height: Elevation of the sun, rad.
+        sun_heading: Azimuth of the sun, rad, counter-clockwise from east.
+        clouds: 0 to 1.
+        fog: Extinction, 1/m.
+        wet: Wetness of the ground, 0 to 1.
+        exposure: Stops relative to the exposure that suits the light.
+        turn: Offset of the clouds.
+    """
 
     sun_height: float = 0.7
     sun_heading: float = 0.8
@@ -44,11 +53,18 @@ class Weather:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera at a place: `pose` (camera to world) [4, 4], what stands there, the weather.
+    """A camera at a place, and what it sees.
 
-    sensor: lens, mosaic, noise and full photosites; seed: of the noise; equal seeds give equal noise. lamps: beside
-    those of street and things; focus: x, y of the place (m) around which shadows are finest, None for just before the
-    camera; decals: above what things wear, the lowest first.
+    Attributes:
+        camera: Size and intrinsics.
+        pose: Camera to world [4, 4].
+        things: What stands there.
+        weather: Time of day and weather.
+        sensor: Lens, mosaic, noise and full photosites.
+        seed: Seed of the noise; equal seeds give equal noise.
+        lamps: Lamps besides those of the street and of things.
+        focus: x, y (m) of the place around which shadows are finest; None: just in front of the camera.
+        decals: Textures above what things wear, the lowest first.
     """
 
     camera: Camera
@@ -64,8 +80,14 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """What light is followed. shadows: of the sun; fine: a fine map of them around the focus; contact: bodies keep the
-    light of the sky from the ground; lamps: those of street and things, and their shadows."""
+    """Which effects of light are rendered.
+
+    Attributes:
+        shadows: Shadows of the sun.
+        fine: A fine shadow map around the focus.
+        contact: Bodies keep the light of the sky from the ground.
+        lamps: Lamps of the street and of things, and their shadows.
+    """
 
     shadows: bool = True
     fine: bool = True
@@ -80,8 +102,12 @@ PLAIN = Quality(shadows=False, fine=False, contact=False, lamps=False)
 class Surface:
     """What covers most of each pixel, [B, H, W, 3] each; zero for sky.
 
-    albedo: linear; normal: unit, world; position: world, m; irradiance: of all light, over pi; gain: what the pixel's
-    radiance gains for a unit of albedo (light, share of the pixel, mirror, wet, fog).
+    Attributes:
+        albedo: Linear.
+        normal: Unit vectors, world.
+        position: World, m.
+        irradiance: Irradiance of all light, over pi.
+        gain: What the pixel's radiance gains per unit of albedo (light, share of the pixel, mirror, wet, fog).
     """
 
     albedo: F32
@@ -93,10 +119,18 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """B pictures: image uint8 sRGB [B, H, W, 3]; radiance linear [B, H, W, 3]; tag [B, H, W] (-1 sky, 0 street, else
-    that of the thing); depth [B, H, W] m along the optical axis, inf for sky; exposure [B]: image is the camera's
-    curve of radiance times it; fragments: pieces of textured surfaces, black in the picture, by pixel and triangle
-    (see `ssad.camera.texture`); surface: what the pixels show, where it was asked for."""
+    """B rendered pictures.
+
+    Attributes:
+        image: uint8 sRGB [B, H, W, 3].
+        radiance: Linear [B, H, W, 3].
+        tag: Tag of the thing that a pixel shows [B, H, W]; -1: sky, 0: street.
+        depth: Depth along the optical axis [B, H, W], m; inf for sky.
+        exposure: [B]; `image` is the camera's curve of radiance times exposure.
+        fragments: Pieces of textured surfaces, which are black in the picture, by pixel and triangle (see
+            `ssad.camera.texture`).
+        surface: What the pixels show, where it was asked for.
+    """
 
     image: U8
     radiance: F32
@@ -141,8 +175,16 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
 
 
 def kernel_lens(intrinsic: F64) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point in px as the kernels have them: they count from the middle of the first pixel,
-    whose place in an intrinsic is (0.5, 0.5)."""
+    """Focal lengths and principal point as the kernels take them, pixels.
+
+    The kernels count from the centre of the first pixel, which is at (0.5, 0.5) in an intrinsic matrix.
+
+    Args:
+        intrinsic: Camera matrix [3, 3].
+
+    Returns:
+        fx, fy, cx, cy.
+    """
     k = intrinsic
     return float(k[0, 0]), float(k[1, 1]), float(k[0, 2] - 0.5), float(k[1, 2] - 0.5)
 
@@ -413,8 +455,10 @@ def _develop(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -
 
 
 def _light_cameras(suns: F64, middles: F64) -> F64:
-    """World to light [B, 4, 4] for directions to the sun and middles [B, 3]: z runs with the light, x and y across it;
-    the middle is the origin, to half a metre."""
+    """World to light [B, 4, 4], for directions to the sun and middles [B, 3].
+
+    z runs with the light, x and y across it; the origin is the middle, rounded to half a metre.
+    """
     z = -suns / np.linalg.norm(suns, axis=1, keepdims=True)
     flat = np.hypot(z[:, 0], z[:, 1])
     level = np.maximum(flat, 1e-6)

@@ -89,10 +89,18 @@ def check_opacity(texture: int, opacity: float, mask: F32 | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Thing:
-    """A body in a view: index of its mesh in the stage, pose (object to world) [4, 4], paint (linear RGB), tag that
-    masks and boxes name it by. layers: what it wears, the lowest first; faces outside of all panels (windows, lamps,
-    tyres) never wear anything. lit: whether its lamps are on (by night they light what is before them); hidden: it
-    casts its shadow and is not seen."""
+    """A body in a view.
+
+    Attributes:
+        mesh: Index of its mesh in the stage.
+        pose: Object to world [4, 4].
+        paint: Linear RGB.
+        tag: Number that identifies it in masks and boxes.
+        layers: Textures that it wears, the lowest first; faces outside all panels (windows, lamps, tyres) never wear
+            any.
+        lit: Whether its lamps are on; by night they light what is in front of them.
+        hidden: Whether it is invisible; it still casts its shadow.
+    """
 
     mesh: int
     pose: F64
@@ -119,8 +127,18 @@ class Draws:
 
 @dataclass(frozen=True, slots=True)
 class Bodies:
-    """The N things of B views, view by view: view, mesh and tag [N], pose [N, 4, 4], paint [N, 3], lit and hidden
-    [N]."""
+    """The N things of B views, view by view.
+
+    Attributes:
+        things: The things themselves.
+        view: View of each [N].
+        mesh: Index of its mesh in the stage [N].
+        pose: Object to world [N, 4, 4].
+        paint: Linear RGB [N, 3].
+        tag: [N].
+        lit: Whether its lamps are on [N].
+        hidden: Whether it only casts a shadow [N].
+    """
 
     things: tuple[Thing, ...]
     view: I32
@@ -231,10 +249,17 @@ class Scene:
         return found
 
     def standing(self, mesh: int) -> tuple[F64, F64, float, float]:
-        """What a mesh covers of the ground: middle [2], half length and width [2], height of its underside and of its
-        top (object frame, m).
+        """What a mesh covers of the ground.
 
-        What looks down from at most half its height says how much of the rectangle about it is covered, and from where.
+        The faces that look down from at most half its height decide how much of the bounding rectangle is covered, and
+        from which height.
+
+        Args:
+            mesh: Index of the mesh.
+
+        Returns:
+            Middle [2]; half length and half width of what is covered [2]; height of its underside; and height of its
+            top, all in the object frame, m.
         """
         return self.kept(("standing", mesh), lambda: _standing(self.meshes[mesh]))  # type: ignore[no-any-return]
 

@@ -205,5 +205,5 @@ def printable(colour: Tensor) -> Tensor:
 
 
 def to_linear(colour: Tensor) -> Tensor:
-    """sRGB in [0, 1] (what is printed, or a PNG) to the linear RGB that textures are in."""
+    """Convert sRGB in [0, 1], as in print or a PNG, to the linear RGB of textures."""
     return torch.where(colour <= 0.04045, colour / 12.92, ((colour.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)

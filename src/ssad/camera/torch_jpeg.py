@@ -94,8 +94,10 @@ def _cosines() -> np.ndarray:
 
 
 def _fast_pass(lines: Tensor) -> Tensor:
-    """libjpeg's fast DCT along the first axis of whole numbers [8, ...], by Arai, Agui and Nakajima with constants of
-    8 bits. Each frequency comes out scaled by `_fast_divisors`."""
+    """Fast DCT of libjpeg along the first axis of integers [8, ...], with 8-bit constants.
+
+    By Arai, Agui and Nakajima. Each frequency comes out scaled by `_fast_divisors`.
+    """
     a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
     s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
     d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4
@@ -116,8 +118,11 @@ def _fast_divisors(table: np.ndarray) -> np.ndarray:
 
 
 def _accurate_pass(lines: Tensor, *, first: bool) -> Tensor:
-    """libjpeg's accurate DCT along the first axis of whole numbers [8, ...], by Loeffler, Ligtenberg and Moschytz with
-    constants of 13 bits. The first pass keeps two bits more, the second takes them off: eighths in the end."""
+    """Accurate DCT of libjpeg along the first axis of integers [8, ...], with 13-bit constants.
+
+    By Loeffler, Ligtenberg and Moschytz. The first pass keeps two extra bits and the second removes them: the result is
+    in eighths.
+    """
     a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
     s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
     d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4

@@ -40,8 +40,10 @@ from ssad.core.errors import ConfigError
 
 @lru_cache(maxsize=8)
 def _lens_weights(blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4]: from a square of four with a border of one px to the
-    photosites of the square."""
+    """Weights of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4].
+
+    The latter lead from a square of four pixels with a border of one pixel to the photosites of the square.
+    """
     centre, side = point_spread(blur)
     line = np.array([side, centre, side])
     spread = line[:, None] * line

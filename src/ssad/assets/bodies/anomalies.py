@@ -253,8 +253,16 @@ def foliage(
     detail: int,
     leaf: float,
 ) -> Mesh:
-    """A tuft of leaves: a dark uneven blob, and triangles about `leaf` m around it. The draws do not depend on the
-    detail."""
+    """A tuft of leaves: a dark, uneven blob, and triangles around it.
+
+    Args:
+        middle: Middle of the blob [3], m.
+        radius: Half axes [3], m.
+        green: Two materials of the leaves, and that of the blob.
+        generator: Source of randomness; the draws do not depend on the detail.
+        detail: Level of detail, 0 (coarse) to 2.
+        leaf: Size of the triangles, m, roughly.
+    """
     count = 48
     tilt, spin = generator.normal(size=(count, 3)), generator.normal(size=(count, 3))
     size = leaf * generator.uniform(0.6, 1.2, count)
@@ -287,8 +295,20 @@ def foliage(
 
 @dataclass(frozen=True, slots=True)
 class _Beast:
-    """Paths of x, z, radius (m) in the plane of symmetry, the shares of a width to a height of trunk and head, how far
-    apart the legs stand, and linear RGB of coats."""
+    """Shape and coats of an animal.
+
+    Attributes:
+        trunk: Path of x, z, radius (m) in the plane of symmetry.
+        neck: The same.
+        head: The same.
+        foreleg: The same.
+        hindleg: The same.
+        tail: The same.
+        ear: x, z, length, width, m.
+        narrow: Ratio of width to height of trunk and head.
+        apart: Distance of the legs from the plane of symmetry, m.
+        coats: Linear RGB of each.
+    """
 
     trunk: Path
     neck: Path
@@ -447,8 +467,10 @@ def _along(path: Path, look: Material, sides: int, narrow: float) -> Mesh:
 
 
 def _spotted(mesh: Mesh, spots: F64, look: Material, *, upright: bool = False) -> Mesh:
-    """The mesh with the faces near some of the spots [n, 3] (from -1 to 1 over its box) of another material; upright:
-    those that look down instead."""
+    """The mesh with another material on the faces near some of the spots [n, 3] (from -1 to 1 over its bounding box).
+
+    upright: the faces that look down get it instead.
+    """
     low, high = mesh.bounds()
     middle = (mesh.corners().mean(1) - low) / (high - low) * 2.0 - 1.0
     if upright:

@@ -230,8 +230,17 @@ def sign(style: str, size: Point, *, generator: np.random.Generator, detail: int
 
 
 def stop_sign(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
-    """A stop sign (R1-1 of the US) on a post that looks along +x and fills its size, m: the octagon is as wide as the
-    body and ends at its top. Its panels are `face` and `back`; a plate below ("all_way") and the post have none."""
+    """A stop sign (R1-1 of the US) on a post, facing +x.
+
+    The octagon is as wide as the body and ends at its top. Its panels are `face` and `back`; a plate below ("all_way")
+    and the post have none.
+
+    Args:
+        style: Name of the style; "all_way": with a plate below; "worn": with worn sheeting.
+        size: Length, width and height of the body, m.
+        generator: Source of randomness.
+        detail: Level of detail.
+    """
     _, width, height = size
     r = 0.5 * width
     red, white = _sheeting(generator, worn=style == "worn")

@@ -1,5 +1,7 @@
-"""People: adults, children and the elderly in a walking cycle, pushing a stroller, standing, at work on the road, or
-seated on a two-wheeler."""
+"""People: adults, children and the elderly.
+
+They are in a walking cycle, pushing a stroller, standing, at work on the road, or seated on a two-wheeler.
+"""
 
 from __future__ import annotations
 

@@ -47,8 +47,15 @@ class FreeGround:
         self.taken[self._cells(np.asarray(xy, np.float64).reshape(-1, 2))] = True
 
     def clear(self, xy: npt.ArrayLike, *, size: float = 0.3, crossing: float = 1.5) -> bool:
-        """Whether a thing of radius `size` may stand here, on a sidewalk or beside it: `KEEP` from driving lanes and
-        junctions, `crossing` m from crosswalks."""
+        """Whether a thing may stand here, on a sidewalk or beside it.
+
+        It must be `KEEP` away from driving lanes and junctions, on ground not yet taken.
+
+        Args:
+            xy: Points [n, 2], m; all must be clear.
+            size: Radius of the thing, m.
+            crossing: Distance to keep from crosswalks, m.
+        """
         p = np.asarray(xy, np.float64).reshape(-1, 2)
         if (self.ground.at(self.ground.drive, p) < KEEP + size).any() or self.taken[self._cells(p)].any():
             return False
@@ -89,12 +96,19 @@ class Side:
 
     @property
     def length(self) -> float:
-        """m."""
+        """Length of the outer edge, m."""
         return float(self.edge.s[-1])
 
     def pose(self, s: float, away: float = 0.0) -> tuple[float, float, float]:
-        """x, y at arc length s, `away` m outwards (negative: towards the road), and the heading of the traffic. Beyond
-        the ends the line goes straight on."""
+        """A pose beside the street; beyond the ends the line goes straight on.
+
+        Args:
+            s: Arc length along the edge, m.
+            away: Distance outwards from the edge, m; negative: towards the road.
+
+        Returns:
+            x, y (m) and the heading of the traffic (rad).
+        """
         edge = self.edge
         at = float(np.clip(s, 0.0, self.length))
         yaw = float(np.interp(at, edge.s, np.unwrap(edge.yaw)))

@@ -127,8 +127,10 @@ def _paint(soup: TriangleBuilder, corners: F64, material: int, *, z: float = PAI
 
 
 def _stop(soup: TriangleBuilder, graph: LaneGraph, lane: int, s: float, *, give_way: bool, look: Look) -> None:
-    """A stop line across a lane; where no signal or stop sign stands, the teeth of a give-way line; arrows on
-    multi-lane arms."""
+    """A stop line across a lane, or the teeth of a give-way line; and arrows on multi-lane arms.
+
+    give_way: no signal or stop sign stands here.
+    """
     x, y, yaw, width = graph.at(lane, s)
     half = 0.5 * width - 0.12
     if give_way:

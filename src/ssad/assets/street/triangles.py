@@ -18,8 +18,16 @@ ArrayLike = npt.ArrayLike
 
 @dataclass(frozen=True)
 class Piece:
-    """Triangles in one frame: vertices [V, 3], faces [F, 3], normals [F, 3, 3], uv [F, 3, 2] m, material [F] and the
-    levels [F] at which each face is drawn."""
+    """Triangles in one frame.
+
+    Attributes:
+        vertices: [V, 3], m.
+        faces: Indices of vertices [F, 3].
+        normals: Of each corner [F, 3, 3].
+        uv: Texture coordinates of each corner [F, 3, 2], m.
+        material: [F].
+        levels: Levels at which each face is drawn [F].
+    """
 
     vertices: F64
     faces: I32

@@ -7,11 +7,16 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Fragment:
-    """A piece of a textured or lit surface in a pixel: its light is what the pixel gains per unit of the texture's
-    colour, which the surface wears or a lamp projects.
+    """A piece of a textured surface, or of a surface onto which a lamp projects a texture, within a pixel.
 
-    place: view, row and column in one number; slot: the triangle's; u, v in the texture's rectangle, 0 to 1; area:
-    share of the texture that the pixel spans; light: RGB.
+    Attributes:
+        place: View, row and column in one number.
+        slot: Slot of the triangle.
+        texture: Which texture.
+        u: Place in the texture's rectangle, 0 to 1.
+        v: The same downwards.
+        area: Share of the texture that the pixel spans.
+        light: What the pixel gains per unit of the texture's colour, RGB.
     """
 
     place: int
@@ -25,8 +30,16 @@ class Fragment:
 
 @wp.struct
 class Layer:
-    """A texture on a body: which, the rectangle of the atlas that it covers (u0, v0, u1, v1), how opaque it is, and
-    where in `Layers.masks` its opacities begin (-1: even), so many columns and rows."""
+    """A texture on a body.
+
+    Attributes:
+        texture: Which texture.
+        box: Rectangle of the atlas that it covers: u0, v0, u1, v1.
+        opacity: 0 to 1.
+        mask: Where its opacities begin in `Layers.masks`; -1 where the opacity is even.
+        columns: Columns of the mask.
+        rows: Rows of the mask.
+    """
 
     texture: int
     box: wp.vec4
@@ -38,8 +51,22 @@ class Layer:
 
 @wp.struct
 class Decal:
-    """A texture on whatever lies in a box in the world: its middle, across and down (each divided by half the side),
-    ahead (unit) and half its depth, m; tag: of the only body that wears it, -1 for any; else as a layer."""
+    """A texture on whatever lies within a box in the world.
+
+    Attributes:
+        texture: Which texture.
+        place: Middle of the box, m.
+        across: Unit vector across the texture, divided by half its width.
+        down: Unit vector down the texture, divided by half its height.
+        ahead: Unit vector into the surface.
+        depth: Half the depth of the box, m.
+        area: Area of the texture, m^2.
+        tag: Tag of the only body that wears it; -1 for any.
+        opacity: 0 to 1.
+        mask: See `Layer`.
+        columns: See `Layer`.
+        rows: See `Layer`.
+    """
 
     texture: int
     place: wp.vec3
@@ -57,8 +84,16 @@ class Decal:
 
 @wp.struct
 class Layers:
-    """Layers of all draws, bottom first: those of draw d begin at start[d] and end at start[d + 1]; decals of all
-    views, above the layers, likewise; opacities; any: 0 where there are none of both."""
+    """Layers of all draws and decals of all views; decals are above layers.
+
+    Attributes:
+        layers: The layers of each draw, bottom first.
+        start: The layers of draw d begin at start[d] and end at start[d + 1].
+        decals: The decals of each view, bottom first.
+        decal_start: The same as `start`, for the decals of each view.
+        masks: Opacities of all masks.
+        any: 0 where there are neither layers nor decals.
+    """
 
     layers: wp.array(dtype=Layer)
     start: wp.array(dtype=int)

@@ -14,9 +14,19 @@ PAST = wp.constant(1.0e-3)  # m behind a pane, where the beam goes on
 
 @wp.struct
 class Target:
-    """A thing: its mesh; world to object (the place is that of the sensor in the object frame); velocity in the world,
-    m/s; centre relative to the sensor and radius of its bounding sphere; first of its faces; luminance of its paint;
-    tag."""
+    """A thing that beams can meet.
+
+    Attributes:
+        mesh: Id of its mesh.
+        turn: Rotation from world to object.
+        place: Position of the sensor in the object frame, m.
+        velocity: World, m/s.
+        centre: Centre of its bounding sphere relative to the sensor, m.
+        radius: Radius of that sphere, m.
+        first: Number of its first face.
+        paint: Luminance of its paint.
+        tag: Its tag.
+    """
 
     mesh: wp.uint64
     turn: wp.mat33

@@ -15,12 +15,20 @@ CELL = wp.constant(8.0)  # m
 
 @wp.struct
 class Lamp:
-    """A lamp in the world: place, axes (across and down, each divided by the tangent of the spread; ahead), light.
+    """A lamp in the world.
 
-    light: irradiance / pi on a plane 1 m ahead, RGB; inner: square of the share of the spread that is fully lit;
-    square: 1 where it lights a rectangle, else an ellipse; reach: m, beyond it is dark; layer: of the lamp shadow
-    maps, -1 for none; near: m, the near plane of that map; texture: what it projects, -1 for plain light; spread:
-    area that it lights on a plane 1 m ahead, m^2.
+    Attributes:
+        place: Position, m.
+        across: Axis across its light, divided by the tangent of the spread.
+        down: Axis down its light, divided by the tangent of the spread.
+        ahead: Axis of its light.
+        light: Irradiance / pi on a plane 1 m ahead, RGB.
+        inner: Square of the share of the spread that is fully lit.
+        square: 1 where it lights a rectangle, else an ellipse.
+        reach: Distance beyond which it lights nothing, m.
+        layer: Layer of the lamp shadow maps; -1 for none.
+        texture: Texture that it projects; -1 for plain light.
+        spread: Area that it lights on a plane 1 m ahead, m^2.
     """
 
     place: wp.vec3
@@ -38,8 +46,16 @@ class Lamp:
 
 @wp.struct
 class Occluder:
-    """A body that stands on the ground: its place, heading (cosine, sine), half length and half width of what it
-    covers, heights of its underside and of its middle, all m; reach: m from its place."""
+    """A body that stands on the ground and keeps the light of the sky from it.
+
+    Attributes:
+        place: Position, m.
+        heading: Cosine and sine.
+        half: Half length and half width of what it covers, m.
+        under: Height of its underside, m.
+        middle: Height of its middle, m.
+        reach: Distance from its place beyond which it hides nothing, m.
+    """
 
     place: wp.vec3
     heading: wp.vec2
@@ -51,8 +67,18 @@ class Occluder:
 
 @wp.struct
 class Near:
-    """Lamps and occluders of all views with their grids. Row `view * CELLS * CELLS + cell` of `lamp_start` is where
-    the lamps of a square begin in `lamp_list`, the next where they end; the same for occluders."""
+    """Lamps and occluders of all views, with their grids.
+
+    Attributes:
+        lamps: All lamps.
+        lamp_start: Where the lamps of a square begin in `lamp_list`, in row `view * CELLS * CELLS + cell`; the next row
+            says where they end.
+        lamp_list: Indices of the lamps that can reach each square.
+        occluders: All occluders.
+        occluder_start: The same as `lamp_start`, for occluders.
+        occluder_list: The same as `lamp_list`, for occluders.
+        shadows: Shadow maps of lamps.
+    """
 
     lamps: wp.array(dtype=Lamp)
     lamp_start: wp.array(dtype=int)
@@ -183,8 +209,11 @@ def lamp_at(
 
 @wp.func
 def spot_of(lamp: Lamp, p: wp.vec3, n: wp.vec3) -> wp.vec3:
-    """Where in a lamp's spread (x, y in -1..1) a point lies that it lights, and how much of the spread an area of
-    1 m^2 there takes."""
+    """Where a lamp lights a point.
+
+    Returns x and y in the lamp's spread (-1 to 1), and the share of the spread that an area of 1 m^2 at the point
+    takes.
+    """
     to = p - lamp.place
     square = wp.max(wp.dot(to, to), 1.0e-4)
     distance = wp.sqrt(square)

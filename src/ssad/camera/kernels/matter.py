@@ -17,8 +17,18 @@ GLASS = wp.constant(6)
 
 @wp.struct
 class Surface:
-    """A material: linear albedo, mirror share, gloss, emission by day and what the night adds to it, 1 where it takes
-    the paint, 1 where it shines only while the lamps of its body are on, pattern."""
+    """A material.
+
+    Attributes:
+        colour: Linear albedo.
+        specular: Share of the light that is mirrored.
+        gloss: How sharp the mirror image is, 0 to 1.
+        emission: Emission by day.
+        night: What the night adds to the emission.
+        paint: 1 where it takes the paint of its body.
+        lamp: 1 where it shines only while the lamps of its body are on.
+        pattern: Such as `BRICK`.
+    """
 
     colour: wp.vec3
     specular: float
@@ -32,8 +42,10 @@ class Surface:
 
 @wp.func
 def octave(uv: wp.vec2, rate: float, depth: float, fine: float) -> float:
-    """1 with smooth noise of `depth` about it, `rate` cells a metre; it fades out where a pixel (`fine` m) has a third
-    of a cell and more."""
+    """Smooth noise around 1 with amplitude `depth` and `rate` cells per metre.
+
+    It fades out where a pixel (`fine` m) is larger than a third of a cell.
+    """
     keep = wp.clamp(2.0 - 3.0 * fine * rate, 0.0, 1.0)
     if keep <= 0.0:
         return 1.0

@@ -64,7 +64,7 @@ def outside(t: Triangle, width: float, height: float) -> int:
 
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, y: float) -> float:
-    """x at which the edge crosses a row; the same number for both triangles that share it."""
+    """Where an edge crosses a row: x, the same number for both triangles that share the edge."""
     if p[1] < q[1] or (p[1] == q[1] and p[0] < q[0]):
         return p[0] + (y - p[1]) * ((q[0] - p[0]) / (q[1] - p[1]))
     return q[0] + (y - q[1]) * ((p[0] - q[0]) / (p[1] - q[1]))
@@ -164,8 +164,9 @@ def fill(
     large: wp.array(dtype=Triangle),
     count: wp.array(dtype=int),
 ):
-    """Moves each listed face into its camera, clips and projects it, and enters it into the samples unless it is turned
-    away. Triangles whose extent has more than `largest` samples are listed in `large` as long as there is room.
+    """Projects each listed face, clipped, and enters it into the samples unless it is turned away.
+
+    Triangles whose extent has more than `largest` samples are listed in `large` instead as long as there is room.
 
     owners: the draw and the face of each index. A parallel projection is light: the ground casts no shadow. Each draw
     has `lanes` threads, which take its faces in turn.

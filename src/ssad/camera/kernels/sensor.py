@@ -7,8 +7,18 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Response:
-    """A view's sensor. centre, side: weights of the lens along an axis; full: light at which a photosite is full;
-    photons: variance for each unit of light; dark: deviation without light; seed: of the noise."""
+    """A view's sensor.
+
+    Attributes:
+        exposure: Factor of the light.
+        centre: Weight of a pixel in the lens's blur along an axis.
+        side: Weight of each of its two neighbours.
+        full: Light at which a photosite is full.
+        photons: Variance for each unit of light.
+        dark: Standard deviation without light.
+        seed: Seed of the noise.
+        mosaic: 1 for a sensor with a colour mosaic.
+    """
 
     exposure: float
     centre: float
@@ -81,8 +91,10 @@ def site(
 def expose(
     radiance: wp.array3d(dtype=wp.vec3), responses: wp.array(dtype=Response), raw: wp.array3d(dtype=float)
 ):  # fmt: skip
-    """Light to photosites, for views with a mosaic: a thread for each square of four, so that none has to choose its
-    colour. raw [B, H, W]."""
+    """Light to photosites raw [B, H, W], for views with a mosaic.
+
+    Each thread handles a square of four, so that no thread has to choose its colour.
+    """
     b, row, column = wp.tid()
     response = responses[b]
     if response.mosaic == 0:
@@ -112,8 +124,11 @@ def develop(
     curve: wp.array(dtype=wp.uint8),
     out: wp.array4d(dtype=wp.uint8),
 ):
-    """Photosites to 8 bits, for views with a mosaic: the missing colours (Malvar, He and Cutler 2004), then the curve.
-    A thread for each square of four. out [B, H, W, 3]."""
+    """Photosites to 8 bits out [B, H, W, 3], for views with a mosaic.
+
+    First the missing colours are interpolated (Malvar, He and Cutler 2004), then the curve is applied. Each thread
+    handles a square of four.
+    """
     b, row, column = wp.tid()
     if responses[b].mosaic == 0:
         return

@@ -31,8 +31,16 @@ class Geometry:
 
 @wp.struct
 class Drawn:
-    """Ranges of listed faces under one matrix each, see `ssad.camera.scene.Draws`; samples: keys of
-    what is seen; owners: draw and face of each key."""
+    """Ranges of listed faces, each under one matrix (see `ssad.camera.scene.Draws`).
+
+    Attributes:
+        samples: Key of what each sample shows.
+        owners: Draw and face of each key.
+        matrices: Object to camera, of each draw.
+        paints: Linear RGB of each draw.
+        tags: Tag of each draw.
+        lit: 1 where the lamps of the draw's body are on.
+    """
 
     samples: wp.array3d(dtype=wp.uint64)
     owners: wp.array(dtype=wp.vec2i)
@@ -56,8 +64,20 @@ class SunShadows:
 
 @wp.struct
 class Output:
-    """What `shade` writes. radiance, tag, depth [B, H, W]; fragments and how many were found; and, where `surface` is
-    1, of what covers most of a pixel: albedo, normal, irradiance / pi and gain [B, H, W]."""
+    """What `shade` writes.
+
+    Attributes:
+        radiance: [B, H, W].
+        tag: [B, H, W].
+        depth: [B, H, W], m.
+        fragments: Pieces of textured surfaces.
+        found: How many fragments were found.
+        surface: 1 where the following four are wanted, [B, H, W] each; they describe what covers most of a pixel.
+        albedo: Linear.
+        normal: Unit vectors, world.
+        irradiance: Of all light, over pi.
+        gain: What the pixel's radiance gains per unit of albedo.
+    """
 
     radiance: wp.array3d(dtype=wp.vec3)
     tag: wp.array3d(dtype=int)
@@ -73,8 +93,19 @@ class Output:
 
 @wp.struct
 class Hit:
-    """Where a ray meets a face: draw and face, point and unit normal in the world, texture coordinates, depth along
-    the axis, distance, all m; slant: cosine between ray and face; stretch: texture area for 1 m^2 of the face."""
+    """Where a ray meets a face.
+
+    Attributes:
+        draw: Its draw.
+        face: Its face.
+        place: Point in the world, m.
+        normal: Unit normal in the world.
+        uv: Texture coordinates.
+        z: Depth along the optical axis, m.
+        distance: Distance from the camera, m.
+        slant: Cosine between the ray and the face's normal.
+        stretch: Texture area for 1 m^2 of the face.
+    """
 
     draw: int
     face: int
@@ -89,8 +120,13 @@ class Hit:
 
 @wp.struct
 class Lit:
-    """Light on a point: irradiance / pi of all, what of it comes straight from the sun (0..1 of the sun's), and which
-    share of the sky it sees."""
+    """Light on a point.
+
+    Attributes:
+        light: Irradiance / pi of all light.
+        sun: Part that comes straight from the sun, as a share of the sun's light, 0 to 1.
+        open_: Share of the sky that the point sees.
+    """
 
     light: wp.vec3
     sun: float
@@ -115,8 +151,10 @@ def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column
 
 @wp.func
 def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
-    """Share of the sun that reaches a point given in texels and metres along the light: four texels, weighted; -1
-    outside the map."""
+    """Share of the sun that reaches a point, from four texels of a shadow map, weighted; -1 outside the map.
+
+    p: the point in texels, and in metres along the light.
+    """
     size = shadows.shape[1]
     if size < 4:
         return -1.0
@@ -303,8 +341,10 @@ def project(
     open_: float,
     fog: float,
 ):
-    """Lists what lamps that project a texture add to a pixel; through: share of light that the surface sends on;
-    span: area of the surface in the pixel, m^2."""
+    """Lists what lamps that project a texture add to a pixel.
+
+    through: share of the light that the surface sends on to the camera; span: area of the surface in the pixel, m^2.
+    """
     for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
         k = near.lamp_list[at]
         if near.lamps[k].texture >= 0:

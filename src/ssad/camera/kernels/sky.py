@@ -7,9 +7,20 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 @wp.struct
 class Light:
-    """Light of a view: unit vector to the sun, its colour (irradiance / pi), sky overhead and at the horizon, light
-    from the ground; extinction of fog, 1/m; clouds in 0..1; wet in 0..1; lamps: how far lamps are on, 0..1;
-    turn: offset of the clouds."""
+    """Light of a view.
+
+    Attributes:
+        sun: Unit vector to the sun.
+        sun_colour: Irradiance / pi of the sun, RGB.
+        zenith: Light of the sky overhead.
+        horizon: Light of the sky at the horizon.
+        ground: Light from the ground.
+        fog: Extinction, 1/m.
+        clouds: 0 to 1.
+        wet: 0 to 1.
+        lamps: How far lamps are on, 0 to 1.
+        turn: Offset of the clouds.
+    """
 
     sun: wp.vec3
     sun_colour: wp.vec3
@@ -72,8 +83,10 @@ def sky(light: Light, ray: wp.vec3, fine: int) -> wp.vec3:
 
 @wp.func
 def surroundings(light: Light, ray: wp.vec3, p: wp.vec3, sharp: float) -> wp.vec3:
-    """What a mirror at a point sees in a direction (unit vector, world): sky, houses up to a roof line, the road;
-    sharp: 1 for glass, less for what blurs its image."""
+    """What a mirror at a point sees in a direction (unit vector, world): sky, houses up to a roof line, the road.
+
+    sharp: 1 for glass, less for a surface that blurs its image.
+    """
     level = wp.max(wp.sqrt(ray[0] * ray[0] + ray[1] * ray[1]), 1.0e-4)
     rise = ray[2] / level
     if sharp * (rise - 0.5) > 0.25:

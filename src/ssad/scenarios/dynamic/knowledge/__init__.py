@@ -1,0 +1,1 @@
+"""The scenario classes: one module each, and what they share."""

@@ -20,10 +20,14 @@ PROGRESS = 0.75  # least share of steps that must raise the loss between two che
 
 @dataclass(frozen=True, slots=True)
 class APGD:
-    """Attributes:
-        steps: gradient steps of each start, the first gradient included.
-        start: where the first start begins.
-        restarts: further random starts.
+    """Auto-PGD.
+
+    Attributes:
+        steps: Gradient steps of each start, including the first gradient.
+        start: Where the first start begins.
+        restarts: Further random starts.
+        name: What tables call it.
+        access: It asks for gradients.
 
     Raises:
         ConfigError: Fewer than two steps, or a negative number of restarts.

@@ -29,9 +29,12 @@ class Attack(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What tables call it."""
+
     @property
-    def access(self) -> Access: ...
+    def access(self) -> Access:
+        """What it asks for: "white-box": gradients; "black-box": only losses; "none": nothing."""
 
     def perturb(self, victim: Victim, budget: Budget) -> Tensor:
         """Look for images that raise the victim's loss.

@@ -31,20 +31,24 @@ SMALLEST = 8  # pixels of a side below which pictures are not shrunk
 
 
 class Defence(Protocol):
-    """What every picture passes: called with images [B, 3, H, W] in [0, 1], it returns images of the same shape, each
-    of which depends on its own image alone, differentiable.
+    """What every picture passes before it reaches the detector.
 
     Attributes:
         name: What tables call it.
-        smooth: Whether its gradient is that of finite differences; where it rounds or draws, it is not, and the check
-            before an attack looks at the detector alone.
+        smooth: Whether its gradient agrees with finite differences. It does not where the defence rounds or draws at
+            random; the check before an attack then covers the detector alone.
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What tables call it."""
+
     @property
-    def smooth(self) -> bool: ...
-    def __call__(self, images: Tensor) -> Tensor: ...
+    def smooth(self) -> bool:
+        """Whether its gradient agrees with finite differences."""
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Images [B, 3, H, W] in [0, 1] to images of the same shape, each from its own image alone; differentiable."""
 
 
 @dataclass(frozen=True, slots=True)

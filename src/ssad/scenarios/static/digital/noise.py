@@ -14,8 +14,11 @@ from ssad.scenarios.static.digital.victim import Victim
 
 @dataclass(frozen=True, slots=True)
 class RandomNoise:
-    """Each value moved by the radius up or down at random (L-infinity), or a random direction of that length (L2): as
-    large as any attack, and it asks nothing."""
+    """Random noise as large as any attack within the budget, without asking the detector anything.
+
+    Under L-infinity each value moves up or down by the radius; under L2 the image moves by the radius in a random
+    direction.
+    """
 
     name: str = "noise"
     access: Access = "none"

@@ -92,9 +92,12 @@ class Objective(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What records call it."""
+
     @property
-    def needs_objects(self) -> bool: ...
+    def needs_objects(self) -> bool:
+        """Whether an image without objects under attack has nothing to ascend."""
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """[B] one value an image, differentiable, higher where the detector does worse."""
@@ -113,6 +116,7 @@ class TrainingLosses:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         if not situation.aim.everything:
             raise ConfigError(f"loss '{self.name}' is of all objects; for some of them use vanish, margin or mislabel")
         found = situation.detector.losses(dense, situation.assignment, reduction="image")
@@ -126,13 +130,18 @@ class TrainingLosses:
 
 @dataclass(frozen=True, slots=True)
 class Vanish:
-    """Every score down at every location, or at those of the aim: the log-probability that nothing is there, summed
-    over locations and classes (the untargeted vanishing of TOG, Chow et al. 2020, for any head)."""
+    """Lower every score at every location, or at those of the aim.
+
+    The loss is the log-probability that nothing is there, summed over locations and classes.
+
+    Source: Chow et al., TOG (2020), untargeted vanishing, here for any head.
+    """
 
     name: str = "vanish"
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         absent = torch.log1p(-log_scores(dense).exp())
         if not situation.aim.everything:
             absent = absent * _weights(dense, situation)[..., None]
@@ -141,15 +150,19 @@ class Vanish:
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """Carlini and Wagner's margin for heads of independent sigmoids: how far the best class of each location lies above
-    the log-odds of a score that no longer counts, less a confidence; summed over locations.
+    """Carlini and Wagner's margin, for heads of independent sigmoids.
+
+    For each location, it is how far the best class lies above the log-odds of a score that no longer counts, down to
+    `confidence` below it; summed over locations.
 
     Attributes:
-        threshold: The score under which a detection does not count.
-        confidence: By how much, in log-odds, locations are pushed below it.
+        threshold: Score below which a detection does not count.
+        confidence: How far below the threshold, in log-odds, locations are pushed.
+        name: What records call it.
+        needs_objects: See `Objective`.
 
     Source: Carlini and Wagner, Towards Evaluating the Robustness of Neural Networks (2017), f6, with the threshold in
-    the place of the runner-up.
+    place of the runner-up.
     """
 
     threshold: float = 0.01
@@ -158,6 +171,7 @@ class Margin:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         best = log_odds(log_scores(dense)).amax(-1)
         above = (best - (math.log(self.threshold / (1 - self.threshold)) - self.confidence)).clamp_min(0.0)
         if not situation.aim.everything:
@@ -202,6 +216,7 @@ class Fabricate:
     needs_objects: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`. Raises ConfigError for an aim at some classes or objects."""
         if not situation.aim.everything:
             raise ConfigError("fabricate makes objects where there are none; it takes no classes and no objects")
         return log_scores(dense).amax(-1).mean(1)
@@ -209,14 +224,22 @@ class Fabricate:
 
 @dataclass(frozen=True, slots=True)
 class Mislabel:
-    """At the locations of objects, a wrong class above the true one: the wanted class of the aim, or the nearest wrong
-    one; no further than `confidence` in log-odds, mean over the locations of an image."""
+    """At the locations of objects, raise a wrong class above the true one; mean over these locations of an image.
+
+    The wrong class is the one that the aim names, or else the nearest.
+
+    Attributes:
+        confidence: Lead of the wrong class, in log-odds, beyond which nothing more is gained.
+        name: What records call it.
+        needs_objects: See `Objective`.
+    """
 
     confidence: float = 5.0
     name: str = "mislabel"
     needs_objects: bool = True
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`. Raises ConfigError if the detector knows only one class, or not a class of the aim."""
         detector, label = situation.detector, situation.assignment.label
         if dense.logit.shape[-1] < 2:
             raise ConfigError(f"{detector.name} knows one class; there is nothing to mislabel")

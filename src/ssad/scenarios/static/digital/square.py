@@ -24,19 +24,23 @@ TINY = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class Square:
-    """Random search: a proposal changes one square of the image to the border of the ball (L-infinity), or moves the
-    mass of one square into another (L2), and stays if it raises the loss.
+    """Random search over squares; a proposal is kept if it raises the loss.
+
+    Under L-infinity, a proposal moves one square of the image to the border of the ball; under L2, it moves the mass of
+    one square into another.
 
     Attributes:
-        queries: losses that are asked for, those of the clean image and of the start included.
-        share: of the image that the first squares cover; they shrink by the schedule of the source, stretched over
-            `queries`.
+        queries: Number of losses asked for, including those of the clean image and of the start.
+        share: Share of the image that the first squares cover; they shrink by the schedule of the source, stretched
+            over `queries`.
+        name: What tables call it.
+        access: It asks only for losses.
 
     Raises:
         ConfigError: Fewer than three queries, or a share outside (0, 1].
 
-    Source: Andriushchenko et al., Square Attack: a query-efficient black-box adversarial attack via random search
-    (ECCV 2020), algorithms 1 to 3; for ImageNet it takes a share of 0.05 under L-infinity and of 0.1 under L2.
+    Source: Andriushchenko et al., Square Attack: a query-efficient black-box adversarial attack via random search (ECCV
+    2020), algorithms 1 to 3; for ImageNet it takes a share of 0.05 under L-infinity and of 0.1 under L2.
     """
 
     queries: int = 1000
@@ -109,8 +113,10 @@ def _tiles(clean: Tensor, chance: np.random.Generator) -> Tensor:
 
 
 def _moved(change: Tensor, side: int, radius: float, chance: np.random.Generator) -> None:
-    """Adds a bump to one window of a change [3, H, W], as long as what the ball has left and the length of another
-    window, which is emptied."""
+    """Empty one window of a change [3, H, W], and add a bump to another.
+
+    The new length of the second window combines the lengths of both windows and what is left of the ball.
+    """
     side = min(side + 1 - side % 2, *change.shape[1:])
     taking, giving = _place(change, side, chance), _place(change, side, chance)
     window = change[taking]

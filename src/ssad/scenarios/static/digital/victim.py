@@ -156,8 +156,10 @@ class Victim:
 
 @contextmanager
 def steady(detector: Any) -> Iterator[None]:
-    """Within the block every part of a detector is in eval mode and its parameters take no gradient; after it modes,
-    flags, gradients and buffers are what they were, whatever an attack or the detector did."""
+    """Keep every part of a detector in eval mode, and its parameters without gradients, within the block.
+
+    Afterwards modes, flags, gradients and buffers are restored, whatever an attack or the detector did.
+    """
     roots = [detector] if isinstance(detector, nn.Module) else []
     roots += [value for value in getattr(detector, "__dict__", {}).values() if isinstance(value, nn.Module)]
     flags = [(one, one.requires_grad, one.grad) for root in roots for one in root.parameters()]

@@ -143,8 +143,14 @@ def _overlap(own: F64, others: F64) -> Bool:
 
 @dataclass(frozen=True, slots=True)
 class _Model:
-    """An object ready to be drawn: its stage, its paint, and the map of its shadow of contact: share of the light that
-    it takes, by cells from a corner (x, y) in its own frame."""
+    """An object ready to be drawn.
+
+    Attributes:
+        stage: Its mesh.
+        paint: Linear RGB.
+        shadow: Contact shadow [h, w]: share of the light that is blocked, by cells in the object's own frame.
+        corner: x, y of the corner of `shadow` in that frame, m.
+    """
 
     stage: Scene
     paint: tuple[float, float, float]

@@ -149,8 +149,15 @@ def _sun(
 
 
 def fog_response(beta: float) -> tuple[F64, F64, F64]:
-    """Echo of fog itself: ranges R [K] of the hard target, the strongest echo of the fog before it (s / m^2;
-    times R^2 and backscatter over beta_0 it is relative to the hard target's in clear air), and where it comes from.
+    """Strongest echo of the fog itself, in front of a hard target.
+
+    Args:
+        beta: Extinction, 1/m.
+
+    Returns:
+        Three arrays [K]. Ranges R of the hard target, m; the strongest echo of the fog before it, s / m^2 (multiplied
+        by R^2 and by backscatter over beta_0, it is relative to the hard target's echo in clear air); range from which
+        it comes, m.
 
     Source: Hahner, Sakaridis, Dai and Van Gool, ICCV 2021, equation 10: the echo integrated over a pulse of 2 x 10 ns.
     """

@@ -22,7 +22,7 @@ def to_linear(codes: Any) -> F64:
 
 
 def to_codes(light: Any) -> F64:
-    """sRGB codes, not rounded, of linear light in 0..1."""
+    """Linear light in 0..1 as sRGB codes in 0..255, not rounded."""
     given = np.asarray(light, np.float64)
     return 255 * np.where(given <= 0.0031308, given * 12.92, 1.055 * np.maximum(given, 0.0031308) ** (1 / 2.4) - 0.055)
 

@@ -41,7 +41,7 @@ def noise_table(name: str, severity: int, calibration: str) -> npt.NDArray[np.in
 
 
 def add_noise(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> tuple[Batch, list[Applied]]:
-    """uniform or gaussian."""
+    """Noise `uniform` or `gaussian`."""
     out = batch.like()
     dim, words, chunk = batch.chunks()
     keys = file_keys(batch, specs, frames, "noise")

@@ -94,8 +94,17 @@ def deformed(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str, l
 
 
 def transformed_boxes(spec: ShiftSpec, boxes: TrackedBoxes, *, scene: str, sample: str) -> TrackedBoxes:
-    """The boxes after an object shift (labels "transformed"): exact for scale and rotation; for shear the least box
-    that keeps the direction of the length and holds the sheared corners. Other shifts leave boxes as they are."""
+    """The boxes after an object shift (labels "transformed"); other shifts leave boxes unchanged.
+
+    Scale and rotation are exact; for shear, it is the smallest box that keeps the direction of the length and contains
+    the sheared corners.
+
+    Args:
+        spec: The shift.
+        boxes: Boxes of one sample.
+        scene: Name of the scene, for the random numbers.
+        sample: Token of the sample, for the random numbers.
+    """
     if spec.family != "object" or spec.name == "motion_blur" or spec.severity == 0 or not len(boxes):
         return boxes
     matrix, centre = deformed(spec, boxes, scene=scene, sample=sample)

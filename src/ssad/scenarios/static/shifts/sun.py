@@ -25,16 +25,28 @@ FACING = 75.0  # degrees from the optical axis beyond which the sun adds no ligh
 
 
 def sun_direction(spec: ShiftSpec, context: SceneContext) -> F64:
-    """Unit vector towards the sun [3], world: the context's, or drawn 2 to 12 degrees high, within 15 of where the ego
-    goes at first."""
+    """Unit vector towards the sun [3], world.
+
+    It is the context's, or else drawn 2 to 12 degrees high, within 15 degrees of the ego's initial heading.
+    """
     return np.array(next(_draws(spec, context)) if context.sun is None else context.sun)
 
 
 def choose_sun(
     spec: ShiftSpec, context: SceneContext, pictures: Sequence[tuple[Frame, U8]]
 ) -> tuple[float, float, float]:
-    """A sun that is free in one of the pictures of a moment: of 16 directions the first one where it is, each drawn one
-    degree higher than that before, the first as by `sun_direction`; that one if it is hidden in all."""
+    """A sun that is visible in one of the pictures of a moment.
+
+    Up to 16 directions are tried, each drawn one degree higher than the one before, the first as by `sun_direction`.
+
+    Args:
+        spec: The shift.
+        context: The scene.
+        pictures: Frame and picture [H, W, 3] of each camera.
+
+    Returns:
+        Unit vector, world: the first direction in which the sun is visible; the first of all if it is always hidden.
+    """
     drawn = list(islice(_draws(spec, context), 16))
     depths: dict[int, F32 | None] = {}
     for toward in drawn:
@@ -86,8 +98,16 @@ def sun_depth(frame: Frame, image: U8) -> F32 | None:
 
 
 def free_sun(frame: Frame, depth: F32 | None, toward: F64) -> float:
-    """Share in [0, 1] of the sun's disc that is free in a picture which it stands in, by the depth of `sun_depth`; 1 if
-    that is None. toward: unit vector [3], world."""
+    """Share of the sun's disc that is visible in a picture that contains it.
+
+    Args:
+        frame: The picture's frame.
+        depth: From `sun_depth`.
+        toward: Unit vector towards the sun [3], world.
+
+    Returns:
+        Share in [0, 1]; 1 if `depth` is None.
+    """
     if depth is None:
         return 1.0
     x, y = _place(frame, toward)

@@ -146,7 +146,7 @@ def _lens_drops(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec
 def add_precipitation(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], contexts: Sequence[SceneContext]
 ) -> tuple[Batch, list[Applied]]:
-    """rain or snow: the veil of what is far away, and streaks of what is within a few metres; rain wets the ground."""
+    """Rain or snow: a veil over what is far away, and streaks of what is close; rain also wets the ground."""
     weathers, clear, depth, sources = _clear(batch, frames, specs, contexts)
     if specs[0].name == "rain":
         batch = wet_ground(batch, frames, specs, (depth, sources))

@@ -22,8 +22,14 @@ _AROUND = 0.15  # m around a box: labels do not fit to the pixel
 def wet_ground(
     batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec], known: tuple[Any, Sequence[str]]
 ) -> Batch:
-    """The pictures with wet ground. known: depth and sources of `depth_grid`; filled-in depth of the road becomes its
-    plane's."""
+    """The pictures with wet ground.
+
+    Args:
+        batch: The pictures.
+        frames: Their frames.
+        specs: Their shifts.
+        known: Depth and sources of `depth_grid`; filled-in depth of the road is replaced by that of its plane.
+    """
     depth, sources = known
     rows, columns = grid_size(batch)
     shape, dim = (batch.count, rows, columns), (batch.count, rows)

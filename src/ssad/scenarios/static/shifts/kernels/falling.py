@@ -276,8 +276,9 @@ def fall(
     wedge: wp.array2d(dtype=float),
     out: wp.array3d(dtype=float),
 ):
-    """Blurs down each column over `length` cells with weights that fall linearly and sum to `gain`, by running sums; so
-    many columns a thread. box, wedge: zeros.
+    """Blurs down each column over `length` cells, by running sums; the weights decrease linearly and add up to `gain`.
+
+    columns: columns for each thread; box, wedge: zeros.
     """
     b, block = wp.tid()
     k = length[b]

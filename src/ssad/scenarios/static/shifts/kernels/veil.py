@@ -94,8 +94,10 @@ def blend_air(
     words: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """image * t + air * (1 - t) in linear light, with t from a quarter grid; `air`: 1 is white. Four pixels are three
-    words; linear, codes: of `light.tables`."""
+    """Airlight over a picture in linear light: image * t + air * (1 - t), with the transmittance t from a quarter grid.
+
+    Four pixels are three words. air: 1 is white; linear, codes: the tables of `light.tables`.
+    """
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))
@@ -251,7 +253,7 @@ def glare(
 
 @wp.func
 def lit(pixel: wp.uint32, gain: wp.uint64, tint: wp.uint64, light: float) -> wp.uint32:
-    """pixel * gain + tint * light (of 1024 both), clipped: what overflows a field is white."""
+    """Return pixel * gain + tint * light (both of 1024), clipped: a field that overflows becomes white."""
     bright = wp.uint64(wp.clamp(int(light + 0.5), 0, 320))
     total = ((spread(pixel) * gain + tint * bright + HALF) >> wp.uint64(10)) & TENS
     over = ((total >> wp.uint64(8)) | (total >> wp.uint64(9))) & ONES
@@ -268,7 +270,7 @@ def blend_glare(
     words: int,
     out: wp.array(dtype=wp.uint32),
 ):
-    """image * gain + tint * grid, clipped: the exposure goes down, the glare comes on top. tint, gain: 0 to 1."""
+    """Glare over a picture whose exposure goes down: image * gain + tint * grid, clipped. tint, gain: 0 to 1."""
     b, y = wp.tid()
     fy = (float(y) + 0.5) * 0.25 - 0.5
     row = int(wp.floor(fy))

@@ -18,8 +18,17 @@ PARTS_OF_LIGHT = wp.constant(float(CODES))
 
 @wp.struct
 class Footprint:
-    """Where a box stands, in the ego's frame: middle, direction of its length, halves of length and width, height
-    of its base (m)."""
+    """Where a box stands, in the ego's frame, m.
+
+    Attributes:
+        x: Of the middle.
+        y: Of the middle.
+        cos: Cosine of the direction of its length.
+        sin: Sine of that direction.
+        half_length: Half its length.
+        half_width: Half its width.
+        base: Height of its base.
+    """
 
     x: float
     y: float
