@@ -19,7 +19,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-imports = typer.Typer(help="Import OpenDRIVE maps and SafeBench, FREA or leaderboard routes.", no_args_is_help=True)
+imports = typer.Typer(
+    help="Import OpenDRIVE maps, SafeBench, FREA or leaderboard routes, and logged drives.", no_args_is_help=True
+)
 app.add_typer(imports, name="import")
 
 Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of `ssad run`.")]
@@ -482,7 +484,9 @@ def list_names(
 
 @imports.command("map")
 def import_map(
-    file: Annotated[Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE.xodr", help="OpenDRIVE file, or a town as SSAD stores it (.npz).")
+    ],
     name: Annotated[str | None, typer.Option(help="Name of the town.  [default: name of the file]")] = None,
 ) -> None:
     """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
@@ -517,6 +521,47 @@ def import_routes(
     save_scenarios(path, scenarios)
     towns = ", ".join(sorted({s.town for s in scenarios}))
     print(f"set {label}: {len(scenarios)} scenarios on {towns}, written to {path}")
+
+
+@imports.command("drive")
+def import_drive(
+    root: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes root folder.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    scene: Annotated[str, typer.Option(help="Name or token of the scene.")],
+    version: Annotated[str | None, typer.Option(help="Version.  [default: the only one]")] = None,
+    on: Annotated[
+        str | None,
+        typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file, of the place.  [default: logged paths]"),
+    ] = None,
+) -> None:
+    """Turn a logged drive in the nuScenes schema into a scenario: the ego is driven anew, all others as logged.
+
+    Where no town is known, lanes are made of the paths that were driven, and stored as a town beside OUT.yaml too.
+    """
+    from ssad.core.lane_graph import save_graph
+    from ssad.core.safeio import home
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.interchange.drive_log import scenario_of_drive
+    from ssad.roads import import_map as store
+    from ssad.roads import town_names
+    from ssad.scenarios.dynamic import save_scenarios
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a scenario file ends in .yaml")
+    with NuScenes(root, version) as data:
+        drive = scenario_of_drive(data, scene, town=out.stem, map_name=on)
+    town = drive.scenario.town
+    if not drive.known:
+        if town_names().get(town) == "built-in":
+            raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
+        save_graph(drive.graph, out.with_suffix(".npz"))
+        store(out.with_suffix(".npz"), town, home())
+    save_scenarios(out, drive.scenario)
+    left = ", ".join(f"{count} {what}" for what, count in sorted(drive.left_out.items()))
+    print(
+        f"scenario {drive.scenario.name}: {len(drive.scenario.actors)} actors in {town}"
+        f"{f'; left out: {left}' if left else ''}; written to {out}"
+    )
 
 
 @app.command()

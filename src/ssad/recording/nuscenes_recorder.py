@@ -417,7 +417,8 @@ def _merge(recording: Recording, names: list[str]) -> None:
         for name in names:
             folder = out / ".parts" / name
             part = safeio.read_json(folder / PART)
-            scene = writer.add_scene(name, description=f"{part['town']}, {part['weather']}")
+            description = f"{part['town']}, {part['weather']}"
+            scene = writer.add_scene(name, description=description, location=part["town"])
             splits["val" if part["town"] in recording.held_out else "train"].append(name)
             splits["all"].append(name)
             for sensor in part["sensors"]:

@@ -9,7 +9,7 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.errors import MapError, install_extra
-from ssad.core.lane_graph import LaneGraph, Marking, save_graph
+from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.core.types import F64, I32, LaneType
 from ssad.roads.signals import Approaches, place_signals, place_signs
 from ssad.roads.xodr import Connection, Lane, Link, Network, Road, read_network
@@ -68,12 +68,16 @@ def bake(xodr: Path, name: str | None = None) -> LaneGraph:
 
 
 def import_map(path: Path, name: str | None, home: Path) -> Path:
-    """Bake an OpenDRIVE file into home/towns/NAME.npz, whole or not at all, and give that path. MapError."""
+    """Bake an OpenDRIVE file into home/towns/NAME.npz, whole or not at all, and give that path. MapError.
+
+    A town that is baked already (.npz) is copied.
+    """
     label = name or Path(path).stem
     if not label or label.startswith(".") or set(label) & set('/\\:*?"<>|\0'):
         raise MapError(f"'{label}' cannot be the name of a town; use letters, digits, _ and -")
     target = Path(home) / "towns" / f"{label}.npz"
-    save_graph(bake(path, label), target)
+    baked = Path(path).suffix == ".npz"
+    save_graph(replace(load_graph(path), name=label) if baked else bake(path, label), target)
     return target
 
 

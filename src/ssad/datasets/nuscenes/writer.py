@@ -95,7 +95,7 @@ class NuScenesWriter:
         if kind is None:
             self.close()
 
-    def add_scene(self, name: str | None = None, *, description: str = "") -> str:
+    def add_scene(self, name: str | None = None, *, description: str = "", location: str = "drawn") -> str:
         """A scene. Without a name it gets the next one of mini_val, mini_train, then scene-9001 and so on."""
         taken = {scene.name for scene in self._rows[Scene].values()}
         if name is None:
@@ -104,7 +104,7 @@ class NuScenesWriter:
         if name in taken:
             raise ValueError(f"scene '{name}' was added before")
         logfile = f"log-{name}"
-        log = self._add(Log(_token("log", logfile), logfile, "ssad", "2020-01-01", "drawn"))
+        log = self._add(Log(_token("log", logfile), logfile, "ssad", "2020-01-01", location))
         return self._add(Scene(_token("scene", name), name, log, description))
 
     def add_sensor(

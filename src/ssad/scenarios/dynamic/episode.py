@@ -186,7 +186,10 @@ def forced_signals(
 def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent], *, movable: int) -> None:
     """RouteError if one of the first `movable` agents touches another one when the episode begins."""
     boxes = []
-    for agent in agents:
+    here = [
+        agent for agent in agents if not agent.trajectory or agent.trajectory[0][0] <= 0.0 <= agent.trajectory[-1][0]
+    ]
+    for agent in here:
         body = model(agent.model)
         boxes.append((agent.pose.x, agent.pose.y, agent.pose.yaw, body.length, body.width))
     for first, one in enumerate(boxes[:movable]):
@@ -195,6 +198,6 @@ def _check_start(scenario: Scenario, agents: Sequence[EpisodeAgent], *, movable:
             reach = 0.5 * (math.hypot(*one[3:]) + math.hypot(*other[3:]))
             if math.hypot(one[0] - other[0], one[1] - other[1]) <= reach and obb_distance(one, other) <= 0.0:
                 raise RouteError(
-                    f"scenario {scenario.name}: {agents[second].name} stands in the {agents[first].name} at the start; "
+                    f"scenario {scenario.name}: {here[second].name} stands in the {here[first].name} at the start; "
                     "move one of them"
                 )
