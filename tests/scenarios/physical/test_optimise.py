@@ -1,4 +1,4 @@
-"""Training textures: on a toy whose optimum is known, continued after a stop to the bit, and refused where it cannot be."""
+"""Training textures: on a toy whose optimum is known, continued to the bit after a stop, refused where it cannot be."""
 
 from __future__ import annotations
 
@@ -154,9 +154,7 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
         train_texture(PLAIN, detector(), SURFACE, seen, start=control("grey", SURFACE.size))
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"epochs": 0}, {"batch": 0}, {"rate": 0.0}, {"optimiser": "lbfgs"}, {"worst": 1.5}]
-)
+@pytest.mark.parametrize("wrong", [{"epochs": 0}, {"batch": 0}, {"rate": 0.0}, {"optimiser": "lbfgs"}, {"worst": 1.5}])
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match="attack odd"):
         TextureAttack("odd", **wrong)  # type: ignore[arg-type]

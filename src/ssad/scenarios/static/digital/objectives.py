@@ -181,8 +181,9 @@ class Margin:
 
 @dataclass(frozen=True, slots=True)
 class Hide:
-    """No box on an object with any score: log(1 - the largest score of its class times IoU over all locations), summed
-    over the objects of the aim.
+    """No box on an object with any score.
+
+    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim.
 
     Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any head.
 
@@ -197,6 +198,7 @@ class Hide:
     needs_objects: bool = True
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         score = log_scores(dense).exp()
         total = dense.logit.new_zeros(len(dense.logit))
         for k, truth in enumerate(situation.assignment.truth):
@@ -307,9 +309,8 @@ def objects_of(situation: Situation, image: int) -> list[int]:
     names = list(aim.becomes) if aim.becomes else aim.classes
     wanted = None if names is None else {_index(situation.detector, name) for name in names}
     numbers = range(len(truth.label)) if aim.objects is None else aim.objects
-    return [
-        number for number in numbers if number < len(truth.label) and (wanted is None or int(truth.label[number]) in wanted)
-    ]
+    labels = truth.label.tolist()
+    return [k for k in numbers if k < len(labels) and (wanted is None or labels[k] in wanted)]
 
 
 def _overlap(box: Tensor, real: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ class Distraction:
     needs_objects: bool = True
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         maps = attention(dense, situation, dense.features[-1:])
         values = []
         for k, box in enumerate(_targets(situation)):
@@ -68,6 +69,7 @@ class Redistribution:
     needs_objects: bool = True
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
         boxes = _targets(situation)
         total = torch.zeros(len(boxes), device=dense.logit.device, dtype=dense.logit.dtype)
         for level in attention(dense, situation, dense.features):
@@ -156,6 +158,6 @@ def _parts(local: Tensor) -> Tensor:
         label = grown
     strength = [
         local[label == number].sum() / (GRID * GRID + 1 - (label == number).sum())
-        for number in label[label > 0].unique().tolist()
+        for number in sorted(set(label[label > 0].tolist()))
     ]
     return torch.stack(strength).mean()

@@ -47,7 +47,8 @@ class Carrier(Protocol):
     """
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What tables call it."""
 
     def on(self, mesh: Mesh) -> Surface:
         """The carrier on a body.
@@ -65,7 +66,7 @@ class Patch:
     """A rectangle stuck on one panel; lamps, windows and plates that it covers stay as they are.
 
     Attributes:
-        panel: Name of the panel (`Mesh.panels`): rear, hood, roof, left_side/front_door, face of a sign, torso_front ...
+        panel: Name of the panel (`Mesh.panels`): rear, hood, roof, left_side/front_door, a sign's face, torso_front ...
         width: In m.
         height: In m.
         centre: Of the patch in the panel's rectangle, shares from its upper left corner.
@@ -86,13 +87,14 @@ class Patch:
         _check_texels(self.texels)
 
     def on(self, mesh: Mesh) -> Surface:
+        """See `Carrier`."""
         u0, v0, u1, v1 = mesh.panel_rectangle(self.panel)
         across, down = metres_of(mesh, self.panel)
         wide, high = self.width / across, self.height / down
         u, v = u0 + self.centre[0] * (u1 - u0), v0 + self.centre[1] * (v1 - v0)
         rectangle = (u - wide / 2, v - high / 2, u + wide / 2, v + high / 2)
-        slack = 1e-6
-        if rectangle[0] < u0 - slack or rectangle[1] < v0 - slack or rectangle[2] > u1 + slack or rectangle[3] > v1 + slack:
+        beyond = max(u0 - rectangle[0], v0 - rectangle[1], rectangle[2] - u1, rectangle[3] - v1)
+        if beyond > 1e-6:
             raise ConfigError(
                 f"a patch of {self.width:g} x {self.height:g} m at {self.centre} does not fit on the panel "
                 f"'{self.panel}', which is {(u1 - u0) * across:.2f} x {(v1 - v0) * down:.2f} m"
@@ -121,6 +123,7 @@ class Camouflage:
         _check_texels(self.texels)
 
     def on(self, mesh: Mesh) -> Surface:
+        """See `Carrier`."""
         if not (mesh.panel >= 0).any():
             raise ConfigError("this body has no panels to paint")
         return _surface(mesh, (0.0, 0.0, 1.0, 1.0), (self.texels, self.texels), metres_of(mesh))

@@ -163,7 +163,7 @@ def train_texture(
                 if inks is not None and attack.printed > 0.0:
                     loss = loss + attack.printed * non_printability(colour, inks, mask)
                 optimiser.zero_grad()
-                loss.backward()
+                torch.autograd.backward(loss)
                 assert colour.grad is not None
                 if not bool(colour.grad.isfinite().all()):
                     raise ConfigError(f"attack {attack.name}: the gradient is not finite in epoch {epoch + 1}")
@@ -179,8 +179,8 @@ def train_texture(
             state.gradients.append(steepest)
             if not any(state.gradients):  # later it means that nothing is left to hide
                 raise ConfigError(
-                    f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never in "
-                    "view, or is not found even without it"
+                    f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never "
+                    "in view, or is not found even without it"
                 )
             if checkpoint is not None:
                 state.save(checkpoint, name)

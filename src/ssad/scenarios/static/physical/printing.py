@@ -1,4 +1,4 @@
-"""What can be printed, and what it looks like where it is stuck: regularisers and the expectation over print and place."""
+"""What can be printed, and how it differs from car to car: regularisers, and the expectation over print and place."""
 
 from __future__ import annotations
 
