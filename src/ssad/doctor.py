@@ -18,7 +18,13 @@ from ssad.core.safeio import home
 
 @dataclass(frozen=True)
 class Finding:
-    """One check. state: ok, missing (some commands need it) or broken (no suite runs without it)."""
+    """One check.
+
+    Attributes:
+        what: What is checked.
+        state: ok, missing (some commands need it) or broken (no suite runs without it).
+        detail: What was found.
+    """
 
     what: str
     state: str

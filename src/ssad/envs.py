@@ -25,6 +25,7 @@ import gymnasium
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
+from ssad.drivers import make_system
 from ssad.roads import LaneGraph, load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 
@@ -39,9 +40,19 @@ ID = "SSAD/Driving-v0"
 def episodes_of(
     scenarios: str | Path | Sequence[str | Path], *, seed: int = 0
 ) -> tuple[list[Episode], Mapping[str, LaneGraph]]:
-    """Concrete episodes of scenario sets, names or files, and the lane graphs of their towns.
+    """Concrete episodes of scenario sets, and the lane graphs of their towns.
 
-    UnknownNameError, ConfigError, RouteError for what cannot be found or built.
+    Args:
+        scenarios: Names of sets or files.
+        seed: Seed of the episodes.
+
+    Returns:
+        The episodes; and lane graphs by the name of the town.
+
+    Raises:
+        UnknownNameError: There is no such set, file or town.
+        ConfigError: A scenario is not valid.
+        RouteError: An episode cannot be built.
     """
     refs = [scenarios] if isinstance(scenarios, (str, Path)) else list(scenarios)
     found = [scenario for ref in refs for scenario in load_scenarios(ref)]
@@ -72,7 +83,7 @@ def make(*, scenarios: str | Sequence[str] = "precrash", episode_seed: int = 0, 
     """One scene; `options` go to `ssad.world.env.SingleEnv` (observation, action, device)."""
     from ssad.world.env import SingleEnv
 
-    return SingleEnv(*episodes_of(scenarios, seed=episode_seed), **options)
+    return SingleEnv(*episodes_of(scenarios, seed=episode_seed), **{"policies": make_system} | options)
 
 
 def make_vec(
@@ -82,7 +93,7 @@ def make_vec(
     from ssad.world.env import VectorEnv
 
     options.pop("vectorization_mode", None)
-    return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **options)
+    return VectorEnv(*episodes_of(scenarios, seed=episode_seed), num_envs, **{"policies": make_system} | options)
 
 
 def make_sb3(

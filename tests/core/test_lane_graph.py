@@ -41,6 +41,17 @@ def test_a_place_on_a_lane_by_hand() -> None:
     assert graph.points(1) == slice(51, 102)
 
 
+@pytest.mark.parametrize("name", ["Ringmere", "Twinford"])
+def test_many_places_are_those_of_one_by_one_to_the_bit(name: str) -> None:
+    graph, draws = load_town(name), np.random.default_rng(0)
+    for lane in range(0, graph.lanes, 3):
+        points = graph.s[graph.points(lane)].astype(np.float64)
+        s = np.concatenate([draws.uniform(-1.0, float(graph.length[lane]) + 1.0, 20), points])
+        found = graph.along(lane, s)
+        assert found.shape == (len(s), 4)
+        assert [tuple(row) for row in found.tolist()] == [graph.at(lane, place) for place in s.tolist()], lane
+
+
 def test_headings_turn_the_short_way() -> None:
     yaw = straight_graph().yaw.copy()
     yaw[:3] = (3.0, -3.0, 3.0)  # 0.28 rad to the left over pi, and back
@@ -48,23 +59,6 @@ def test_headings_turn_the_short_way() -> None:
     turn = 2 * np.pi - 6.0
     assert graph.at(0, 0.5)[2] == pytest.approx(3.0 + 0.25 * turn)
     assert graph.at(0, 2.5)[2] == pytest.approx(-3.0 - 0.25 * turn)
-
-
-@pytest.mark.parametrize("name", ["Oldmarket", "Ringmere"])
-def test_many_places_at_once_are_those_one_by_one_to_the_bit(name: str) -> None:
-    graph, draws = load_town(name), np.random.default_rng(0)
-    for lane in draws.choice(graph.lanes, 60):
-        length = float(graph.length[lane])
-        places = [
-            -1.0,
-            0.0,
-            length,
-            length + 1.0,
-            float(graph.s[graph.points(lane)][1]),
-            *draws.uniform(0, length, 5).tolist(),
-        ]
-        one_by_one = np.array([graph.at(int(lane), s) for s in places])
-        np.testing.assert_array_equal(graph.along(int(lane), places), one_by_one)
 
 
 def test_lanes_of_one_road_and_one_sign_run_the_same_way() -> None:

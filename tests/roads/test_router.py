@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,6 +18,7 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import LaneType, Pose, Route
 from ssad.roads import LaneGraph, LaneQuery, random_route, route_along
+from ssad.roads.router import _Leg, _line
 
 TURN = 0.28  # rad a metre: the tightest turn has 8 m radius, the shortest lane change is 10 m
 
@@ -137,6 +140,32 @@ def test_random_routes(name: str) -> None:
         check(graph, route)
     again = [random_route(graph, lane, s, 90.0, generator("same")) for _ in range(2)]
     assert np.array_equal(again[0].xy, again[1].xy)
+
+
+def test_a_route_does_not_depend_on_those_drawn_before() -> None:
+    """Whole lanes are kept, and lane changes move what they are given."""
+    used = built_in("Crossgate")
+    lanes = np.flatnonzero((used.kind == LaneType.DRIVING) & (used.length > 20.0)).tolist()
+    draws = np.random.default_rng(1)
+    ends = [[(*used.at(lane, 5.0)[:2],) for lane in draws.choice(lanes, 2).tolist()] for _ in range(30)]
+    for _ in range(2):
+        for pair in ends:
+            with contextlib.suppress(RouteError):
+                route_along(used, pair)
+    assert len(used.kept) > 10
+    compared = 0
+    for pair in ends[::5]:
+        with contextlib.suppress(RouteError):
+            one, other = route_along(used, pair), route_along(replace(used), pair)
+            assert one.xy.tobytes() == other.xy.tobytes()
+            assert one.width.tobytes() == other.width.tobytes()
+            compared += 1
+    assert compared > 2
+    lane = min(lanes, key=lambda lane: abs(float(used.length[lane]) - 30.0))
+    leg = _Leg(((lane, 0.0, float(used.length[lane])),))
+    plain, fine = _line(used, leg)[0], _line(used, leg, 0.5)[0]
+    assert len(fine) > 1.9 * float(used.length[lane]) > len(plain)
+    assert np.array_equal(_line(used, leg)[0], plain)
 
 
 def test_key_points_select_the_lane() -> None:

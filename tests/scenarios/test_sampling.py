@@ -79,7 +79,7 @@ NOMINAL = {
 
 
 # fields that came later: at their defaults they change nothing
-LATER = {"trajectory": (), "contact": "end"}
+LATER = {"trajectory": (), "contact": "end", "policy": ""}
 
 
 def feed(digest: Any, value: object) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -118,6 +119,15 @@ def test_without_policies_it_is_said_what_to_give() -> None:
     for _ in range(10):
         env.step(env.action_space.sample() * 0)
     assert env.world.state().speed[0, 2] > 0.5
+
+
+def test_environments_by_name_know_the_drivers(tmp_path: Path) -> None:
+    save_scenarios(tmp_path / "one.yaml", [scenario()])
+    env = gymnasium.make("ssad.envs:SSAD/Driving-v0", scenarios=str(tmp_path / "one.yaml"), disable_env_checker=True)
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(0 * env.action_space.sample())
+    assert env.unwrapped.world.state().speed[0, 2] > 0.5
 
 
 def test_the_search_for_a_way_out_drives_them_too() -> None:

@@ -31,10 +31,18 @@ PLAIN_CLASSES: Final = ("stop_sign",)
 
 
 def class_of(kind: str) -> str:
-    """The nuScenes class of a kind of body. KeyError: it has none."""
+    """The nuScenes class of a kind of body.
+
+    Raises:
+        KeyError: It has none.
+    """
     return CATEGORY_TO_CLASS[BODY_CATEGORIES[kind]]
 
 
 def plain_body(size: Point) -> Mesh:
-    """A box of sheet metal for what has no body of its own; size: length, width, height, m."""
+    """A box of sheet metal for what has no body of its own.
+
+    Args:
+        size: Length, width, height, m.
+    """
     return box(size, material=Material("sheet", (0.5, 0.08, 0.06), gloss=0.4), centre=(0, 0, size[2] / 2))

@@ -37,7 +37,11 @@ class FaceList:
 
 
 def beside(file: Path, reference: str) -> Path:
-    """A file that another one refers to: it must lie in the same folder or below. FormatError."""
+    """A file that another one refers to: it must be in the same folder or below.
+
+    Raises:
+        FormatError: It is elsewhere.
+    """
     folder = file.parent.resolve()
     target = (folder / reference).resolve()
     if "\0" in reference or ":" in reference or not target.is_relative_to(folder):

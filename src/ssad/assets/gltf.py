@@ -29,7 +29,11 @@ MAX_NODES = 20_000
 
 
 def read_gltf(file: Path) -> FaceList:
-    """Triangles of the default scene in the frame of the file. FormatError."""
+    """Triangles of the default scene, in the frame of the file.
+
+    Raises:
+        FormatError: The file is broken, or uses what is not supported.
+    """
     data = safeio.read_bytes(file, limit=MAX_BYTES)
     chunk = None
     if file.suffix.lower() == ".glb":

@@ -35,10 +35,18 @@ def load_mesh(
 ) -> Mesh:
     """A mesh from an .obj, .gltf or .glb file in the object frame: x forward, z up, base centred on the origin.
 
-    `unit` is the length of one unit of the file in metres; `up` and `forward` are axes of the file (x, -x, y, ...;
-    default z and x for OBJ, y and z for glTF, as its standard says); `size` (m) stretches the mesh to fill a box.
-    `paint` names the materials that take paint or a texture (default: all); their groups become panels, and their
-    texture coordinates must lie in one tile. FormatError, ConfigError.
+    Args:
+        path: The file.
+        unit: Length of one unit of the file, m.
+        up: Axis of the file (x, -x, y, ...) that points up; None: z for OBJ, y for glTF, as its standard says.
+        forward: Axis of the file that points forward; None: x for OBJ, z for glTF.
+        size: Length, width and height that the mesh is stretched to, m; None: as it is.
+        paint: Names of the materials that take paint or a texture; None: all. Their groups become panels, and their
+            texture coordinates must be in one tile.
+
+    Raises:
+        FormatError: The file is broken, or uses what is not supported.
+        ConfigError: An argument does not fit.
     """
     file = Path(path)
     suffix = file.suffix.lower()

@@ -96,7 +96,11 @@ class _Obj:
 
 
 def read_obj(file: Path) -> FaceList:
-    """Triangles of an OBJ file with the materials of its MTL files, in the frame of the file. FormatError."""
+    """Triangles of an OBJ file with the materials of its MTL files, in the frame of the file.
+
+    Raises:
+        FormatError: A file is broken.
+    """
     text = safeio.read_text(file, limit=MAX_BYTES).replace("\\\n", " ").replace("\\\r\n", " ")
     state = _Obj(file)
     tables = {"v": (state.v, 3), "vt": (state.vt, 2), "vn": (state.vn, 3)}

@@ -174,7 +174,11 @@ def system_name(detector: str, guard: Guarded | None) -> str:
 
 
 def guard_of(suite: DigitalSuite, entry: Entry) -> Guarded | None:
-    """The defence of a row; it is built, to see whether it takes its options. ConfigError."""
+    """The defence of a row; it is built in order to see whether it accepts its options.
+
+    Raises:
+        ConfigError: It does not, or there is no such defence.
+    """
     if entry.defence is None:
         if entry.aware:
             raise ConfigError(f"suite {suite.name}: attack {entry.name}: aware of which defence? it names none")
@@ -187,7 +191,11 @@ def guard_of(suite: DigitalSuite, entry: Entry) -> Guarded | None:
 
 
 def rows_of(suite: DigitalSuite) -> list[Point]:
-    """The rows of the tables. ConfigError."""
+    """The rows of the tables.
+
+    Raises:
+        ConfigError: An attack does not exist or refuses a setting, or one appears twice.
+    """
     found = []
     for one in suite.attacks:
         guard = guard_of(suite, one)
@@ -237,7 +245,11 @@ def points_of(suite: DigitalSuite) -> list[Point]:
 
 
 def transfers_of(suite: DigitalSuite) -> list[Point]:
-    """The attacks whose pictures are shown to other detectors. ConfigError."""
+    """The attacks whose pictures are shown to other detectors.
+
+    Raises:
+        ConfigError: An attack does not exist or refuses a setting.
+    """
     return [Point((_spec(suite, one, one.radius, one.steps),), scenes=one.scenes or 0) for one in suite.transfer]
 
 

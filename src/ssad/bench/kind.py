@@ -129,7 +129,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Replay:
-    """A cell run again. difference: None when equal to the bit, else where the two part; trace, graph: of a drive."""
+    """A cell run again.
+
+    Attributes:
+        cell: The cell.
+        difference: None if the result is equal to the bit, else where the two differ.
+        trace: What happened in the drive.
+        graph: The town of the drive.
+    """
 
     cell: Cell
     difference: str | None
@@ -161,10 +168,16 @@ class Kind(ABC):
 
     @abstractmethod
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Resolve a suite. check: look at all input, so that what is wrong with it ends here and not in a record.
+        """Resolve a suite.
+
+        Args:
+            suite: The suite.
+            device: Where its cells run.
+            check: Whether to check all input, so that errors show up here and not in a record.
 
         Raises:
-            ConfigError, FormatError: the input is wrong.
+            ConfigError: The input is wrong.
+            FormatError: The input is wrong.
         """
 
     @abstractmethod

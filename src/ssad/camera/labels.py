@@ -31,11 +31,14 @@ _bounds: WeakKeyDictionary[Scene, dict[int, tuple[F64, F64]]] = WeakKeyDictionar
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """What is seen of the things of one view: N rows in order of their tags, for each with a visible pixel.
+    """What is seen of the things of one view: N rows in the order of their tags, one for each with a visible pixel.
 
-    tag [N]; box [N, 4]: x0, y0, x1, y1 of the visible pixels, at pixel edges; pixels [N]: how many are visible;
-    share [N] in 0..1: visible pixels of those that it would cover in the picture were nothing else there; inside [N]
-    in 0..1: share of its projection that lies in the picture.
+    Attributes:
+        tag: [N].
+        box: x0, y0, x1, y1 of the visible pixels, at pixel edges [N, 4].
+        pixels: Number of visible pixels [N].
+        share: Visible pixels as a share of those that it would cover if nothing else were there, 0 to 1 [N].
+        inside: Share of its projection that lies in the picture, 0 to 1 [N].
     """
 
     tag: I32
@@ -49,9 +52,17 @@ class Labels:
 
 
 def label_picture(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> Labels:
-    """Labels of picture `index`, which shows `view` of `stage`; scale: samples a pixel that it was rendered with.
+    """Labels of a picture. Things with tags below 1 get none; things that share a tag count as one.
 
-    Things with tags below 1 get no label; things of one tag are one. ConfigError: the picture shows another view.
+    Args:
+        stage: The scene.
+        view: The view that was rendered.
+        picture: The rendered pictures.
+        index: Which of them.
+        scale: Samples along each side of a pixel that it was rendered with.
+
+    Raises:
+        ConfigError: The picture shows another view.
     """
     tag, box, pixels = extents(_tags(view, picture, index))
     alone, inside = _amodal(stage, view, tag, scale=scale)
@@ -60,7 +71,18 @@ def label_picture(stage: Scene, view: View, picture: Picture, index: int = 0, *,
 
 
 def visible_share(stage: Scene, view: View, picture: Picture, index: int = 0, *, scale: int = 2) -> dict[int, float]:
-    """Visible share in 0..1 for the tag (1 and more) of each thing of a view, 0 for what is not seen. ConfigError."""
+    """Visible share (0 to 1) of each thing of a view, by its tag (1 and above); 0 for what is not seen.
+
+    Args:
+        stage: See `label_picture`.
+        view: See `label_picture`.
+        picture: See `label_picture`.
+        index: See `label_picture`.
+        scale: See `label_picture`.
+
+    Raises:
+        ConfigError: The picture shows another view.
+    """
     labels = label_picture(stage, view, picture, index, scale=scale)
     shares = dict.fromkeys(sorted({t.tag for t in view.things if t.tag > 0}), 0.0)
     return shares | dict(zip(labels.tag.tolist(), labels.share.tolist(), strict=True))

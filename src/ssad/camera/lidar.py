@@ -33,10 +33,17 @@ ON_ROOF: F64 = np.array([[0.0, 1, 0, 0.94], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 
 class Lidar:
     """A spinning LiDAR.
 
-    beams: elevations, rad, lowest first; azimuths: columns a turn; to_ego [4, 4]; reach: m; noise: standard deviation
-    of the range, m; period: s a turn; blind: m within which nothing returns; lost: share of returns that are lost
-    whatever they hit; faint: share of light (albedo times cosine of incidence over squared metres) at which a return
-    is lost with probability 1/e; 0: none is lost for being faint.
+    Attributes:
+        beams: Elevations, lowest first, rad.
+        azimuths: Columns in a turn.
+        to_ego: Sensor to ego [4, 4].
+        reach: m.
+        noise: Standard deviation of the range, m.
+        period: Time of a turn, s.
+        blind: Distance within which nothing returns, m.
+        lost: Share of returns that are lost whatever they hit.
+        faint: Share of light (albedo times cosine of incidence over squared metres) at which a return is lost with
+            probability 1/e; 0: none is lost for being faint.
     """
 
     beams: F64
@@ -135,12 +142,26 @@ def sweep(
     motion: bool = False,
     before: tuple[F64, Sequence[Thing]] | None = None,
 ) -> tuple[F32, I32]:
-    """One turn: points [P, 5] (x, y, z in the sensor frame, m; intensity 0..255; ring) and tags [P] (0: street).
+    """One turn of a LiDAR.
 
-    ego_to_world [4, 4]; key: of the noise, e.g. (seed, scene, sample). With `motion` the turn ends at the moment given
-    and began one period earlier at `before` (pose of the ego, and things, known by their tags; that they turn is left
-    out). Its points are given in the sensor frame at the end: the motion of the ego is taken out, that of others not.
-    ConfigError for a LiDAR, poses or things that do not fit.
+    With `motion`, the turn ends at the moment given and began one period earlier. Its points are given in the sensor
+    frame at the end: the motion of the ego is compensated, that of others is not.
+
+    Args:
+        stage: The scene.
+        lidar: The LiDAR.
+        ego_to_world: [4, 4].
+        things: What stands there.
+        key: Key of the noise, e.g. (seed, scene, sample).
+        motion: Whether the sensor and the things move during the turn.
+        before: Pose of the ego [4, 4], and things (identified by their tags; their rotation is ignored), one period
+            earlier.
+
+    Returns:
+        Points [P, 5] (x, y, z in the sensor frame, m; intensity 0..255; ring) and tags [P] (0: street).
+
+    Raises:
+        ConfigError: The LiDAR, poses or things do not fit.
     """
     _check(stage, lidar, ego_to_world, things)
     things = [t for t in things if stage.count[t.mesh]]

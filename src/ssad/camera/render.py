@@ -249,11 +249,20 @@ def render(
     linear: bool = True,
     surface: bool = False,
 ) -> Picture:
-    """Pictures of views of one size. ConfigError for views that do not fit.
+    """Render views of one size.
 
-    scale: samples a pixel along each side; quality: what light is followed; download: numpy arrays; else the picture's
-    image, radiance, tag and depth stay on the stage's device as Warp arrays; linear: download the radiance too;
-    surface: say what each pixel shows.
+    Args:
+        stage: The scene.
+        views: The views.
+        scale: Samples along each side of a pixel.
+        quality: Which effects of light are rendered.
+        download: Whether to return numpy arrays; else image, radiance, tag and depth stay on the stage's device as Warp
+            arrays.
+        linear: Whether to download the radiance too.
+        surface: Whether to say what each pixel shows.
+
+    Raises:
+        ConfigError: The views do not fit.
     """
     if not views:
         raise ConfigError("no view to render")

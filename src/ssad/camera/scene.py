@@ -266,11 +266,17 @@ class Scene:
     def tiles(
         self, eyes: F64, axes: F64 | None, *, reach: tuple[float, float], far: F64, horizon: bool
     ) -> tuple[I32, I32, I32]:
-        """First and count in the list of the street's tiles that B views need, and whose view it is.
+        """The street's tiles that B views need.
 
-        eyes [B, 3]; axes [B, 3] viewing directions: what lies wholly behind is left out (None: all around); reach:
-        distances up to which tiles are drawn in full and without small things; far [B]: beyond it not at all;
-        horizon: whether the far ground belongs to it.
+        Args:
+            eyes: Positions [B, 3].
+            axes: Viewing directions [B, 3]: what lies wholly behind is left out. None: all around.
+            reach: Distances up to which tiles are drawn in full, and without small things, m.
+            far: Distance beyond which tiles are not drawn at all [B], m.
+            horizon: Whether the far ground belongs to them.
+
+        Returns:
+            First and count in the list of faces, and the view, of each tile.
         """
         street = self.street
         if street is None:
@@ -306,9 +312,17 @@ class Scene:
         horizon: bool = True,
         casting: bool = False,
     ) -> Draws:
-        """What B views need: tiles of the street, and things that are neither wholly behind them nor beyond `far` [B].
+        """What B views need: tiles of the street, and things that are neither wholly behind them nor too far away.
 
-        inverses [B, 4, 4]: world to camera; casting: hidden things too. Other arguments as for `tiles`.
+        Args:
+            inverses: World to camera [B, 4, 4].
+            bodies: The things of all views.
+            eyes: See `tiles`.
+            axes: See `tiles`.
+            reach: See `tiles`.
+            far: Distance beyond which nothing is drawn [B], m.
+            horizon: See `tiles`.
+            casting: Whether hidden things are needed too.
         """
         first, count, view = self.tiles(eyes, axes, reach=reach, far=far, horizon=horizon)
         tiles = len(first)

@@ -51,7 +51,11 @@ class Taps:
 
 
 def levels_of(size: tuple[int, int]) -> list[tuple[int, int]]:
-    """Heights and widths of the pyramid: each half of the one before, rounded up, down to 1 x 1. ConfigError."""
+    """Heights and widths of the pyramid: each half of the one before, rounded up, down to 1 x 1.
+
+    Raises:
+        ConfigError: A side is not from 1 to 2^14 texels.
+    """
     height, width = size
     if min(height, width) < 1 or max(height, width) > 1 << 14:
         raise ConfigError(f"a texture of {height} x {width} texels: from 1 to {1 << 14} a side")

@@ -30,10 +30,13 @@ UNIT_CORNERS: F64 = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5
 
 @dataclass(frozen=True, slots=True)
 class WorldBoxes:
-    """N boxes in the world, columns.
+    """N boxes in the world, as columns.
 
-    centre [N, 3] m: the middle; size_lwh [N, 3] m: along the box's x (forward), y (left) and z (up); rotation [N, 4]
-    quaternions (w, x, y, z) of these axes; velocity [N, 2 or 3] m/s, NaN where unknown.
+    Attributes:
+        centre: Middle [N, 3], m.
+        size_lwh: Size along the box's x (forward), y (left) and z (up) [N, 3], m.
+        rotation: Quaternions (w, x, y, z) of these axes [N, 4].
+        velocity: [N, 2 or 3], m/s; NaN where unknown.
     """
 
     centre: F64

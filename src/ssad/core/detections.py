@@ -74,12 +74,19 @@ class Detections:
 
 @dataclass(frozen=True, slots=True)
 class Dense:
-    """Raw outputs before any threshold or suppression, differentiable to the image.
+    """Raw outputs before any threshold or suppression, differentiable with respect to the image.
 
-    logit [B, P, C]: class logits; quality [B, P]: the logit that multiplies them (objectness, centreness), None for a
-    detector without; box [B, P, 4]: 2D boxes; place [P, 2]: x, y of the cell's middle in pixels; stride [P];
-    level [P]: index of the map it comes from; maps: the detector's own maps by name, as its source returns them;
-    features: trunk or neck maps [B, K, h, w], finest first, for attention-based attacks.
+    Attributes:
+        logit: Class logits [B, P, C].
+        quality: Logit whose sigmoid multiplies the class score (objectness, centreness) [B, P]; None for a detector
+            without.
+        box: 2D boxes [B, P, 4].
+        place: x, y of the cell's middle [P, 2], pixels.
+        stride: Stride of each place [P], pixels.
+        level: Index of the map that each place comes from [P].
+        maps: The detector's own maps by name, as its source returns them.
+        features: Maps of trunk or neck [B, K, h, w], finest first, for attention-based attacks.
+        size: Height and width of the picture.
     """
 
     logit: Tensor
@@ -97,8 +104,11 @@ class Dense:
 class Assignment:
     """Target assignment: which object each location is trained to predict. Fixed before an attack or a training step.
 
-    label [B, P]: class, -1 background, -2 ignored; owner [B, P]: index into that image's objects, -1 none; extra: what
-    else the detector's loss needs.
+    Attributes:
+        label: Class [B, P]; -1 background, -2 ignored.
+        owner: Index into that image's objects [B, P]; -1 for none.
+        truth: The objects of each image.
+        extra: What else the detector's loss needs.
     """
 
     label: Tensor

@@ -42,11 +42,18 @@ class Camera:
 class Frame:
     """One exposure of one camera, without its pixels.
 
-    scene, sample: keys of randomness (weather is drawn once a scene, sensor noise once a file); time s;
-    ego_to_world [4, 4]; ego_velocity [3] m/s in the world frame; depth [h, w] metres along the optical axis, in any
-    resolution (0: unknown, inf: sky); points [P, 3] LiDAR returns in the camera frame, from which depth is filled in
-    where `depth` is None; sun: the share of the sun's disc that is free, where another camera of the moment sees it
-    (None: not known; each picture is then judged by itself).
+    Attributes:
+        camera: The camera.
+        scene: Key of what is drawn once for a scene, such as weather.
+        sample: Key of what is drawn once for a file, such as sensor noise.
+        time: s.
+        ego_to_world: [4, 4].
+        ego_velocity: World frame [3], m/s.
+        boxes: Objects.
+        depth: Depth along the optical axis [h, w], m, in any resolution (0: unknown, inf: sky).
+        points: LiDAR returns in the camera frame [P, 3], from which depth is filled in where `depth` is None.
+        sun: Share of the sun's disc that is visible, where another camera of the same moment sees it; None: unknown, so
+            that each picture is judged by itself.
     """
 
     camera: Camera
@@ -78,8 +85,14 @@ class SweepFrame:
 class StandingObject:
     """A thing that stands still in the world over a whole scene.
 
-    kind, style: of `ssad.assets.bodies`; seed: of its looks; size: length, width, height, m; place: middle of its base
-    in the world, m; yaw: radians; level: least severity at which it is there.
+    Attributes:
+        kind: A kind of `ssad.assets.bodies`.
+        style: A style of that kind.
+        seed: Seed of its looks.
+        size: Length, width, height, m.
+        place: Middle of its base in the world, m.
+        yaw: rad.
+        level: Lowest severity at which it is present.
     """
 
     kind: str
@@ -93,12 +106,15 @@ class StandingObject:
 
 @dataclass(frozen=True, slots=True)
 class SceneContext:
-    """What is constant over a scene and drawn or measured once: the key, brightness, where it goes.
+    """What is constant over a scene and drawn or measured once.
 
-    light: brightness of the sky in [0, 1] (for airlight and flakes: dark at night); heading: of the ego in the world at
-    the start of the scene, radians; start: its first time, s; sun: unit vector towards it in the world, where it was
-    chosen so that it is seen (None: drawn); objects: what stands on its road and is of no class (None: drawn for each
-    picture by itself).
+    Attributes:
+        scene: Key of the scene.
+        light: Brightness of the sky in [0, 1], for airlight and flakes, which are dark at night.
+        heading: Heading of the ego in the world at the start of the scene, rad.
+        start: First time of the scene, s.
+        sun: Unit vector towards the sun in the world, where it was chosen so that it is visible; None: drawn.
+        objects: Objects of no class that stand on the road; None: drawn for each picture by itself.
     """
 
     scene: str = ""

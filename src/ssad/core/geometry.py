@@ -55,11 +55,17 @@ def corners(x: ArrayLike, y: ArrayLike, yaw: ArrayLike, length: ArrayLike, width
 
 
 def obb_distance(a: ArrayLike, b: ArrayLike) -> Floats:
-    """Distance [...] between oriented boxes, 0 where they overlap.
+    """Distance between oriented boxes, 0 where they overlap.
 
-    a, b [..., 5]: x, y, yaw, length, width (broadcast against each other). Two convex shapes which do not
-    overlap are nearest at a corner of one of them, so eight point-to-box distances and a separating-axis test
-    suffice.
+    Two convex shapes that do not overlap are nearest at a corner of one of them, so eight point-to-box distances and a
+    separating-axis test suffice.
+
+    Args:
+        a: Boxes [..., 5]: x, y, yaw, length, width.
+        b: Boxes of the same kind, broadcast against `a`.
+
+    Returns:
+        Distances [...].
     """
     first, second = np.broadcast_arrays(_floats(a), _floats(b))
     one = corners(*(first[..., i] for i in range(5)))

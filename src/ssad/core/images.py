@@ -20,7 +20,11 @@ BAND = 26  # pixels of a caption
 
 
 def read_image(path: str | Path) -> U8:
-    """A JPEG or PNG as uint8 [H, W, 3] RGB. FormatError: missing, cut short, not an image, grey, alpha or 16 bit."""
+    """Read a JPEG or PNG as uint8 [H, W, 3] RGB.
+
+    Raises:
+        FormatError: The file is missing or truncated, is not an image, or is grey, has alpha or 16 bits.
+    """
     return decode_image(read_bytes(path), str(path))
 
 
@@ -98,7 +102,12 @@ def captioned(image: U8, caption: str, width: int) -> U8:
 
 
 def save_picture(path: Path, image: U8) -> None:
-    """A picture as PNG or JPEG, by the name of the file. StoreError, ConfigError."""
+    """Write a picture as PNG or JPEG, by the name of the file.
+
+    Raises:
+        StoreError: The file cannot be written.
+        ConfigError: The name of the file ends in something else.
+    """
     if path.suffix.lower() in (".jpg", ".jpeg"):
         write_atomic(path, encode_jpeg(image, 88, "420"))
         return

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -41,21 +43,48 @@ class LaneGraph:
     """Lanes of a town as polylines that run in the direction of traffic. Arrays are read-only.
 
     L lanes, P points, E links, S signals, K stop lines, C crosswalks, G signs, R rules; metres, radians, m/s, world
-    frame.
-    A lane is one lane of one OpenDRIVE lane section; sidewalks and shoulders run as the driving lanes beside
-    them.
+    frame. A lane is one lane of one OpenDRIVE lane section; sidewalks and shoulders run in the direction of the driving
+    lanes beside them.
 
-    xy [P, 2], z, yaw, width, s [P]: centre line, its heading, the lane's width, arc length from the lane's
-    start. offset [L+1]: points of lane i are offset[i]:offset[i+1] (at least two). kind [L]: `LaneType`.
-    road, section, lane_id [L]: OpenDRIVE ids. junction [L]: junction the lane crosses, -1 none.
-    speed_limit [L]. left, right [L]: lane beside it as seen in its own direction (any kind, any direction),
-    -1 none. left_marking, right_marking [L]: `Marking` towards it. succ_offset [L+1], succ [E]: lanes that
-    follow. signal_xy [S, 2], signal_yaw [S] (direction of the traffic it faces), signal_junction [S];
-    signal_phase [S]: signals of a junction with equal phase are green together; signal_virtual [S]: not in
-    the map, off unless forced. stop_signal, stop_lane, stop_s [K]: signal that controls a lane at arc length
-    stop_s (near the lane's end). crosswalk_offset [C+1], crosswalk_xy [., 2]: corners of the crosswalks.
-    sign_kind [G]: `SignKind`; sign_xy [G, 2], sign_yaw [G] (direction of the traffic it faces); rule_sign, rule_lane,
-    rule_s [R]: sign that rules a lane, whose stop line is at arc length rule_s.
+    Attributes:
+        name: Name of the town.
+        xy: Points of the centre lines [P, 2].
+        z: Height of each point [P].
+        yaw: Heading of the centre line at each point [P].
+        width: Width of the lane at each point [P].
+        s: Arc length from the lane's start to each point [P].
+        offset: Points of lane i are offset[i]:offset[i+1], at least two [L+1].
+        kind: `LaneType` [L].
+        road: OpenDRIVE id of the road [L].
+        section: Number of the OpenDRIVE lane section [L].
+        lane_id: OpenDRIVE id of the lane [L].
+        junction: Junction that the lane crosses [L]; -1 for none.
+        speed_limit: [L].
+        left: Lane on the left as seen in its own direction, of any kind and direction [L]; -1 for none.
+        right: The same on the right [L].
+        left_marking: `Marking` towards the left lane [L].
+        right_marking: `Marking` towards the right lane [L].
+        succ_offset: Lanes that follow lane i are succ[succ_offset[i]:succ_offset[i+1]] [L+1].
+        succ: See `succ_offset` [E].
+        signal_xy: [S, 2].
+        signal_yaw: Direction of the traffic that the signal faces [S].
+        signal_junction: Junction of the signal [S].
+        signal_phase: Signals of a junction with equal phase are green together [S].
+        signal_virtual: Signals that are not in the map, and are off unless forced [S].
+        stop_signal: Signal that controls a lane [K].
+        stop_lane: The lane that it controls [K].
+        stop_s: Arc length of the stop line on that lane, near its end [K].
+        crosswalk_offset: Corners of crosswalk i are crosswalk_xy[crosswalk_offset[i]:crosswalk_offset[i+1]] [C+1].
+        crosswalk_xy: See `crosswalk_offset` [., 2].
+        sign_kind: `SignKind` [G].
+        sign_xy: [G, 2].
+        sign_yaw: Direction of the traffic that the sign faces [G].
+        rule_sign: Sign that rules a lane [R].
+        rule_lane: The lane that it rules [R].
+        rule_s: Arc length of the stop line on that lane [R].
+        length: Length of each lane [L].
+        pred_offset: As `succ_offset`, for the lanes that lead to lane i [L+1].
+        pred: As `succ`, for the lanes that lead to lane i [E].
     """
 
     name: str
@@ -118,6 +147,11 @@ class LaneGraph:
     def lanes(self) -> int:
         """Number of lanes L."""
         return len(self.kind)
+
+    @cached_property
+    def kept(self) -> dict[Any, Any]:
+        """What was worked out from these lanes and is asked for again."""
+        return {}
 
     def points(self, lane: int) -> slice:
         """The slice of the point arrays that holds a lane's centre line."""
@@ -241,13 +275,21 @@ def town_file(town: str) -> str:
 
 
 def save_graph(graph: LaneGraph, path: Path | str) -> None:
-    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes. StoreError."""
+    """Write a lane graph as .npz without pickle, whole or not at all; equal graphs give equal bytes.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     header = np.array([f"ssad-lane-graph {FORMAT}", graph.name])
     save_npz(path, {"header": header} | {name: getattr(graph, name) for name in _DTYPES})
 
 
 def load_graph(path: Path | str) -> LaneGraph:
-    """Read what `save_graph` wrote. MapError: missing, broken, too large, or not a lane graph."""
+    """Read what `save_graph` wrote.
+
+    Raises:
+        MapError: The file is missing, broken, too large, or not a lane graph.
+    """
     source, mend = Path(path), "bake the map again with ssad import map"
     try:
         arrays = load_npz(source, limit=MAX_FILE)

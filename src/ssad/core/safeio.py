@@ -40,7 +40,11 @@ def home() -> Path:
 
 
 def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
-    """The whole file, refused beyond `limit` bytes. FormatError."""
+    """Read a whole file.
+
+    Raises:
+        FormatError: The file cannot be read, or is larger than `limit` bytes.
+    """
     try:
         with open(path, "rb") as file:
             # room is made for as much as is asked for: what the file says it has; a pipe is read in parts
@@ -57,7 +61,11 @@ def read_bytes(path: str | Path, *, limit: int = 64 * MIB) -> bytes:
 
 
 def read_text(path: str | Path, *, limit: int = 64 * MIB) -> str:
-    """The whole file as UTF-8 text. FormatError."""
+    """Read a whole file as UTF-8 text.
+
+    Raises:
+        FormatError: The file cannot be read, is larger than `limit` bytes, or is not UTF-8.
+    """
     try:
         return read_bytes(path, limit=limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -229,7 +237,11 @@ def parse_yaml(text: str, name: str = "<text>") -> Any:
 
 
 def read_yaml_document(path: str | Path, *, limit: int = 16 * MIB) -> Document:
-    """Parse a YAML file and keep line numbers for later errors (`Document.error`). FormatError."""
+    """Parse a YAML file and keep line numbers for later errors (`Document.error`).
+
+    Raises:
+        FormatError: The file cannot be read, is larger than `limit` bytes, or is not valid YAML.
+    """
     return parse_yaml_document(read_text(path, limit=limit), str(path))
 
 
@@ -269,7 +281,11 @@ def parse_json(text: str | bytes, name: str = "<text>") -> Any:
 
 
 def read_json(path: str | Path, *, limit: int = 256 * MIB) -> Any:
-    """Plain data of a JSON file. FormatError."""
+    """Read plain data from a JSON file.
+
+    Raises:
+        FormatError: The file cannot be read, is larger than `limit` bytes, or is not valid JSON.
+    """
     return parse_json(read_text(path, limit=limit), str(path))
 
 
@@ -300,7 +316,11 @@ def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
 
 
 def read_xml(path: str | Path, *, limit: int = 256 * MIB) -> Element:
-    """Root element of an XML file, safely. FormatError."""
+    """Read the root element of an XML file, safely.
+
+    Raises:
+        FormatError: The file cannot be read, is larger than `limit` bytes, or is not valid XML.
+    """
     return parse_xml(read_bytes(path, limit=limit), str(path))
 
 
@@ -326,12 +346,20 @@ def npz_bytes(arrays: Mapping[str, npt.ArrayLike]) -> bytes:
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, npt.ArrayLike]) -> None:
-    """Write a deterministic compressed npz, atomically. StoreError."""
+    """Write a deterministic compressed npz, atomically.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     write_atomic(path, npz_bytes(arrays))
 
 
 def load_npz(path: str | Path, *, limit: int = 2048 * MIB) -> dict[str, npt.NDArray[Any]]:
-    """Arrays of an npz; pickles, and members larger than they say, are refused. FormatError."""
+    """Read the arrays of an npz; pickles, and members larger than they claim to be, are refused.
+
+    Raises:
+        FormatError: The file cannot be read, is too large, or is not such an npz.
+    """
     data = read_bytes(path, limit=limit)
     arrays: dict[str, npt.NDArray[Any]] = {}
     try:
@@ -366,7 +394,11 @@ def _read_npy(data: bytes) -> npt.NDArray[Any]:
 
 
 def make_folder(path: str | Path) -> Path:
-    """The folder, made with its parents, and checked to be writable. StoreError."""
+    """Make a folder with its parents, and check that it is writable.
+
+    Raises:
+        StoreError: It cannot be made or written to.
+    """
     folder = Path(path)
     probe = folder / f".probe-{os.getpid()}"
     try:
@@ -380,7 +412,11 @@ def make_folder(path: str | Path) -> Path:
 
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` (same suffix) that replaces it when the block ends well. StoreError."""
+    """A temporary path beside `path` (same suffix) that replaces it when the block ends well.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     target = Path(path)
     temporary = target.with_name(f".{target.stem}-{os.getpid()}-{os.urandom(4).hex()}.tmp{target.suffix}")
     try:
@@ -397,6 +433,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_atomic(path: str | Path, data: str | bytes) -> None:
-    """Write the whole file or nothing: temporary file in the same folder, fsync, rename. StoreError."""
+    """Write the whole file or nothing: temporary file in the same folder, fsync, rename.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.encode() if isinstance(data, str) else data)

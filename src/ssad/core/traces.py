@@ -30,7 +30,11 @@ def _arrays(trace: EpisodeTrace) -> dict[str, npt.NDArray[Any]]:
 
 
 def save_trace(path: str | Path, trace: EpisodeTrace) -> None:
-    """Write a trace (compressed, atomic). StoreError."""
+    """Write a trace, compressed and atomically.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     meta = safeio.dump_json(_meta(trace) | {"format": FORMAT})
     safeio.save_npz(path, {"meta": np.frombuffer(meta.encode(), np.uint8), **_arrays(trace)})
 

@@ -83,10 +83,14 @@ class SignalState(IntEnum):
 class Controller(IntEnum):
     """Who steers an agent.
 
-    NONE stands still; EXTERNAL takes the action given to `World.step`; AUTOPILOT follows its route, sees everything
-    and yields; FOLLOW keeps its route and target speed and sees nothing; SCRIPT runs its phases; PLACED is put where
-    `World.place` says: how another simulator is mirrored; TRAJECTORY is where its rows of time and place have it: how a
-    log is replayed.
+    Attributes:
+        NONE: Nobody: it stands still.
+        EXTERNAL: It takes the action given to `World.step`.
+        AUTOPILOT: It follows its route, sees everything and yields.
+        FOLLOW: It keeps its route and target speed and sees nothing.
+        SCRIPT: It runs its phases.
+        PLACED: It is put where `World.place` says; this is how another simulator is mirrored.
+        TRAJECTORY: It is where its rows of time and place have it; this is how a log is replayed.
     """
 
     NONE = 0
@@ -195,7 +199,14 @@ class SignalPlan:
 
 @dataclass(frozen=True)
 class TrafficPlan:
-    """Random background vehicles: share of the spawn points near the route, and least and most vehicles (FREA)."""
+    """Random background vehicles (FREA).
+
+    Attributes:
+        intensity: Share of the spawn points near the route that get a vehicle.
+        minimum: Least number of vehicles.
+        maximum: Largest number of vehicles.
+        wake_distance: Distance of the ego at which a vehicle wakes, m; 0: it is awake from the start.
+    """
 
     intensity: float = 0.3
     minimum: int = 5
@@ -220,10 +231,23 @@ class Limits:
 class Scenario:
     """What happens, as its author wrote it; round-trips through YAML.
 
-    `type` names a scenario class (`StraightObstacle`, ..., `NaturalJunction`) which turns `route`, `trigger`,
-    `placements` and `parameters` into actors, or is `Custom`, which takes `actors` as they are.
-    route: key points (x, y) in metres, at least two; trigger: the place the scenario is built around;
-    placements: poses of actors whose place the scenario's author fixed; seed varies what is random in it.
+    Attributes:
+        name: Name of the scenario.
+        type: Scenario class (`StraightObstacle`, ..., `NaturalJunction`) that turns `route`, `trigger`, `placements`
+            and `parameters` into actors; or `Custom`, which takes `actors` as they are.
+        town: Name of the town.
+        route: Key points (x, y), m; at least two.
+        trigger: The place that the scenario is built around.
+        placements: Poses of actors whose place the author fixed.
+        parameters: Values of the class's parameters.
+        actors: Actors of a `Custom` scenario.
+        signals: Plan of the traffic lights.
+        traffic: Background traffic.
+        limits: When the episode ends.
+        target_speed: Of the ego, m/s.
+        seed: Varies what is random in it.
+        group: Group that it belongs to in a set.
+        source: Where it comes from.
     """
 
     name: str
@@ -266,7 +290,21 @@ class Route:
 
 @dataclass(frozen=True)
 class EpisodeAgent:
-    """One agent of a concrete episode: where it starts and how it is driven; trajectory, policy: see `Actor`."""
+    """One agent of a concrete episode: where it starts and how it is driven.
+
+    Attributes:
+        name: Name of the agent.
+        model: Name of its model.
+        controller: Who steers it.
+        pose: Where it starts.
+        speed: At the start, m/s.
+        target_speed: m/s.
+        phases: What it does under SCRIPT.
+        route: What it follows.
+        wake_distance: Distance of the ego at which it wakes, m; 0: it is awake from the start.
+        trajectory: See `Actor`.
+        policy: See `Actor`.
+    """
 
     name: str
     model: str
@@ -285,8 +323,17 @@ class EpisodeAgent:
 class Episode:
     """A scenario made concrete on a lane graph: everything a world needs to run it. Agent 0 is the ego.
 
-    signal_override: signal index of the town -> forced state, until `override_until` seconds.
     `Condition.actor` counts the agents after the ego, in order: actor 0 is agent 1.
+
+    Attributes:
+        key: Key of the episode.
+        scenario: The scenario.
+        town: Name of the town.
+        agents: The ego and all others.
+        signal_override: Index of a signal of the town -> forced state, until `override_until`.
+        override_until: s.
+        limits: When the episode ends.
+        seed: Varies what is random in it.
     """
 
     key: str
@@ -301,16 +348,39 @@ class Episode:
 
 @dataclass(frozen=True)
 class EpisodeTrace:
-    """What happened in one episode: one row a recorded step, row 0 is the start. T rows, A agents, agent 0 the ego.
+    """What happened in one episode: T rows, for the start and each recorded step; A agents, of which 0 is the ego.
 
-    dt s. names, models, kind [A]; length, width [A] m. x, y [T, A] m, yaw [T, A] rad, speed [T, A] m/s (signed,
-    forward), active [T, A] (False: not present). Ego only, all [T]: accel m/s^2 (along its heading),
-    contact (`Contact` bits of contacts that began in this step), contact_agent (agent first touched in this step, -1
-    none, -2 not an agent), off_road, route_distance m (least distance to the rest of the route), route_complete in
-    percent, driven m so far, lane_invasion (lane markings crossed in this step), red_light and stop_sign (lines run
-    in this step), throttle, brake, steer (the control applied), signal [T, S'] states of the `signal_ids`.
-    route [N, 2] m: the ego's route. end: why it ended (`collision`, `complete`, `max_steps`, `max_distance`,
-    `max_time`).
+    Attributes:
+        key: Key of the episode.
+        town: Name of the town.
+        dt: Time of a step, s.
+        names: Of the agents.
+        models: Of the agents.
+        kind: Of the agents [A].
+        length: [A], m.
+        width: [A], m.
+        x: [T, A], m.
+        y: [T, A], m.
+        yaw: [T, A], rad.
+        speed: Signed, forward [T, A], m/s.
+        active: Whether the agent is present [T, A].
+        accel: Of the ego along its heading [T], m/s^2. This and all the following [T] are of the ego.
+        contact: `Contact` bits of contacts that began in this step [T].
+        contact_agent: Agent first touched in this step [T]; -1 none, -2 not an agent.
+        off_road: [T].
+        route_distance: Least distance to the rest of the route [T], m.
+        route_complete: [T], percent.
+        driven: Distance so far [T], m.
+        lane_invasion: Lane markings crossed in this step [T].
+        red_light: Stop lines of red lights run in this step [T].
+        stop_sign: Lines of stop signs run in this step [T].
+        throttle: Applied [T].
+        brake: Applied [T].
+        steer: Applied [T].
+        signal_ids: Traffic lights whose states are recorded [S'].
+        signal: Their states [T, S'].
+        route: The ego's route [N, 2], m.
+        end: Why it ended (`collision`, `complete`, `max_steps`, `max_distance`, `max_time`).
     """
 
     key: str

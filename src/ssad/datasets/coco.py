@@ -54,8 +54,8 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
 
     Args:
         classes: Names, in the order of the labels.
-        images: For each image file_name, width, height, anything else, and `objects`, each with label (index), box (x1,
-            y1, x2, y2), pixels (area), crowd and anything else.
+        images: For each image file_name, width, height, anything else, and `objects`, each with label (index), box
+            (x1, y1, x2, y2), pixels (area), crowd and anything else.
         about: The `info` of the file.
 
     Returns:

@@ -30,9 +30,18 @@ def make_detector(
 ) -> Any:
     """A detector by name, frozen and in eval mode on a device.
 
-    weights: None: the shipped ones if there are any, else fresh ones; "random": fresh ones from `seed`; else a file
-    (see `ssad.detectors.checkpoints.load_weights`; darknet's .weights for YOLOv3). options: what its builder takes.
-    UnknownNameError, ConfigError, FormatError.
+    Args:
+        name: Name of the detector.
+        weights: None: the shipped ones if there are any, else fresh ones; "random": fresh ones from `seed`; else a file
+            (see `ssad.detectors.checkpoints.load_weights`; darknet's .weights for YOLOv3).
+        device: Where it is put.
+        seed: Of fresh weights.
+        **options: What its builder takes.
+
+    Raises:
+        UnknownNameError: There is no such detector.
+        ConfigError: The builder refuses an option.
+        FormatError: The weights cannot be read, or do not fit.
     """
     build = resolve("detector", DETECTORS, name)
     if name not in DETECTORS:

@@ -25,10 +25,16 @@ class DetectorCheckError(AssertionError):
 
 
 def check_detector(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> None:
-    """Hold a detector to `ssad.core.protocols.Detector`; raises DetectorCheckError with every broken promise.
+    """Hold a detector to `ssad.core.protocols.Detector`.
 
-    size: height and width of the pictures that are tried, random ones (others follow); intrinsic [3, 3] of the camera
-    for them, for detectors of task "3d" (default: a focal length of 0.8 times the width).
+    Args:
+        detector: The detector.
+        intrinsic: Camera matrix [3, 3] of the pictures that are tried, for detectors of task "3d"; None: a focal length
+            of 0.8 times the width.
+        size: Height and width of these pictures, which are random; others follow.
+
+    Raises:
+        DetectorCheckError: The detector breaks promises; the message has every one of them.
     """
     faults = find_faults(detector, intrinsic=intrinsic, size=size)
     if faults:

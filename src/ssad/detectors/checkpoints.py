@@ -74,9 +74,13 @@ def hash_state(state: Mapping[str, Tensor]) -> str:
 def load_weights(path: str | Path) -> dict[str, Tensor]:
     """Tensors by name from a file or folder, on the CPU, in the types in which they are stored.
 
-    .safetensors: one file, or shards (any one of them, NAME.safetensors for NAME-00001-of-00003.safetensors, an index
-    NAME.safetensors.index.json, or the folder); .pth, .pt, .ckpt, .bin: the state dict in a PyTorch checkpoint, also
-    inside "state_dict", "model" or "ema" (averaged weights win), or of a pickled module. FormatError.
+    Args:
+        path: .safetensors: one file, or shards (any one of them, NAME.safetensors for NAME-00001-of-00003.safetensors,
+            an index NAME.safetensors.index.json, or the folder). .pth, .pt, .ckpt, .bin: the state dict in a PyTorch
+            checkpoint, also inside "state_dict", "model" or "ema" (averaged weights win), or of a pickled module.
+
+    Raises:
+        FormatError: The file cannot be read, or holds no such tensors.
     """
     place = Path(path).expanduser()
     if place.suffix in PICKLED and place.is_file():
@@ -176,7 +180,14 @@ def _shard_names(stem: str, count: int) -> list[str]:
 
 
 def read_card(path: str | Path) -> Card:
-    """The card of weights: NAME.json, named itself or by NAME.safetensors (or another file beside it). FormatError."""
+    """The card of weights.
+
+    Args:
+        path: NAME.json, NAME.safetensors or another file beside it.
+
+    Raises:
+        FormatError: The card is missing or broken.
+    """
     place = Path(path).expanduser()
     shard = SHARD.fullmatch(place.name)
     file = place if place.suffix == ".json" else place.with_name(f"{shard['stem'] if shard else place.stem}.json")
@@ -196,7 +207,11 @@ def read_card(path: str | Path) -> Card:
 
 
 def load_card(path: str | Path) -> tuple[Card, dict[str, Tensor]]:
-    """A card and the weights beside it, whose hash must be the card's. FormatError."""
+    """A card and the weights beside it, whose hash must be the card's.
+
+    Raises:
+        FormatError: The card or the weights are missing, broken, or do not belong together.
+    """
     card = read_card(path)
     place = Path(path).expanduser()
     whole = place.with_suffix(".safetensors") if place.suffix == ".json" else place
@@ -214,10 +229,22 @@ def save_weights(
 ) -> Card:
     """Write NAME.safetensors (or its shards) and the card NAME.json; the same bytes for the same tensors.
 
-    half: matrices and kernels as float16, where they fit; vectors (biases, norms) and integers stay as they are.
-    shard_mb: largest file in 10^6 bytes; a single tensor that is larger gets a file of its own. Every file is written
-    whole or not at all, the card last; shards of older weights of this name are removed. Returns the card as written.
-    ConfigError: no tensors, or NaN or infinite ones; StoreError.
+    Every file is written whole or not at all, the card last; shards of older weights of this name are removed.
+
+    Args:
+        path: NAME.safetensors.
+        state: Tensors by name.
+        card: What the weights are; hash and version are filled in.
+        half: Whether to store matrices and kernels as float16 where they fit; vectors (biases, norms) and integers stay
+            as they are.
+        shard_mb: Largest file in 10^6 bytes; a single tensor that is larger gets a file of its own.
+
+    Returns:
+        The card as written.
+
+    Raises:
+        ConfigError: There are no tensors, or some are NaN or infinite.
+        StoreError: A file cannot be written.
     """
     target = Path(path).expanduser()
     if target.suffix != ".safetensors" or SHARD.fullmatch(target.name):
@@ -279,7 +306,11 @@ def _groups(state: Mapping[str, Tensor], *, limit: int) -> list[dict[str, Tensor
 
 
 def check_finite(state: Mapping[str, Tensor], where: str) -> None:
-    """FormatError: a tensor holds NaN or infinite values."""
+    """Check that no tensor holds NaN or infinite values.
+
+    Raises:
+        FormatError: One does; `where` names the weights in the message.
+    """
     for name, value in state.items():
         if value.is_floating_point() and not bool(value.isfinite().all()):
             wrong = int((~value.isfinite()).sum())
@@ -287,10 +318,17 @@ def check_finite(state: Mapping[str, Tensor], where: str) -> None:
 
 
 def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path) -> None:
-    """Copy weights into a module whose names and shapes they must match; on an error the module is as it was.
+    """Copy weights into a module whose names and shapes they must match; on an error the module stays as it was.
 
-    Values are cast to the module's types. Missing counters of BatchNorm's steps are let pass. FormatError: missing or
-    foreign names, another shape, NaN or infinite values, integers for weights.
+    Values are cast to the module's types. Missing counters of BatchNorm's steps are accepted.
+
+    Args:
+        module: The module.
+        state: Tensors by name.
+        where: Where they come from, for messages.
+
+    Raises:
+        FormatError: Names are missing or unknown, shapes differ, values are NaN or infinite, or weights are integers.
     """
     own = module.state_dict(keep_vars=True)
     name = str(getattr(module, "name", type(module).__name__))

@@ -44,13 +44,19 @@ class Images:
 def as_images(x: Any, *, where: str = "images") -> Images:
     """One picture or a batch, from files, arrays or tensors; gradients of float tensors are kept.
 
-    x: a file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright as its EXIF says, or 16); a numpy array
-    [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; a list of any of these, of
-    one size. Channels are RGB (OpenCV reads BGR: turn its arrays round first). uint8 is divided by 255, uint16 by 65535
-    (also when only 12 of its bits are used, with a note); floats must lie in [0, 1]. Greyscale is repeated to three
-    channels and alpha is left out, both with a note, since detectors are made for colour. Any size goes.
+    Channels are RGB (OpenCV reads BGR: reverse its arrays first). uint8 is divided by 255, uint16 by 65535 (also when
+    only 12 of its bits are used, with a note); floats must be in [0, 1]. Greyscale is repeated to three channels and
+    alpha is left out, both with a note, since detectors are made for colour. Any size is accepted.
 
-    ConfigError: another shape, type or range, or pictures of different sizes; FormatError: a file that is no picture.
+    Args:
+        x: A file name (PNG, JPEG, TIFF, BMP, WebP; 8 bits, then turned upright as its EXIF says, or 16); a numpy array
+            [H, W], [H, W, 1|3|4] or [B, H, W, 1|3|4]; a torch tensor [3, H, W] or [B, 1|3|4, H, W]; or a list of any of
+            these, all of one size.
+        where: Name of the argument, for messages.
+
+    Raises:
+        ConfigError: Another shape, type or range, or pictures of different sizes.
+        FormatError: A file is not a picture.
     """
     if isinstance(x, Sequence) and not isinstance(x, str | bytes):
         if not x:

@@ -32,9 +32,15 @@ _NAMES = ("cls_scores", "bbox_preds", "dir_cls_preds", "depth_cls_preds", "attr_
 def load(name: str, state_dict: Mapping[str, Any] | str | Path) -> Mono3D:
     """The full-size detector "fcos3d" or "pgd" with official weights, frozen, on the CPU.
 
-    state_dict: tensors (or arrays) by mmdetection3d's names (backbone., neck., bbox_head.), also inside
-    {"state_dict": ...}; or a file that `ssad.detectors.checkpoints.load_weights` reads. Names and shapes must fit one
-    to one. ConfigError, FormatError.
+    Args:
+        name: "fcos3d" or "pgd".
+        state_dict: Tensors (or arrays) by mmdetection3d's names (backbone., neck., bbox_head.), also inside
+            {"state_dict": ...}; or a file that `ssad.detectors.checkpoints.load_weights` reads. Names and shapes must
+            match one to one.
+
+    Raises:
+        ConfigError: There is no such detector.
+        FormatError: The weights cannot be read, or do not fit.
     """
     if name not in _BUILDERS:
         raise ConfigError(f"load: '{name}' is no detector with official weights; choose fcos3d or pgd")
@@ -53,11 +59,19 @@ def infer(
 ) -> tuple[dict[str, list[Tensor]], dict[str, Tensor]]:
     """Head maps and boxes of one image as mmdetection3d gives them in eval mode; on the detector's device.
 
-    image [H, W, 3] uint8, BGR, any H and W (padded to multiples of 32 here); cam2img [4, 4] or [3, 3].
-    maps: cls_scores, bbox_preds, dir_cls_preds, (depth_cls_preds,) attr_preds, centernesses, each one tensor
-    [1, C, h, w] a level. boxes: bboxes_3d [N, 9] as CameraInstance3DBoxes stores them (x, y, z of the middle of the
-    bottom, length, height, width, yaw, velocity x, z), scores_3d, labels_3d, attr_labels [N], in its order, after its
-    thresholds and suppression. ConfigError: another shape or type.
+    Args:
+        detector: A detector from `load`.
+        image: [H, W, 3] uint8, BGR, any H and W (padded to multiples of 32 here).
+        cam2img: [4, 4] or [3, 3].
+
+    Returns:
+        Maps: cls_scores, bbox_preds, dir_cls_preds, (depth_cls_preds,) attr_preds, centernesses, each one tensor
+        [1, C, h, w] for each level. Boxes: bboxes_3d [N, 9] as CameraInstance3DBoxes stores them (x, y, z of the middle
+        of the bottom, length, height, width, yaw, velocity x, z), scores_3d, labels_3d, attr_labels [N], in its order,
+        after its thresholds and suppression.
+
+    Raises:
+        ConfigError: Another shape or type.
     """
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:

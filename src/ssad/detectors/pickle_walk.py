@@ -31,7 +31,11 @@ class Steps:
         self.left = MOST_STEPS
 
     def take(self, count: int) -> None:
-        """Some more steps. RefusedError: too many."""
+        """Count some more steps.
+
+        Raises:
+            RefusedError: There are too many.
+        """
         self.left -= count
         if self.left < 0:
             raise RefusedError(f"its pickle takes more than {MOST_STEPS:,} steps to read, far more than weights do")

@@ -229,7 +229,8 @@ class _Numbers:
 def read_pickled(path: str | Path) -> dict[str, Tensor]:
     """The state dict in a checkpoint file, alone or nested (`NESTS`, averaged weights first), or of a pickled module.
 
-    FormatError: the file is cut short, no checkpoint, hostile, or holds no tensors by name.
+    Raises:
+        FormatError: The file is truncated, not a checkpoint, hostile, or holds no tensors by name.
     """
     try:
         with open(path, "rb") as file:

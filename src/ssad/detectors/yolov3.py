@@ -38,7 +38,18 @@ def yolov3(
     input_width: int | None = None,
     seed: int = 0,
 ) -> Yolo:
-    """YOLOv3 with fresh weights, or with those of a darknet `.weights` file (FormatError)."""
+    """YOLOv3 with fresh weights, or with those of a darknet `.weights` file.
+
+    Args:
+        classes: Names of the classes.
+        spec: Architecture and anchors.
+        weights: A darknet `.weights` file; None: fresh weights.
+        input_width: Width to which pictures are resized inside; None: they are not.
+        seed: Of fresh weights.
+
+    Raises:
+        FormatError: The file is broken or does not fit.
+    """
     detector = Yolo(spec, classes, input_width=input_width, seed=seed)
     if weights is not None:
         read_darknet(detector, weights)

@@ -20,7 +20,11 @@ NEAR = 0.1  # m in front of the camera at which boxes are cut
 
 
 def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
-    """Scenes of a split that the data set has. ConfigError: none, or no such split."""
+    """Scenes of a split that the data set has.
+
+    Raises:
+        ConfigError: There is none, or no such split.
+    """
     there = {scene.name for scene in data.scenes()}
     found = tuple(name for name in scenes_of_split(data.root, data.version, split) if name in there)
     if not found:
@@ -31,8 +35,13 @@ def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
 def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) -> Truth:
     """What a camera should find of a sample's boxes: those of the ten classes whose middle is in the picture.
 
-    hit: only those with a LiDAR point (what nobody can see is not learned). Boxes as `ssad.core.detections`
-    defines them; velocity in the camera's x and z; box: hull of the projected corners, cut at the picture's border.
+    Boxes are as `ssad.core.detections` defines them; velocity is in the camera's x and z; box is the hull of the
+    projected corners, clipped to the picture.
+
+    Args:
+        frame: The camera frame.
+        found: Annotations of its sample.
+        hit: Whether only boxes with a LiDAR point count: what nobody can see is not learned.
     """
     if frame.intrinsic is None:
         raise ConfigError(f"{frame.channel} is no camera")

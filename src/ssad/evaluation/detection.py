@@ -51,7 +51,11 @@ def to_images(pictures: Sequence[U8], device: torch.device | str) -> torch.Tenso
 
 
 def to_host(found: Sequence[Detections]) -> list[Detections]:
-    """Detections of a batch on the CPU: a copy a column, as each copy waits for the device. ConfigError: no tensors."""
+    """Detections of a batch on the CPU, in one copy for each column, since each copy waits for the device.
+
+    Raises:
+        ConfigError: They are not tensors.
+    """
     flat = zip(*(_host([getattr(one, name) for one in found]) for name in ("score", "label", "box")), strict=True)
     solids = [one.solid for one in found if one.solid is not None]
     names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
@@ -79,7 +83,15 @@ def joined(parts: Sequence[torch.Tensor], change: Callable[[torch.Tensor], torch
 def detect_scene(
     detector: Detector, root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None
 ) -> list[SampleBoxes]:
-    """Boxes in the world for each sample of a scene. look: gives the pictures of camera frames (default: the files)."""
+    """Boxes in the world for each sample of a scene.
+
+    Args:
+        detector: The detector.
+        root: The nuScenes root.
+        scene: The scene.
+        device: Where the detector is.
+        look: Gives the pictures of camera frames; None: reads the files.
+    """
     return detect_with([detector], root, scene, device=device, look=look)[0]
 
 
@@ -87,10 +99,20 @@ def detect_with(
     detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None,
     ahead: bool = True, at_once: int = AT_ONCE,
 ) -> list[list[SampleBoxes]]:  # fmt: skip
-    """As `detect_scene` for several detectors, which are shown the same pictures: a list a detector.
+    """As `detect_scene`, for several detectors that are shown the same pictures.
 
-    ahead: the next pictures are made while these are looked at; not where `look` needs a detector for itself.
-    at_once: samples that a GPU is shown at once.
+    Args:
+        detectors: The detectors.
+        root: The nuScenes root.
+        scene: The scene.
+        device: Where the detectors are.
+        look: Gives the pictures of camera frames; None: reads the files.
+        ahead: Whether the next pictures are made while these are looked at; False where `look` needs a detector for
+            itself.
+        at_once: Samples that a GPU is shown at once.
+
+    Returns:
+        Boxes of each sample, one list for each detector.
     """
     by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
@@ -204,7 +226,12 @@ def score_3d(
 
 
 def numbers(scores: DetectionScores, *, few: bool = False) -> dict[str, float]:
-    """mAP, NDS, AP of each class, true-positive errors; few: mAP, NDS and the AP of cars alone. NaN is left out."""
+    """The figures of scores: mAP, NDS, AP of each class and true-positive errors; those that are NaN are left out.
+
+    Args:
+        scores: The scores.
+        few: Whether only mAP, NDS and the AP of cars are wanted.
+    """
     found = {"mAP": scores.mean_ap, "NDS": scores.nd_score, "AP_car": scores.mean_dist_aps["car"]}
     if not few:
         found |= {f"AP_{name}": value for name, value in scores.mean_dist_aps.items()}

@@ -309,7 +309,11 @@ def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, Any]]:
 
 
 def forget_failures(paths: Sequence[Path]) -> None:
-    """Takes away files in which a detector's reason stands, so that they are made anew. FormatError: broken."""
+    """Remove the files that record a detector's failure, so that they are made anew.
+
+    Raises:
+        FormatError: A file is broken.
+    """
     for path in paths:
         if path.is_file():
             try:

@@ -44,10 +44,13 @@ def boxes_of(found: Annotations) -> tuple[TrackedBoxes, npt.NDArray[np.intp]]:
 
 
 class SceneShifter:
-    """A scene seen through a shift; pure: what a frame gives depends on the scene, the frame and the spec alone.
+    """A scene seen through a shift; what a frame gives depends only on the scene, the frame and the spec.
 
-    root: the dataset's folder; scene: from `NuScenes.scene`; spec: the shift; random: draw its severity anew (by
-    sample in the paper's calibration, by scene in the physical one).
+    Args:
+        root: The folder of the dataset.
+        scene: From `NuScenes.scene`.
+        spec: The shift.
+        random: Whether its severity is drawn anew (by sample in the paper's calibration, by scene in the physical one).
     """
 
     def __init__(self, root: Path, scene: SceneData, spec: ShiftSpec, *, random: bool = False) -> None:
@@ -131,7 +134,11 @@ class SceneShifter:
         return np.asarray((places[after] - places[before]) / span) if span > 0 else np.zeros(3)
 
     def cloud(self, frame: SensorFrame) -> F32:
-        """The clean points [P, 5] of a sweep, the last few kept. FormatError."""
+        """The clean points [P, 5] of a sweep; the last few sweeps are kept.
+
+        Raises:
+            FormatError: The sweep cannot be read.
+        """
         if frame.token not in self._clouds:
             self._clouds[frame.token] = read_points(self.root / frame.filename)
             self._clouds[frame.token].setflags(write=False)
@@ -240,7 +247,11 @@ class SceneShifter:
         return self._frame(frame, boxes, self._points(frame), self._depth(frame))
 
     def read(self, frame: SensorFrame) -> U8:
-        """The clean image. FormatError, also when its size is not what the tables say."""
+        """The clean image.
+
+        Raises:
+            FormatError: The image cannot be read, or its size is not what the tables say.
+        """
         image = read_image(self.root / frame.filename)
         if frame.width and image.shape[:2] != (frame.height, frame.width):
             raise FormatError(
@@ -252,9 +263,18 @@ class SceneShifter:
     def images(
         self, frames: Sequence[SensorFrame], *, clean: Sequence[U8] | None = None, device: str | None = None
     ) -> tuple[list[U8], list[Applied]]:
-        """Shifted images [H, W, 3] of camera frames of one size, and what was done. FormatError.
+        """Shifted images of camera frames of one size.
 
-        clean: the images from `read`, where they are at hand.
+        Args:
+            frames: The frames.
+            clean: Their images from `read`, if they are at hand.
+            device: Where to compute.
+
+        Returns:
+            The images [H, W, 3], and what was done to each.
+
+        Raises:
+            FormatError: An image or sweep cannot be read.
         """
         pixels = [self.read(f) for f in frames] if clean is None else clean
         specs = [self.spec(f) for f in frames]
@@ -268,7 +288,11 @@ class SceneShifter:
         return list(out), done
 
     def image(self, frame: SensorFrame, *, clean: U8 | None = None) -> tuple[U8, Applied]:
-        """One shifted image. FormatError."""
+        """One shifted image, and what was done.
+
+        Raises:
+            FormatError: An image or sweep cannot be read.
+        """
         images, done = self.images([frame], clean=None if clean is None else [clean])
         return images[0], done[0]
 
@@ -288,7 +312,11 @@ class SceneShifter:
         return place_objects(self.base, self.scene.record.token, poses.reshape(-1, 4, 4), boxes)
 
     def points(self, frame: SensorFrame) -> tuple[F32, Applied]:
-        """The shifted points [P, 5] of a LiDAR frame. FormatError."""
+        """The shifted points [P, 5] of a LiDAR frame, and what was done.
+
+        Raises:
+            FormatError: The sweep cannot be read.
+        """
         objects = self.base.family == "object"
         boxes = boxes_of(self.scene.annotations_of(frame))[0] if objects else TrackedBoxes.empty()
         sweep = SweepFrame(
@@ -307,10 +335,17 @@ class SceneShifter:
         return next((f for f in self._sweeps if f.key_frame and f.sample_token == sample_token), None)
 
     def labels(self, sample_token: str, *, lidar: bool | None = True) -> Annotations:
-        """The boxes of a sample as they stand after the shift, with the points that are in each. FormatError.
+        """The boxes of a sample after the shift, with the number of points in each.
 
-        lidar: count the points in the shifted sweep (True), in the clean one (False), or leave the counts (None).
         Severity 0 changes nothing, counts included.
+
+        Args:
+            sample_token: Token of the sample.
+            lidar: Count the points in the shifted sweep (True), in the clean one (False), or leave the counts unchanged
+                (None).
+
+        Raises:
+            FormatError: The sweep cannot be read.
         """
         found = self.scene.annotations(sample_token)
         frame = next((f for f in self.scene.frames if f.sample_token == sample_token), None)

@@ -36,12 +36,26 @@ def score_results(
     replicates: int = 0,
     check: Check | None = None,
 ) -> dict[str, Any]:
-    """The devkit's metrics_summary (label_aps ... meta), and under `ssad` what it does not have.
+    """Score a results file as the devkit does.
 
-    `ssad`: AP by threshold, number of boxes that count by class, samples, scenes, wall time in seconds, and with
-    replicates > 0 the limits of mAP and NDS (95 %, bootstrap over scenes). check: called with the meta of the file
-    and the ground truth before anything is computed; it raises what it does not accept, and what it returns goes into
-    `ssad`. Values that have no meaning are NaN, as in the devkit. FormatError, ConfigError.
+    Args:
+        results: The file.
+        dataroot: The nuScenes root.
+        version: Its version.
+        split: The split that the results are of.
+        config: Settings of the task.
+        replicates: Number of bootstrap replicates; 0: no intervals.
+        check: Called with the meta of the file and the ground truth before anything is computed; it raises what it does
+            not accept, and what it returns is added to `ssad`.
+
+    Returns:
+        The devkit's metrics_summary (label_aps ... meta), and under `ssad` what that does not have: AP by threshold,
+        number of boxes that count by class, samples, scenes, wall time in seconds, and with replicates > 0 the limits
+        of mAP and NDS (95 %, bootstrap over scenes). Values that have no meaning are NaN, as in the devkit.
+
+    Raises:
+        FormatError: The results or the tables are broken.
+        ConfigError: There is no such version or split.
     """
     began = time.perf_counter()
     root = Path(dataroot)

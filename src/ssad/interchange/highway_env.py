@@ -53,7 +53,12 @@ CAR = Model("car", AgentKind.CAR, 5.0, 2.0, 1.5, 5.0, MAX_STEER, MAX_ACCELERATIO
 class Place:
     """One of highway-env's environments.
 
-    route: nodes of the ego's route (empty: straight on); spawn_every: steps after which a vehicle may appear.
+    Attributes:
+        environment: Its name.
+        route: Nodes of the ego's route; empty: straight on.
+        target_speed: m/s.
+        duration: s.
+        spawn_every: Steps after which a vehicle may appear; 0: never.
     """
 
     environment: str

@@ -98,7 +98,11 @@ class RayCluster:
         self._tasks[self._remote.remote((task.function, task.argument, task.timeout_s), self._start)] = task
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """What has ended, after so many seconds at the latest. SSADError: no worker can start."""
+        """See `Backend`.
+
+        Raises:
+            SSADError: No worker can start.
+        """
         if not self._tasks:
             time.sleep(seconds)
             return []

@@ -83,7 +83,11 @@ class Worker:
         return Outcome(task, status, value, reason, error, time.monotonic() - self.began)
 
     def hear(self) -> Outcome | None:
-        """An answer: of its start, or of its task. SSADError: it cannot start."""
+        """An answer: that it has started, or the outcome of its task.
+
+        Raises:
+            SSADError: It cannot start.
+        """
         try:
             kind, value = self.answers.recv()
         except (EOFError, OSError):
@@ -100,7 +104,11 @@ class Worker:
         return self.outcome("failed", str(value), error=value if isinstance(value, SSADError) else None)
 
     def overdue(self) -> Outcome:
-        """It took too long. SSADError: to start."""
+        """The outcome of a task that took too long.
+
+        Raises:
+            SSADError: It was the start that took too long.
+        """
         if not self.ready:
             raise SSADError(f"a worker process did not start within {START_S:.0f} s: {self._last_words()}")
         assert self.task is not None
@@ -177,7 +185,11 @@ class LocalProcesses:
         self._waiting.append(task)
 
     def wait(self, seconds: float) -> list[Outcome]:
-        """What has ended, after so many seconds at the latest. SSADError: no worker can start."""
+        """See `Backend`.
+
+        Raises:
+            SSADError: No worker can start.
+        """
         self._hand_out()
         found, self._unsent = self._unsent, []
         pause = min([seconds, LOOK_S, *(max(0.0, w.deadline - time.monotonic()) for w in self._workers)])

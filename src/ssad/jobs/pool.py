@@ -31,7 +31,12 @@ class Pool:
         self._queue: deque[Task] = deque()
 
     def add(self, task: Task, *, first: bool = False) -> None:
-        """One more task; first: before all that has not begun and was not added so."""
+        """Add a task.
+
+        Args:
+            task: The task.
+            first: Whether it goes before all tasks that have not begun and were not added first themselves.
+        """
         (self._urgent if first else self._queue).append(task)
 
     def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:

@@ -45,11 +45,15 @@ class Store:
 
     @classmethod
     def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
-        """Take the folder for this run: a new one, or one of the same run to go on with.
+        """Take the folder for this run: a new one, or one of the same run that is resumed.
 
-        run: what run.json shall say; its "identity" must equal that of a run already there. retry: cells that failed
-        are as if they had never run. StoreError when the folder cannot be written, is in use, or belongs to another
-        run; nothing is changed then.
+        Args:
+            folder: The folder.
+            run: What run.json shall say; its "identity" must equal that of a run already there.
+            retry: Whether cells that failed are treated as if they had never run.
+
+        Raises:
+            StoreError: The folder cannot be written, is in use, or belongs to another run; nothing is changed then.
         """
         path = Path(folder)
         _check_content(path, run)
@@ -86,7 +90,15 @@ class Store:
             self._files[name] = _open_append(self.folder / name)
 
     def append(self, result: Mapping[str, Any], episode: Mapping[str, Any] | None) -> None:
-        """Add one finished cell; durable when this returns. A key that is already there raises ValueError."""
+        """Add one finished cell; it is durable when this returns.
+
+        Args:
+            result: The record.
+            episode: Line for episodes.jsonl, if there is one.
+
+        Raises:
+            ValueError: There is already a record of this key.
+        """
         key = str(result["key"])
         if key in self.results:
             raise ValueError(f"cell {key} is already in the store")

@@ -62,7 +62,11 @@ class Backend(Protocol):
         """Take a task; only while `busy` is below `capacity`."""
 
     def wait(self, seconds: float) -> Sequence[Outcome]:
-        """What has ended, after so many seconds at the latest. SSADError: no worker can start."""
+        """What has ended, after so many seconds at the latest.
+
+        Raises:
+            SSADError: No worker can start.
+        """
 
     def close(self) -> None:
         """End all that runs."""

@@ -25,11 +25,18 @@ def boxes(trace: EpisodeTrace) -> F64:
 
 
 def time_to_collision(first: npt.ArrayLike, second: npt.ArrayLike, velocity: npt.ArrayLike) -> F64:
-    """Time [...] until two boxes touch, s; 0 if they overlap, inf if they never do.
+    """Time until two boxes touch, s; exact for boxes that move at constant velocity and do not turn.
 
-    first, second [..., 5]: x, y, yaw, length, width; velocity [..., 2] m/s of the first less that of the second,
-    constant, no turning. Exact: along each of the four edge normals the shadows of the boxes overlap during one
-    interval of time, and convex bodies overlap when all four do (separating axes, swept).
+    Along each of the four edge normals the shadows of the boxes overlap during one interval of time, and convex bodies
+    overlap when all four do (separating axes, swept).
+
+    Args:
+        first: Boxes [..., 5]: x, y, yaw, length, width.
+        second: Boxes of the same kind.
+        velocity: Velocity of the first minus that of the second [..., 2], m/s.
+
+    Returns:
+        Times [...]: 0 if they overlap, inf if they never do.
     """
     a, b, v = (np.asarray(value, np.float64) for value in (first, second, velocity))
     gap = b[..., :2] - a[..., :2]

@@ -59,8 +59,12 @@ UNDEFINED: Mapping[str, tuple[str, ...]] = {
 class DetectionScores:
     """The scores of a set.
 
-    ap [C, D]: AP by class and threshold; errors [C, 5]: TP errors by class and TP_METRICS, NaN where they have no
-    meaning; truth, predictions [C]: numbers of boxes that count.
+    Attributes:
+        config: Settings of the task.
+        ap: AP by class and threshold [C, D].
+        errors: TP errors by class and TP_METRICS [C, 5]; NaN where they have no meaning.
+        truth: Number of true boxes that count [C].
+        predictions: Number of predicted boxes that count [C].
     """
 
     config: DetectionConfig
@@ -134,9 +138,13 @@ class DetectionScores:
 
 @dataclass(frozen=True)
 class Matches:
-    """What matched what, by class; enough for the scores under any weights of the samples.
+    """Which predictions match which boxes, by class; enough for the scores under any weights of the samples.
 
-    truth_counts [C, S]: ground-truth boxes by class and sample.
+    Attributes:
+        config: Settings of the task.
+        samples: Number of samples.
+        classes: Matches of each class.
+        truth_counts: True boxes by class and sample [C, S].
     """
 
     config: DetectionConfig
@@ -145,7 +153,11 @@ class Matches:
     truth_counts: I32
 
     def scores(self, weights: npt.NDArray[np.integer[Any]] | None = None) -> DetectionScores:
-        """The scores; weights [S]: how often each sample counts, as if it stood there so many times in a row."""
+        """The scores.
+
+        Args:
+            weights: How often each sample counts, as if it occurred that many times in a row [S]; None: once.
+        """
         times = np.ones(self.samples, np.int64) if weights is None else np.asarray(weights, np.int64)
         if times.shape != (self.samples,) or (times < 0).any():
             raise ValueError(f"weights: expected {self.samples} numbers that are not negative")
@@ -171,9 +183,17 @@ def match(
     config: DetectionConfig = CVPR_2019,
     names: Sequence[str] | None = None,
 ) -> Matches:
-    """Match predictions with ground truth, both filtered; samples: how many there are; names: their tokens.
+    """Match predictions with ground truth, both filtered.
 
-    FormatError: too many predictions in a sample, a matched box without a size.
+    Args:
+        truth: True boxes.
+        predictions: Predicted boxes.
+        samples: Number of samples.
+        config: Settings of the task.
+        names: Tokens of the samples, for messages.
+
+    Raises:
+        FormatError: A sample has too many predictions, or a matched box has no size.
     """
     check_counts(predictions, config=config, names=names)
     counts = np.bincount(truth.label.astype(np.int64) * samples + truth.sample, minlength=len(config.classes) * samples)
@@ -191,10 +211,16 @@ def scene_intervals(
     generator: np.random.Generator,
     replicates: int = 200,
 ) -> dict[str, tuple[float, float]]:
-    """Limits of mean_ap and nd_score by the bootstrap over scenes (key frames of a scene are alike).
+    """Limits of mean_ap and nd_score by the bootstrap over scenes, since key frames of a scene are alike.
 
-    scene_of_sample [S]: index of the scene of each sample. With fewer than five scenes there is no interval: both are
-    NaN.
+    Args:
+        matches: From `match`.
+        scene_of_sample: Index of the scene of each sample [S].
+        generator: Source of randomness.
+        replicates: Number of replicates.
+
+    Returns:
+        Name -> lower and upper limit; with fewer than five scenes there is no interval, and both are NaN.
     """
     scenes, scene = np.unique(scene_of_sample, return_inverse=True)
     draws = generator.multinomial(len(scenes), np.full(len(scenes), 1.0 / len(scenes)), size=replicates)

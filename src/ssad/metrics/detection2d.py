@@ -19,10 +19,14 @@ RECALL = np.linspace(0.0, 1.0, 101)
 
 @dataclass(frozen=True)
 class Boxes2D:
-    """2D boxes of a set, one row a box.
+    """2D boxes of a set, one in each row.
 
-    image [N], label [N]: indices; box [N, 4]: x1, y1, x2, y2 in pixels; score [N], None for ground truth; ignore [N]:
-    crowd regions of the ground truth, in which detections count neither as right nor as wrong.
+    Attributes:
+        image: Index of the image [N].
+        label: Index of the class [N].
+        box: x1, y1, x2, y2 in pixels [N, 4].
+        score: [N]; None for ground truth.
+        ignore: Crowd regions of the ground truth, in which detections count neither as right nor as wrong [N].
     """
 
     image: I32
@@ -56,8 +60,15 @@ def match_2d(
 ) -> Matched2D:
     """Match detections and ground truth of the same image and label whose IoU reaches the threshold.
 
-    labels: number of them; max_detections: the best ones of an image and label that are looked at. ValueError:
-    detections without scores.
+    Args:
+        truth: True boxes.
+        detections: Detected boxes, with scores.
+        labels: Number of labels.
+        threshold: Least IoU of a match.
+        max_detections: How many detections of an image and label are considered, best first.
+
+    Raises:
+        ValueError: The detections have no scores.
     """
     if detections.score is None:
         raise ValueError("detections need scores")

@@ -26,10 +26,15 @@ RACKED: Final = ("bicycle", "motorcycle")
 
 @dataclass(frozen=True)
 class BoxTable(WorldBoxes):
-    """Boxes of a set, one row a box; the rows of a sample stand together, in the order of the devkit's lists.
+    """Boxes of a set, one in each row; the rows of a sample are together, in the order of the devkit's lists.
 
-    velocity [N, 2]; sample [N]: index of the sample; label [N]: index of the class; attribute [N]: index, -1 for none;
-    score [N], -1 for ground truth; ego_distance [N]: in the plane, m.
+    Attributes:
+        velocity: [N, 2], m/s.
+        sample: Index of the sample [N].
+        label: Index of the class [N].
+        attribute: Index [N]; -1 for none.
+        score: [N]; -1 for ground truth.
+        ego_distance: Distance from the ego in the plane [N], m.
     """
 
     sample: I32
@@ -56,7 +61,11 @@ class BoxTable(WorldBoxes):
 
 @dataclass(frozen=True)
 class BikeRacks(WorldBoxes):
-    """Bicycle racks; sample [N]: index of the sample."""
+    """Bicycle racks.
+
+    Attributes:
+        sample: Index of the sample [N].
+    """
 
     sample: I32
 
@@ -65,7 +74,14 @@ class BikeRacks(WorldBoxes):
 class DetectionConfig:
     """Settings of the task; the defaults are the official detection_cvpr_2019.
 
-    class_range: class -> range in metres, in the order of the labels; dist_ths: thresholds of a match, m.
+    Attributes:
+        class_range: Class -> range, m, in the order of the labels.
+        dist_ths: Thresholds of a match, m.
+        dist_th_tp: The threshold whose matches the TP errors are of, m.
+        min_recall: Recall up to which AP and TP errors do not count.
+        min_precision: Precision that is subtracted before AP is averaged.
+        max_boxes_per_sample: Maximum number of predictions in a sample.
+        mean_ap_weight: Weight of mAP in NDS; each TP score has the weight 1.
     """
 
     class_range: Mapping[str, float] = field(default_factory=lambda: RANGES)
@@ -116,10 +132,16 @@ def keep_boxes(
     points: npt.NDArray[Any] | None = None,
     racks: BikeRacks | None = None,
 ) -> Bool:
-    """Which boxes [N] the task counts: nearer than the range of their class, not empty, not parked in a rack.
+    """Which boxes the task counts: nearer than the range of their class, not empty, not parked in a rack.
 
-    points [N]: LiDAR and radar points in the box; boxes with 0 are left out (negative: not known). racks: bicycles and
-    motorcycles whose centre lies in a rack of the same sample are left out.
+    Args:
+        boxes: The boxes.
+        config: Settings of the task.
+        points: LiDAR and radar points in each box [N]; boxes with 0 are left out (negative: unknown).
+        racks: Bicycles and motorcycles whose centre lies in a rack of the same sample are left out.
+
+    Returns:
+        Mask [N].
     """
     ranges = np.array(list(config.class_range.values()), np.float64)
     keep: Bool = boxes.ego_distance < ranges[boxes.label]

@@ -27,9 +27,13 @@ PAIRS = 1 << 16  # pairs looked at together: bounds the memory
 class ClassMatches:
     """The predictions of a class from best to worst, and which of them are matched.
 
-    sample [n], score [n]; hits: for each threshold the places [T] in that order of the matched ones, ascending;
-    errors [5, T] of those of the TP threshold, in the order of TP_METRICS (NaN: not known); runs: where the run of
-    equal scores of one sample that each is in begins [n], and its length [n], None if there are no ties.
+    Attributes:
+        sample: Sample of each [n].
+        score: Score of each [n].
+        hits: For each threshold, the ranks [T] of the matched ones, ascending.
+        errors: Errors of the matches at the TP threshold [5, T], in the order of TP_METRICS (NaN: unknown).
+        runs: For each prediction, where the run of equal scores of one sample that it belongs to begins [n], and the
+            length of the run [n]; None if there are no ties.
     """
 
     sample: I32
@@ -48,7 +52,19 @@ def match_class(
     config: DetectionConfig,
     names: Sequence[str] | None = None,
 ) -> ClassMatches:
-    """Match the boxes of one class. FormatError: a matched box without a size (names: tokens of the samples)."""
+    """Match the boxes of one class.
+
+    Args:
+        truth: True boxes.
+        predictions: Predicted boxes.
+        label: The class.
+        samples: Number of samples.
+        config: Settings of the task.
+        names: Tokens of the samples, for messages.
+
+    Raises:
+        FormatError: A matched box has no size.
+    """
     own = np.flatnonzero(predictions.label == label)
     rank = own[np.argsort(predictions.score[own], kind="stable")[::-1]]
     real = np.flatnonzero(truth.label == label)
@@ -125,8 +141,14 @@ def pairs_of(count: I64, start: I64) -> Iterator[tuple[I64, I64]]:
 def assign(pred: I64, box: I64, distance: F64, *, boxes: int, thresholds: Sequence[float]) -> list[tuple[I64, I64]]:
     """For each threshold the matched predictions, ascending, and the boxes that they take.
 
-    pred, box, distance [K]: the near pairs, sorted as `_near_pairs` gives them. A proposer is a prediction at a
-    threshold; its choices are the first ones of its pairs, up to the threshold.
+    A proposer is a prediction at a threshold; its choices are the first ones of its pairs, up to the threshold.
+
+    Args:
+        pred: Prediction of each near pair [K], sorted as `_near_pairs` gives them.
+        box: True box of each pair [K].
+        distance: Distance of each pair [K], m.
+        boxes: Number of true boxes.
+        thresholds: Thresholds of a match, m.
     """
     n = len(thresholds)
     head = np.flatnonzero(np.r_[True, pred[1:] != pred[:-1]]) if len(pred) else np.zeros(0, np.int64)

@@ -52,11 +52,30 @@ PLACE_FORGOTTEN = 5.0
 class EpisodeMetrics:
     """Raw metrics of one episode; NaN where the trace has nothing to measure, None where the world has not.
 
-    collision; collision_events and collisions_* (events by what was hit); off_road m driven off the road;
-    off_road_fraction of the metres driven; distance_to_route m; route_completion and route_following in [0, 1]; time s;
-    driven m; red_lights, stop_signs, lane_invasions (counts; stop_signs is None in a world without stop signs, and the
-    driving score then leaves them out); acceleration m/s^2; yaw_velocity rad/s;
-    in_route_failure; driving_score in [0, 100]; min_ttc s and pet s (10: none); min_distance m (NaN: nobody else).
+    Attributes:
+        collision: Whether there was one.
+        collision_events: Number of them.
+        collisions_vehicle: Events with vehicles.
+        collisions_walker: Events with pedestrians.
+        collisions_cyclist: Events with cyclists.
+        collisions_static: Events with anything else.
+        off_road: Distance driven off the road, m.
+        off_road_fraction: Share of the distance driven.
+        distance_to_route: m.
+        route_completion: 0 to 1.
+        route_following: 0 to 1.
+        time: s.
+        driven: Distance, m.
+        red_lights: Number of red lights run.
+        stop_signs: Number of stop signs run; None in a world without, whose driving score then leaves them out.
+        acceleration: m/s^2.
+        yaw_velocity: rad/s.
+        lane_invasions: Number of them.
+        in_route_failure: Whether the ego left its route too far or for too long (see the function of this name).
+        driving_score: 0 to 100.
+        min_ttc: Least time to collision, s (10: none).
+        pet: Post-encroachment time, s (10: none).
+        min_distance: Least distance to another agent, m (NaN: there is none).
     """
 
     collision: bool
@@ -208,7 +227,10 @@ def in_route_failure(trace: EpisodeTrace) -> bool:
 def driving_score(completion: float, infractions: Mapping[str, int], off_road_fraction: float) -> float:
     """CARLA leaderboard 1.0 driving score in [0, 100]: route completion times a factor for each infraction.
 
-    completion in [0, 1]; infractions: counts by the names of `PENALTIES`; off_road_fraction of the metres driven.
+    Args:
+        completion: Route completion in [0, 1].
+        infractions: Counts by the names of `PENALTIES`.
+        off_road_fraction: Share of the distance driven.
     """
     factor = math.prod(PENALTIES[name] ** count for name, count in infractions.items())
     return 100.0 * completion * factor * (1.0 - off_road_fraction)

@@ -19,9 +19,19 @@ Scores = Mapping[str, Sequence[float | None]]  # None: not run, which is refused
 
 
 def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
-    """CE of each shift: sum over severities of 1 - score, relative to that of the baseline system (1 = alike).
+    """Corruption error (CE) of each shift.
 
-    ConfigError: a missing value, other shifts than the baseline, a baseline that is perfect under a shift.
+    It is the sum over severities of 1 - score, relative to that of the baseline system (1: equally good).
+
+    Args:
+        scores: Scores by shift.
+        baseline: Scores of the baseline system by shift.
+
+    Returns:
+        Shift -> CE.
+
+    Raises:
+        ConfigError: A value is missing, the baseline has other shifts, or it is perfect under a shift.
     """
     names, values = _table(scores, "scores")
     others, base = _table(baseline, "baseline")
@@ -37,7 +47,18 @@ def corruption_error(scores: Scores, baseline: Scores) -> dict[str, float]:
 
 
 def resilience_rate(scores: Scores, clean: float) -> dict[str, float]:
-    """RR of each shift: mean over severities of score / clean score. ConfigError: a missing value, clean is not > 0."""
+    """Resilience rate (RR) of each shift: mean over severities of score / clean score.
+
+    Args:
+        scores: Scores by shift.
+        clean: Score without a shift.
+
+    Returns:
+        Shift -> RR.
+
+    Raises:
+        ConfigError: A value is missing, or the clean score is not above 0.
+    """
     names, values = _table(scores, "scores")
     if not clean > 0.0 or math.isinf(clean):
         raise ConfigError(f"the clean score is {clean}; a resilience rate needs one above 0")

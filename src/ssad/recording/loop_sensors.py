@@ -131,6 +131,10 @@ class Onboard:
         Args:
             simulator: The one that runs. What was known of another one is forgotten.
         """
+        self._follow(simulator)
+
+    def _follow(self, simulator: Simulator) -> WorldState:
+        """See `follow`; the state of the simulator."""
         if simulator is not self._simulator:
             self._simulator, self._tracks = simulator, {}
             self._cast(simulator)
@@ -143,6 +147,7 @@ class Onboard:
                 looks = self.town(simulator.graphs[one.town]).looks(one)
                 track = self._tracks[scene] = _Track(episode, looks)
             track.follow(step, state.pose[scene, : len(track.looks.models)])
+        return state
 
     def town(self, graph: LaneGraph) -> EpisodeScene:
         """The scene of a town, with the bodies of all episodes that were seen there."""
@@ -159,8 +164,7 @@ class Onboard:
 
     def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
         """What agents [N, 2] (scene, agent) could see now; without those whose episode has ended."""
-        self.follow(simulator)
-        state, ended = simulator.state(), simulator.ended()
+        state, ended = self._follow(simulator), simulator.ended()
         found, moments = [], {}
         for row, (scene, agent) in enumerate(agents.tolist()):
             if ended[scene] != End.RUNNING:

@@ -150,7 +150,18 @@ def to_latex(table: Table) -> str:
 
 
 def write_tables(folder: Path, found: Sequence[Table]) -> list[Path]:
-    """tables/<name>.csv, .md and .tex, each written whole or not at all. StoreError."""
+    """Write tables/NAME.csv, .md and .tex, each whole or not at all.
+
+    Args:
+        folder: Where `tables` is made.
+        found: The tables.
+
+    Returns:
+        Paths of the files.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
     out = []
     (folder / "tables").mkdir(parents=True, exist_ok=True)
     for table in found:

@@ -46,7 +46,15 @@ class _Shape:
 
 
 def bake(xodr: Path, name: str | None = None) -> LaneGraph:
-    """Lane graph of an OpenDRIVE file. MapError: what is wrong with it, or that carla is not installed."""
+    """Lane graph of an OpenDRIVE file.
+
+    Args:
+        xodr: The file.
+        name: Name of the town; None: that of the file.
+
+    Raises:
+        MapError: The file is wrong in some way, or carla is not installed.
+    """
     path = Path(xodr)
     network = read_network(path)
     keys = [
@@ -68,9 +76,18 @@ def bake(xodr: Path, name: str | None = None) -> LaneGraph:
 
 
 def import_map(path: Path, name: str | None, home: Path) -> Path:
-    """Bake an OpenDRIVE file into home/towns/NAME.npz, whole or not at all, and give that path. MapError.
+    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, whole or not at all.
 
-    A town that is baked already (.npz) is copied.
+    Args:
+        path: The file; a town that is baked already (.npz) is copied.
+        name: Name of the town; None: that of the file.
+        home: Folder of the towns' folder.
+
+    Returns:
+        Path of the lane graph.
+
+    Raises:
+        MapError: See `bake`.
     """
     label = name or Path(path).stem
     if not label or label.startswith(".") or set(label) & set('/\\:*?"<>|\0'):

@@ -23,8 +23,11 @@ DRIVABLE = (LaneType.DRIVING, LaneType.PARKING)
 class Nearest:
     """Answer for n points; unpacks as (lane, s, lateral, inside).
 
-    lane [n], -1 where none is within reach; s [n] m along it; lateral [n] m from its centre line, left positive (s
-    and lateral are 0 where lane is -1); inside [n]: the point is within the lane's strip.
+    Attributes:
+        lane: Nearest lane [n]; -1 where none is within reach.
+        s: Arc length along it [n], m; 0 where lane is -1.
+        lateral: Distance from its centre line, left positive [n], m; 0 where lane is -1.
+        inside: Whether the point is within the lane's strip [n].
     """
 
     lane: I32
@@ -40,11 +43,19 @@ class Nearest:
 class Grid:
     """Segments of centre lines, and for each cell those that can be the nearest to a point of that cell.
 
-    seg [M, 4]: x0, y0, x1, y1; seg_half [M, 2]: half widths at both ends; seg_lane [M]; seg_s [M]: arc length
-    at the first end; cell_offset [nx*ny+1], cell_seg [.]: segments of cell iy*nx+ix, `CELL` m wide; origin: lower left
-    corner. Nearness is distance from the centre line less the half width there, so that two lanes of
-    different width meet at their common edge. A cell answers exactly for every point up to `MARGIN` outside a
-    lane; it is empty beyond.
+    Nearness is distance from the centre line minus the half width there, so that two lanes of different width meet at
+    their common edge. A cell answers exactly for every point up to `MARGIN` outside a lane; it is empty beyond.
+
+    Attributes:
+        seg: x0, y0, x1, y1 [M, 4].
+        seg_half: Half widths at both ends [M, 2].
+        seg_lane: Lane of each segment [M].
+        seg_s: Arc length at the first end [M].
+        cell_offset: Where the segments of cell iy*nx+ix, `CELL` m wide, begin in `cell_seg` [nx*ny+1].
+        cell_seg: See `cell_offset`.
+        origin: Lower left corner.
+        nx: Number of columns.
+        ny: Number of rows.
     """
 
     seg: F32

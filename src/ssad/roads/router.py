@@ -50,11 +50,17 @@ class _Leg:
 
 
 def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]], *, spacing: float = 1.0) -> Route:
-    """The shortest drive through key points [n >= 2], in their order, along lanes and lane changes.
+    """The shortest drive through key points, in their order, along lanes and lane changes.
 
-    A `Pose` selects among lanes that run its way; a bare (x, y) only by distance. Ends are the projections of the
-    first and last key point; one between may be passed in the lane beside it. RouteError: too few points, one that
-    is off the road, or no way between two of them.
+    The ends are the projections of the first and last key point; one between them may be passed in the lane beside it.
+
+    Args:
+        graph: The town.
+        keypoints: Two or more. A `Pose` selects among lanes that run in its direction, a bare (x, y) only by distance.
+        spacing: Distance between two points of the route, m.
+
+    Raises:
+        RouteError: There are too few points, one is off the road, or no way leads from one to the next.
     """
     if len(keypoints) < 2:
         raise RouteError(f"town '{graph.name}': a route needs at least two key points, not {len(keypoints)}")
@@ -79,9 +85,17 @@ def route_along(graph: LaneGraph, keypoints: Sequence[Pose | tuple[float, float]
 
 
 def random_route(graph: LaneGraph, lane: int, s: float, length: float, rng: np.random.Generator) -> Route:
-    """A drive of `length` m from arc length s of a lane, taking a random driving successor at every lane's end.
+    """A drive that takes a random driving successor at the end of every lane.
 
-    It ends early where the road does. RouteError: nothing of the road is left.
+    Args:
+        graph: The town.
+        lane: Lane that it starts on.
+        s: Arc length on that lane, m.
+        length: Length of the drive, m; it ends early where the road does.
+        rng: Source of randomness.
+
+    Raises:
+        RouteError: Nothing of the road is left.
     """
     legs, rest = [], length
     while True:
@@ -225,18 +239,27 @@ def _search(graph: LaneGraph, starts: list[tuple[float, _Spot]], goal: _Spot) ->
 
 def _line(graph: LaneGraph, leg: _Leg, step: float = math.inf) -> tuple[F64, I32]:
     """Rows [n, 6] (x, y, cos, sin, speed limit, width) along a leg's lanes, at most `step` m apart; lanes [n]."""
-    rows, lanes = [], []
-    for lane, s0, s1 in leg.parts:
-        along = graph.s[graph.points(lane)]
-        inner = along if math.isinf(step) else np.arange(s0, s1, step)
-        inner = inner[(inner > s0 + 0.02) & (inner < s1 - 0.02)]
-        found = graph.along(lane, [s0, *inner.tolist(), s1])
-        limit = np.full(len(found), float(graph.speed_limit[lane]))
-        heading = found[:, 2].tolist()  # numpy's own sines differ from those of libm in the last digit
-        cos, sin = [math.cos(yaw) for yaw in heading], [math.sin(yaw) for yaw in heading]
-        rows.append(np.column_stack([found[:, :2], cos, sin, limit, found[:, 3]]))
-        lanes.append(np.full(len(found), lane, np.int32))
+    rows = [_part(graph, part, step) for part in leg.parts]
+    lanes = [np.full(len(drawn), part[0], np.int32) for drawn, part in zip(rows, leg.parts, strict=True)]
     return np.concatenate(rows), np.concatenate(lanes)
+
+
+def _part(graph: LaneGraph, part: tuple[int, float, float], step: float) -> F64:
+    """The rows of `_line` for one lane; those of a whole lane are kept, since most routes of a town have it."""
+    lane, s0, s1 = part
+    whole = math.isinf(step) and s0 == 0.0 and s1 == float(graph.length[lane])
+    if whole and lane in graph.kept:
+        found: F64 = graph.kept[lane]
+        return found
+    inner = graph.s[graph.points(lane)].astype(np.float64) if math.isinf(step) else np.arange(s0, s1, step)
+    inner = inner[(inner > s0 + 0.02) & (inner < s1 - 0.02)]
+    limit = float(graph.speed_limit[lane])
+    places = graph.along(lane, [s0, *inner.tolist(), s1]).tolist()
+    rows = np.array([(x, y, math.cos(yaw), math.sin(yaw), limit, width) for x, y, yaw, width in places], np.float64)
+    if whole:
+        rows.setflags(write=False)
+        graph.kept[lane] = rows
+    return rows
 
 
 def _change(graph: LaneGraph, leg: _Leg, old: tuple[int, float]) -> tuple[F64, I32]:

@@ -16,11 +16,20 @@ SETBACK_OF_CROSSWALK = 17.0  # m from the end of an arm to the crosswalk of a ro
 
 @dataclass(frozen=True)
 class RoadSpec:
-    """A road along a polyline whose inner corners are rounded with `radius` m; its halves are equal.
+    """A road along a polyline with rounded inner corners; its halves are equal.
 
-    lanes a side of `width` m, then a shoulder and a sidewalk (m, 0: none); `limit` in mph; median: m between the
-    halves; one_way: the right half alone, driven from the first point to the last. Signals and crosswalks belong to the
-    junctions where streets end.
+    Signals and crosswalks belong to the junctions where streets end.
+
+    Attributes:
+        points: x, y of the polyline, m.
+        lanes: Number of lanes on each side.
+        width: Width of a lane, m.
+        shoulder: Width of the shoulder, m; 0: none.
+        sidewalk: Width of the sidewalk, m; 0: none.
+        limit: Speed limit, mph.
+        radius: Radius of the corners, m.
+        median: Distance between the halves, m.
+        one_way: Only the right half, driven from the first point to the last.
     """
 
     points: tuple[Point, ...]
@@ -36,10 +45,16 @@ class RoadSpec:
 
 @dataclass(frozen=True)
 class Roundabout:
-    """A ring of one lane, driven counterclockwise, where streets of one lane a side end that point at its middle.
+    """A ring of one lane, driven counterclockwise; streets with one lane on each side that end at its middle meet it.
 
-    radius: m from the middle to the middle of the lane; width: m, of that lane; spread: rad from the axis of an arm to
-    where its traffic joins and leaves the ring; limit: mph on the ring. Arms yield to the ring.
+    Arms yield to the ring.
+
+    Attributes:
+        place: Middle, m.
+        radius: Distance from the middle to the middle of the lane, m.
+        width: Width of that lane, m.
+        spread: Angle from the axis of an arm to where its traffic joins and leaves the ring, rad.
+        limit: Speed limit on the ring, mph.
     """
 
     place: Point
@@ -94,7 +109,14 @@ class Town:
 
 @dataclass(frozen=True)
 class Arm:
-    """The end of a street at a junction. heading: outwards from the junction; at_end: the street ends here."""
+    """The end of a street at a junction.
+
+    Attributes:
+        road: OpenDRIVE id of the street.
+        street: Its specification.
+        heading: Outwards from the junction, rad.
+        at_end: Whether the street ends here; else it begins here.
+    """
 
     road: int
     street: RoadSpec
@@ -217,7 +239,13 @@ def fill_way(
 ) -> None:
     """Lanes of a connecting road: those of the movement, and shoulder and sidewalk where it runs along a kerb.
 
-    eased: the lanes' widths leave and arrive without a kink.
+    Args:
+        road: The connecting road.
+        start: Arm that it comes from.
+        end: Arm that it leads to.
+        pairs: Numbers of the incoming and of the outgoing lane of each.
+        kerb: Whether it runs along a kerb.
+        eased: Whether the widths of the lanes change without a kink at both ends.
     """
     length = float(road.get("length", "0"))
     lanes = lane_section(road)

@@ -22,7 +22,11 @@ from ssad.toolbox.write import materialise
 
 
 def severities(text: str) -> tuple[Strength, ...]:
-    """Severities from the text of --severity, such as "1,3" or "random". ConfigError."""
+    """Severities from the text of --severity, such as "1,3" or "random".
+
+    Raises:
+        ConfigError: The text is neither.
+    """
     found: list[Strength] = []
     for part in (p.strip() for p in text.split(",")):
         if part == "random":
@@ -35,7 +39,11 @@ def severities(text: str) -> tuple[Strength, ...]:
 
 
 def shift_names(names: Sequence[str]) -> tuple[str, ...]:
-    """The shifts of --shifts; ["all"] means those of the paper. UnknownNameError."""
+    """The shifts of --shifts; ["all"] means those of the paper.
+
+    Raises:
+        UnknownNameError: There is no such shift.
+    """
     if list(names) == ["all"]:
         return tuple(SHIFTS)
     for name in names:
@@ -57,7 +65,28 @@ def shift_folder(
     ray: str | None,
     settings: Mapping[str, Any],
 ) -> int:
-    """Write nuScenes-N, print one line per root, return the exit code. ConfigError, FormatError, StoreError."""
+    """Write nuScenes-N and print one line for each root.
+
+    Args:
+        source: The nuScenes root.
+        out: Folder of the roots.
+        shifts: See `shift_names`.
+        severity: See `severities`.
+        version: Version of the dataset; None: the only one.
+        split: Split whose scenes are written; None: none is chosen.
+        scenes: Names of the scenes.
+        workers: See `materialise`.
+        ray: See `materialise`.
+        settings: Further fields of `Options`.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: See `materialise`.
+        FormatError: See `materialise`.
+        StoreError: See `materialise`.
+    """
     with NuScenes(source, version) as data:
         chosen = tuple(scenes) or (tuple(scenes_of_split(source, data.version, split)) if split else ())
         version = data.version
@@ -100,7 +129,11 @@ def shift_folder(
 
 
 def verify_folder(out: Path) -> int:
-    """Compare a root, or all roots in a folder, with their manifests; exit code 1 if files differ. StoreError."""
+    """Compare a root, or all roots in a folder, with their manifests; exit code 1 if files differ.
+
+    Raises:
+        StoreError: There is nothing to compare, or it cannot be read.
+    """
     roots = [out] if (out / PAGE).is_file() or (out / "manifest").is_dir() else sorted(out.glob("*/manifest"))
     roots = [root.parent if root.name == "manifest" and root != out else root for root in roots]
     if not roots:
@@ -128,7 +161,24 @@ def write_contact_sheets(
     seed: int,
     calibration: str,
 ) -> None:
-    """Write two contact sheets of an image, or of one camera of a dataset. ConfigError, SSADError."""
+    """Write two contact sheets of an image, or of one camera of a dataset.
+
+    Args:
+        source: The image, or a nuScenes root.
+        out: Where the sheets are written.
+        version: Version of the dataset; None: the only one.
+        channel: Name of the camera.
+        split: Must be None: a contact sheet is not of a split.
+        scenes: Name of the scene, at most one, for a dataset; none: the first.
+        boxes: Boxes in the image, see `parse_box`.
+        severity: See `severities`; the first one is used.
+        seed: Seed of the shifts.
+        calibration: Calibration of the shifts.
+
+    Raises:
+        ConfigError: The arguments do not fit together.
+        SSADError: The image or the dataset cannot be read, or a sheet cannot be written.
+    """
     if split is not None or (scenes and source.is_file()):
         raise ConfigError(
             f"{'--split' if split is not None else '--scenes'} cannot be used for a contact sheet of {source}"

@@ -74,9 +74,19 @@ def own_frame(image: U8, rectangles: Sequence[Sequence[float]] = ()) -> Frame:
 def pick_frame(
     data: NuScenes, *, channel: str = "CAM_FRONT", scene: str | None = None, seed: int = 0
 ) -> tuple[U8, Frame, SceneContext]:
-    """The key frame of a camera that shows most boxes in full, of a scene (default: the first); its image and scene.
+    """The key frame of a camera that shows most boxes in full.
 
-    seed: of the sun's place. ConfigError: no such scene or camera.
+    Args:
+        data: The dataset.
+        channel: Name of the camera.
+        scene: Name of the scene; None: the first.
+        seed: Seed of the sun's position.
+
+    Returns:
+        Image [H, W, 3], its frame, and its scene.
+
+    Raises:
+        ConfigError: There is no such scene or camera.
     """
     chosen = data.scene(data.scenes()[0].token if scene is None else scene)
     shifter = SceneShifter(data.root, chosen, ShiftSpec("scale", 3))
@@ -183,7 +193,11 @@ def write_sheets(
 
 
 def parse_box(text: str) -> tuple[float, ...]:
-    """x0,y0,x1,y1 -> numbers. ConfigError."""
+    """Four numbers from the text x0,y0,x1,y1.
+
+    Raises:
+        ConfigError: The text is something else.
+    """
     try:
         found = tuple(float(part) for part in text.split(","))
     except ValueError:

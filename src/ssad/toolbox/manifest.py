@@ -151,11 +151,21 @@ def manifest_digest(root: Path) -> str:
 
 
 def check_manifest(root: Path, scenes: Iterable[str] = (), *, sample: int = 16) -> dict[str, Any] | None:
-    """The manifest of a root after a check that its data are shifted indeed; None for a clean dataset.
+    """The manifest of a root, after a check that its data are indeed shifted.
 
     Lines must be those that the page has hashes of; each file must be there with its size, and not be a link to the
-    clean one; `sample` of them, by a fixed draw, are hashed; the boxes must be those that the page names. scenes:
-    names that must be covered, and the only ones looked at; none: all of them. StoreError.
+    clean one; `sample` of them, by a fixed draw, are hashed; the boxes must be those that the page names.
+
+    Args:
+        root: A nuScenes root.
+        scenes: Names of the scenes that must be covered, and the only ones checked; none: all.
+        sample: Number of files that are hashed.
+
+    Returns:
+        The manifest; None for a clean dataset.
+
+    Raises:
+        StoreError: The check fails.
     """
     root = Path(root)
     manifest = read_manifest(root)
@@ -225,9 +235,14 @@ def _wrong_boxes(root: Path, manifest: Mapping[str, Any]) -> Iterator[str]:
 
 
 def verify(root: Path) -> tuple[int, list[str]]:
-    """Hashes every file and table of a root: the number of files, and a line for each that is not as in the manifest.
+    """Compare every file and table of a root with the manifest, by their hashes.
 
-    StoreError for a root without a manifest; FormatError when that is broken.
+    Returns:
+        Number of files; and a line for each that differs from the manifest.
+
+    Raises:
+        StoreError: The root has no manifest.
+        FormatError: The manifest is broken.
     """
     root = Path(root)
     manifest = read_manifest(root)

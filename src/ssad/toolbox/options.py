@@ -17,13 +17,22 @@ Strength = int | Literal["random"]
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What to write.
+    """What to write. A file in which nothing changes is linked, so that severity 0 gives the dataset itself.
 
-    source: a nuScenes root; out: folder that gets one root a shift and severity; shifts and severities: all pairs of
-    them; scenes: names, empty for all; sweeps, lidar: whether files between key frames and LiDAR files are shifted
-    too (else they are linked); labels: which boxes sample_annotation.json holds (the other set lies beside it);
-    a file in which nothing changes is linked, so that severity 0 gives the dataset itself; quality, subsampling: of
-    JPEG files ("auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420).
+    Attributes:
+        source: A nuScenes root.
+        out: Folder that gets one root for each pair of shift and severity.
+        version: Version of the dataset.
+        shifts: Names of the shifts.
+        severities: 0 to 5, or "random".
+        seed: Seed of all draws.
+        calibration: Calibration of the shifts.
+        labels: Which boxes sample_annotation.json holds; the other set is written beside it.
+        scenes: Names of scenes; empty: all.
+        sweeps: Whether files between key frames are shifted too; else they are linked.
+        lidar: Whether LiDAR files are shifted too; else they are linked.
+        quality: Of JPEG files.
+        subsampling: Of JPEG files; "auto": 444 for sensor noise, which 420 would weaken by 29 %, else 420.
     """
 
     source: Path
@@ -76,7 +85,14 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Shard:
-    """One scene under one shift: what a worker is given. severity as asked for."""
+    """One scene under one shift: what a worker is given.
+
+    Attributes:
+        options: What to write.
+        shift: Name of the shift.
+        severity: As asked for.
+        scene: Name of the scene.
+    """
 
     options: Options = field(repr=False)
     shift: str

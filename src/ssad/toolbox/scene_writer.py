@@ -42,7 +42,12 @@ _DATA: dict[object, NuScenes] = {}
 
 
 class SceneLabels(msgspec.Struct):
-    """The boxes of a scene after the shift, by token; lines: hash of the manifest lines they were made with."""
+    """The boxes of a scene after the shift.
+
+    Attributes:
+        lines: Hash of the manifest lines that they were made with.
+        boxes: Boxes by token.
+    """
 
     lines: str
     boxes: dict[str, msgspec.Raw]
@@ -278,9 +283,18 @@ def _temporary(root: Path) -> Path:
 
 
 def link(root: Path, source: Path, target: Path) -> None:
-    """A symbolic link in place of whatever was there. StoreError.
+    """Put a symbolic link in place of whatever was there.
 
-    It names the file that `source` is in the end; a file beside it by name alone, so that a root may be moved.
+    It names the file that `source` finally resolves to; a file beside it is named relatively, so that a root may be
+    moved.
+
+    Args:
+        root: Folder of the dataset.
+        source: What the link leads to.
+        target: Where the link is put.
+
+    Raises:
+        StoreError: The link cannot be written.
     """
     end = source.name if source.parent == target.parent else os.path.realpath(source)
     try:

@@ -51,10 +51,23 @@ class Written:
 def materialise(
     options: Options, *, workers: int | None = None, ray: str | None = None, progress: Progress = lambda done, of: None
 ) -> list[Written]:
-    """Writes one nuScenes root a shift and severity. Run again to resume: what stands is kept.
+    """Write one nuScenes root for each shift and severity; run again, it resumes and keeps what is there.
 
-    workers: processes (None: one a core); ray: address of a cluster that sees the same folders. The bytes do not
-    depend on either. ConfigError, FormatError, StoreError; StoreError also when a shift changed no image at all.
+    The bytes depend neither on the number of workers nor on the cluster.
+
+    Args:
+        options: What to write.
+        workers: Number of processes; None: one for each core; 0: all in this process.
+        ray: Address of a cluster that sees the same folders.
+        progress: Called with the number of finished parts and of all parts.
+
+    Returns:
+        The state of each root.
+
+    Raises:
+        ConfigError: The options do not fit together, or do not fit the dataset.
+        FormatError: The dataset is broken.
+        StoreError: A root cannot be written, or a shift changed no image at all.
     """
     if workers is not None and workers < 0:
         raise ConfigError(f"{workers} workers: expected 1 or more (0: in this process)")

@@ -13,7 +13,17 @@ from ssad.training.batches import Item
 
 
 def nuscenes_items(root: Path, version: str | None, split: str, *, limit: int | None = None) -> Iterator[Item]:
-    """Every key picture of every camera of a split; limit: of so many scenes. ConfigError: an unknown split."""
+    """Every key picture of every camera of a split.
+
+    Args:
+        root: The nuScenes root.
+        version: Its version; None: the only one.
+        split: Name of the split.
+        limit: Number of scenes; None: all.
+
+    Raises:
+        ConfigError: The split is unknown.
+    """
     with NuScenes(root, version) as data:
         names = scenes_of(data, split)
         for name in names[:limit]:

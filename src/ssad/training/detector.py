@@ -70,7 +70,11 @@ class Plan:
 
 
 def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
-    """key=value pairs, values as YAML. ConfigError."""
+    """Names and values from key=value pairs, values as YAML.
+
+    Raises:
+        ConfigError: A pair has no "=".
+    """
     found = []
     for text in texts:
         key, equals, value = text.partition("=")
@@ -82,7 +86,12 @@ def parse_changes(texts: Sequence[str]) -> tuple[tuple[str, Any], ...]:
 
 
 def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
-    """The truth of each picture; target: only the object that the set is about counts, all others are crowd."""
+    """The truth of each picture.
+
+    Args:
+        data: The set.
+        target: Whether only the object that the set is about counts; all others are then crowd.
+    """
     return [
         Truth(
             torch.from_numpy(image.label.astype(np.int64)), torch.from_numpy(image.box.astype(np.float32)),
@@ -93,7 +102,11 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
 
 
 def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
-    """Classes and pictures of a split of clips. ConfigError: no such split."""
+    """Classes and pictures of a split of clips.
+
+    Raises:
+        ConfigError: There is no such split.
+    """
     path = folder / "annotations" / f"{split}.json"
     if not path.is_file():
         raise ConfigError(f"{folder}: no annotations/{split}.json; record it with: ssad record {folder} --clips drive")
@@ -105,7 +118,19 @@ def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
 
 
 def run_training(plan: Plan, *, say: Say = print) -> Iterator[str]:
-    """Trains and writes OUT/NAME.safetensors with its card; lines about what was written. ConfigError, FormatError."""
+    """Train a detector, and write OUT/NAME.safetensors with its card.
+
+    Args:
+        plan: What to train.
+        say: Called with a line about progress.
+
+    Yields:
+        Lines about what was written.
+
+    Raises:
+        ConfigError: The plan does not fit the data or this machine.
+        FormatError: Data, weights or an interrupted training are broken.
+    """
     recipe = find_recipe(plan.recipe, **dict(plan.changes))
     device = _device(plan.device)
     if plan.gpus > 1:

@@ -66,12 +66,29 @@ def train(
     seconds: float | None = None,
     about: str = "",
 ) -> Any:
-    """Trains a detector on a bank and gives back the one to use (the average of the weights, if one is kept).
+    """Train a detector on a set of pictures.
 
-    OUT/last.pt holds all that is needed to go on after a stop; OUT/log.jsonl a line an epoch. validate: metrics of a
-    detector, every `recipe.validate` epochs but the last. seconds: stop after the epoch in which this time is over (to
-    be gone on with). about: what else the result depends on (data, first weights), to be the same when it goes on.
-    FormatError: last.pt is of another recipe, of other data or broken; StoreError; ConfigError: the loss is not finite.
+    OUT/last.pt holds all that is needed to resume after a stop; OUT/log.jsonl has a line for each epoch.
+
+    Args:
+        detector: The detector; it is changed.
+        bank: Pictures and their truth.
+        recipe: The recipe.
+        out: Folder to write to.
+        device: Where to train.
+        validate: Metrics of a detector; called every `recipe.validate` epochs but the last.
+        say: Called with a line about progress.
+        share: The part of the work of this process.
+        seconds: Stop after the epoch in which this time runs out, s; it can be resumed.
+        about: What else the result depends on (data, first weights); it must be the same when the training is resumed.
+
+    Returns:
+        The detector to use: the average of the weights, if one is kept.
+
+    Raises:
+        FormatError: last.pt is of another recipe, of other data, or broken.
+        StoreError: A file cannot be written.
+        ConfigError: The loss is not finite.
     """
     where = torch.device(device)
     detector.to(where)
@@ -252,7 +269,11 @@ def read_rows(out: Path) -> list[dict[str, Any]]:
 
 
 def write_row(out: Path, row: dict[str, Any]) -> None:
-    """Writes the line of an epoch; lines of this epoch and of later ones go. StoreError."""
+    """Write the line of an epoch; lines of this epoch and of later ones are removed.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     try:
         rows = read_rows(out) if (out / LOG).is_file() else []
         kept = [one for one in rows if one["epoch"] < row["epoch"]]

@@ -23,17 +23,36 @@ Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 class Recipe:
     """A training run. Learning rates are for one step on `batch` images over all devices.
 
-    optimizer, lr, momentum (of SGD, or beta 1 of AdamW), weight_decay (not on norms and biases), clip: norm of the
-    gradient, 0 none; schedule: "cosine" or "linear" from lr to lr * last, or "step": a tenth after each of `steps`
-    (epochs); warmup: iterations from a third of lr; average: decay of the weights' moving average, 0 none; amp:
-    bfloat16 on a GPU; compile: layers that can be fused are compiled on a GPU (needs Triton and a C compiler); freeze:
-    prefixes of parameters that stay; norm_eval: BatchNorm keeps its statistics.
-    flip: chance of a mirror image; zoom: range of the scale of a random crop; jitter: of brightness, contrast,
-    saturation and gamma; noise: largest deviation of added noise. keep: least visible share of a box after a crop, 2D
-    only (a 3D box stays while its middle is in sight). rare: pictures with a class that fewer than this share of them
-    show are repeated (see `batches.repeats`), 0 none. validate: epochs from one validation to the next.
-    radius: adversarial training: every picture is attacked by PGD on the training losses within this L-infinity radius
-    (code values of 0..255), 0 none; attack_steps: gradient steps of these attacks.
+    Attributes:
+        detector: Name of the detector.
+        epochs: Number of epochs.
+        batch: Images in a step, over all devices.
+        lr: Learning rate.
+        optimizer: "sgd" or "adamw".
+        momentum: Of SGD, or beta 1 of AdamW.
+        weight_decay: Does not apply to norms and biases.
+        schedule: "cosine" or "linear" from lr to lr * last, or "step": a tenth after each of `steps`.
+        last: See `schedule`.
+        steps: Epochs; see `schedule`.
+        warmup: Iterations over which the rate rises from a third of lr.
+        clip: Norm to which the gradient is clipped; 0: it is not.
+        average: Decay of the moving average of the weights; 0: none is kept.
+        amp: bfloat16 on a GPU.
+        compile: Whether layers that can be fused are compiled on a GPU (needs Triton and a C compiler).
+        freeze: Prefixes of the names of parameters that stay as they are.
+        norm_eval: Whether BatchNorm keeps its statistics.
+        flip: Probability of a mirror image.
+        zoom: Range of the scale of a random crop.
+        jitter: Of brightness, contrast, saturation and gamma.
+        noise: Largest standard deviation of added noise.
+        keep: Least visible share of a box after a crop, 2D only (a 3D box stays while its middle is in sight).
+        rare: Pictures with a class that fewer than this share of them show are repeated (see `batches.repeats`); 0:
+            none.
+        validate: Epochs from one validation to the next.
+        radius: Adversarial training: every picture is attacked by PGD on the training losses within this L-infinity
+            radius (code values of 0..255); 0: none.
+        attack_steps: Gradient steps of these attacks.
+        seed: Of all random draws.
     """
 
     detector: str
@@ -122,7 +141,12 @@ RECIPES: dict[str, Recipe] = {
 
 
 def find_recipe(name: str, **changes: Any) -> Recipe:
-    """A recipe by name with some of its values changed. UnknownNameError, ConfigError."""
+    """A recipe by name, with some of its values changed.
+
+    Raises:
+        UnknownNameError: There is no such recipe.
+        ConfigError: A value does not fit.
+    """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
     known = sorted(f.name for f in fields(Recipe) if f.name != "detector")

@@ -145,14 +145,22 @@ def draw_paint(generator: np.random.Generator) -> tuple[float, float, float]:
 
 
 def draw_style(kind: str, *, generator: np.random.Generator) -> str:
-    """A style of a kind, as often as its weight says. UnknownNameError."""
+    """Draw a style of a kind, by the weights of its styles.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+    """
     styles = _body(kind).styles
     weights = np.array([s.weight for s in styles.values()])
     return list(styles)[int(generator.choice(len(weights), p=weights / weights.sum()))]
 
 
 def draw_size(kind: str, style: str, *, generator: np.random.Generator) -> Point:
-    """A size (length, width, height, m) of a style: normal about its mean, cut at two deviations. UnknownNameError."""
+    """Draw a size (length, width, height, m) of a style: normal around its mean, truncated at two standard deviations.
+
+    Raises:
+        UnknownNameError: There is no such kind or style.
+    """
     entry = _style(kind, style)
     share = 1.0 + entry.spread * np.clip(generator.normal(size=3), -2.0, 2.0) * [1.0, 0.5, 0.7]
     length, width, height = (float(v) for v in np.asarray(entry.size) * share)
@@ -170,11 +178,21 @@ def make_body(
 ) -> Mesh:
     """The mesh of a kind of road user or furniture, see `BODIES`; base centred on the origin, x forward.
 
-    `style` and `size` (length, width, height, m) are drawn where None. The mesh fills its size exactly; a walker
-    fills it over the whole walking cycle. `detail` 2 is full, 0 is for far away: draws and size do not depend on it. A
-    panel has the same place in the texture atlas in every body of a style, whatever its size and detail. `phase` (rad)
-    is the place in the cycle of a walker or the angle of a bicycle's crank. The generator always gives the same number
-    of draws for a style. UnknownNameError, ConfigError.
+    The mesh fills its size exactly; a walker fills it over the whole walking cycle. A panel has the same place in the
+    texture atlas in every body of a style, whatever its size and detail. The generator always yields the same number of
+    draws for a style.
+
+    Args:
+        kind: Name of the kind.
+        style: Name of the style; None: drawn.
+        size: Length, width and height, m; None: drawn.
+        generator: Source of randomness.
+        detail: 2 is full, 0 is for far away; draws and size do not depend on it.
+        phase: Place in the cycle of a walker, or angle of a bicycle's crank, rad.
+
+    Raises:
+        UnknownNameError: There is no such kind or style.
+        ConfigError: The size is not three lengths in [0.01, 100] m, or there is no such detail.
     """
     body = _body(kind)
     drawn_style = draw_style(kind, generator=generator)

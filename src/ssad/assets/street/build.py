@@ -27,10 +27,16 @@ REVISION = 3  # of what is built: a cached street of another revision is not use
 
 
 def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
-    """The static geometry of a town, given as a lane graph or by name.
+    """The static geometry of a town; equal arguments give equal bytes.
 
-    seed: draws facades, colours and plants; style: one of STYLES (default: that of the town). Equal arguments give
-    equal bytes. MapError: not flat or no drivable lane; UnknownNameError: no such town or style.
+    Args:
+        town: A lane graph, or the name of a town.
+        seed: Draws facades, colours and plants.
+        style: One of STYLES; None: that of the town.
+
+    Raises:
+        MapError: The town is not flat, or has no drivable lane.
+        UnknownNameError: There is no such town or style.
     """
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)

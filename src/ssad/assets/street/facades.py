@@ -137,9 +137,18 @@ def gable(
     x: tuple[float, float], y: tuple[float, float], z: float, rise: float, *, roof: int, wall: int,
     across: bool = False, eaves: float = 0.4, hip: float = 0.0,
 ) -> list[Piece]:  # fmt: skip
-    """A pitched roof over a block with its eaves at z; the ridge runs along x, or along y if `across`.
+    """A pitched roof over a block.
 
-    hip: m by which the ridge is shorter at each end (0: gables, which are walls).
+    Args:
+        x: Extent of the block along x, m.
+        y: Extent of the block along y, m.
+        z: Height of the eaves, m.
+        rise: Height of the ridge above the eaves, m.
+        roof: Material of the roof.
+        wall: Material of the gables.
+        across: Whether the ridge runs along y; else along x.
+        eaves: How far the roof reaches beyond the block, m.
+        hip: Length by which the ridge is shorter at each end, m; 0: gables, which are walls.
     """
     (a0, a1), (b0, b1) = (y, x) if across else (x, y)
     half = 0.5 * (b1 - b0)

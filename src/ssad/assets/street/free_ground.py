@@ -86,8 +86,10 @@ def polygon_distance(xy: F64, corners: F64) -> F64:
 class Side:
     """One side of a street outside junctions: the outer edge of its outermost lane, and where its kerb is.
 
-    kerb: m from the outer edge to the kerb (the sidewalk's width, 0 without one). frontage: buildings face it; not so a
-    motorway and its ramps.
+    Attributes:
+        edge: The outer edge.
+        kerb: Distance from the outer edge to the kerb, m: the sidewalk's width, 0 without one.
+        frontage: Whether buildings face it; not so a motorway and its ramps.
     """
 
     edge: Edge

@@ -55,8 +55,11 @@ def lamp(look: Look) -> tuple[Piece, tuple[float, float]]:
 class SignalMast:
     """A signal post in its own frame: x towards the traffic that it faces, the road towards -y.
 
-    heads: (y, z) of the middle of each head; lens: first face of the red, amber and green lens of each head; sides:
-    faces of a lens.
+    Attributes:
+        piece: Its triangles.
+        heads: y, z of the middle of each head, m.
+        lens: First face of the red, amber and green lens of each head.
+        sides: Number of faces of a lens.
     """
 
     piece: Piece

@@ -28,19 +28,32 @@ REACH = (70.0, 180.0)  # m from the eye up to which tiles are drawn at level 0 a
 class Street:
     """Triangles of a town. Arrays are read-only.
 
-    vertices [V, 3]; faces [F, 3] counter-clockwise seen from outside; normals [F, 3, 3] unit, one for each corner;
-    uv [F, 3, 2] metres on the surface (x and y of the world on the ground; on walls u runs right and v up from
-    the ground); material [F] index into `materials`.
-
     Tiles are squares of `tile` m: tile iy * nx + ix begins at `origin` + tile * (ix, iy). Level k (0 full, 1 without
     small things, 2 boxes and crowns) of tile t draws the faces order[offset[k, t] : offset[k, t + 1]]; those of the
-    last tile, nx * ny, are far ground and hills, which belong to every view at every level. A thing stands whole in
-    the tile of its middle. Ground shared by levels is listed in each.
+    last tile, nx * ny, are far ground and hills, which belong to every view at every level. A thing is wholly in the
+    tile of its middle. Ground shared by levels is listed in each.
 
-    lamps [M, 4]: x, y, z of a street lamp's light and its heading (from the post to the road). heads [H, 4]: x, y, z
-    of the middle of a signal head and the heading it faces; head_signal [H]: its signal in the lane graph;
-    head_lens [H, 3, 2]: first and last + 1 face of its red, amber and green lens. parking [., 3]: x, y, yaw of
-    places for parked cars, off the road.
+    Attributes:
+        name: Name of the town.
+        style: Name of its style.
+        vertices: [V, 3], m.
+        faces: Counter-clockwise seen from outside [F, 3].
+        normals: Unit vectors, one for each corner [F, 3, 3].
+        uv: Metres on the surface [F, 3, 2]: x and y of the world on the ground; on walls u runs right and v up from the
+            ground.
+        material: Index into `materials` [F].
+        materials: All materials.
+        tile: Side of a tile, m.
+        origin: x, y of the first tile, m.
+        nx: Number of tiles along x.
+        ny: Number of tiles along y.
+        order: See above.
+        offset: See above.
+        lamps: x, y, z of a street lamp's light, and its heading from the post to the road [M, 4].
+        heads: x, y, z of the middle of a signal head, and the heading that it faces [H, 4].
+        head_signal: Signal of each head in the lane graph [H].
+        head_lens: First face and end of the faces of its red, amber and green lens [H, 3, 2].
+        parking: x, y, yaw of places for parked cars, off the road [., 3].
     """
 
     name: str
@@ -118,7 +131,11 @@ _ARRAYS = array_dtypes(Street)
 
 
 def save_street(street: Street, path: Path | str) -> None:
-    """Write a street as .npz, whole or not at all; equal streets give equal bytes. StoreError."""
+    """Write a street as .npz, whole or not at all; equal streets give equal bytes.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
     table = street.materials
     head = [f"ssad-street {FORMAT}", street.name, street.style]
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -131,7 +148,11 @@ def save_street(street: Street, path: Path | str) -> None:
 
 
 def load_street(path: Path | str) -> Street:
-    """Read what `save_street` wrote. FormatError: missing, broken, or not a street."""
+    """Read what `save_street` wrote.
+
+    Raises:
+        FormatError: The file is missing, broken, or not a street.
+    """
     arrays = load_npz(path)
     header = arrays.get("header")
     wanted = {"header", "size", "material_name", "material_value", *_ARRAYS}

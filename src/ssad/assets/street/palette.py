@@ -16,9 +16,22 @@ from ssad.core.errors import unknown_name
 class TownStyle:
     """What lines the streets of a kind of town.
 
-    buildings: kind -> weight along streets; back: the same for the inside of blocks; setback: m from the sidewalk
-    (least, most); gap: m between neighbours; earth: name of the ground; trees: for 1,000 m^2 of open ground; rows:
-    m between street trees, 0 none; hedges, fences: share of fronts; lamp: m between lamps; yellow: centre lines.
+    Attributes:
+        buildings: Kind -> weight, along streets.
+        back: Kind -> weight, inside blocks.
+        setback: Least and largest distance from the sidewalk, m.
+        gap: Least and largest distance between neighbours, m.
+        earth: Name of the ground.
+        trees: Number for 1,000 m^2 of open ground.
+        rows: Distance between street trees, m; 0: none.
+        hedges: Share of fronts with a hedge.
+        fences: Share of fronts with a fence.
+        lamp: Distance between lamps, m.
+        yellow: Whether centre lines are yellow.
+        old: Whether there are lanterns, shop fronts and paved courts.
+        vacant: Share of plots left open.
+        furniture: Density of street furniture.
+        tree_kinds: Kinds of trees.
     """
 
     buildings: Mapping[str, float]
@@ -69,7 +82,11 @@ OF_TOWN = {
 
 
 def style_of(town: str, style: str | None = None) -> str:
-    """Name of the style asked for, or that which belongs to the town. UnknownNameError."""
+    """Name of the style asked for, or else of the one that belongs to the town.
+
+    Raises:
+        UnknownNameError: There is no such style.
+    """
     name = style or OF_TOWN.get(town, "town")
     if name not in STYLES:
         raise unknown_name("street style", name, STYLES)

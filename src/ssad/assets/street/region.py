@@ -26,11 +26,15 @@ Grid = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Ground:
-    """Signed distances in metres at the nodes [ny + 1, nx + 1] of a raster of 1 m, negative inside, at most `REACH`.
+    """Signed distances at the nodes [ny + 1, nx + 1] of a raster of 1 m; negative inside, at most `REACH`, m.
 
-    road: driving lanes, shoulders, junctions; walk: sidewalks; drive: driving lanes and junctions alone; paved: road
-    and sidewalk. inner: open ground that streets enclose.
-    origin: x, y of the first node, whole metres.
+    Attributes:
+        origin: x, y of the first node, whole metres.
+        road: Driving lanes, shoulders and junctions.
+        walk: Sidewalks.
+        drive: Only driving lanes and junctions.
+        paved: Road and sidewalk.
+        inner: Open ground that streets enclose.
     """
 
     origin: tuple[float, float]
@@ -60,7 +64,11 @@ class Ground:
 
 
 def survey(graph: LaneGraph) -> Ground:
-    """Distances of a flat town. MapError: it has bridges or hills, or no drivable lane."""
+    """Distances of a flat town.
+
+    Raises:
+        MapError: It has bridges or hills, or no drivable lane.
+    """
     driving = graph.kind == LaneType.DRIVING
     if not driving.any():
         raise MapError(f"town '{graph.name}': no drivable lane; choose another town")

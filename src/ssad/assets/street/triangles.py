@@ -76,7 +76,13 @@ class TriangleBuilder:
         return first
 
     def place(self, piece: Piece, poses: ArrayLike, *, scale: ArrayLike = 1.0) -> int:
-        """Copies of a piece at poses [n, 4] (x, y, z, yaw), each a thing of its own; scale: [n] or [n, 3]."""
+        """Add copies of a piece, each a thing of its own.
+
+        Args:
+            piece: The piece.
+            poses: x, y, z, yaw of each copy [n, 4].
+            scale: [n] or [n, 3].
+        """
         pose = np.asarray(poses, np.float64).reshape(-1, 4)
         n, v, f = len(pose), len(piece.vertices), len(piece.faces)
         if not n or not f:

@@ -304,7 +304,12 @@ def state_hash(detector: Any) -> str:
 
 
 def data_of(suite: DetectorSuite) -> dict[str, Any]:
-    """What the results depend on of the data set, which is looked at. ConfigError, FormatError."""
+    """What the results depend on of the data set, which is checked.
+
+    Raises:
+        ConfigError: There is no such version, split or scene.
+        FormatError: The data set is broken.
+    """
     if suite.data == RECORDED:
         if suite.split not in ("val", "all"):
             raise ConfigError(f"suite {suite.name}: recorded data have the splits val and all, not '{suite.split}'")

@@ -266,7 +266,13 @@ def suite_scenarios(suite: DrivingSuite) -> tuple[Scenario, ...]:
 
 
 def episode_of(cell: Cell) -> Episode:
-    """The concrete episode of a cell. RouteError, MapError or ConfigError when it cannot be built."""
+    """The concrete episode of a cell.
+
+    Raises:
+        RouteError: It cannot be built.
+        MapError: It cannot be built.
+        ConfigError: It cannot be built.
+    """
     from ssad.interchange.highway_env import highway_episode
     from ssad.scenarios.dynamic import build_episode, scenario_from
 
@@ -333,7 +339,11 @@ def plain(value: Any) -> Any:
 
 
 def make_pictures(names: Sequence[str], folder: Path) -> None:
-    """Makes what is missing of DIR/pictures; pictures.json says what each shows. StoreError."""
+    """Make what is missing of DIR/pictures; pictures.json says what each shows.
+
+    Raises:
+        StoreError: A file cannot be written.
+    """
     target, captions = folder / "pictures", {}
     if "shifts" in names:
         captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a street of Larkhill."

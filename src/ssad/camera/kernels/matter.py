@@ -22,7 +22,7 @@ class Surface:
     Attributes:
         colour: Linear albedo.
         specular: Share of the light that is mirrored.
-        gloss: How sharp the mirror image is, 0 to 1.
+        gloss: How strong and sharp the mirror image is, 0 to 1.
         emission: Emission by day.
         night: What the night adds to the emission.
         paint: 1 where it takes the paint of its body.

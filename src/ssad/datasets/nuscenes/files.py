@@ -18,7 +18,11 @@ POINT_BYTES = 20
 
 
 def read_points(path: str | Path) -> F32:
-    """A LiDAR sweep (.pcd.bin) as float32 [N, 5]. FormatError: missing, of another size, or not finite."""
+    """Read a LiDAR sweep (.pcd.bin) as float32 [N, 5].
+
+    Raises:
+        FormatError: The file is missing, has a size that does not fit, or holds values that are not finite.
+    """
     data = read_bytes(path, limit=1 << 28)
     if len(data) % POINT_BYTES:
         raise FormatError(f"{path}: {len(data)} bytes are no whole number of {POINT_BYTES}-byte points (cut short?)")

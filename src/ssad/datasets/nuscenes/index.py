@@ -65,9 +65,16 @@ def fingerprint(root: Path, version: str) -> tuple[tuple[str, int, int], ...]:
 
 
 def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
-    """The index of a version folder, built where there is none yet. FormatError for broken tables, StoreError.
+    """The index of a version folder, built where there is none yet.
 
-    small: bytes of all tables below which the index is in memory (default `SMALL`).
+    Args:
+        root: The nuScenes root.
+        version: Name of the version.
+        small: Bytes of all tables below which the index is held in memory; None: `SMALL`.
+
+    Raises:
+        FormatError: The tables are broken, or changed while they were indexed.
+        StoreError: The index cannot be written.
     """
     state = fingerprint(root, version)
     if sum(size for _, size, _ in state) < (SMALL if small is None else small):
@@ -88,7 +95,17 @@ def open_index(root: Path, version: str, *, small: int | None = None) -> Index:
 
 
 def build(path: Path, root: Path, version: str) -> None:
-    """Write the index file, atomically; memory stays that of a block of a table. FormatError, StoreError."""
+    """Write the index file, atomically; only one block of a table is in memory at a time.
+
+    Args:
+        path: The index file.
+        root: The nuScenes root.
+        version: Name of the version.
+
+    Raises:
+        FormatError: The tables are broken.
+        StoreError: The file cannot be written.
+    """
     advice = "set SSAD_HOME to a folder that can be written and has room"
     try:
         with atomic_path(path) as temporary:

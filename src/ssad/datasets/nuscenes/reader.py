@@ -49,9 +49,14 @@ R = TypeVar("R", bound=TableRecord)
 class NuScenes:
     """A nuScenes root folder. It may be passed to other processes: each opens the index for itself.
 
-    root: folder with samples/, sweeps/ and one folder a version; version: such as v1.0-mini, None for the only one.
-    ConfigError when the version is not there or not clear; FormatError for broken tables; StoreError when the index
-    of a large version cannot be written.
+    Args:
+        root: Folder with samples/, sweeps/ and a folder for each version.
+        version: Such as v1.0-mini; None for the only one.
+
+    Raises:
+        ConfigError: The version is not there, or there are several and none is named.
+        FormatError: The tables are broken.
+        StoreError: The index of a large version cannot be written.
     """
 
     def __init__(self, root: Path, version: str | None = None) -> None:
@@ -77,7 +82,12 @@ class NuScenes:
         return list(self._scenes)
 
     def scene(self, name_or_token: str) -> SceneData:
-        """A scene by name or token, with everything in it. ConfigError for an unknown one, FormatError."""
+        """A scene by name or token, with everything in it.
+
+        Raises:
+            ConfigError: There is no such scene.
+            FormatError: The tables are broken.
+        """
         for record in self._scenes:
             if name_or_token in (record.name, record.token):
                 return self._load(record)

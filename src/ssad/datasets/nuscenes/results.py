@@ -66,9 +66,14 @@ class _File(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Results:
-    """A results file: sample tokens [S], boxes (rows in the order of the file, ego_distance NaN), points [N], meta.
+    """A results file.
 
-    points: LiDAR and radar points in a box, -1 where the file does not say; boxes with 0 do not count in the devkit.
+    Attributes:
+        samples: Tokens [S].
+        boxes: Rows in the order of the file; ego_distance is NaN.
+        points: LiDAR and radar points in each box [N], -1 where the file does not say; boxes with 0 do not count in the
+            devkit.
+        meta: The meta of the file.
     """
 
     samples: tuple[str, ...]
@@ -80,11 +85,18 @@ class Results:
 def read_results(
     path: str | Path, samples: Sequence[str] | None = None, *, subset: bool = False, max_boxes: int = MAX_BOXES
 ) -> Results:
-    """Read a results file.
+    """Read a results file. Velocities may be NaN (also written null).
 
-    samples: the tokens that it must have, no more and no less; `BoxTable.sample` indexes them. None: as the file has
-    them. subset: the file may have more, which are passed over, and the rows follow the order of `samples` (what the
-    devkit does for a custom split). Velocities may be NaN (also written null). FormatError.
+    Args:
+        path: The file.
+        samples: Tokens that it must have, no more and no less; `BoxTable.sample` indexes them. None: as the file has
+            them.
+        subset: The file may have more samples, which are ignored, and the rows follow the order of `samples` (as in the
+            devkit for a custom split).
+        max_boxes: Maximum number of boxes in a sample.
+
+    Raises:
+        FormatError: The file is broken, or has other samples.
     """
     file = _decode(path)
     found, meta = file.results, file.meta
@@ -106,7 +118,12 @@ def read_results(
 
 
 def with_ego(boxes: BoxTable, ego: F64) -> BoxTable:
-    """The boxes with their distance in the plane from the ego; ego [S, 3]: its global position at each sample."""
+    """The boxes with their distance from the ego in the plane.
+
+    Args:
+        boxes: The boxes.
+        ego: Global position of the ego at each sample [S, 3], m.
+    """
     with np.errstate(over="ignore"):
         dx, dy = (boxes.centre[:, :2] - ego[boxes.sample, :2]).T
         return replace(boxes, ego_distance=np.sqrt(dx * dx + dy * dy))

@@ -23,7 +23,11 @@ def official_splits() -> Mapping[str, tuple[str, ...]]:
 
 
 def own_splits(root: Path, version: str) -> dict[str, tuple[str, ...]]:
-    """The splits of ROOT/VERSION/splits.json ({name: [scene names]}), none where there is no such file. FormatError."""
+    """The splits of ROOT/VERSION/splits.json ({name: [scene names]}); none where there is no such file.
+
+    Raises:
+        FormatError: The file is broken.
+    """
     path = root / version / "splits.json"
     if not path.is_file():
         return {}
@@ -39,8 +43,11 @@ def own_splits(root: Path, version: str) -> dict[str, tuple[str, ...]]:
 def scenes_of_split(root: Path, version: str, split: str) -> tuple[str, ...]:
     """Names of the scenes of a split.
 
-    The folder's own splits.json goes first, then `all` (every scene of the version), then the official lists, some of
-    whose scenes another version may not have. ConfigError: no such split.
+    The folder's own splits.json takes precedence, then `all` (every scene of the version), then the official lists,
+    some of whose scenes another version may not have.
+
+    Raises:
+        ConfigError: There is no such split.
     """
     own = own_splits(root, version)
     if split in own:

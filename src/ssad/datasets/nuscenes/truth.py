@@ -42,8 +42,15 @@ T = TypeVar("T")
 class GroundTruth:
     """What a results file is compared with.
 
-    samples: tokens [S]; scene [S] indexes scenes (names); ego [S, 3] global position, m; boxes (not filtered), points
-    [N] in a box (LiDAR and radar), visibility [N] 1 .. 4, 0 for not known; racks.
+    Attributes:
+        samples: Tokens [S].
+        scene: Index of each sample's scene in `scenes` [S].
+        scenes: Names of the scenes.
+        ego: Global position of the ego at each sample [S, 3], m.
+        boxes: All boxes, not filtered.
+        points: LiDAR and radar points in each box [N].
+        visibility: 1 to 4; 0 for unknown [N].
+        racks: Bicycle racks.
     """
 
     samples: tuple[str, ...]
@@ -97,11 +104,20 @@ class _Annotation(msgspec.Struct, gc=False):
 def read_truth(
     root: str | Path, version: str, *, scenes: Collection[str] | None = None, samples: Collection[str] | None = None
 ) -> GroundTruth:
-    """The ground truth of some scenes (names), of some samples (tokens), or of all.
+    """The ground truth of some scenes, of some samples, or of all.
 
-    Samples and the boxes of each stand in the order of their tables. Annotations outside of the detection classes are
-    left out. FormatError: a broken table, a link into nowhere, an annotation with two attributes. ConfigError: no
-    sample chosen.
+    Samples and the boxes of each are in the order of their tables. Annotations outside the detection classes are left
+    out.
+
+    Args:
+        root: The nuScenes root.
+        version: Name of the version.
+        scenes: Names of the scenes; None: all.
+        samples: Tokens of the samples; None: all.
+
+    Raises:
+        FormatError: A table is broken, a reference leads nowhere, or an annotation has two attributes.
+        ConfigError: No sample is chosen.
     """
     tables = _Tables(Path(root), version)
     names = {s.token: s.name for s in tables.rows("scene", Scene)}

@@ -67,8 +67,8 @@ class _Frame:
 class NuScenesWriter:
     """Collects the records of a version; sensor files are written at once, the tables by `close`.
 
-    As a context manager it closes when the block ends well, and writes no tables otherwise. Wrong use (an unknown
-    token, a time given twice) is a ValueError; a folder that cannot be written is a StoreError.
+    As a context manager it closes when the block ends well, and writes no tables otherwise. Its methods raise
+    ValueError for wrong use (an unknown token, a time given twice), and StoreError where a folder cannot be written.
     """
 
     def __init__(self, root: Path, version: str = "v1.0-mini") -> None:
@@ -117,7 +117,19 @@ class NuScenesWriter:
         rotation: Quaternion,
         intrinsic: Sequence[Sequence[float]] = (),
     ) -> str:
-        """A sensor on the ego in a scene: pose in the ego frame, intrinsic 3 x 3 for cameras. Calibration token."""
+        """Add a sensor on the ego in a scene.
+
+        Args:
+            scene: Token of the scene.
+            channel: Name of the sensor.
+            modality: camera, lidar or radar.
+            translation: Position in the ego frame, m.
+            rotation: Orientation in the ego frame, quaternion.
+            intrinsic: 3 x 3 for cameras.
+
+        Returns:
+            Token of the calibration.
+        """
         if modality not in _FORMATS:
             raise ValueError(f"modality '{modality}' is none of {', '.join(_FORMATS)}")
         sensor = _token("sensor", channel)
@@ -146,10 +158,20 @@ class NuScenesWriter:
         sample: str | None = None,
         size: tuple[int, int] = (0, 0),
     ) -> str:
-        """A file of a sensor: its bytes, or a file to link to (copied where it cannot be linked).
+        """Add a file of a sensor: its bytes, or a file to link to (copied where it cannot be linked).
 
-        sample: the key frame it belongs to, None for a sweep, which gets the sample that follows it; size: width and
-        height of an image in pixels.
+        Args:
+            scene: Token of the scene.
+            channel: Name of the sensor.
+            timestamp_us: Time, microseconds.
+            data: Bytes, or the file.
+            ego_translation: Position of the ego in the world, m.
+            ego_rotation: Orientation of the ego in the world, quaternion.
+            sample: Token of the key frame that it belongs to; None for a sweep, which gets the sample that follows it.
+            size: Width and height of an image in pixels.
+
+        Returns:
+            Token of the file's record.
         """
         record = self._known(Scene, scene)
         if (scene, channel) not in self._mounted:

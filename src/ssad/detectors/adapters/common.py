@@ -18,7 +18,16 @@ from ssad.detectors.yolo.assign import Targets, pad_truth
 
 
 class Adapter(nn.Module, ABC):
-    """What every 2D detector has. threshold: default of `predict`. ConfigError: not in [0, 1)."""
+    """What every 2D detector has in common.
+
+    Args:
+        name: What tables call it.
+        classes: Names of the classes.
+        threshold: Default of `predict`.
+
+    Raises:
+        ConfigError: The threshold is not in [0, 1).
+    """
 
     task: Literal["2d", "3d"] = "2d"
 
@@ -109,14 +118,29 @@ def resize_and_pad(images: Tensor, inside: tuple[int, int], *, multiple: int, gr
 
 
 def check_threshold(name: str, threshold: float) -> float:
-    """The threshold. ConfigError: not in [0, 1)."""
+    """The threshold, checked.
+
+    Raises:
+        ConfigError: It is not in [0, 1).
+    """
     if not 0 <= threshold < 1:
         raise ConfigError(f"{name}: threshold {threshold} is not in [0, 1)")
     return threshold
 
 
 def check_truth(name: str, truth: Sequence[Truth], images: int, *, scale: Tensor, classes: int) -> Targets:
-    """Truth of all images in one, boxes times scale [4]. ConfigError: of another number of images, or broken."""
+    """Truth of all images in one, with boxes in pixels of the network's input.
+
+    Args:
+        name: Name of the detector, for messages.
+        truth: Truth of each image.
+        images: Number of images.
+        scale: Factor of the boxes [4].
+        classes: Number of classes.
+
+    Raises:
+        ConfigError: The truth is of another number of images, or broken.
+    """
     if len(truth) != images or not truth:
         raise ConfigError(f"{name}: truth of {len(truth)} images for a batch of {images}; it takes one each")
     return pad_truth(truth, scale, classes=classes)

@@ -24,13 +24,20 @@ from ssad.detectors.yolo.assign import Targets
 class OneStage(Adapter):
     """An FCOS, RetinaNet or SSD model of torchvision as a detector. Starts frozen and in eval mode.
 
-    model: the network; classes: their names in the order of the head's columns `columns`, which leave out background
-    and columns without a name; threshold: default of `predict`, default the model's.
-
     `Dense`: logit is the head's, for SSD (softmax with background) the log-odds of each class, so that its sigmoid is
-    the source's score; quality is FCOS's centreness (whose score is the root of the product), else None. maps hold
-    cls_logits [B, P, columns], bbox_regression [B, P, 4], FCOS's bbox_ctrness, anchors [P, 4] in the network's input,
-    and scale [4] from the picture to it. The model's own resizing happens inside.
+    the source's score; quality is FCOS's centreness (whose score is the square root of the product), else None. maps
+    hold cls_logits [B, P, columns], bbox_regression [B, P, 4], FCOS's bbox_ctrness, anchors [P, 4] in the network's
+    input, and scale [4] from the picture to it. The model's own resizing happens inside.
+
+    Args:
+        model: The network.
+        classes: Names of the classes, in the order of `columns`.
+        columns: Columns of the head that belong to the classes, without background and columns without a name.
+        name: What tables call it.
+        threshold: Default of `predict`; None: the model's.
+
+    Raises:
+        ConfigError: The model is none of these.
     """
 
     columns: Tensor
@@ -55,7 +62,11 @@ class OneStage(Adapter):
         return self
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
+        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable with respect to them.
+
+        Raises:
+            ConfigError: The images have another shape or type.
+        """
         size = check_images(self.name, images)
         batch, _ = self.model.transform(list(images.to(next(self.model.parameters()).dtype)))
         features = list(self.model.backbone(batch.tensors).values())

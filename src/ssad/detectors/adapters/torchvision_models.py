@@ -39,9 +39,18 @@ def torchvision_detector(
 ) -> OneStage | TwoStage:
     """A detection model of torchvision (`MODELS`), frozen and in eval mode.
 
-    classes: of the weights, without background (default: the 80 of COCO in torchvision's 91 columns); weights: a file
-    as `load_weights` takes it, such as torchvision's own .pth files, default fresh ones from `seed`; options: of
-    torchvision's builder, such as min_size and max_size, the size inside. UnknownNameError, ConfigError, FormatError.
+    Args:
+        model: Name of the model.
+        classes: Of the weights, without background; None: the 80 of COCO in torchvision's 91 columns.
+        weights: A file as `load_weights` takes it, such as torchvision's own .pth files; None: fresh ones.
+        threshold: Default of `predict`; None: the model's.
+        seed: Of fresh weights.
+        **options: Of torchvision's builder, such as min_size and max_size, the size inside.
+
+    Raises:
+        UnknownNameError: There is no such model.
+        ConfigError: The builder refuses an option.
+        FormatError: The weights cannot be read, or do not fit.
     """
     if model not in MODELS:
         raise unknown_name("torchvision detector", model, MODELS)
@@ -80,7 +89,11 @@ def _check_options(model: str, options: Iterable[str]) -> None:
 
 
 def fit_torchvision(detector: OneStage | TwoStage, state: dict[str, Any], where: str | Path) -> None:
-    """Copy weights with torchvision's own names into the detector. FormatError."""
+    """Copy weights with torchvision's own names into the detector.
+
+    Raises:
+        FormatError: The weights do not fit; `where` names them in the message.
+    """
     frozen = not any(key.endswith(COUNTER) for key in state)
     if frozen and detector.name.removeprefix("torchvision:") in NO_EPS:
         for part in detector.model.modules():
@@ -101,8 +114,15 @@ def wrap(
 ) -> OneStage | TwoStage:
     """A model of torchvision's classes FCOS, RetinaNet, SSD or FasterRCNN that you built yourself, as a detector.
 
-    classes: without background; columns: of the head, which belong to them (default 1, 2, ...). ConfigError: a model
-    of another class.
+    Args:
+        model: The model.
+        classes: Names of the classes, without background.
+        columns: Columns of the head that belong to the classes; None: 1, 2, ...
+        name: What tables call it.
+        threshold: Default of `predict`; None: the model's.
+
+    Raises:
+        ConfigError: The model is of another class.
     """
     columns = list(range(1, len(classes) + 1)) if columns is None else list(columns)
     if isinstance(model, detection.FasterRCNN):

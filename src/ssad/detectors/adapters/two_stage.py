@@ -62,7 +62,11 @@ class TwoStage(Adapter):
         return self
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
+        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable with respect to them.
+
+        Raises:
+            ConfigError: The images have another shape or type.
+        """
         size = check_images(self.name, images)
         rows = [self._one(image) for image in torch.split(images.to(next(self.model.parameters()).dtype), 1)]
         maps = {name: torch.cat([row[name] for row in rows]) for name in rows[0] if name not in ("anchors", "inside")}

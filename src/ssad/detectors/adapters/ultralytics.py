@@ -62,9 +62,17 @@ def ultralytics_detector(
 ) -> Ultralytics:
     """A model by the name of one of the package's own descriptions, such as yolov8n or yolov5nu.
 
-    weights: a file as `load_weights` takes it, .pt files of the package included (only their tensors are read, by
-    their names; nothing in them runs); default fresh ones from `seed`. ConfigError: the package is not there, or knows
-    no such detection model; FormatError.
+    Args:
+        model: Name of the description.
+        classes: Names of the classes.
+        weights: A file as `load_weights` takes it, including .pt files of the package (only their tensors are read, by
+            their names; nothing in them runs); None: fresh ones.
+        input_width: Width to which pictures are resized inside; None: they are not.
+        seed: Of fresh weights.
+
+    Raises:
+        ConfigError: The package is not installed, or knows no such detection model.
+        FormatError: The weights cannot be read, or do not fit.
     """
     package = load_package()
     with torch.random.fork_rng(devices=[]):
@@ -85,7 +93,11 @@ def ultralytics_detector(
 
 
 def load_package() -> Any:
-    """The package's module of networks, imported offline; what the import changes is put back. ConfigError."""
+    """The package's module of networks, imported offline; what the import changes is restored.
+
+    Raises:
+        ConfigError: The package is not installed, or does not import.
+    """
     import cv2
 
     held = dict(os.environ)

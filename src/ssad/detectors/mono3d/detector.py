@@ -40,11 +40,16 @@ MULTIPLE = 32
 class Mono3D(nn.Module):
     """A monocular 3D detector; parts and weights carry mmdetection3d's names (backbone, neck, bbox_head).
 
-    Starts frozen and in eval mode with fresh weights from `seed`. Truth and detections are in the camera frame of the
-    intrinsic that is handed in; it is used as given (a place is column and row times stride plus half the stride: the
-    middle of what its cell covers, counted from the picture's corner as in an intrinsic).
+    It starts frozen and in eval mode. Truth and detections are in the camera frame of the intrinsic that is passed in,
+    which is used as given: a place is column and row times stride plus half the stride, the middle of what its cell
+    covers, counted from the picture's corner as in an intrinsic.
+
     `Dense`: maps are mmdetection3d's in eval mode, in pixels of the network's input; quality: centreness; box: hull of
-    the projected corners, or PGD's own 2D box, cut at the border; while training there are none ([B, 0, 4]).
+    the projected corners, or PGD's own 2D box, clipped at the border; while training there are none ([B, 0, 4]).
+
+    Args:
+        config: The configuration.
+        seed: Of the fresh weights.
     """
 
     task: Literal["2d", "3d"] = "3d"
@@ -68,9 +73,14 @@ class Mono3D(nn.Module):
         return self.dense(images, intrinsic)
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs for images [B, 3, H, W] in [0, 1] and intrinsic [B, 3, 3], differentiable to the images.
+        """Raw outputs, differentiable with respect to the images.
 
-        ConfigError: another shape or type, or no intrinsic.
+        Args:
+            images: [B, 3, H, W] in [0, 1].
+            intrinsic: [B, 3, 3].
+
+        Raises:
+            ConfigError: Another shape or type, or no intrinsic.
         """
         size, lens = self._check(images, intrinsic)
         scale = self._scale(size, lens)
@@ -189,7 +199,11 @@ class Mono3D(nn.Module):
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
-        """The source's assignment; extra: see `ssad.detectors.mono3d.targets`. ConfigError: truth does not fit."""
+        """The target assignment of the source; extra: see `ssad.detectors.mono3d.targets`.
+
+        Raises:
+            ConfigError: The truth does not fit.
+        """
         if len(truth) != len(dense.logit):
             raise ConfigError(f"{self.name}: truth of {len(truth)} images for a batch of {len(dense.logit)}")
         lens = dense.maps["intrinsic"][0]
@@ -200,7 +214,11 @@ class Mono3D(nn.Module):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """See `ssad.detectors.mono3d.losses`. ConfigError: the assignment was made for other pictures."""
+        """See `ssad.detectors.mono3d.losses`.
+
+        Raises:
+            ConfigError: The assignment was made for pictures of another number or size.
+        """
         if assignment.label.shape != dense.logit.shape[:2]:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         lens = dense.maps["intrinsic"][0]

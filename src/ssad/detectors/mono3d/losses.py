@@ -22,10 +22,20 @@ def losses(
     config: Mono3DConfig, flat: Flat, places: Places, assignment: Assignment, lens: Tensor, *, factor: Tensor | None,
     fuse: Fuse, reduction: Reduction,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """cls, offset, depth, size, rotsin, velo, dir, attr, centerness, and for PGD bbox2d and consistency.
+    """Training losses; depth is compared as the head predicts it, before the factor.
 
-    lens [B, 3, 3] of the network's input; factor [B]: of the depth (see `Head.forward`); fuse: PGD's fusion of depth.
-    Depth is compared as the head predicts it, before the factor.
+    Args:
+        config: The configuration of the detector.
+        flat: Outputs of the head.
+        places: Places of the pictures.
+        assignment: From `ssad.detectors.mono3d.targets`.
+        lens: Intrinsics of the network's input [B, 3, 3].
+        factor: Factor of the depth [B] (see `Head.forward`).
+        fuse: PGD's fusion of depth.
+        reduction: "batch": over all images; "image": each image's own.
+
+    Returns:
+        cls, offset, depth, size, rotsin, velo, dir, attr, centerness, and for PGD bbox2d and consistency.
     """
     label = assignment.label
     image, place = (label >= 0).nonzero(as_tuple=True)

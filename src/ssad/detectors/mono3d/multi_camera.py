@@ -40,12 +40,20 @@ class DetectedBoxes(WorldBoxes):
 def merge_cameras(
     found: Sequence[Detections], cam_to_ego: Sequence[F64], ego_to_global: Sequence[F64]
 ) -> DetectedBoxes:
-    """Detections of the cameras of one moment as boxes in the world, by class and falling score.
+    """Detections of the cameras of one moment as boxes in the world, by class and descending score.
 
-    As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are taken
-    to the camera that looks ahead (upright there); of those of a class that overlap by 5 % or more on its ground the
-    best stays; at most 500, then the best. cam_to_ego, ego_to_global [4, 4] at each camera's own time; with one pose
-    for all cameras the result is mmdetection3d 1.4's. ConfigError: not one pose a camera.
+    As mmdetection3d exports to nuScenes: boxes beyond the range of their class from the ego are dropped; all are moved
+    to the camera that looks ahead (upright there); of those of a class that overlap by 5 % or more on its ground, the
+    best stays; if there are more than 500, the best 500 stay. With one pose for all cameras the result is mmdetection3d
+    1.4's.
+
+    Args:
+        found: Detections of each camera.
+        cam_to_ego: Camera to ego [4, 4] of each.
+        ego_to_global: Ego to world [4, 4], at each camera's own time.
+
+    Raises:
+        ConfigError: There is not one pose for each camera, or there are no 3D boxes.
     """
     if not len(found) == len(cam_to_ego) == len(ego_to_global):
         raise ConfigError(f"merge_cameras: {len(found)} cameras with {len(cam_to_ego)} and {len(ego_to_global)} poses")

@@ -64,10 +64,16 @@ def rotated_iou(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotated_nms(boxes: Tensor, score: Tensor, group: Tensor, *, threshold: float) -> Tensor:
-    """Indices of the rectangles [N, 5] that stay, groups in rising order and scores falling in each.
+    """Greedy suppression of rotated rectangles within groups; of two with the same score, the earlier one is better.
 
-    Greedy within a group: one goes if its IoU with a better one that stays is at least the threshold (above 0). Of two
-    that score the same, the earlier one is the better.
+    Args:
+        boxes: Rectangles [N, 5].
+        score: [N].
+        group: [N]; only rectangles of the same group suppress each other.
+        threshold: One is dropped if its IoU with a better one that stays is at least this (above 0).
+
+    Returns:
+        Indices of those that stay, groups in ascending order and scores descending within each.
     """
     rank = score.argsort(descending=True, stable=True)
     rank = rank[group[rank].argsort(stable=True)]

@@ -19,10 +19,20 @@ FAR = 1e8
 
 
 def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: Tensor, scale: Tensor) -> Assignment:
-    """Targets of B images; lens [B, 3, 3] and `scale` [2] (x, y) lead from the picture to the network's input.
+    """Targets of B images.
 
     extra: reg [B, P, 13]: offset (place minus projected centre, in strides), depth, size, local yaw, velocity (NaN
-    where unknown), 2D distances in strides; attribute [B, P]; centreness [B, P]. ConfigError: truth without 3D boxes.
+    where unknown), 2D distances in strides; attribute [B, P]; centreness [B, P].
+
+    Args:
+        config: The configuration of the detector.
+        places: Its places.
+        truth: Truth of each image.
+        lens: Intrinsics of the pictures [B, 3, 3].
+        scale: Factors (x, y) from the picture to the network's input [2].
+
+    Raises:
+        ConfigError: The truth has no 3D boxes.
     """
     for k, one in enumerate(truth):
         if one.solid is None:

@@ -24,7 +24,11 @@ MAX_BYTES = 1024 * MIB
 
 
 def convolutions(detector: Yolo) -> list[list[Tensor]]:
-    """The values of each convolution in the file's order. ConfigError: a network that darknet does not know."""
+    """The values of each convolution in the file's order.
+
+    Raises:
+        ConfigError: The network is not one of darknet's.
+    """
     if isinstance(detector.network, CSPNetwork):
         raise ConfigError(f"{detector.name} is no darknet network; .weights files are for YOLOv3 and YOLOv3-tiny")
     layers: list[list[Tensor]] = []
@@ -42,11 +46,19 @@ def convolutions(detector: Yolo) -> list[list[Tensor]]:
 
 
 def read_darknet(detector: Yolo, path: str | Path, *, layers: int | None = None) -> int:
-    """Fill the detector with a file's weights; returns the number of images they have seen.
+    """Fill the detector with a file's weights.
 
-    layers: only the first so many convolutions, for trunk files such as darknet53.conv.74 (52); the rest stays as it
-    is. FormatError: the file is missing, cut short, of another network, or holds values that are no weights; the
-    detector is then unchanged.
+    Args:
+        detector: The detector; it stays unchanged on an error.
+        path: The file.
+        layers: Only the first so many convolutions, for trunk files such as darknet53.conv.74 (52); the rest stays as
+            it is.
+
+    Returns:
+        Number of images that the weights have seen.
+
+    Raises:
+        FormatError: The file is missing, truncated, of another network, or holds values that cannot be weights.
     """
     wanted = convolutions(detector)
     if layers is not None and not 0 < layers <= len(wanted):

@@ -21,15 +21,25 @@ MULTIPLE = 32
 
 
 class Yolo(Adapter):
-    """An anchor-based detector with objectness.
+    """An anchor-based detector with objectness. Starts frozen and in eval mode.
 
-    classes: names in the order of the class logits; input_width: pictures are resized to so many pixels (bilinear,
-    aspect kept to the pixel), default: their own scale; threshold, nms_iou (default: the spec's), limit: for `predict`;
-    seed: of the fresh weights. In both cases pictures are padded with grey at the right and bottom to a multiple of 32.
-    Starts frozen and in eval mode. Its state dict holds the anchors, so that weights bring theirs.
+    Pictures are padded with grey at the right and bottom to a multiple of 32. The state dict holds the anchors, so that
+    weights bring theirs.
 
     `Dense`: maps["raw"] holds the head maps [B, A * (5 + C), h, w], finest first; places run over levels, anchors,
-    rows, columns; `place` and `stride` are in pixels of the picture handed in; features: what the heads read.
+    rows, columns; `place` and `stride` are in pixels of the picture passed in; features: what the heads read.
+
+    Args:
+        spec: Architecture, anchors and rules.
+        classes: Names in the order of the class logits.
+        input_width: Width to which pictures are resized (bilinear, aspect kept to the pixel); None: they are not.
+        threshold: Default of `predict`.
+        nms_iou: IoU of suppression in `predict`; None: the spec's.
+        limit: Maximum number of detections in `predict`.
+        seed: Of the fresh weights.
+
+    Raises:
+        ConfigError: A setting does not fit.
     """
 
     anchors: Tensor
@@ -59,7 +69,11 @@ class Yolo(Adapter):
         self.requires_grad_(False).eval()
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
-        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable to them. ConfigError: another shape or type."""
+        """Raw outputs for images [B, 3, H, W] in [0, 1], differentiable with respect to them.
+
+        Raises:
+            ConfigError: The images have another shape or type.
+        """
         size = check_images(self.name, images, least=0)
         inside = size_inside(size, self.input_width)
         images = images.to(next(self.network.parameters()).dtype)
@@ -93,7 +107,8 @@ class Yolo(Adapter):
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:
         """The detector's own assignment; extra: box [B, P, 4], the target in pixels of the picture, zeros without one.
 
-        ConfigError: truth that does not belong to the images, or is none (labels out of range, empty boxes).
+        Raises:
+            ConfigError: The truth does not belong to the images, or is broken (labels out of range, empty boxes).
         """
         scale = self._scale(dense.size, dense.box)
         targets = check_truth(self.name, truth, len(dense.box), scale=scale, classes=len(self.classes))
@@ -106,7 +121,11 @@ class Yolo(Adapter):
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
-        """box, obj and cls; see `losses_v3` and `losses_v5`. ConfigError: an assignment made for other pictures."""
+        """Training losses box, obj and cls; see `losses_v3` and `losses_v5`.
+
+        Raises:
+            ConfigError: The assignment was made for other pictures.
+        """
         if dense.quality is None or assignment.label.shape != dense.quality.shape:
             raise ConfigError(f"{self.name}: the assignment was made for pictures of another number or size")
         grid = self._grid_of(dense)

@@ -24,12 +24,19 @@ Maps = tuple[Tensor, ...]
 
 @dataclass(frozen=True)
 class YoloSpec:
-    """What makes one of these detectors.
+    """What defines one of these detectors.
 
-    rule: "v3" or "v5": decoding, assignment and losses; network: "darknet53", "tiny" or "csp"; anchors: width and
-    height in pixels, a tuple a level, finest first; strides of the levels; width, depth: multiples of the channels and
-    of the repeats in the published table; grey: the value of padding; nms_iou: suppression at more overlap;
-    box_loss: "ciou", or for v3 "squares", the sum of squared errors of its paper.
+    Attributes:
+        name: Name of the detector.
+        rule: "v3" or "v5": decoding, assignment and losses.
+        network: "darknet53", "tiny" or "csp".
+        anchors: Width and height in pixels, a tuple for each level, finest first.
+        strides: Stride of each level.
+        width: Multiple of the channels in the published table.
+        depth: Multiple of the repeats in the published table.
+        grey: Value of the padding.
+        nms_iou: IoU above which suppression drops the worse of two boxes.
+        box_loss: "ciou", or for v3 "squares", the sum of squared errors of its paper.
     """
 
     name: str

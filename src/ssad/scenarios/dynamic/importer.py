@@ -73,8 +73,11 @@ class _Road:
 def import_routes(folder: Path) -> tuple[Scenario, ...]:
     """All scenarios of a folder, in its order; of several lists in `scenario_type` the longest is taken.
 
-    folder: a SafeBench, FREA or leaderboard folder, or one list in `scenario_type`. FormatError says what
-    is broken and where.
+    Args:
+        folder: A SafeBench, FREA or leaderboard folder, or one list in `scenario_type`.
+
+    Raises:
+        FormatError: The message says what is broken and where.
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":

@@ -44,5 +44,10 @@ def scenario_text(scenarios: Scenario | Iterable[Scenario]) -> str:
 
 
 def save_scenarios(path: str | Path, scenarios: Scenario | Iterable[Scenario]) -> None:
-    """Write scenarios as YAML, atomically; `read_scenarios` reads them equal. ConfigError, StoreError."""
+    """Write scenarios as YAML, atomically; `read_scenarios` reads equal ones.
+
+    Raises:
+        ConfigError: A scenario is not valid.
+        StoreError: The file cannot be written.
+    """
     write_atomic(path, scenario_text(scenarios))

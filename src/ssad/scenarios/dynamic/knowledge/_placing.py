@@ -193,7 +193,11 @@ def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> Place:
 
 
 def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[int, int]:
-    """Route points where the first junction after the trigger begins and where it has ended. RouteError."""
+    """Route points where the first junction after the trigger begins and where it has ended.
+
+    Raises:
+        RouteError: The route passes no junction after its trigger.
+    """
     span = _first_junction(graph, route, trigger_index(scenario, route) if scenario.trigger is not None else 0)
     if span is None:
         raise RouteError(f"scenario {scenario.name}: the route passes no junction after its trigger")

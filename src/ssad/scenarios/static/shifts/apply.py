@@ -29,15 +29,23 @@ def shift_images(
     contexts: Mapping[str, SceneContext] | None = None,
     device: str | None = None,
 ) -> tuple[Any, list[Applied]]:
-    """Applies a shift to images.
+    """Apply a shift to images.
 
-    images: uint8 RGB [H, W, 3] or [B, H, W, 3] (numpy or torch), or torch float32 [B, 3, H, W] in [0, 1] (a camera
-    has 8 bits: they are rounded to 255 levels); frames: what is known of each (None: a typical camera, another sample
-    each); spec: one for all or one each, of one name and calibration; contexts: what is constant over a scene, by its
-    key (missing: measured on each image alone); device: where to compute (None: where the images are).
+    The result for an image depends only on its frame and spec, never on the rest of the batch.
 
-    Returns the images in the kind and shape they came in, and what was done to each. The result for an image depends
-    on its frame and spec alone, never on the rest of the batch. ConfigError for what does not fit together.
+    Args:
+        images: uint8 RGB [H, W, 3] or [B, H, W, 3] (numpy or torch), or torch float32 [B, 3, H, W] in [0, 1] (a camera
+            has 8 bits: they are rounded to 255 levels).
+        frames: What is known of each; None: a typical camera, and a different sample for each.
+        spec: One for all or one for each, of one name and calibration.
+        contexts: What is constant over a scene, by its key; missing: measured on each image alone.
+        device: Where to compute; None: where the images are.
+
+    Returns:
+        The images, in the kind and shape in which they came, and what was done to each.
+
+    Raises:
+        ConfigError: The arguments do not fit together.
     """
     batch = to_batch(images, device)
     if frames is None:
@@ -118,11 +126,15 @@ def _context(batch: Batch, b: int, frame: Frame, contexts: Mapping[str, SceneCon
 
 
 def sky_light(images: Sequence[U8], depths: Sequence[F32 | None] = (), *, night: bool = False) -> float:
-    """Brightness in [0, 1] of the brightest thirtieth of the sky: what fog scatters.
+    """Brightness in [0, 1] of the brightest thirtieth of the sky, which is what fog scatters.
 
-    depths: maps [h, w] of any size, inf where there is sky; those of images without one are None. Where too little of
-    the sky is known, the upper halves of all images stand for it; by night their median, as lamps and walls in lamp
-    light are brighter than the sky.
+    Where too little of the sky is known, the upper halves of all images stand for it; by night their median, since
+    lamps and walls in lamp light are brighter than the sky.
+
+    Args:
+        images: Pictures [H, W, 3].
+        depths: Maps [h, w] of any size, inf where there is sky; None for images without one.
+        night: Whether it is night.
     """
     found, sky = [], []
     for n, image in enumerate(images):

@@ -75,9 +75,14 @@ class Batch:
 
 
 def to_batch(images: Any, device: str | None = None) -> Batch:
-    """uint8 [H, W, 3] or [B, H, W, 3], numpy or torch, or torch float32 [B, 3, H, W] in [0, 1] -> Batch.
+    """A batch from images.
 
-    device: "cpu" or "cuda..."; None: where the images are. ConfigError for other shapes and kinds.
+    Args:
+        images: uint8 [H, W, 3] or [B, H, W, 3], numpy or torch, or torch float32 [B, 3, H, W] in [0, 1].
+        device: "cpu" or "cuda..."; None: where the images are.
+
+    Raises:
+        ConfigError: The images have another shape or kind.
     """
     if isinstance(images, Batch):
         return images

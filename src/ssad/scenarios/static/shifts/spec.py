@@ -46,10 +46,19 @@ VERSIONS: Final[dict[Calibration, int]] = {"physical": 3, "paper": 3}
 
 @dataclass(frozen=True, slots=True)
 class ShiftSpec:
-    """A shift to apply: name, severity (0: identity), seed, calibration. ConfigError for unknown ones.
+    """A shift to apply.
 
     Random numbers depend on the seed, the shift and what they are for, not on the severity: a sun stays where it is
     when it becomes stronger, so that severities can be compared in pairs.
+
+    Attributes:
+        name: Name of the shift.
+        severity: 0 (identity) to 5.
+        seed: Seed of its random numbers.
+        calibration: Calibration of its severities.
+
+    Raises:
+        ConfigError: There is no such shift, severity or calibration.
     """
 
     name: str

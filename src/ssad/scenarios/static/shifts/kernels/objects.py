@@ -7,12 +7,29 @@ from ssad.scenarios.static.shifts.kernels.shared import spread
 
 @wp.struct
 class Item:
-    """A box in one image, before (old) and after (new); camera frame, metres; pixels for the rest.
+    """A box in one image, before (old) and after (new) a shift; camera frame in metres, else pixels.
 
-    into, into_origin: camera frame -> unit cube of the new box; back, back_origin: unit cube -> the old box;
-    middle: a point inside both outlines; new_first, new_count, old_first, old_count: their outlines (convex, in
-    `points`); low, high: pixels that may change; node_first, node_wide: its displacement nodes; rank: order among the
-    boxes of the image, the farthest 1; skip: nothing to paint, it only hides others.
+    Attributes:
+        image: Its image.
+        into: Camera frame to the unit cube of the new box, matrix.
+        into_origin: The same, origin.
+        back: Unit cube to the old box, matrix.
+        back_origin: The same, origin.
+        middle: A point inside both outlines.
+        new_first: First point of the new outline (convex) in `points`.
+        new_count: Number of its points.
+        old_first: First point of the old outline (convex) in `points`.
+        old_count: Number of its points.
+        low_x: First column that may change.
+        low_y: First row that may change.
+        high_x: End of the columns that may change.
+        high_y: End of the rows that may change.
+        node_first: First of its displacement nodes.
+        node_wide: Columns of these nodes.
+        node_high: Rows of these nodes.
+        rank: Order among the boxes of the image, 1 for the farthest.
+        skip: 1 where there is nothing to paint: the box only hides others.
+        streak: Vector of its motion blur, pixels.
     """
 
     image: int

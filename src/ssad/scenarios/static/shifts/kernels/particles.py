@@ -9,9 +9,17 @@ from ssad.scenarios.static.shifts.kernels.shared import colour, draw, unit
 class Air:
     """What falls, the same for all cameras of a scene. Lengths in metres, diameters in millimetres.
 
-    tile: period of the particle field; wind: m/s; slope: exponent of the size distribution, 1/mm; low: least diameter;
-    reach: share of sizes up to the largest; drag: 10.3 exp(-0.6 low) of the speed of fall; growth: visible over melted
-    diameter; snow: 1 for flakes, 0 for drops.
+    Attributes:
+        key: Key of its random numbers.
+        tile: Period of the particle field.
+        wind: m/s.
+        slope: Exponent of the size distribution, 1/mm.
+        low: Least diameter.
+        reach: Share of sizes up to the largest.
+        drag: 10.3 exp(-0.6 low) of the speed of fall.
+        growth: Ratio of visible to melted diameter.
+        snow: 1 for flakes, 0 for drops.
+        count: Number of particles.
     """
 
     key: wp.uint64
@@ -28,7 +36,15 @@ class Air:
 
 @wp.struct
 class LensDrop:
-    """A drop on the lens of one image: centre and radius in pixels, height over width."""
+    """A drop on the lens.
+
+    Attributes:
+        image: The image that shows it.
+        x: Centre, pixels.
+        y: Centre, pixels.
+        radius: Pixels.
+        oval: Height over width.
+    """
 
     image: int
     x: float
