@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from helpers.quick import others_slow
 
 from ssad.assets.mesh import Material
 from ssad.assets.street import STYLES, Street, build_street, cached_street, load_street, save_street
@@ -22,6 +23,7 @@ from ssad.core.types import LaneType
 from ssad.roads.query import LaneQuery
 
 TOWNS = ("Twinford", "Crossgate", "Oldmarket", "Larkhill", "Ringmere")
+QUICK = ("Twinford", "Oldmarket")  # a regular town and one of crooked streets and cobbles
 GROUND = ("asphalt", "asphalt_patch", "asphalt_worn", "marking_white", "marking_yellow", "cast_iron")
 WALLS = ("plaster", "brick", "boards", "cladding", "sheet", "roof_tiles", "stone")
 STREETS = (LaneType.DRIVING, LaneType.PARKING)
@@ -75,10 +77,7 @@ def from_lanes(graph: LaneGraph, xy: npt.NDArray[np.float64]) -> npt.NDArray[np.
     return gap
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["Twinford", "Oldmarket", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Crossgate", "Larkhill"))],
-)
+@pytest.mark.parametrize("name", others_slow(["Twinford", "Oldmarket", "Crossgate", "Larkhill"], ["Oldmarket"]))
 def test_nothing_stands_on_lanes_junctions_or_crosswalks(name: str) -> None:
     graph, scene = town(name), street(name)
     p = corners(scene)
@@ -110,7 +109,7 @@ def test_nothing_stands_on_lanes_junctions_or_crosswalks(name: str) -> None:
     assert from_lanes(graph, walls).min() >= 1.0
 
 
-@pytest.mark.parametrize("name", TOWNS)
+@pytest.mark.parametrize("name", others_slow(TOWNS, QUICK))
 def test_lanes_lie_on_one_sheet_of_road(name: str) -> None:
     graph, scene = town(name), street(name)
     rng = np.random.default_rng(7)
@@ -155,7 +154,7 @@ def test_regions_have_no_cracks() -> None:
     assert np.minimum(outside, hole).max() < 0.05
 
 
-@pytest.mark.parametrize("name", TOWNS)
+@pytest.mark.parametrize("name", others_slow(TOWNS, QUICK))
 def test_arrays_tiles_and_levels(name: str) -> None:
     scene = street(name)
     scene.check()
@@ -180,7 +179,7 @@ def test_arrays_tiles_and_levels(name: str) -> None:
     assert set(scene.select(eye, reach=(1e4, 1e4), far=1e4).tolist()) == set(parts[0].tolist())
 
 
-@pytest.mark.parametrize("name", TOWNS)
+@pytest.mark.parametrize("name", others_slow(TOWNS, QUICK))
 def test_signals_and_lamps(name: str) -> None:
     graph, scene = town(name), street(name)
     assert set(scene.head_signal.tolist()) == set(np.flatnonzero(~graph.signal_virtual).tolist())
@@ -239,15 +238,17 @@ def test_styles_differ() -> None:
     graph = town("Twinford")
     changed = build_street(graph, style="outskirts")
     assert changed.style == "outskirts"
-    grounds = [
-        {"grass", "lawn", "meadow", "cobbles"} & {m.name for m in s.materials} for s in (changed, *map(street, TOWNS))
-    ]
-    assert "meadow" in grounds[0]
-    assert ["cobbles" in g for g in grounds] == [False, False, False, True, False, False]
-    assert [street(name).style for name in TOWNS] == ["town", "city", "old", "suburb", "town"]
+    assert "meadow" in {m.name for m in changed.materials}
     assert set(STYLES) >= {"town", "city", "old", "suburb", "outskirts"}
     with pytest.raises(UnknownNameError, match="closest"):
         build_street(graph, style="suburbs")
+
+
+@pytest.mark.parametrize("name", others_slow(TOWNS, QUICK))
+def test_towns_have_styles(name: str) -> None:
+    scene = street(name)
+    assert scene.style == dict(zip(TOWNS, ("town", "city", "old", "suburb", "town"), strict=True))[name]
+    assert ("cobbles" in {m.name for m in scene.materials}) == (name == "Oldmarket")
 
 
 def test_cache(ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

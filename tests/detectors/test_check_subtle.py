@@ -11,6 +11,7 @@ from typing import Any, Literal
 import pytest
 import torch
 from helpers.mono3d import TINY, TINY_PGD, lively, perfect, some_truth
+from helpers.quick import others_slow
 from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
@@ -28,7 +29,7 @@ SIZE = (48, 64)
 SHIPPED = ["yolov5n", "yolov3-tiny", "fcos3d-light", "pgd-det-light"]
 
 
-@pytest.mark.parametrize("name", ["yolov5n", "fcos3d-light"])  # all of them in the slow test below
+@pytest.mark.parametrize("name", others_slow(["yolov5n", "fcos3d-light"], ["yolov5n"]))  # all in the slow test below
 def test_the_shipped_ones_keep_every_promise(name: str) -> None:
     detector = make_detector(name)
     if detector.task == "3d":

@@ -115,10 +115,11 @@ def heap(count: int, *, seed: int = 0, spread: float = 6.0) -> tuple[Tensor, Ten
     return rows, torch.rand(count, generator=draws), torch.randint(0, 3, (count,), generator=draws)
 
 
+@pytest.mark.parametrize("count", [120, pytest.param(260, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("threshold", [0.05, 0.3, 0.8])
 @pytest.mark.parametrize("spread", [1.0, 6.0, 60.0])
-def test_suppression_equals_a_slow_reference(threshold: float, spread: float) -> None:
-    rows, score, group = heap(260, spread=spread)
+def test_suppression_equals_a_slow_reference(threshold: float, spread: float, count: int) -> None:
+    rows, score, group = heap(count, spread=spread)
     found = rotated_nms(rows, score, group, threshold=threshold)
     assert found.tolist() == slow_nms(rows, score, group, threshold)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.bodies import two_phases
+from helpers.quick import others_slow
 from helpers.sharing import Shared
 
 from ssad.core.errors import FormatError
@@ -56,7 +57,7 @@ def test_cards_say_where_they_are_from(name: str) -> None:
     make_detector(name)  # checks the hash
 
 
-@pytest.mark.parametrize("name", TWO)
+@pytest.mark.parametrize("name", others_slow(TWO, ["yolov5n"]))
 def test_the_followed_car_is_found_in_a_town_never_seen(name: str, clips: tuple[CocoSet, PictureSet]) -> None:
     data, bank = clips
     detector = make_detector(name)
@@ -84,7 +85,7 @@ def drive(shared: Shared) -> Path:
     return shared("shipped-drive", make)
 
 
-@pytest.mark.parametrize("name", THREE)
+@pytest.mark.parametrize("name", others_slow(THREE, ["fcos3d-light"]))
 def test_objects_are_found_in_space_in_a_town_never_seen(name: str, drive: Path) -> None:
     scores = score_3d(make_detector(name), drive, "v1.0-ssad", SCENES)
     assert scores["AP_car"] > 0.1, scores  # 0.2 and more

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.quick import others_slow
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.types import LaneType
@@ -52,7 +53,7 @@ def check_against_brute(graph: LaneGraph, types: tuple[LaneType, ...], seed: int
                 assert inside[i] == (gap[i] < 0)
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", others_slow(BUILT_IN, ["Twinford", "Ringmere"]))
 @pytest.mark.parametrize("types", [DRIVABLE, (LaneType.SIDEWALK, LaneType.SHOULDER)])
 def test_nearest_is_brute_force(name: str, types: tuple[LaneType, ...]) -> None:
     check_against_brute(built_in(name), types, seed=len(name))

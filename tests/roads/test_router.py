@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from helpers.quick import others_slow
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.errors import RouteError
@@ -20,6 +21,7 @@ from ssad.core.types import LaneType, Pose, Route
 from ssad.roads import LaneGraph, LaneQuery, random_route, route_along
 from ssad.roads.router import _Leg, _line
 
+QUICK = ("Twinford", "Ringmere")  # a grid with its shortest ways exact, and roundabouts
 TURN = 0.28  # rad a metre: the tightest turn has 8 m radius, the shortest lane change is 10 m
 
 
@@ -98,7 +100,7 @@ def lane_distance(graph: LaneGraph, start: tuple[int, float], end: tuple[int, fl
     return min(best, least[end[0]] + end[1])
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", others_slow(BUILT_IN, QUICK))
 def test_routes_between_random_places(name: str) -> None:
     graph = built_in(name)
     rng = generator("router", name)
@@ -130,7 +132,7 @@ def test_a_lane_change_is_smooth_and_takes_about_20_m(name: str) -> None:
     assert 10.0 < moving.sum() * 0.5 < 21.0
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", others_slow(BUILT_IN, QUICK))
 def test_random_routes(name: str) -> None:
     graph = built_in(name)
     rng = generator("random", name)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.quick import others_slow
 from roads.towns import BUILT_IN, built_in
 
 from benchmarks.make_towns import TOWNS, generate_town
@@ -166,7 +167,7 @@ def test_proving_ground_has_room_for_every_scenario() -> None:
         assert graph.s[part][straight].max() >= 180.0
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", others_slow(BUILT_IN, ["Twinford", "Ringmere"]))
 def test_the_shipped_town_is_what_the_code_writes(name: str, tmp_path: Path) -> None:
     pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")
     path = tmp_path / f"{name}.xodr"

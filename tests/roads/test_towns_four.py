@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.quick import others_slow
 
 from benchmarks.make_scenario_sets import natural
 from benchmarks.make_towns import TOWNS, generate_town
@@ -64,7 +65,7 @@ def test_existing_towns_have_not_changed(name: str) -> None:
     assert hashlib.sha256(npz_bytes(arrays)).hexdigest() == KEPT[name]
 
 
-@pytest.mark.parametrize("name", NEW)
+@pytest.mark.parametrize("name", others_slow(NEW, ["Oldmarket"]))
 def test_the_shipped_file_is_small_and_what_the_code_writes(name: str, tmp_path: Path) -> None:
     assert len(baked(name)) < 200_000
     text = generate_town(name)
@@ -111,7 +112,7 @@ def test_lanes_are_smooth(name: str) -> None:
             assert abs(wrap_angle(graph.yaw[a] - graph.yaw[b])) < np.radians(1.0)
 
 
-@pytest.mark.parametrize("name", NEW)
+@pytest.mark.parametrize("name", others_slow(NEW, ["Oldmarket"]))
 def test_streets_do_not_overlap(name: str) -> None:
     """Lanes of different streets keep apart outside junctions."""
     graph = town(name)
@@ -152,7 +153,7 @@ def test_the_four_differ() -> None:
     assert len(set(junctions.values())) >= 3
 
 
-@pytest.mark.parametrize("name", NEW)
+@pytest.mark.parametrize("name", others_slow(NEW, ["Oldmarket"]))
 def test_natural_traffic_gets_through(name: str) -> None:
     graph = town(name)
     scenarios = natural(graph, 8)[::4]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.quick import others_slow
 from world.worlds import GRAPHS, ego, episode, line_route
 
 from benchmarks.traffic import LENGTH, ROUTES, measure, town_routes, traffic, upper_limit
@@ -46,7 +47,10 @@ def test_natural_traffic_hurts_nobody_and_gets_through() -> None:
     assert np.median(moved) > 20.0  # not by standing still
 
 
-@pytest.mark.parametrize(("name", "green"), [("Oldmarket", False), ("Twinford", True), ("Crossgate", False)])
+@pytest.mark.parametrize(
+    ("name", "green"),
+    others_slow([("Oldmarket", False), ("Twinford", True), ("Crossgate", False)], [("Twinford", True)]),
+)
 def test_no_queue_stands_for_ever(name: str, green: bool) -> None:
     """Dense traffic of 40 vehicles for four minutes: every queue clears, nobody leaves the road."""
     graph = load_town(name)

@@ -173,8 +173,8 @@ class LaneGraph:
         """x, y, yaw and width at arc length s of a lane (s is held inside the lane)."""
         part = self.points(lane)
         along = self.s[part]
-        i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(along) - 2))
-        t = float(np.clip((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0, 1.0))
+        i = min(max(int(along.searchsorted(s, side="right")) - 1, 0), len(along) - 2)
+        t = float(min(max((s - along[i]) / max(float(along[i + 1] - along[i]), 1e-9), 0.0), 1.0))
         i += part.start
         x, y = (1.0 - t) * self.xy[i] + t * self.xy[i + 1]
         turn = (float(self.yaw[i + 1] - self.yaw[i]) + np.pi) % (2 * np.pi) - np.pi

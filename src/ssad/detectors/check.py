@@ -43,19 +43,35 @@ def check_detector(detector: Any, *, intrinsic: Tensor | None = None, size: tupl
 
 def find_faults(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> list[str]:
     """The promises that a detector breaks, a sentence each; none for one that keeps them."""
+    return list(each_fault(detector, intrinsic=intrinsic, size=size))
+
+
+def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[int, int] = (96, 128)) -> Iterator[str]:
+    """As `find_faults`, one by one as they are found, the cheap parts first: who waits for one need not try the rest.
+
+    Args:
+        detector: What may keep to `ssad.core.protocols.Detector`.
+        intrinsic: [3, 3] of the camera, for detectors of task "3d"; by default a focal length of 0.8 times the width.
+        size: Height and width of the pictures that are tried, pixels.
+
+    Yields:
+        A sentence for each broken promise.
+    """
     if not isinstance(detector, Detector):
         wanted = ("name", "task", "classes", "predict", "dense", "assign", "losses")
         missing = [name for name in wanted if not hasattr(detector, name)]
-        return [f"it lacks {', '.join(missing)} of ssad.core.protocols.Detector"]
+        yield f"it lacks {', '.join(missing)} of ssad.core.protocols.Detector"
+        return
     trial = CheckCase(detector, size, intrinsic)
     for part in (
         _check_names, _check_dense, check_places, _check_gradient, _check_predict, check_boxes, check_solids,
         _check_batch, _check_losses, check_loss_signs, check_slopes, check_small_changes, _check_modes, _check_sizes,
         _check_refusals,
     ):  # fmt: skip
+        told = len(trial.faults)
         with trial.guarded(part.__name__.strip("_").removeprefix("check_").replace("_", " ")):
             part(trial)
-    return trial.faults
+        yield from trial.faults[told:]
 
 
 # ---------------------------------------------------------------- the promises
