@@ -412,6 +412,7 @@ def _shift_list() -> dict[str, str]:
 
 def _attack_list() -> dict[str, str]:
     from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
+    from ssad.scenarios.static.physical import default_carrier, physical_names
 
     def about(name: str, where: str) -> str:
         if name not in ATTACKS:
@@ -422,6 +423,7 @@ def _attack_list() -> dict[str, str]:
         return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
 
     rows = {name: about(name, where) for name, where in attack_names().items()}
+    rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
     return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
 
 

@@ -88,7 +88,7 @@ class Mesh:
 
     def panel_rectangle(self, name: str) -> Rectangle:
         """Rectangle (u0, v0, u1, v1) of a panel in the atlas. ConfigError for an unknown name."""
-        indices = self._panel_indices(name)
+        indices = self.panel_indices(name)
         if self.rectangles:
             r = np.array([self.rectangles[i] for i in indices])
             return float(r[:, 0].min()), float(r[:, 1].min()), float(r[:, 2].max()), float(r[:, 3].max())
@@ -98,7 +98,8 @@ class Mesh:
         low, high = uv.min(axis=0), uv.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
-    def _panel_indices(self, name: str) -> list[int]:
+    def panel_indices(self, name: str) -> list[int]:
+        """Numbers of a panel and of its parts in `panels`. ConfigError for an unknown name."""
         indices = [i for i, panel in enumerate(self.panels) if panel == name or panel.startswith(f"{name}/")]
         if not indices:
             raise ConfigError(f"no panel '{name}'; this mesh has: {', '.join(self.panels) or 'no panels'}")

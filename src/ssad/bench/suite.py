@@ -22,6 +22,7 @@ KINDS: dict[str, str] = {
     "driving": "ssad.bench.kinds.driving:Driving",
     "detection": "ssad.bench.kinds.detection:Detection",
     "digital": "ssad.bench.kinds.digital:Digital",
+    "physical": "ssad.bench.kinds.physical:Physical",
 }
 """Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
 

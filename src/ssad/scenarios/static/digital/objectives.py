@@ -180,6 +180,37 @@ class Margin:
 
 
 @dataclass(frozen=True, slots=True)
+class Hide:
+    """No box on an object with any score.
+
+    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim.
+
+    Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any head.
+
+    Attributes:
+        others: How many locations next to the best one count too, by their own value; 1 is the source's.
+        name: What records call it.
+        needs_objects: Without an object there is nothing to hide.
+    """
+
+    others: int = 1
+    name: str = "hide"
+    needs_objects: bool = True
+
+    def __call__(self, dense: Dense, situation: Situation) -> Tensor:
+        """See `Objective`."""
+        score = log_scores(dense).exp()
+        total = dense.logit.new_zeros(len(dense.logit))
+        for k, truth in enumerate(situation.assignment.truth):
+            for number in objects_of(situation, k):
+                overlap = _overlap(dense.box[k], truth.box[number].to(dense.box))
+                value = score[k, :, int(truth.label[number])] * overlap
+                best = value.topk(min(self.others, len(value))).values.clamp_max(1 - 1e-6)
+                total[k] = total[k] + torch.log1p(-best).sum()
+        return total
+
+
+@dataclass(frozen=True, slots=True)
 class Fabricate:
     """Scores up everywhere: the mean over locations of the log-score of the best class (TOG's fabrication)."""
 
@@ -233,6 +264,7 @@ OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
     **{name: partial(TrainingLosses, name, terms) for name, terms in TERMS.items()},
     "vanish": Vanish,
     "margin": Margin,
+    "hide": Hide,
     "fabricate": Fabricate,
     "mislabel": Mislabel,
 }
@@ -269,6 +301,24 @@ def _weights(dense: Dense, situation: Situation) -> Tensor:
         aimed = torch.unique(situation.assignment.owner[k][chosen[k]])
         chosen[k] |= _on(dense.place, truth.box.to(dense.place)[aimed])
     return chosen.to(dense.logit.dtype)
+
+
+def objects_of(situation: Situation, image: int) -> list[int]:
+    """Indices of the objects of an image that are under attack: those of the aim's numbers and classes."""
+    aim, truth = situation.aim, situation.assignment.truth[image]
+    names = list(aim.becomes) if aim.becomes else aim.classes
+    wanted = None if names is None else {_index(situation.detector, name) for name in names}
+    numbers = range(len(truth.label)) if aim.objects is None else aim.objects
+    labels = truth.label.tolist()
+    return [k for k in numbers if k < len(labels) and (wanted is None or labels[k] in wanted)]
+
+
+def _overlap(box: Tensor, real: Tensor) -> Tensor:
+    """IoU [P] of boxes [P, 4] with one box [4]."""
+    side = (torch.minimum(box[:, 2:], real[2:]) - torch.maximum(box[:, :2], real[:2])).clamp_min(0.0)
+    both = side.prod(1)
+    area = (box[:, 2:] - box[:, :2]).clamp_min(0.0).prod(1) + (real[2:] - real[:2]).prod() - both
+    return both / area.clamp_min(1e-9)
 
 
 def _on(place: Tensor, box: Tensor) -> Tensor:

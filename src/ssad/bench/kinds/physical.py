@@ -1,0 +1,203 @@
+"""Kind `physical`: 2D detectors x textures on a car that drives, trained in one town and tested in another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
+from ssad.bench.kinds.detection import state_hash
+from ssad.bench.physical_rows import Pair, PhysicalSuite, carrier_of, row_of, target_of
+from ssad.bench.physical_textures import (
+    about,
+    carried,
+    clip_image,
+    picture_path,
+    see,
+    sightings_of,
+    texture_name,
+    texture_of,
+    texture_path,
+)
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.images import save_picture
+from ssad.detectors import make_detector
+from ssad.evaluation.target_scores import target_scores
+from ssad.evaluation.target_sheet import target_sheet
+from ssad.jobs.machine import keep_memory, quiet_warp
+from ssad.jobs.pool import open_pool, run_all
+from ssad.jobs.progress import Live
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.roads import town_names
+from ssad.scenarios.static.physical import CONTROLS
+
+CLEAN = "clean"
+
+
+class Physical(Kind):
+    """See the module. A piece is the training of a texture, which several cells show."""
+
+    name = "physical"
+    suite = PhysicalSuite
+    columns = (
+        Column("AP50", "AP50 of the target", "", "lower"),
+        Column("AP50_all", "AP50 of all cars", "", "lower"),
+        Column("ASR_25", "targets lost at score 0.25", "", "higher"),
+        Column("ASR_50", "targets lost at score 0.5", "", "higher"),
+        Column("confidence", "mean score of the target", "", "lower"),
+    )
+    factors = ("test", "detector", "carrier", "attack", "source")
+
+    def plan(self, suite: PhysicalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Detectors and carriers are built once, so that what is wrong ends here."""
+        target = target_of(suite)
+        weights = {}
+        for name in suite.detectors:
+            detector = make_detector(name)
+            if detector.task != "2d" or "car" not in detector.classes:
+                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector with a class car")
+            weights[name] = state_hash(detector)
+        for pair in suite.pairs:
+            for town in (pair.train, pair.test):
+                if town not in town_names():
+                    raise ConfigError(f"suite {suite.name}: unknown town '{town}' (see: ssad list towns)")
+        rows = [row_of(suite, entry) for entry in suite.attacks]
+        for row in rows:
+            carrier_of(row).on(target.mesh())
+        cells: dict[str, Cell] = {}
+        for pair in suite.pairs:
+            for detector in suite.detectors:
+                for row in [{"attack": None}, *rows]:
+                    for cell in self._cells(suite, pair, detector, row, weights, device):
+                        cells.setdefault(cell.key, cell)
+        return Plan(self, suite, device, tuple(cells.values()), {"weights": weights}, {}, None)
+
+    def _cells(  # noqa: PLR0917
+        self,
+        suite: PhysicalSuite,
+        pair: Pair,
+        detector: str,
+        row: Mapping[str, Any],
+        weights: Mapping[str, str],
+        device: str,
+    ) -> list[Cell]:
+        """The cells of an attack on a detector in a pair of towns."""
+        attack = row["attack"]
+        trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
+        sources = suite.detectors if trained and suite.transfer else [detector]
+        seeds = range(suite.seeds) if attack in ("random", "noise", "shuffled") else (0,)
+        found = []
+        for source in sources:
+            for seed in seeds:
+                spec = {**row, "pair": pair.model_dump(), "source": source if trained else "", "number": seed}
+                fields = {
+                    "test": pair.test, "train": pair.train, "detector": detector, "carrier": row.get("carrier", ""),
+                    "attack": CLEAN if attack is None else attack if not row["of"] else f"shuffled {row['of']}",
+                    "source": source if trained else "", "number": seed,
+                }  # fmt: skip
+                title = "/".join([detector, pair.test, fields["attack"], str(fields["carrier"]), source, str(seed)])
+                inputs = suite.target, suite.behind, suite.size, suite.floor, suite.replicates, device
+                found.append(
+                    self.make_cell(
+                        title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights[source]
+                    )
+                )
+        return found
+
+    def order(self, cell: Cell) -> float:
+        """Clean first, then controls, then what is trained."""
+        return 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Records the pictures, and renders once what they see of each carrier."""
+        suite: PhysicalSuite = plan.suite
+        images: dict[str, int] = {}
+        for pair in suite.pairs:
+            for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
+                images[town] = max(images.get(town, 0), count)
+        target = target_of(suite)
+        for town, count in images.items():
+            clips = Clips(
+                folder / "data" / town, ((town, count),), (), target=target, behind=suite.behind, size=suite.size,
+                seed=suite.seed, device=plan.device,
+            )  # fmt: skip
+            with Live(f"recording {town}", count, 0, console=resources.console, unit="parts") as live:
+                record_clips(clips, workers=resources.workers, ray=resources.ray, progress=live.show)
+        surfaces = {safeio.dump_json(carried(c.spec)): carried(c.spec) for c in plan.cells if c.spec["attack"]}
+        tasks = [
+            (str(folder / "data" / town), suite.target, row, plan.device)
+            for town in images
+            for row in surfaces.values()
+        ]
+        if tasks:
+            pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
+            with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
+                run_all(pool, see, tasks, progress=live.show)
+        return {
+            "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
+        }  # fmt: skip
+
+    def start(self, job: Job) -> None:
+        """Memory for tensors is kept."""
+        keep_memory()
+        quiet_warp()
+
+    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
+        """The training of the cell's texture, unless it is done."""
+        spec = cell.spec
+        if not spec["source"] or texture_path(job, spec).is_file():
+            return {}
+        return {f"texture {texture_name(spec)}": dict(spec)}
+
+    def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
+        """Train a texture."""
+        texture_of(job, data)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
+        """Scores in the town of the test."""
+        found = {}
+        for cell in cells:
+            spec = cell.spec
+            clean = sightings_of(job, cell.system, None, spec["pair"])
+            before = target_scores(clean, replicates=job.settings["replicates"], seed=job.settings["seed"])
+            if spec["attack"] is None:
+                found[cell.key] = before
+                continue
+            floor, have = job.settings["floor"], before["metrics"]["AP50"] or 0.0
+            if have < floor:
+                raise CellError(
+                    f"{cell.system} finds the clean car with AP50 {have:.3f}, which is less than the floor of {floor:g}"
+                )
+            own = target_scores(
+                sightings_of(job, cell.system, spec, spec["pair"]), clean, replicates=job.settings["replicates"],
+                seed=job.settings["seed"],
+            )  # fmt: skip
+            artefacts = {"texture": str(picture_path(job, spec).relative_to(job.folder))}
+            found[cell.key] = {**own, "clean_AP50": have, "artefacts": artefacts, **about(job, spec)}
+        return found
+
+    def finish(self, plan: Plan, folder: Path) -> None:
+        """One picture of the first test town under each texture: DIR/pictures/textures.jpg."""
+        suite: PhysicalSuite = plan.suite
+        job = Job(folder, plan.device, {"target": suite.target, "seed": suite.seed})
+        path, pair, name = folder / "pictures" / "textures.jpg", suite.pairs[0], suite.detectors[0]
+        chosen: dict[str, dict[str, Any]] = {}
+        for cell in plan.cells:
+            mine = cell.system == name and cell.spec["pair"] == pair.model_dump() and cell.spec["source"] in ("", name)
+            if mine and cell.spec["attack"] and cell.spec["number"] == 0:
+                if cell.spec["source"] and not texture_path(job, cell.spec).is_file():
+                    continue
+                chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", dict(cell.spec))
+        if not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
+            shown = [(CLEAN, clip_image(job, pair.test, None))]
+            shown += [(title, clip_image(job, pair.test, spec)) for title, spec in chosen.items()]
+            save_picture(path, target_sheet(make_detector(name, device=plan.device), shown, plan.device))
+        if path.is_file():
+            caption = (
+                f"What {name} finds (orange, score at least 0.25) in a picture of {pair.test}, clean and attacked."
+            )
+            safeio.write_atomic(
+                path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n"
+            )

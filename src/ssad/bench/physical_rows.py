@@ -1,0 +1,124 @@
+"""What a suite of the kind `physical` says, and its rows as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from ssad.bench.digital_points import named
+from ssad.bench.kind import Names, SuiteBase
+from ssad.core.errors import ConfigError
+from ssad.recording.target import TargetCar, parse_target
+from ssad.scenarios.static.physical import CARRIERS, CONTROLS, Carrier, default_carrier, make_physical
+
+_STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class Pair(BaseModel):
+    """Where textures are trained and where they are tested: towns, and numbers of pictures."""
+
+    model_config = _STRICT
+
+    train: str
+    test: str
+    train_images: int = Field(default=600, ge=1)
+    test_images: int = Field(default=400, ge=1)
+
+
+class Entry(BaseModel):
+    """A row of the table.
+
+    Attributes:
+        name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
+        carrier: patch or camouflage, with its settings as `options`; default: the attack's own.
+        options: of the carrier.
+        settings: fields of `TextureAttack` that differ.
+        of: of the control shuffled: the attack whose texture is shuffled.
+    """
+
+    model_config = _STRICT
+
+    name: str = Field(min_length=1)
+    carrier: Literal["patch", "camouflage"] | None = None
+    options: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
+    of: str | None = None
+
+
+class PhysicalSuite(SuiteBase):
+    """One table: 2D detectors x textures on a car, each trained on drives in one town and tested in another.
+
+    Attributes:
+        detectors: 2D detectors with a class `car`.
+        target: the car, as for `ssad record --target`.
+        pairs: towns.
+        attacks: names, or mappings with the keys of `Entry`.
+        epochs: of all trained textures, in place of their own; None: their own.
+        seeds: of each control that is drawn at random.
+        transfer: whether a texture is shown to the other detectors too.
+        behind: m from the camera to the target.
+        size: of the pictures, px a side.
+        floor: least AP50 of the clean pictures, below which no attack is reported.
+        replicates: of the bootstrap over drives.
+    """
+
+    kind: Literal["physical"]
+    detectors: Names = Field(default=["yolov5n", "yolov3-tiny"], min_length=1)
+    target: str = "sedan:silver:0"
+    pairs: list[Pair] = Field(default=[Pair(train="Twinford", test="Oldmarket")], min_length=1)
+    attacks: list[Entry] = Field(min_length=1)
+    epochs: int | None = Field(default=None, ge=1)
+    seeds: int = Field(default=3, ge=1)
+    transfer: bool = False
+    behind: float = Field(default=20.0, ge=3.0, le=60.0)
+    size: int = Field(default=640, ge=64)
+    floor: float = Field(default=0.9, ge=0.0, le=1.0)
+    replicates: int = Field(default=100, ge=0, le=10_000)
+
+    @field_validator("attacks", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """A name alone is an attack with nothing else said."""
+        return named(value)
+
+
+def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
+    """A row as plain data: attack, carrier, options, settings, of.
+
+    Raises:
+        UnknownNameError, ConfigError: No such attack, or settings that it does not have.
+    """
+    carrier = entry.carrier or default_carrier(entry.of or entry.name)
+    found = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}, "of": None}
+    if entry.name not in CONTROLS:
+        settings = ({"epochs": suite.epochs} if suite.epochs is not None else {}) | entry.settings
+        make_physical(entry.name, **settings)
+        return found | {"settings": settings}
+    if entry.settings:
+        raise ConfigError(f"suite {suite.name}: {entry.name} is not trained and has no settings")
+    if (entry.name == "shuffled") != (entry.of is not None):
+        raise ConfigError(f"suite {suite.name}: shuffled, and it alone, says of which attack (of: NAME)")
+    if entry.of is None:
+        return found
+    sources = [one for one in suite.attacks if one.name == entry.of and one.name not in CONTROLS]
+    if len(sources) != 1:
+        raise ConfigError(f"suite {suite.name}: shuffled of '{entry.of}': there must be one such attack")
+    return {**row_of(suite, sources[0]), "attack": "shuffled", "of": entry.of}
+
+
+def target_of(suite: PhysicalSuite) -> TargetCar:
+    """The car of a suite. ConfigError: it names a sign."""
+    target = parse_target(suite.target)
+    if not isinstance(target, TargetCar):
+        raise ConfigError(f"suite {suite.name}: target {suite.target}: only cars are driven")
+    return target
+
+
+def carrier_of(row: Mapping[str, Any]) -> Carrier:
+    """The carrier of a row. ConfigError: an option that it does not have."""
+    try:
+        return CARRIERS[row["carrier"]](**row["options"])
+    except TypeError as error:
+        raise ConfigError(f"{row['carrier']}: {str(error).partition(') ')[2] or error}") from None

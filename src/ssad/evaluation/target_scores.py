@@ -1,0 +1,146 @@
+"""How well a detector finds the target of a physical attack: AP50, and the share of pictures in which it is found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ssad.core.detections import Detections, Truth
+from ssad.core.seeding import generator
+from ssad.core.types import F64, I32, Bool
+from ssad.metrics.detection2d import Boxes2D, average_precision
+from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
+
+IOU = 0.5
+CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What a detector found in one picture of the target, as plain arrays.
+
+    Attributes:
+        drive: The drive that the picture is of; pictures of one drive are alike.
+        box: Found boxes of the target's class [N, 4], best first.
+        score: Their scores [N].
+        real: True boxes of that class [Q, 4], the target first.
+        crowd: Which of these count neither as found nor as missed [Q].
+    """
+
+    drive: str
+    box: F64
+    score: F64
+    real: F64
+    crowd: Bool
+
+    @property
+    def confidence(self) -> float:
+        """The best score of a box on the target (IoU of one half at least); 0 without one."""
+        side = np.minimum(self.box[:, 2:], self.real[0, 2:]) - np.maximum(self.box[:, :2], self.real[0, :2])
+        both = np.where((side > 0.0).all(1), side.prod(1), 0.0)
+        union = (self.box[:, 2:] - self.box[:, :2]).prod(1) + (self.real[0, 2:] - self.real[0, :2]).prod() - both
+        on = both >= IOU * union
+        return float(self.score[on].max()) if on.any() else 0.0
+
+
+def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
+    """What was found of the class of the target, the first object of the truth."""
+    label = int(truth.label[0])
+    own, same = (found.label == label).cpu(), (truth.label == label).cpu()
+    crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
+    return Sighting(
+        drive, found.box.cpu()[own].double().numpy(), found.score.cpu()[own].double().numpy(),
+        truth.box.cpu()[same].double().numpy(), crowd[same.numpy()],
+    )  # fmt: skip
+
+
+def target_scores(
+    sightings: Sequence[Sighting], clean: Sequence[Sighting] | None = None, *, replicates: int = 100, seed: int = 0
+) -> dict[str, Any]:
+    """Scores of a set of pictures.
+
+    AP50 counts the target alone, AP50_all every vehicle of its class. found_25 and found_50 are shares of the pictures
+    in which the target is found with that score; ASR_25 and ASR_50 the share of those where it is found without the
+    attack and is not with it (no match is counted twice).
+
+    Args:
+        sightings: With the attack.
+        clean: The same pictures without it; None for these themselves.
+        replicates: Of the bootstrap over drives, for the intervals of AP.
+        seed: Of its draws.
+
+    Returns:
+        metrics; intervals (95 %; of drives, absent where there are too few); n, the number of pictures; drives.
+    """
+    drives = sorted({one.drive for one in sightings})
+    of = np.array([drives.index(one.drive) for one in sightings], np.int32)
+    metrics: dict[str, float | None] = {}
+    intervals: dict[str, list[float] | None] = {}
+    for name, target_only in (("AP50", True), ("AP50_all", False)):
+        value = metrics[name] = _precision(sightings, target_only=target_only)
+        if len(drives) >= MIN_CLUSTERS and replicates and value is not None:
+            draws, values = generator("target scores", seed, name), []
+            for _ in range(replicates):
+                drawn = draws.integers(len(drives), size=len(drives))
+                picked = np.concatenate([np.flatnonzero(of == drive) for drive in drawn])
+                values.append(_precision([sightings[k] for k in picked], target_only=target_only))
+            spread = np.asarray(np.var([v for v in values if v is not None], ddof=1))
+            low, high = replicate_limits(np.asarray(value), spread, len(drives), bounded=True)
+            intervals[name] = [float(low), float(high)]
+    best = np.array([one.confidence for one in sightings])
+    before = best if clean is None else np.array([one.confidence for one in clean])
+    for level in CONFIDENCES:
+        percent = round(100 * level)
+        found = best > level
+        metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(found, np.ones(len(best), bool), of)
+        if clean is not None:
+            metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
+    metrics["confidence"] = float(best.mean())
+    kept = {name: limits for name, limits in intervals.items() if limits is not None}
+    rounded = {name: None if value is None else round(value, 6) for name, value in metrics.items()}
+    return {"metrics": rounded, "intervals": kept, "n": len(sightings), "drives": len(drives)}
+
+
+def _precision(sightings: Sequence[Sighting], *, target_only: bool) -> float | None:
+    """AP50 of the target alone (other vehicles count neither way), or of all vehicles of its class."""
+    crowd = []
+    for one in sightings:
+        own = one.crowd.copy()
+        own[0] = False
+        if target_only:
+            own[1:] = True
+        crowd.append(own)
+    value = average_precision(
+        _boxes([s.real for s in sightings], ignore=crowd),
+        _boxes([s.box for s in sightings], score=[s.score for s in sightings]),
+        labels=1,
+        threshold=IOU,
+    )[0]
+    return None if np.isnan(value) else float(value)
+
+
+def _boxes(
+    boxes: Sequence[F64], *, score: Sequence[F64] | None = None, ignore: Sequence[Bool] | None = None
+) -> Boxes2D:
+    image: I32 = np.repeat(np.arange(len(boxes), dtype=np.int32), [len(b) for b in boxes])
+    return Boxes2D(
+        image, np.zeros(len(image), np.int32), np.concatenate(boxes), None if score is None else np.concatenate(score),
+        None if ignore is None else np.concatenate(ignore),
+    )  # fmt: skip
+
+
+def _share(event: Bool, counted: Bool, drive: I32) -> tuple[float | None, list[float] | None]:
+    """Share of the counted pictures with an event, and its interval from drives; None where nothing is counted."""
+    if not counted.any():
+        return None, None
+    drives, own = np.unique(drive[counted], return_inverse=True)
+    size = np.bincount(own).astype(np.float64)
+    sums: F64 = np.bincount(own, weights=event[counted].astype(np.float64)).astype(np.float64)
+    share = float(sums.sum() / size.sum())
+    if len(drives) < MIN_CLUSTERS:
+        return share, None
+    limits = bounded_limits(sums, Clusters(size, np.zeros(len(size), np.intp)), cap=2.0 * float(size.sum()))
+    return share, [float(limits.low), float(limits.high)]

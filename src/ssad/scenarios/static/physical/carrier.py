@@ -1,0 +1,174 @@
+"""What a physical attack is printed on: a patch on a panel of the target, or its whole paint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from torch import Tensor
+
+from ssad.assets.mesh import Mesh, Rectangle
+from ssad.camera.scene import Layer
+from ssad.camera.texture import paint_mask, printable, to_linear
+from ssad.core.errors import ConfigError
+from ssad.core.types import F64, Bool
+
+LARGEST = 4096  # texels of a side
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A carrier on a certain body: all that is needed to show a texture on it.
+
+    Attributes:
+        layer: What the target wears (texture 0).
+        size: Height and width of the texture, texels.
+        mask: Texels [H, W] that are somewhere on the body; what others hold is never seen.
+        metres: Width and height of what the whole texture covers, m; for a camouflage those of the whole atlas.
+    """
+
+    layer: Layer
+    size: tuple[int, int]
+    mask: Bool
+    metres: tuple[float, float]
+
+    @property
+    def texels_per_metre(self) -> float:
+        """The finer of the two directions."""
+        return max(self.size[1] / self.metres[0], self.size[0] / self.metres[1])
+
+
+class Carrier(Protocol):
+    """Where a texture goes, whatever the body.
+
+    Attributes:
+        name: What tables call it.
+    """
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+
+    def on(self, mesh: Mesh) -> Surface:
+        """The carrier on a body.
+
+        Args:
+            mesh: The target's.
+
+        Raises:
+            ConfigError: The body has no such panel, or no room on it.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A rectangle stuck on one panel; lamps, windows and plates that it covers stay as they are.
+
+    Attributes:
+        panel: Name of the panel (`Mesh.panels`): rear, hood, roof, left_side/front_door, a sign's face, torso_front ...
+        width: In m.
+        height: In m.
+        centre: Of the patch in the panel's rectangle, shares from its upper left corner.
+        texels: Along the longer side.
+        name: What tables call it.
+    """
+
+    panel: str = "rear"
+    width: float = 1.0
+    height: float = 0.5
+    centre: tuple[float, float] = (0.5, 0.5)
+    texels: int = 96
+    name: str = "patch"
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0.0 and self.height > 0.0):
+            raise ConfigError(f"a patch of {self.width} x {self.height} m: give a width and a height above 0")
+        _check_texels(self.texels)
+
+    def on(self, mesh: Mesh) -> Surface:
+        """See `Carrier`."""
+        u0, v0, u1, v1 = mesh.panel_rectangle(self.panel)
+        across, down = metres_of(mesh, self.panel)
+        wide, high = self.width / across, self.height / down
+        u, v = u0 + self.centre[0] * (u1 - u0), v0 + self.centre[1] * (v1 - v0)
+        rectangle = (u - wide / 2, v - high / 2, u + wide / 2, v + high / 2)
+        beyond = max(u0 - rectangle[0], v0 - rectangle[1], rectangle[2] - u1, rectangle[3] - v1)
+        if beyond > 1e-6:
+            raise ConfigError(
+                f"a patch of {self.width:g} x {self.height:g} m at {self.centre} does not fit on the panel "
+                f"'{self.panel}', which is {(u1 - u0) * across:.2f} x {(v1 - v0) * down:.2f} m"
+            )
+        longest = max(self.width, self.height)
+        size = (
+            max(1, round(self.texels * self.height / longest)),
+            max(1, round(self.texels * self.width / longest)),
+        )
+        return _surface(mesh, rectangle, size, (self.width, self.height))
+
+
+@dataclass(frozen=True, slots=True)
+class Camouflage:
+    """The whole paint of the body: all panels, but no windows, lamps, plates and tyres.
+
+    Attributes:
+        texels: Of each side of the atlas.
+        name: What tables call it.
+    """
+
+    texels: int = 128
+    name: str = "camouflage"
+
+    def __post_init__(self) -> None:
+        _check_texels(self.texels)
+
+    def on(self, mesh: Mesh) -> Surface:
+        """See `Carrier`."""
+        if not (mesh.panel >= 0).any():
+            raise ConfigError("this body has no panels to paint")
+        return _surface(mesh, (0.0, 0.0, 1.0, 1.0), (self.texels, self.texels), metres_of(mesh))
+
+
+def _check_texels(texels: int) -> None:
+    if not 1 <= texels <= LARGEST:
+        raise ConfigError(f"a texture of {texels} texels: from 1 to {LARGEST} a side")
+
+
+def _surface(mesh: Mesh, rectangle: Rectangle, size: tuple[int, int], metres: tuple[float, float]) -> Surface:
+    mask = paint_mask(mesh, size, rectangle)
+    if not mask.any():
+        raise ConfigError("no face of the body lies under the texture; choose another place")
+    return Surface(Layer(0, rectangle), size, mask, metres)
+
+
+def metres_of(mesh: Mesh, panel: str | None = None) -> tuple[float, float]:
+    """Metres of the body for the whole width and the whole height of the atlas.
+
+    Args:
+        mesh: The body.
+        panel: On this panel; None: on all of them.
+
+    Returns:
+        Along u and along v: means over the faces by their area in the atlas.
+
+    Raises:
+        ConfigError: There is no such panel, or it has no faces.
+    """
+    chosen = mesh.panel >= 0 if panel is None else np.isin(mesh.panel, mesh.panel_indices(panel))
+    uv: F64 = mesh.uv[chosen].astype(np.float64)
+    corners = mesh.corners()[chosen]
+    along = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], axis=-1)
+    edges = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
+    area = np.abs(np.linalg.det(along))
+    some = area > 1e-9
+    if not some.any():
+        raise ConfigError(f"panel '{panel}' has no faces; choose another panel")
+    tangents = edges[some] @ np.linalg.inv(along[some])  # [F, 3, 2] m for the whole of u, of v
+    lengths = np.linalg.norm(tangents, axis=1)
+    u, v = np.average(lengths, axis=0, weights=area[some])
+    return float(u), float(v)
+
+
+def albedo_of(colour: Tensor) -> Tensor:
+    """What is printed [3, H, W] or [B, 3, H, W], sRGB in 0 to 1, as linear albedo that ink and paper can have."""
+    return printable(to_linear(colour))

@@ -1,0 +1,116 @@
+"""What can be printed, and how it differs from car to car: regularisers, and the expectation over print and place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ssad.core.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Expectation:
+    """How a texture differs from print to print and from car to car: uniform draws, one of each for a picture.
+
+    Attributes:
+        contrast: Least and greatest factor about mid-grey.
+        brightness: Greatest change, of the range of colours.
+        noise: Greatest change of a texel by itself.
+        shift: Greatest shift of the texture, share of its sides; what comes in repeats the edge.
+        turn: Greatest turn, rad.
+
+    Source: ranges of contrast, brightness and noise as in Thys et al., Fooling automated surveillance cameras (2019).
+    """
+
+    contrast: tuple[float, float] = (0.8, 1.2)
+    brightness: float = 0.1
+    noise: float = 0.1
+    shift: float = 0.03
+    turn: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.contrast[0] <= self.contrast[1]:
+            raise ConfigError(f"contrast {self.contrast}: give a least and a greatest factor above 0")
+        if min(self.brightness, self.noise, self.shift, self.turn) < 0.0 or self.shift >= 0.5:
+            raise ConfigError("brightness, noise, shift and turn are 0 or more, shift is below 0.5")
+
+    def draw(self, colour: Tensor, generator: torch.Generator) -> Tensor:
+        """The texture as it is on one car.
+
+        Args:
+            colour: sRGB [3, H, W] in 0 to 1.
+            generator: On the CPU, so that the draws are the same on every device.
+
+        Returns:
+            [3, H, W] in 0 to 1, differentiable in `colour`.
+        """
+
+        def uniform(low: float, high: float, *shape: int) -> Tensor:
+            return (low + (high - low) * torch.rand(shape, generator=generator)).to(colour)
+
+        found = colour
+        if self.shift > 0.0 or self.turn > 0.0:
+            angle = uniform(-self.turn, self.turn, 1)[0]
+            move = uniform(-2.0 * self.shift, 2.0 * self.shift, 2)
+            height, width = colour.shape[1:]
+            aspect = width / height
+            cos, sin = torch.cos(angle), torch.sin(angle)
+            rows = torch.stack([
+                torch.stack([cos, -sin / aspect, move[0]]), torch.stack([sin * aspect, cos, move[1]])
+            ])  # fmt: skip
+            grid = functional.affine_grid(rows[None], [1, *colour.shape], align_corners=False)
+            found = functional.grid_sample(
+                found[None], grid, mode="bilinear", padding_mode="border", align_corners=False
+            )[0]
+        factor = uniform(*self.contrast, 1)
+        found = 0.5 + factor * (found - 0.5) + uniform(-self.brightness, self.brightness, 1)
+        if self.noise > 0.0:
+            found = found + uniform(-self.noise, self.noise, *colour.shape)
+        return found.clamp(0.0, 1.0)
+
+
+NOMINAL = Expectation((1.0, 1.0), 0.0, 0.0, 0.0, 0.0)
+"""Printed and placed exactly."""
+
+
+def total_variation(colour: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean length of the difference from each texel to the next one across and down.
+
+    Args:
+        colour: [3, H, W].
+        mask: Texels [H, W] that count; a pair counts if both do. None: all.
+
+    Returns:
+        A scalar; 0 for an even texture. Differentiable.
+    """
+    inside = torch.ones(colour.shape[1:], dtype=torch.bool, device=colour.device) if mask is None else mask.bool()
+    across = (colour[:, :, 1:] - colour[:, :, :-1]).square().sum(0)
+    down = (colour[:, 1:] - colour[:, :-1]).square().sum(0)
+    pairs = torch.cat([across[inside[:, 1:] & inside[:, :-1]], down[inside[1:] & inside[:-1]]])
+    if not len(pairs):
+        return colour.sum() * 0.0
+    return (pairs + 1e-8).sqrt().mean() - 1e-4
+
+
+def non_printability(colour: Tensor, printable: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean distance of the texels' colours to the nearest printable colour.
+
+    Args:
+        colour: sRGB [3, H, W].
+        printable: Colours [N, 3] that a printer can make, sRGB.
+        mask: Texels [H, W] that count. None: all.
+
+    Returns:
+        A scalar, 0 where all colours are printable. Differentiable.
+
+    Source: the non-printability score of Sharif et al., Accessorize to a Crime (2016), with the nearest colour in place
+    of the product over all, which underflows.
+    """
+    rows = colour.flatten(1).T if mask is None else colour[:, mask.bool()].T
+    if not len(rows):
+        return colour.sum() * 0.0
+    gaps = torch.cdist(rows, printable.to(rows))
+    return gaps.amin(1).mean()

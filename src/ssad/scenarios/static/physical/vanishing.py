@@ -1,0 +1,19 @@
+"""A strong modern camouflage: no box of any score on the target, over views, light and print."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from ssad.scenarios.static.physical.optimise import TextureAttack
+
+
+def vanishing(**settings: Any) -> TextureAttack:
+    """The loss of ACTIVE and RAUCA on a texture of the whole paint.
+
+    Half of each epoch's pictures are those on which the attack does worst, as in R-PGA.
+
+    Source: Suryanto et al., ACTIVE (2023); Zhou et al., RAUCA (2024); the mining of views: R-PGA (2026).
+    """
+    attack = TextureAttack("vanishing", "hide", epochs=40, rate=0.04, worst=0.5)
+    return replace(attack, **settings)

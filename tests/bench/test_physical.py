@@ -1,0 +1,131 @@
+"""Kind `physical`: its plan, and a small run from the recording to the report, resumed and replotted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssad.bench.kind import Job, Resources
+from ssad.bench.kinds.physical import Physical
+from ssad.bench.physical_rows import PhysicalSuite
+from ssad.bench.physical_textures import texture_name, texture_of
+from ssad.bench.run import run
+from ssad.bench.suite import load_suite
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.images import read_image
+
+PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
+
+
+def suite(**changes: Any) -> PhysicalSuite:
+    """A suite that takes seconds."""
+    given: dict[str, Any] = {
+        "kind": "physical", "name": "small", "detectors": ["yolov5n"], "pairs": [PAIR], "epochs": 1, "seeds": 1,
+        "size": 320, "behind": 10.0, "replicates": 0, "floor": 0.0,
+        "attacks": [{"name": "random", "carrier": "patch"}, "vanishing", {"name": "shuffled", "of": "vanishing"}],
+    }  # fmt: skip
+    return PhysicalSuite.model_validate(given | changes)
+
+
+def test_cells_are_attacks_by_detector_and_towns() -> None:
+    plan = Physical().plan(suite(detectors=["yolov5n", "yolov3-tiny"], transfer=True, seeds=2))
+    rows = [(c.fields["detector"], c.fields["attack"], c.fields["source"], c.fields["number"]) for c in plan.cells]
+    assert rows[:8] == [
+        ("yolov5n", "clean", "", 0), ("yolov5n", "random", "", 0), ("yolov5n", "random", "", 1),
+        ("yolov5n", "vanishing", "yolov5n", 0), ("yolov5n", "vanishing", "yolov3-tiny", 0),
+        ("yolov5n", "shuffled vanishing", "yolov5n", 0), ("yolov5n", "shuffled vanishing", "yolov5n", 1),
+        ("yolov5n", "shuffled vanishing", "yolov3-tiny", 0),
+    ]  # fmt: skip
+    assert len({cell.key for cell in plan.cells}) == len(plan.cells) == 2 * 9
+    trained = {texture_name(cell.spec) for cell in plan.cells if cell.spec["source"]}
+    assert len(trained) == 2, "a texture for each detector, shown to both and shuffled"
+
+
+def test_a_key_covers_what_decides_the_result() -> None:
+    one = {cell.name: cell.key for cell in Physical().plan(suite()).cells}
+    assert {cell.name: cell.key for cell in Physical().plan(suite()).cells} == one
+    for change in ({"epochs": 2}, {"behind": 12.0}, {"target": "suv:red:0"}):
+        other = {cell.name: cell.key for cell in Physical().plan(suite(**change)).cells}
+        assert (
+            other["yolov5n/Oldmarket/vanishing/camouflage/yolov5n/0"]
+            != one["yolov5n/Oldmarket/vanishing/camouflage/yolov5n/0"]
+        ), change
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"detectors": ["fcos3d-light"]}, ConfigError, "fcos3d-light is no 2D detector"),
+        ({"pairs": [PAIR | {"test": "Nowhere"}]}, ConfigError, "unknown town 'Nowhere'"),
+        ({"target": "stop_sign"}, ConfigError, "only cars are driven"),
+        ({"attacks": ["vanish"]}, UnknownNameError, "vanishing"),
+        ({"attacks": [{"name": "vanishing", "settings": {"speed": 3}}]}, ConfigError, "no setting 'speed'"),
+        ({"attacks": [{"name": "random", "settings": {"rate": 1.0}}]}, ConfigError, "is not trained"),
+        ({"attacks": [{"name": "shuffled"}]}, ConfigError, "of which attack"),
+        ({"attacks": [{"name": "shuffled", "of": "das"}]}, ConfigError, "there must be one such attack"),
+        ({"attacks": [{"name": "adv-patch", "options": {"panel": "wing"}}]}, ConfigError, "no panel 'wing'"),
+        ({"attacks": [{"name": "adv-patch", "options": {"width": 9.0}}]}, ConfigError, "does not fit"),
+        ({"attacks": [{"name": "adv-patch", "options": {"colour": 1}}]}, ConfigError, "colour"),
+    ],
+)
+def test_a_wrong_suite_ends_in_one_line(change: Mapping[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message) as found:
+        Physical().plan(suite(**change))
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.parametrize("name", ["physical", "physical-quick"])
+def test_the_shipped_suites_can_be_planned(name: str) -> None:
+    assert len(load_suite(name).attacks) >= 5
+
+
+@pytest.mark.slow
+def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
+    plan = Physical().plan(suite())
+    records = run(plan, tmp_path, Resources(workers=2))
+    assert [record["status"] for record in records] == ["ok"] * 4
+    clean, random, trained, shuffled = records
+    assert clean["metrics"]["AP50"] > 0.5
+    assert "ASR_25" not in clean["metrics"]
+    assert trained["epochs"] == 1
+    assert "epochs" not in random
+    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
+    cell = next(cell for cell in plan.cells if cell.fields["attack"] == "vanishing")
+    colour = texture_of(job, cell.spec)
+    picture = read_image(tmp_path / trained["artefacts"]["texture"])
+    assert picture.shape == (128, 128, 3)
+    kept = np.abs(picture / 255 - colour.permute(1, 2, 0).numpy()).max(2) < 0.005
+    assert kept.mean() > 0.3, "what is on the body; the gutter is grey"
+    assert shuffled["artefacts"]["texture"] != trained["artefacts"]["texture"]
+    plan.kind.finish(plan, tmp_path)
+    assert read_image(tmp_path / "pictures" / "textures.jpg").shape[1] == 3 * 644
+    results = (tmp_path / "results.jsonl").read_bytes()
+    assert run(plan, tmp_path, Resources(workers=1)) == records
+    assert (tmp_path / "results.jsonl").read_bytes() == results
+    texture = tmp_path / trained["artefacts"]["texture"].replace(".png", ".npz")
+    texture.unlink()
+    assert np.array_equal(texture_of(job, cell.spec), colour), "the checkpoint goes on where it ended"
+    texture.unlink()
+    texture.with_suffix(".checkpoint.npz").unlink()
+    assert np.array_equal(texture_of(job, cell.spec), colour), "trained anew, the same to the bit"
+
+
+def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No attack is reported where the detector does worse than the floor without it."""
+    from ssad.bench.kind import CellError
+    from ssad.evaluation.target_scores import Sighting
+
+    nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
+    monkeypatch.setattr("ssad.bench.kinds.physical.sightings_of", lambda *given: [nothing])
+    plan = Physical().plan(suite(floor=0.9))
+    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
+    (clean,) = Physical().execute([plan.cells[0]], job).values()
+    assert clean["metrics"]["AP50"] == 0.0
+    with pytest.raises(CellError, match=r"AP50 0\.000, which is less than the floor of 0\.9"):
+        Physical().execute([plan.cells[1]], job)
+    assert safeio.dump_json(dict(clean))

@@ -1,0 +1,85 @@
+"""Scores of a target by hand: AP of it alone and of all cars, targets lost, intervals from drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.core.detections import Detections, Truth
+from ssad.evaluation.target_scores import Sighting, sighting, target_scores
+
+TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
+
+
+def seen(*found: tuple[list[float], float], drive: str = "a", real: tuple[list[float], ...] = (TARGET,)) -> Sighting:
+    """A picture with true boxes, the target first, and found boxes with their scores."""
+    boxes = np.array([box for box, _ in found], float).reshape(-1, 4)
+    scores = np.array([score for _, score in found], float)
+    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool))
+
+
+def test_only_boxes_of_the_targets_class_count() -> None:
+    truth = Truth(
+        torch.tensor([1, 0, 1]), torch.tensor([TARGET, OTHER, OTHER]), crowd=torch.tensor([False, False, True])
+    )
+    found = Detections(torch.tensor([0.9, 0.8]), torch.tensor([0, 1]), torch.tensor([TARGET, OTHER]))
+    one = sighting("a", found, truth)
+    assert one.box.tolist() == [OTHER]
+    assert one.score.tolist() == pytest.approx([0.8])
+    assert one.real.tolist() == [TARGET, OTHER]
+    assert one.crowd.tolist() == [False, True]
+    assert one.confidence == 0.0, "the box on the target has another class"
+
+
+def test_a_target_is_found_where_a_box_covers_half() -> None:
+    half = [10.0, 10.0, 30.0, 40.0]
+    less = [10.0, 10.0, 29.0, 40.0]
+    assert seen((half, 0.6)).confidence == pytest.approx(0.6)
+    assert seen((less, 0.6)).confidence == 0.0
+    assert seen((TARGET, 0.3), (half, 0.7)).confidence == pytest.approx(0.7)
+    assert seen().confidence == 0.0
+
+
+def test_precision_of_the_target_alone_leaves_other_cars_out() -> None:
+    """The other car is found in both pictures and the target in one; a box on nothing costs precision."""
+    both = (TARGET, OTHER)
+    pictures = [seen((TARGET, 0.9), (OTHER, 0.8), real=both), seen((OTHER, 0.95), real=both)]
+    found = target_scores(pictures)["metrics"]
+    assert found["AP50"] == pytest.approx(51 / 101, abs=1e-6), "recall of one half at full precision"
+    assert found["AP50_all"] == pytest.approx(76 / 101, abs=1e-6)
+    wrong = [seen(([200.0, 10.0, 240.0, 40.0], 0.99), (TARGET, 0.9), real=both)]
+    assert target_scores(wrong)["metrics"]["AP50"] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_targets_lost_are_those_that_were_found_before() -> None:
+    clean = [seen((TARGET, 0.9)), seen((TARGET, 0.4)), seen((TARGET, 0.6)), seen((TARGET, 0.1))]
+    attacked = [seen((TARGET, 0.3)), seen(), seen((TARGET, 0.55)), seen((TARGET, 0.9))]
+    found = target_scores(attacked, clean)["metrics"]
+    assert found["ASR_25"] == pytest.approx(1 / 3, abs=1e-6), "of three that were found, one is lost"
+    assert found["ASR_50"] == pytest.approx(1 / 2, abs=1e-6)
+    assert found["found_25"] == pytest.approx(3 / 4)
+    assert found["confidence"] == pytest.approx((0.3 + 0.55 + 0.9) / 4)
+    nothing = target_scores([seen()], [seen()])["metrics"]
+    assert nothing["ASR_25"] is None, "nothing could be lost"
+    assert "ASR_25" not in target_scores(clean)["metrics"]
+
+
+def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
+    draws = np.random.default_rng(0)
+
+    def pictures(drives: int, each: int) -> list[Sighting]:
+        levels = draws.random(drives)
+        return [seen((TARGET, float(level)), drive=str(k)) for k, level in enumerate(levels) for _ in range(each)]
+
+    some = pictures(8, 3)
+    assert "found_50" not in target_scores([one for one in some if one.drive in "0123"])["intervals"], "too few drives"
+    once, often = target_scores(some), target_scores([one for one in some for _ in range(4)])
+    assert once["drives"] == often["drives"] == 8
+    for name in ("found_25", "found_50"):
+        assert once["intervals"][name] == pytest.approx(often["intervals"][name], abs=1e-9)
+        low, high = once["intervals"][name]
+        assert low < once["metrics"][name] < high
+    low, high = once["intervals"]["AP50"]
+    assert low <= once["metrics"]["AP50"] <= high
+    assert target_scores(some)["intervals"] == once["intervals"], "the draws come from the seed"

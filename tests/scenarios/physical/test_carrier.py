@@ -1,0 +1,107 @@
+"""Carriers: a texture of a true size on a named panel, or on all paint and nothing else; the same on any target."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.assets.mesh import Material, Mesh, box
+from ssad.camera.render import View, render
+from ssad.camera.rig import RIG, rig_camera
+from ssad.camera.scene import Scene, Thing
+from ssad.camera.texture import PRINTABLE
+from ssad.core.errors import ConfigError
+from ssad.recording.target import TargetCar, TargetSign
+from ssad.scenarios.static.physical.carrier import Camouflage, Patch, albedo_of, metres_of
+
+PAINT = Material("paint", (0.5, 0.5, 0.5))
+CHANNEL = next(iter(RIG))
+
+
+def panel(width: float, height: float, rectangle: tuple[float, float, float, float]) -> Mesh:
+    """A body whose only panel `rear` has a size (m) and a rectangle of the atlas."""
+    u0, v0, u1, v1 = rectangle
+    corners = np.array([[0, 0, height], [0, -width, height], [0, -width, 0], [0, 0, 0]], np.float32)
+    uv = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    normals = np.tile(np.array([-1, 0, 0], np.float32), (2, 3, 1))
+    return Mesh(corners, faces, normals, uv[faces], np.zeros(2, np.int32), np.zeros(2, np.int32), (PAINT,), ("rear",))
+
+
+def test_a_patch_has_its_size_in_metres() -> None:
+    mesh = panel(2.0, 0.8, (0.1, 0.2, 0.6, 0.4))
+    assert metres_of(mesh, "rear") == pytest.approx((4.0, 4.0))
+    surface = Patch("rear", width=1.0, height=0.4, texels=50).on(mesh)
+    assert surface.layer.rectangle == pytest.approx((0.225, 0.25, 0.475, 0.35))
+    assert surface.size == (20, 50)
+    assert surface.texels_per_metre == pytest.approx(50.0)
+    assert surface.mask.all()
+    moved = Patch("rear", width=1.0, height=0.4, centre=(0.25, 0.25)).on(mesh)
+    assert moved.layer.rectangle == pytest.approx((0.1, 0.2, 0.35, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("patch", "message"),
+    [
+        ({"width": 2.5, "height": 0.4}, "does not fit on the panel 'rear', which is 2.00 x 0.80 m"),
+        ({"width": 1.0, "height": 0.4, "centre": (0.1, 0.5)}, "does not fit"),
+        ({"panel": "wing"}, "no panel 'wing'; this mesh has: rear"),
+        ({"width": 0.0}, "width and a height above 0"),
+        ({"texels": 0}, "from 1 to 4096"),
+    ],
+)
+def test_a_patch_that_cannot_be_is_refused_in_one_line(patch: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
+        Patch(**patch).on(panel(2.0, 0.8, (0.1, 0.2, 0.6, 0.4)))  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+def test_a_body_without_panels_takes_no_camouflage() -> None:
+    with pytest.raises(ConfigError, match="no panels"):
+        Camouflage().on(box((1.0, 1.0, 1.0), material=PAINT))
+
+
+@pytest.mark.parametrize("style", ["sedan", "suv", "van"])
+def test_a_patch_lies_on_the_rear_of_every_car_in_its_size(style: str) -> None:
+    """What is seen from behind has the patch's size, in pixels of a camera straight behind it."""
+    mesh = TargetCar(style).mesh()
+    surface = Patch("rear", width=0.9, height=0.3, centre=(0.5, 0.6)).on(mesh)
+    camera = rig_camera(CHANNEL, 640)
+    away = 12.0
+    low, _ = mesh.bounds()
+    height = 0.8
+    behind = np.eye(4)
+    behind[:3, :3] = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # x right, y down, z ahead
+    behind[:3, 3] = low[0] - away, 0.0, height
+    view = View(camera, behind, (Thing(0, np.eye(4), tag=1, layers=(surface.layer,)),))
+    picture = render(Scene(None, [mesh]), [view])
+    assert set(np.unique(picture.fragments["texture"])) == {0}
+    rows, columns = np.divmod(picture.fragments["place"].astype(int), camera.width)
+    pixel = camera.intrinsic[0, 0] / away
+    assert np.ptp(columns) + 1 == pytest.approx(0.9 * pixel, abs=0.12 * 0.9 * pixel + 2)
+    assert np.ptp(rows) + 1 <= 0.3 * pixel + 3
+    assert (columns.min() + columns.max()) / 2 == pytest.approx(camera.intrinsic[0, 2], abs=2.5)
+
+
+def test_a_camouflage_covers_every_panel_and_nothing_between() -> None:
+    surface = Camouflage(64).on(TargetCar().mesh())
+    assert surface.layer.rectangle == (0.0, 0.0, 1.0, 1.0)
+    assert 0.3 < surface.mask.mean() < 0.9
+    mesh = TargetCar().mesh()
+    for name in mesh.panels:
+        u0, v0, u1, v1 = mesh.panel_rectangle(name)
+        assert surface.mask[int(32 * (v0 + v1)), int(32 * (u0 + u1))], name
+
+
+def test_a_sign_takes_a_patch_on_its_face() -> None:
+    size = TargetSign().full_size[1]
+    surface = Patch("face", width=0.5 * size, height=0.5 * size).on(TargetSign().mesh())
+    u0, v0, u1, v1 = surface.layer.rectangle
+    assert (u1 - u0, v1 - v0) == pytest.approx((0.242, 0.242), abs=0.005)
+
+
+def test_albedo_is_what_ink_and_paper_can_have() -> None:
+    found = albedo_of(torch.tensor([0.0, 0.5, 1.0]).reshape(3, 1, 1))
+    low, high = PRINTABLE
+    assert found.flatten().tolist() == pytest.approx([low, low + (high - low) * 0.21404, high], abs=1e-4)
