@@ -17,7 +17,8 @@ from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
 from ssad.world.episode_arrays import build
-from ssad.world.kernels.data import HORIZON, Ego, Presence, State, Work, array_types
+from ssad.world.kernels.belief import see
+from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
@@ -26,7 +27,7 @@ from ssad.world.models import MODELS
 
 VERSION = "2"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
-_STATE, _EGO = array_types(State), array_types(Ego)
+_STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,9 @@ class World:
         shape = (self.batch, self.agents, HORIZON)
         for name, array in _STATE.items():
             setattr(self.arrays, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
+        self.seen = Seen()
+        for name, array in _SEEN.items():
+            setattr(self.seen, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
         self.ego = Ego()
         for name, array in _EGO.items():
             setattr(self.ego, name, wp.zeros(self.batch, dtype=array.dtype, device=device))
@@ -100,9 +104,12 @@ class World:
         self._restart = [self.launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
         self._plan = [self.launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
         self._plan += [
-            self.launch(sight, flat, [bank, roads, state, self.work, self.agents, dt]),
-            self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers, dt]),
-            self.launch(drive, flat, [bank, roads, state, self.agents, dt]),
+            self.launch(see, flat, [bank, roads, state, self.seen]),
+            self.launch(sight, flat, [bank, roads, state, self.seen, self.work, self.agents, self.agents, dt]),
+            self.launch(
+                meet, workers, [bank, roads, state, self.seen, self.work, self.agents, self.agents, workers, dt]
+            ),
+            self.launch(drive, flat, [bank, roads, state, self.seen, self.agents, self.agents, dt]),
         ]
         self._advance = [
             self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),
