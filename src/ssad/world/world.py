@@ -25,7 +25,7 @@ from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 
-VERSION = "2"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "3"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
 
@@ -104,7 +104,7 @@ class World:
         self._restart = [self.launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
         self._plan = [self.launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
         self._plan += [
-            self.launch(see, flat, [bank, roads, state, self.seen]),
+            self.launch(see, flat, [bank, roads, state, self.seen, dt]),
             self.launch(sight, flat, [bank, roads, state, self.seen, self.work, self.agents, self.agents, dt]),
             self.launch(
                 meet, workers, [bank, roads, state, self.seen, self.work, self.agents, self.agents, workers, dt]

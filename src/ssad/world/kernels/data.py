@@ -115,8 +115,6 @@ class State:
     stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
-    forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
-    span: wp.array2d(dtype=wp.vec4)  # [B, A] least x, y and greatest x, y of the pose and its forecast
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
@@ -134,7 +132,7 @@ class Seen:
     pose: wp.array2d(dtype=wp.vec3)  # [B, rows] x, y, yaw
     speed: wp.array2d(dtype=wp.float32)  # [B, rows] m/s along the heading
     half: wp.array2d(dtype=wp.vec2)  # [B, rows] half length, half width
-    forecast: wp.array3d(dtype=wp.vec3)  # [B, rows, HORIZON] x, y, yaw where it will be
+    forecast: wp.array3d(dtype=wp.vec3)  # [B, rows, HORIZON] x, y, yaw where it will be if it keeps its speed
     span: wp.array2d(dtype=wp.vec4)  # [B, rows] least x, y and greatest x, y of the pose and its forecast
     # [B, rows] m from the centre to where it would wait (its stop line, or the junction) and to the next junction (FAR:
     # none), TurnRank there, and m that its path ahead leaves the straight line along its heading

@@ -5,8 +5,6 @@ import warp as wp
 from ssad.core.types import AgentKind, Contact, Controller, SignalState
 from ssad.world.kernels.data import (
     FAR,
-    HORIZON,
-    STRIDE,
     ContactPolicy,
     Ego,
     End,
@@ -259,14 +257,6 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     elif bank.cruise[e, i][1] > 0.0:
         awake = Presence.ASLEEP
     state.active[b, i] = awake
-    far = start[3] * STRIDE * float(HORIZON)
-    tip = wp.vec2(pose[0] + far * wp.cos(pose[2]), pose[1] + far * wp.sin(pose[2]))
-    state.span[b, i] = wp.vec4(
-        wp.min(pose[0], tip[0]), wp.min(pose[1], tip[1]), wp.max(pose[0], tip[0]), wp.max(pose[1], tip[1])
-    )
-    for k in range(HORIZON):
-        ahead = start[3] * STRIDE * float(k + 1)
-        state.forecast[b, i, k] = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
 
 
 @wp.kernel(enable_backward=False)
