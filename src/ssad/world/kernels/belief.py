@@ -9,13 +9,23 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, Seen, State, TurnRank
-from ssad.world.kernels.shared import route_at, wrap
+from ssad.world.kernels.shared import route_at, signal_state, wrap
 
 KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
 ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
 CLEARING = wp.constant(3.0)  # m/s
 STRAIGHT_TURN = wp.constant(1.0e-3)  # 1/m, or rad: less is straight on
 LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expected to turn
+
+
+@wp.func
+def light(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
+) -> int:
+    """State of a signal as i sees it."""
+    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] >= 0:
+        return seen.light[b, index]
+    return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
 
 
 @wp.func

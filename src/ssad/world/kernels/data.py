@@ -141,6 +141,7 @@ class Seen:
     waited: wp.array2d(dtype=wp.float32)  # [B, rows] s at rest while wanting to go
     gives_way: wp.array2d(dtype=wp.int32)  # [B, rows] 1: can be relied on to give way
     believes: wp.array(dtype=wp.int32)  # [B] 1: the ego plans over the rows from A on, not over the truth
+    light: wp.array2d(dtype=wp.int32)  # [B, S] SignalState that such an ego believes, -1: as it is
 
 
 @wp.struct

@@ -11,6 +11,7 @@ from ssad.world.kernels.data import (
     EpisodeArrays,
     Presence,
     Roads,
+    Seen,
     State,
     TurnRank,
     Work,
@@ -261,7 +262,13 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
 
 @wp.kernel(enable_backward=False)
 def restart_record(
-    bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    ego: Ego,
+    mask: wp.array(dtype=wp.int32),
+    ended_too: int,
 ):
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
@@ -273,6 +280,7 @@ def restart_record(
     mask[b] = 0
     state.step[b] = 0
     state.end[b] = End.RUNNING
+    seen.believes[b] = 0
     ego.contact[b] = 0
     ego.contact_agent[b] = -1
     ego.touching[b] = wp.int64(0)

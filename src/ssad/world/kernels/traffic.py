@@ -8,6 +8,7 @@ predicted conflict that it must yield to (here).
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller, SignalState
+from ssad.world.kernels.belief import light
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
@@ -26,7 +27,6 @@ from ssad.world.kernels.shared import (
     boxes_touch,
     route_frame,
     sign_line,
-    signal_state,
 )
 
 IDM_BRAKE = wp.constant(3.0)
@@ -123,11 +123,12 @@ def inside(seen: Seen, b: int, j: int) -> bool:
 
 @wp.func
 def waits(
-    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, j: int, e: int, dt: float
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
 ) -> bool:
     """Whether i, who is still before the junction, lets j go first, who is inside.
 
-    Not if it can no longer stop with 4 m/s^2, nor on green for someone who turns left from the other side.
+    Not if it can no longer stop with 4 m/s^2, nor on green (as `me` sees it) for someone who turns left from the other
+    side.
     """
     way = seen.way[b, i]
     v = seen.speed[b, i]
@@ -136,7 +137,7 @@ def waits(
     index = seen.signal[b, i]
     turns = seen.way[b, j][2] > way[2]
     if turns and index >= 0 and wp.cos(seen.pose[b, i][2] - seen.pose[b, j][2]) < -0.5:
-        if signal_state(bank, roads, e, index, float(state.step[b]) * dt) == SignalState.GREEN:
+        if light(bank, roads, state, seen, b, me, e, index, dt) == SignalState.GREEN:
             lets = False
     return lets
 
@@ -157,9 +158,9 @@ def has_priority(
     c = seen.way[b, j]
     inside_i = inside(seen, b, i)
     inside_j = inside(seen, b, j)
-    if inside_i and not inside_j and waits(bank, roads, state, seen, b, j, i, e, dt):
+    if inside_i and not inside_j and waits(bank, roads, state, seen, b, i, j, i, e, dt):
         return True
-    if inside_j and not inside_i and waits(bank, roads, state, seen, b, i, j, e, dt):
+    if inside_j and not inside_i and waits(bank, roads, state, seen, b, i, i, j, e, dt):
         return False
     if a[2] != c[2]:
         return a[2] < c[2]
@@ -276,7 +277,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Wor
     index = roads.path_signal[first]
     lit = int(SignalState.OFF)
     if index >= 0 and rule[1] - part < SIGHT + 40.0:
-        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+        lit = light(bank, roads, state, seen, b, i, e, index, dt)
     if lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         ahead = roads.ahead[first][0] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
@@ -423,7 +424,7 @@ def meet(
                     index = roads.path_signal[first]
                     lit = int(SignalState.OFF)
                     if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
-                        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+                        lit = light(bank, roads, state, seen, b, i, e, index, dt)
                     entered = inside(seen, b, j)
                     crosses = wp.abs(wp.cos(q[2] - pose[2])) < 0.7
                     if lit == SignalState.OFF or lit == SignalState.RED or entered or crosses:
