@@ -78,6 +78,23 @@ def test_the_truth_handed_in_gives_the_same_bits_in_all_182_episodes() -> None:
     _same_bits(1, ("precrash", "natural"))
 
 
+def test_the_truth_handed_in_fills_rows_with_the_truth() -> None:
+    episodes, graphs = natural("precrash", 4)
+    world = World(episodes, graphs, ego=Controller.AUTOPILOT)
+    for _ in range(30):
+        world.step()
+    truth = world.truth()
+    world.believe(truth)
+    world.truth()  # looks anew
+    used = truth.kind > 0
+    assert used.sum() > 10
+    assert (truth.stood[used] > 0.0).any()
+    for name in ("kind", "pose", "speed", "half", "forecast", "span", "way", "signal", "waited", "gives_way"):
+        rows = world.array(f"seen.{name}")
+        believed = rows[:, world.agents : 2 * world.agents]
+        assert np.array_equal(believed[used], rows[:, : world.agents][used]), name
+
+
 def test_beliefs_do_not_depend_on_batch_or_order() -> None:
     episodes, graphs = natural("precrash", 4)
     count = len(episodes)
@@ -244,13 +261,14 @@ def test_background_traffic_does_not_believe_what_the_ego_believes() -> None:
     follower = EpisodeAgent(
         "b", "car", Controller.AUTOPILOT, Pose(10.0, 0.0, 0.0), 8.0, 8.0, route=line_route(10.0, 300.0)
     )
-    world = World([episode(alone(60.0, 0.0), follower, standing(72.0))], GRAPHS)
+    slow = replace(alone(40.0, 2.0), target_speed=2.0)
+    world = World([episode(slow, follower, standing(80.0))], GRAPHS)
     world.believe(world.truth().keep(np.zeros((1, 3), bool)))
-    for _ in range(60):
+    for _ in range(250):
         world.step()
     assert world.ended()[0] == 1  # the ego drives into what it does not know of
-    touch = int(world.array("touch")[0, 1])
-    assert touch == 0  # who follows it brakes
+    assert int(world.array("touch")[0, 1]) == 0  # who follows it brakes
+    assert world.array("pose")[0, 1, 0] > 50.0
 
 
 def test_a_believed_signal_holds_for_the_ego_alone() -> None:
@@ -323,6 +341,12 @@ def test_lanes_are_found_under_the_middle_of_a_lane() -> None:
     assert lane.tolist() == pick
     assert np.allclose(s, graph.length[pick] / 2, atol=0.5)
     assert np.abs(left).max() < 0.3
+    aside = places.copy()
+    aside[:, :2] += 0.8 * np.stack([-np.sin(places[:, 2]), np.cos(places[:, 2])], 1)
+    found = lanes.match(aside)
+    assert np.allclose(found[2], 0.8, atol=0.3)
+    near = lanes.follow(aside, np.full(len(pick), 0.2), *found)[:, 0]  # 0.1 m further on, as far aside as now
+    assert np.abs(near[:, :2] - aside[:, :2]).max() < 0.3
     places[:, 2] += np.pi
     assert (lanes.match(places)[0] != np.array(pick)).all()  # not against its direction
 

@@ -124,15 +124,18 @@ class World:
         flat = (self.batch, self.agents)
         bank, roads, state, seen = self.bank.episodes, self.bank.roads, self.arrays, self.seen
 
+        # threads of a scene where each has little to do: to begin one costs more than that on CPU
+        threads = 1 if self.device == "cpu" else self.agents
+        few = (self.batch, threads)
+
         def restarts(ended_too: int) -> list[Any]:
-            rest = [self.ego, self._mask, ended_too]
             return [
-                self.launch(restart, flat, [bank, roads, state, *rest]),
-                self.launch(restart_record, self.batch, [bank, roads, state, seen, *rest]),
+                self.launch(restart, few, [bank, roads, state, self._mask, ended_too, self.agents, threads]),
+                self.launch(restart_record, self.batch, [bank, roads, state, seen, self.ego, self._mask, ended_too]),
             ]
 
         self._restart = restarts(0)
-        self._see = self.launch(see, flat, [bank, roads, state, seen, dt])
+        self._see = self.launch(see, few, [bank, roads, state, seen, self.agents, threads, dt])
         self._plan = [
             *(restarts(1) if autoreset else []),
             self._see,
@@ -142,7 +145,7 @@ class World:
         ]
         self._advance = [
             self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),
-            self.launch(contact, flat, [bank, state, self.work, self.agents]),
+            self.launch(contact, few, [bank, state, self.work, self.agents, threads]),
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
         ]
         self._graph: Any = None

@@ -65,12 +65,9 @@ def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
     return wp.vec3(x, y, yaw)
 
 
-@wp.kernel(enable_backward=False)
-def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
-    """Fill every agent's own row."""
-    b, i = wp.tid()
-    if state.end[b] != End.RUNNING:
-        return
+@wp.func
+def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, dt: float):
+    """Fill an agent's own row."""
     if state.active[b, i] == Presence.ABSENT:
         seen.kind[b, i] = AgentKind.NONE
         return
@@ -109,10 +106,8 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
     if wp.abs(goes) > 0.1:
         known = float(0.0)
         curvature = float(0.0)
-        begin = pose
         if follows:
             known = shown(roads, route, at)
-            begin = route_at(roads, route[0], route[1], known)
         elif wp.abs(speed) > 1.0:
             curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
             if wp.abs(curvature) > STRAIGHT_TURN:
@@ -122,10 +117,11 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
             q = pose
             if not follows:
                 q = turned(pose, ahead, curvature)
-            elif float(at) + ahead > known:
-                q = turned(begin, float(at) + ahead - known, 0.0)
             else:
-                q = route_at(roads, route[0], route[1], float(at) + ahead)
+                q = route_at(roads, route[0], route[1], wp.min(float(at) + ahead, known))
+                over = float(at) + ahead - known
+                if over > 0.0:
+                    q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
             seen.forecast[b, i, k] = q
             low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
             high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
@@ -135,3 +131,12 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
     seen.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])
     seen.way[b, i] = way
     seen.signal[b, i] = signal
+
+
+@wp.kernel(enable_backward=False)
+def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, threads: int, dt: float):
+    """Fill every agent's own row."""
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            look_at(bank, roads, state, seen, b, i, dt)

@@ -25,14 +25,9 @@ def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
     return wp.vec3(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), a[2] + 0.5 * wrap(b[2] - a[2]))
 
 
-@wp.kernel(enable_backward=False)
-def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
-    """Which agents each agent touches, at the end of the step and half-way through it; wakes sleeping traffic."""
-    b, i = wp.tid()
-    if b == 0 and i == 0:
-        work.count[0] = 0  # for the next step's `sight`
-    if state.end[b] != End.RUNNING:
-        return
+@wp.func
+def look_for_contacts(bank: EpisodeArrays, state: State, b: int, i: int, agents: int):
+    """Which agents an agent touches, at the end of the step and half-way through it; wakes it near the ego."""
     mask = wp.int64(0)
     if state.active[b, i] != Presence.ABSENT:
         e = state.episode[b]
@@ -59,6 +54,17 @@ def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
             if wp.length(wp.vec2(ego[0] - p[0], ego[1] - p[1])) < bank.cruise[e, i][1]:
                 state.active[b, i] = Presence.AWAKE
     state.touch[b, i] = mask
+
+
+@wp.kernel(enable_backward=False)
+def contact(bank: EpisodeArrays, state: State, work: Work, agents: int, threads: int):
+    """Contacts of all agents; wakes sleeping traffic."""
+    b, first = wp.tid()
+    if b == 0 and first == 0:
+        work.count[0] = 0  # for the next step's `sight`
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            look_for_contacts(bank, state, b, i, agents)
 
 
 @wp.func
@@ -218,15 +224,9 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     state.end[b] = end
 
 
-@wp.kernel(enable_backward=False)
-def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
-    """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
-    b, i = wp.tid()
-    go = mask[b] == 1
-    if ended_too == 1 and state.end[b] != End.RUNNING:
-        go = True
-    if not go:
-        return
+@wp.func
+def put_back(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
+    """Put an agent back to where its episode begins."""
     e = state.episode[b]
     start = bank.start[e, i]
     pose = wp.vec3(start[0], start[1], start[2])
@@ -258,6 +258,26 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     elif bank.cruise[e, i][1] > 0.0:
         awake = Presence.ASLEEP
     state.active[b, i] = awake
+
+
+@wp.kernel(enable_backward=False)
+def restart(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    mask: wp.array(dtype=wp.int32),
+    ended_too: int,
+    agents: int,
+    threads: int,
+):
+    """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
+    b, first = wp.tid()
+    go = mask[b] == 1
+    if ended_too == 1 and state.end[b] != End.RUNNING:
+        go = True
+    if go:
+        for i in range(first, agents, threads):
+            put_back(bank, roads, state, b, i)
 
 
 @wp.kernel(enable_backward=False)
