@@ -20,16 +20,16 @@ in which batches come; and what is random comes from `ssad.core.seeding` alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import F32, F64, I32, U8, Bool, Controller, Episode
+from ssad.core.types import F32, F64, I32, U8, AgentKind, Bool, Controller, Episode
 
 Scenes = Sequence[int] | npt.NDArray[np.integer[Any]]
 
@@ -160,7 +160,7 @@ class Observation:
         signal: [N, 2] state of the next signal on the route (`ssad.core.types.SignalState`) and metres to its stop
             line. Without a signal: 0 (off) and 1e6.
         done: [N] whether the episode has ended; the control is then ignored.
-        readings: What the sensors that the driver asked for show, [N, ...] each.
+        readings: What the sensors that the driver asked for show, [N, ...] each; `truth` a `Belief` of N rows.
     """
 
     scene: I32
@@ -177,7 +177,67 @@ class Observation:
     others_lane: U8
     signal: F32
     done: Bool
-    readings: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    readings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What the Autopilot plans over: K others around each ego, in the world frame, as a perceiver sees them.
+
+    Pose, speed, size and kind are enough. What is None is made up from them: an object drives on along the lane under
+    it, straight on where lanes part, at its speed; walkers, and who is on no lane that goes its way, move straight on;
+    vehicles are relied on to give way, walkers and things are not.
+
+    Attributes:
+        pose: [B, K, 3] x, y, yaw of the centre of the body.
+        speed: [B, K] m/s along its heading, negative in reverse.
+        size: [B, K, 2] length and width, m.
+        kind: [B, K] `ssad.core.types.AgentKind`; NONE: the row is not used, and its other values do not count.
+        forecast: [B, K, 8, 3] x, y, yaw where it will be in 0.5, 1, ... 4 s.
+        way: [B, K, 4] m from its centre to where it would wait (the stop line before it, or the junction) and to the
+            next junction (0 inside; 1e6: none), how it turns there (0 straight, 1 right, 2 left; 3 more with a stop or
+            yield sign), and m that its path ahead leaves the straight line along its heading.
+        line_signal: [B, K] signal of the stop line before it, -1 none.
+        stood: [B, K] s that it has been at rest while wanting to go.
+        gives_way: [B, K] whether it can be relied on to give way to those who go first.
+        signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: as it is. None: all as
+            they are.
+    """
+
+    pose: F32
+    speed: F32
+    size: F32
+    kind: I32
+    forecast: F32 | None = None
+    way: F32 | None = None
+    line_signal: I32 | None = None
+    stood: F32 | None = None
+    gives_way: Bool | None = None
+    signal: npt.NDArray[np.int8] | None = None
+
+    def keep(self, mask: Bool) -> Self:
+        """Forget objects.
+
+        Args:
+            mask: [B, K] those that stay.
+
+        Returns:
+            The same belief without the others.
+        """
+        return replace(self, kind=np.where(mask, self.kind, np.int32(AgentKind.NONE)))
+
+    def rows(self, scenes: Scenes) -> Self:
+        """Pick scenes.
+
+        Args:
+            scenes: N of them.
+
+        Returns:
+            The belief of these scenes, [N, K]; its arrays are copies.
+        """
+        given = {f.name: getattr(self, f.name) for f in fields(self)}
+        which = np.asarray(scenes, np.int64)
+        return replace(self, **{name: value[which] for name, value in given.items() if value is not None})
 
 
 @runtime_checkable
@@ -230,6 +290,48 @@ class Driver(Protocol):
             With a fourth column, the throttle drives in reverse where that is above 0.5. A walker's throttle is its
             speed as a share of 4 m/s, and its steer turns it by up to half a turn a second. A value that is not
             finite in a running episode fails the episode.
+        """
+
+
+@runtime_checkable
+class Believer(Protocol):
+    """A driver of egos whose controller is AUTOPILOT: what it believes goes into the Autopilot's planner.
+
+    It works in simulators that are a `Planner`.
+    """
+
+    def believe(self, view: Observation) -> Belief:
+        """Say what is around the egos, before each step.
+
+        Args:
+            view: What the N egos see now, one row a scene, in order. The sensor `truth` shows a `Belief` [N, K] that
+                holds everybody, with all that the Autopilot of the background traffic knows of them.
+
+        Returns:
+            The belief [N, K] of each row; K may change from step to step. Rows of ended episodes do not count.
+        """
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """A simulator whose Autopilot plans over a belief."""
+
+    def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
+        """Hand in what egos believe; it is in force until the next one, or until the scene starts again.
+
+        Args:
+            belief: [B, K]. None: the truth again.
+            scenes: [B] whose egos believe it; None: all.
+
+        Raises:
+            ConfigError: An array is of another shape, or a number that counts is not finite.
+        """
+
+    def truth(self) -> Belief:
+        """Tell the truth as a belief: handed in as it is, nobody drives otherwise.
+
+        Returns:
+            [B, A]; row i is agent i, and the row of the ego itself is not used.
         """
 
 
@@ -347,7 +449,7 @@ Selector = Callable[[WorldState], Bool]
 Policies = Callable[[str], Driver]
 """The driver of a name that an episode gives to an agent (`ssad.core.types.Actor.policy`), a new one at each call."""
 
-Sensor = Callable[[Any, I32], npt.NDArray[Any]]
+Sensor = Callable[[Any, I32], Any]
 """From a simulator and agents [N, 2] (scene, agent) to readings [N, ...]; pictures are [N, C, H, W].
 
 One that also has a method `follow`, which takes the simulator, is told of every step, also where nobody looks."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import cast
 
-from ssad.core.driving import Driver
+from ssad.core.driving import Believer, Driver
 from ssad.core.errors import ConfigError
 from ssad.core.types import Controller
 
 SYSTEMS: dict[str, str] = {
     "autopilot": "ssad.drivers.builtin:Autopilot",
     "blind": "ssad.drivers.builtin:Blind",
+    "line-of-sight": "ssad.drivers.belief:LineOfSight",
 }
 
 
@@ -41,3 +42,5 @@ class _Named:
         self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset
         self.act = system.act
+        if isinstance(system, Believer):
+            self.believe = system.believe

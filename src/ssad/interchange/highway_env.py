@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Scenes, WorldState
+from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph, Marking
 from ssad.core.types import (
@@ -356,3 +356,11 @@ class HighwayEnv:
     ) -> None:
         """Let somebody else drive agents, as `World.take`."""
         self.mirror.take(agents, controller, policy=policy, target_speed=target_speed)
+
+    def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
+        """Hand in what egos believe, as `World.believe`."""
+        self.mirror.believe(belief, scenes)
+
+    def truth(self) -> Belief:
+        """The truth as a belief, as `World.truth`."""
+        return self.mirror.truth()

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ssad.core.driving import LaneRelation, Observation, WorldState
 from ssad.core.geometry import to_local
@@ -18,9 +17,7 @@ NEAREST = 16  # rows of `others`
 SIGHT = 60.0  # m
 
 
-def observe(
-    state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, npt.NDArray[Any]] | None = None
-) -> Observation:
+def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, Any] | None = None) -> Observation:
     """What the agents [N, 2] (scene, agent) see; see `ssad.core.driving.Observation`. ended [B]."""
     scene, agent = np.asarray(agents, np.int32).T
     here = state.pose[scene, agent]

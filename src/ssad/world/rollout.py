@@ -8,7 +8,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Driver, Perturbation, Policies, Scenes, Selector, Sensor, Simulator, WorldState
+from ssad.core.driving import (
+    Believer,
+    Driver,
+    Perturbation,
+    Planner,
+    Policies,
+    Scenes,
+    Selector,
+    Sensor,
+    Simulator,
+    WorldState,
+)
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
@@ -54,6 +65,8 @@ class Loop:
         for who, driver in self.drivers:
             if isinstance(who, int) and not 0 <= who < simulator.agents:
                 raise ConfigError(f"driver {driver.name}: there is no agent {who}; scenes have {simulator.agents}")
+            if isinstance(driver, Believer):
+                _check_believer(simulator, who, driver)
             for name in getattr(driver, "sensors", ()):
                 if name not in self.sensors:
                     known = ", ".join(self.sensors)
@@ -84,7 +97,7 @@ class Loop:
         for policy, (who, driver) in enumerate(self.drivers):
             if isinstance(who, int):
                 self._seat(policy, (np.arange(simulator.agents) == who) & started[:, None])
-            if driver.controller == Controller.EXTERNAL and scenes is None:
+            if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
                 driver.reset(running)
 
     def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
@@ -112,7 +125,7 @@ class Loop:
         for policy, (who, driver) in enumerate(self.drivers):
             agents = self._fixed[policy]
             external = driver.controller == Controller.EXTERNAL
-            if agents is None or external:
+            if agents is None or external or isinstance(driver, Believer):
                 state = self.simulator.state() if state is None else state
             if agents is None and not isinstance(who, int):
                 assert state is not None
@@ -130,7 +143,22 @@ class Loop:
                 asked = True
                 given = self._act(driver, state, agents)
                 self._controls[agents[:, 0], agents[:, 1], : given.shape[1]] = given
+            if isinstance(driver, Believer) and agents is not None:
+                assert state is not None
+                self._believe(driver, state, agents)
         self.simulator.step(self._controls if asked else None)
+
+    def _believe(self, driver: Driver, state: WorldState, egos: I32) -> None:
+        """Hand what the driver believes to the planner; scenes that have ended keep what they had."""
+        assert isinstance(driver, Believer)
+        assert isinstance(self.simulator, Planner)
+        ended = self.simulator.ended() != End.RUNNING
+        readings = {name: self._read(name, driver, state, egos) for name in getattr(driver, "sensors", ())}
+        belief = driver.believe(observe(state, egos, ended, readings))
+        try:
+            self.simulator.believe(belief, ~ended)
+        except ConfigError as error:
+            raise ConfigError(f"system {driver.name}: {error}") from None
 
     def _act(self, driver: Driver, state: WorldState, agents: I32) -> F32:
         """Controls [N, 3|4] of the agents; 0 where the episode has ended."""
@@ -147,9 +175,9 @@ class Loop:
             raise ConfigError(f"system {driver.name}: act returned a control that is not finite")
         return np.where(running[:, None], given, np.float32(0.0))
 
-    def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> npt.NDArray[Any]:
+    def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> Any:
         reading = self.sensors[name](self.simulator, agents)
-        if self.perturbation is None or reading.ndim != 4:
+        if self.perturbation is None or getattr(reading, "ndim", 0) != 4:
             return reading
         episodes, assigned = self.simulator.episodes, self.simulator.assigned
         generators = []
@@ -170,6 +198,17 @@ def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
         return np.asarray(told[simulator.assigned] & free & state.active)
 
     return choose
+
+
+def _check_believer(simulator: Simulator, who: int | Selector, driver: Driver) -> None:
+    if driver.controller != Controller.AUTOPILOT:
+        raise ConfigError(
+            f"driver {driver.name} has a belief, so its controller must be AUTOPILOT, which plans over it"
+        )
+    if not isinstance(who, int) or who != 0:
+        raise ConfigError(f"driver {driver.name} plans over a belief: it can drive egos alone, agent 0")
+    if not isinstance(simulator, Planner):
+        raise ConfigError(f"driver {driver.name} plans over a belief, which this simulator takes from nobody")
 
 
 def run(loop: Loop) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ssad.core.driving import Sensor
+from ssad.core.driving import Belief, Planner, Sensor
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, I32
 from ssad.world.kernels.look import CHANNELS, OBSERVATION, look, look_as_adversary, look_from_above
@@ -71,12 +71,21 @@ def from_above(side: int = ABOVE, pixels: float = PIXELS, behind: float = BEHIND
     return read
 
 
+def truth(simulator: Any, agents: I32) -> Belief:
+    """What the Autopilot of the background traffic knows of everybody, for egos [N, 2]; see `Planner.truth`."""
+    if not isinstance(simulator, Planner):
+        raise ConfigError("this simulator's Autopilot plans over no belief: it cannot tell the truth as one")
+    return simulator.truth().rows(agents[:, 0])
+
+
 SENSORS: dict[str, Sensor] = {
     "safebench": _rows(look, OBSERVATION, slice(0, 4)),
     "frea": _rows(look, OBSERVATION, slice(4, OBSERVATION)),
     "adversary": _rows(look_as_adversary, 24, slice(0, 24)),
     "above": from_above(),
+    "truth": truth,
 }
 """`safebench` [N, 4]: lateral offset m, heading error rad, speed m/s, 1 if a vehicle is in the same lane within 15 m
 ahead. `frea` [N, 24]: 4 rows of 6, the agent, the two nearest vehicles and the route. `adversary` [N, 24]: FREA's
-adversary, the ego, the nearest other vehicle and the goal. `above`: see `from_above`."""
+adversary, the ego, the nearest other vehicle and the goal. `above`: see `from_above`. `truth`: a `Belief`,
+see `truth`."""

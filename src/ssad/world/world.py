@@ -12,21 +12,23 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from ssad.core.driving import Scenes, WorldState
+from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
+from ssad.world.belief import Lanes, check, complete, lanes_of
 from ssad.world.episode_arrays import build
-from ssad.world.kernels.data import HORIZON, Ego, Presence, State, Work, array_types
+from ssad.world.kernels.belief import see
+from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 
-VERSION = "2"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "3"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
-_STATE, _EGO = array_types(State), array_types(Ego)
+_STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
 
 
 @dataclass(frozen=True)
@@ -75,11 +77,14 @@ class World:
         self.batch = len(order)
         if self.batch * self.agents**2 >= 1 << 29:
             raise ConfigError(f"{self.batch} scenes of {self.agents} agents are too many for one world")
+        self.believed = 0  # room for objects of a belief in each scene
         self._views: dict[str, npt.NDArray[Any]] = {}
         self.arrays = State()
         shape = (self.batch, self.agents, HORIZON)
         for name, array in _STATE.items():
             setattr(self.arrays, name, wp.zeros(shape[: array.ndim], dtype=array.dtype, device=device))
+        self.seen = Seen()
+        self._lanes: dict[str, Lanes] = {}
         self.ego = Ego()
         for name, array in _EGO.items():
             setattr(self.ego, name, wp.zeros(self.batch, dtype=array.dtype, device=device))
@@ -89,28 +94,61 @@ class World:
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
-        pairs = self.batch * self.agents * max(self.agents - 1, 1)
-        self.work.pair = wp.zeros(pairs, dtype=wp.int32, device=device)
-        # one thread walks the list on CPU; on CUDA enough to fill the device
-        workers = 1 if device == "cpu" else min(pairs, 1 << 21)
+        self._settings = (dt, substeps, autoreset)
         self._assign(order.astype(np.int32))
-        bank, roads, state = self.bank.episodes, self.bank.roads, self.arrays
-        again = [bank, roads, state, self.ego, self._mask]
-        restarts = ((restart, flat), (restart_record, self.batch))
-        self._restart = [self.launch(kernel, dim, [*again, 0]) for kernel, dim in restarts]
-        self._plan = [self.launch(kernel, dim, [*again, 1]) for kernel, dim in restarts] if autoreset else []
-        self._plan += [
-            self.launch(sight, flat, [bank, roads, state, self.work, self.agents, dt]),
-            self.launch(meet, workers, [bank, roads, state, self.work, self.agents, workers, dt]),
-            self.launch(drive, flat, [bank, roads, state, self.agents, dt]),
+        self._make_room(0)
+        self.reset()
+
+    def _make_room(self, believed: int) -> None:
+        """Room for that many objects of a belief in each scene, and the launches of a step, which refer to it."""
+        rows = self.agents + believed
+        if self.batch * self.agents * rows >= 1 << 29:
+            raise ConfigError(f"{self.batch} scenes of {self.agents} agents and {believed} objects are too many")
+        old = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.believed else {}
+        self.believed = believed
+        for name, array in _SEEN.items():
+            shape = {"believes": (self.batch,), "light": (self.batch, self.bank.forced.shape[1])}.get(
+                name, (self.batch, rows, HORIZON)[: array.ndim]
+            )
+            setattr(self.seen, name, wp.zeros(shape, dtype=array.dtype, device=self.device))
+            self._views.pop(f"seen.{name}", None)
+        for name, value in old.items():
+            new = self.array(f"seen.{name}").copy()
+            new[tuple(slice(n) for n in value.shape)] = value
+            self.put(f"seen.{name}", new)
+        pairs = self.batch * (self.agents * max(self.agents - 1, 1) + believed)
+        self.work.pair = wp.zeros(pairs, dtype=wp.int32, device=self.device)
+        # one thread walks the list on CPU; on CUDA enough to fill the device
+        workers = 1 if self.device == "cpu" else min(pairs, 1 << 21)
+        dt, substeps, autoreset = self._settings
+        flat = (self.batch, self.agents)
+        bank, roads, state, seen = self.bank.episodes, self.bank.roads, self.arrays, self.seen
+
+        # threads of a scene where each has little to do: to begin one costs more than that on CPU
+        threads = 1 if self.device == "cpu" else self.agents
+        few = (self.batch, threads)
+
+        def restarts(ended_too: int) -> list[Any]:
+            return [
+                self.launch(restart, few, [bank, roads, state, self._mask, ended_too, self.agents, threads]),
+                self.launch(restart_record, self.batch, [bank, roads, state, seen, self.ego, self._mask, ended_too]),
+            ]
+
+        self._restart = restarts(0)
+        self._see = self.launch(see, few, [bank, roads, state, seen, self.agents, threads, dt])
+        self._plan = [
+            *(restarts(1) if autoreset else []),
+            self._see,
+            self.launch(sight, flat, [bank, roads, state, seen, self.work, self.agents, rows, dt]),
+            self.launch(meet, workers, [bank, roads, state, seen, self.work, self.agents, rows, workers, dt]),
+            self.launch(drive, flat, [bank, roads, state, seen, self.agents, rows, dt]),
         ]
         self._advance = [
             self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),
-            self.launch(contact, flat, [bank, state, self.work, self.agents]),
+            self.launch(contact, few, [bank, state, self.work, self.agents, threads]),
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
         ]
         self._graph: Any = None
-        self.reset()
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """A recorded launch: its arguments are packed once."""
@@ -143,7 +181,10 @@ class World:
         return self.array("episode").copy()
 
     def array(self, name: str) -> npt.NDArray[Any]:
-        """A state or ego array by name as numpy: a view on CPU, a copy on CUDA. Ego's come as `ego.<name>`."""
+        """A state or ego array by name as numpy: a view on CPU, a copy on CUDA.
+
+        Ego's come as `ego.<name>`, those of `Seen` as `seen.<name>`.
+        """
         view = self._views.get(name)
         if view is None:
             view = self._source(name).numpy()
@@ -154,7 +195,8 @@ class World:
     def _source(self, name: str) -> Any:
         if name in ("controls", "places"):
             return getattr(self, name)
-        return getattr(self.ego, name[4:]) if name.startswith("ego.") else getattr(self.arrays, name)
+        part, _, own = name.rpartition(".")
+        return getattr({"": self.arrays, "ego": self.ego, "seen": self.seen}[part], own)
 
     def put(self, name: str, value: npt.NDArray[Any]) -> None:
         """Fill the array that `array` reads."""
@@ -280,6 +322,66 @@ class World:
             raise ConfigError(f"places must be ({self.batch}, {self.agents}, 4) finite numbers: x, y, yaw, speed")
         self.put("places", given)
 
+    def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
+        """Hand in what egos believe, over which their Autopilot plans until the next one or until the scene restarts.
+
+        Args:
+            belief: [B, K]. None: the truth again.
+            scenes: [B] whose egos believe it; None: all.
+
+        Raises:
+            ConfigError: An array is of another shape, or a number that counts is not finite.
+        """
+        which = np.ones(self.batch, bool) if scenes is None else np.asarray(scenes, bool)
+        if which.shape != (self.batch,):
+            raise ConfigError(f"a mask of scenes has shape {which.shape}; expected ({self.batch},)")
+        believes = np.where(which, belief is not None, self.array("seen.believes"))
+        if belief is not None:
+            light = self.array("seen.light")
+            check(belief, self.batch, light.shape[1], which)
+            towns = [self.episodes[k].town for k in self.array("episode")]
+            rows = complete(belief, lanes_of(self.graphs, towns, self._lanes), which)
+            count = rows["kind"].shape[1]
+            if count > self.believed:
+                self._make_room(-(-count // 16) * 16)
+            for name, value in rows.items():
+                self._put_rows(name, value, which)
+            told = np.full(light.shape, -1) if belief.signal is None else np.asarray(belief.signal)
+            self.put("seen.light", np.where(which[:, None], told, light).astype(np.int32))
+        self.put("seen.believes", believes.astype(np.int32))
+
+    def _put_rows(self, name: str, value: npt.NDArray[Any], scenes: Bool) -> None:
+        """Fill the rows that hold a belief; those that are left over hold nobody."""
+        array = self.array(f"seen.{name}")
+        end = self.agents + value.shape[1]
+        array[scenes, self.agents : end] = value[scenes]
+        if name == "kind":
+            array[scenes, end:] = AgentKind.NONE
+        if self.device != "cpu":
+            self.put(f"seen.{name}", array)
+
+    def truth(self) -> Belief:
+        """The truth as a belief [B, A]: handed in as it is, nobody drives otherwise. Row i is agent i.
+
+        The row of the ego itself is not used, nor those of scenes that have ended.
+        """
+        self._see.launch()
+        seen = {name: self.array(f"seen.{name}") for name in _SEEN}
+        own = {name: a[:, : self.agents].copy() for name, a in seen.items() if name not in ("believes", "light")}
+        own["kind"][:, 0] = AgentKind.NONE
+        own["kind"][self.ended() != 0] = AgentKind.NONE
+        return Belief(
+            pose=own["pose"],
+            speed=own["speed"],
+            size=np.float32(2.0) * own["half"],
+            kind=own["kind"],
+            forecast=own["forecast"],
+            way=own["way"],
+            line_signal=own["signal"],
+            stood=own["waited"],
+            gives_way=own["gives_way"] != 0,
+        )
+
     def state(self) -> WorldState:
         """Where everybody is; see `WorldState`. On CPU most arrays are views that hold until the next step."""
         fixed = self._fixed
@@ -323,20 +425,38 @@ class World:
         """Copy of all that changes."""
         arrays = {name: self.array(name).copy() for name in _STATE}
         arrays |= {f"ego.{name}": self.array(f"ego.{name}").copy() for name in _EGO}
+        if self.array("seen.believes").any():
+            arrays |= {f"seen.{name}": self.array(f"seen.{name}").copy() for name in _SEEN}
         return Snapshot(arrays)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world; raises ConfigError if it is of another shape."""
+        believed = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
+        if believed > self.believed:
+            self._make_room(believed)
         for name, value in snapshot.arrays.items():
-            if self.array(name).shape != value.shape:
+            old = self.array(name)
+            new = value
+            if name.startswith("seen.") and value.ndim > 1 and old.shape[1] > value.shape[1]:
+                new = old.copy()  # there is more room by now
+                new[:, : value.shape[1]] = value
+                if name == "seen.kind":
+                    new[:, value.shape[1] :] = AgentKind.NONE
+            if old.shape != new.shape:
                 raise ConfigError(f"snapshot does not fit this world: {name} has shape {value.shape}")
-            self.put(name, value)
+            self.put(name, new)
+        if "seen.believes" not in snapshot.arrays:
+            self.put("seen.believes", np.zeros(self.batch, np.int32))
         self._forget()
 
     def hashes(self) -> list[str]:
         """One hash a scene over all that changes (but its place in the batch and bank)."""
         arrays = [self.array(name) for name in _STATE if name != "episode"]
         arrays += [self.array(f"ego.{name}") for name in _EGO]
+        believes = self.array("seen.believes")
+        rows = [self.array(f"seen.{name}") for name in _SEEN if name not in ("believes", "light")]
+        kind, light = self.array("seen.kind"), self.array("seen.light")
+        order = self.array("episode")
         out = []
         for b in range(self.batch):
             live = self._fixed["kind"][b] != AgentKind.NONE
@@ -345,6 +465,11 @@ class World:
                 row = a[b]
                 # empty slots that only the batch's widest scene needs do not count
                 h.update(np.ascontiguousarray(row[live] if np.ndim(row) and len(row) == len(live) else row).tobytes())
+            if believes[b]:
+                used = np.flatnonzero(kind[b, self.agents :]) + self.agents
+                for a in rows:
+                    h.update(np.ascontiguousarray(a[b, used]).tobytes())
+                h.update(light[b, : len(self.graphs[self.episodes[order[b]].town].signal_phase)].tobytes())
             out.append(h.hexdigest())
         return out
 

@@ -115,13 +115,33 @@ class State:
     stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
-    forecast: wp.array3d(dtype=wp.vec3)  # [B, A, HORIZON] x, y, yaw where it will be if it keeps its speed
-    span: wp.array2d(dtype=wp.vec4)  # [B, A] least x, y and greatest x, y of the pose and its forecast
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
     lane: wp.array2d(dtype=wp.int32)  # [B, A] lane under the centre, -1 off the road
     lateral: wp.array2d(dtype=wp.vec2)  # [B, A] m left of that lane's centre line, half width of the lane there
     touch: wp.array2d(dtype=wp.int64)  # [B, A] agents touched now, one bit an agent
+
+
+@wp.struct
+class Seen:
+    """What can be known of agents, the same for all who look: the rows from 0 to A - 1 hold the truth about each agent,
+    those from A on what the scene's ego believes to be around it. All that an Autopilot knows of others stands here.
+    """
+
+    kind: wp.array2d(dtype=wp.int32)  # [B, rows] AgentKind, NONE: nobody
+    pose: wp.array2d(dtype=wp.vec3)  # [B, rows] x, y, yaw
+    speed: wp.array2d(dtype=wp.float32)  # [B, rows] m/s along the heading
+    half: wp.array2d(dtype=wp.vec2)  # [B, rows] half length, half width
+    forecast: wp.array3d(dtype=wp.vec3)  # [B, rows, HORIZON] x, y, yaw where it will be if it keeps its speed
+    span: wp.array2d(dtype=wp.vec4)  # [B, rows] least x, y and greatest x, y of the pose and its forecast
+    # [B, rows] m from the centre to where it would wait (its stop line, or the junction) and to the next junction (FAR:
+    # none), TurnRank there, and m that its path ahead leaves the straight line along its heading
+    way: wp.array2d(dtype=wp.vec4)
+    signal: wp.array2d(dtype=wp.int32)  # [B, rows] signal of its next stop line, -1 none
+    waited: wp.array2d(dtype=wp.float32)  # [B, rows] s at rest while wanting to go
+    gives_way: wp.array2d(dtype=wp.int32)  # [B, rows] 1: can be relied on to give way
+    believes: wp.array(dtype=wp.int32)  # [B] 1: the ego plans over the rows from A on, not over the truth
+    light: wp.array2d(dtype=wp.int32)  # [B, S] SignalState that such an ego believes, -1: as it is
 
 
 @wp.struct

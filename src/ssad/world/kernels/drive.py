@@ -6,7 +6,7 @@ The Autopilot is the background traffic and the ego baseline alike; how it react
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, State, When
+from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, Seen, State, When
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, wrap
 
 
@@ -66,16 +66,21 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
 
 
 @wp.func
-def room_behind(bank: EpisodeArrays, state: State, b: int, i: int, e: int, agents: int) -> bool:
+def room_behind(seen: Seen, b: int, i: int, agents: int, rows: int) -> bool:
     """Whether nobody is within a metre and a half behind a vehicle."""
-    pose = state.pose[b, i]
-    own = bank.body[bank.model[e, i]]
+    pose = seen.pose[b, i]
+    own = seen.half[b, i]
     back = wp.vec3(pose[0] - 1.5 * wp.cos(pose[2]), pose[1] - 1.5 * wp.sin(pose[2]), pose[2])
     free = int(1)
-    for j in range(agents):
-        if j != i and state.active[b, j] != Presence.ABSENT:
-            q = state.pose[b, j]
-            other = bank.body[bank.model[e, j]]
+    from_row = int(0)
+    to_row = agents
+    if i == 0 and seen.believes[b] == 1:
+        from_row = agents
+        to_row = rows
+    for j in range(from_row, to_row):
+        if j != i and seen.kind[b, j] != AgentKind.NONE:
+            q = seen.pose[b, j]
+            other = seen.half[b, j]
             near = wp.length(wp.vec2(q[0] - back[0], q[1] - back[1])) < own[0] + other[0] + 3.0
             ahead = (q[0] - pose[0]) * wp.cos(pose[2]) + (q[1] - pose[1]) * wp.sin(pose[2])
             if near and ahead < 0.5 * own[0] and boxes_touch(back, own[0] + 0.3, own[1] + 0.3, q, other[0], other[1]):
@@ -84,7 +89,7 @@ def room_behind(bank: EpisodeArrays, state: State, b: int, i: int, e: int, agent
 
 
 @wp.kernel(enable_backward=False)
-def drive(bank: EpisodeArrays, roads: Roads, state: State, agents: int, dt: float):
+def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, rows: int, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, i = wp.tid()
     if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
@@ -150,7 +155,7 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, agents: int, dt: floa
             brake = 1.0
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
         if who == Controller.AUTOPILOT and state.stalled[b, i] == 1 and v < 0.3:
-            if room_behind(bank, state, b, i, e, agents):
+            if room_behind(seen, b, i, agents, rows):
                 throttle = 0.0
                 if v > -1.0:
                     throttle = 0.4

@@ -1,10 +1,10 @@
-"""One step of motion: kinematic bicycle with actuator limits, walkers, progress along routes, forecasts."""
+"""One step of motion: kinematic bicycle with actuator limits, walkers, progress along routes."""
 
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State
-from ssad.world.kernels.shared import lane_under, on_track, route_at, sign_line, track_at, wrap
+from ssad.world.kernels.data import End, EpisodeArrays, Presence, Roads, State
+from ssad.world.kernels.shared import lane_under, on_track, sign_line, track_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -12,7 +12,6 @@ GRIP_LIMIT = wp.constant(GRIP)
 STEER_SECONDS = wp.constant(STEER_TIME)
 REVERSE_LIMIT = wp.constant(REVERSE_SPEED)
 STOPPED = wp.constant(0.3)  # m/s: slower, a vehicle has stopped
-CLEARING = wp.constant(3.0)  # m/s
 BEFORE_LINE = wp.constant(4.0)  # m from the front to the line within which a stop at a stop sign counts
 WALKER_TURN = wp.constant(WALKER_RATE)
 
@@ -177,28 +176,3 @@ def move(
     under = lane_under(roads, bank.town[e], pose[0], pose[1])
     state.lane[b, i] = int(under[0])
     state.lateral[b, i] = wp.vec2(under[1], under[2])
-
-    follows = route[1] > 1
-    if follows:
-        p = roads.path[route[0] + at]
-        off = wp.vec2(pose[0] - p[0], pose[1] - p[1])
-        if wp.length(off) > 4.0:
-            follows = False  # far from its route: nothing says where it goes
-    low = wp.vec2(pose[0], pose[1])
-    high = low
-    goes = speed
-    if follows and who == Controller.AUTOPILOT and roads.rule[route[0] + at][2] < bank.body[m][0] - 1.0:
-        goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
-    if wp.abs(goes) > 0.1:
-        for k in range(HORIZON):
-            ahead = goes * STRIDE * float(k + 1)
-            q = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
-            if follows:
-                q = route_at(roads, route[0], route[1], float(at) + ahead)
-            state.forecast[b, i, k] = q
-            low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
-            high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
-    else:
-        for k in range(HORIZON):
-            state.forecast[b, i, k] = pose
-    state.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])

@@ -5,14 +5,13 @@ import warp as wp
 from ssad.core.types import AgentKind, Contact, Controller, SignalState
 from ssad.world.kernels.data import (
     FAR,
-    HORIZON,
-    STRIDE,
     ContactPolicy,
     Ego,
     End,
     EpisodeArrays,
     Presence,
     Roads,
+    Seen,
     State,
     TurnRank,
     Work,
@@ -26,14 +25,9 @@ def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
     return wp.vec3(0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), a[2] + 0.5 * wrap(b[2] - a[2]))
 
 
-@wp.kernel(enable_backward=False)
-def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
-    """Which agents each agent touches, at the end of the step and half-way through it; wakes sleeping traffic."""
-    b, i = wp.tid()
-    if b == 0 and i == 0:
-        work.count[0] = 0  # for the next step's `sight`
-    if state.end[b] != End.RUNNING:
-        return
+@wp.func
+def look_for_contacts(bank: EpisodeArrays, state: State, b: int, i: int, agents: int):
+    """Which agents an agent touches, at the end of the step and half-way through it; wakes it near the ego."""
     mask = wp.int64(0)
     if state.active[b, i] != Presence.ABSENT:
         e = state.episode[b]
@@ -60,6 +54,17 @@ def contact(bank: EpisodeArrays, state: State, work: Work, agents: int):
             if wp.length(wp.vec2(ego[0] - p[0], ego[1] - p[1])) < bank.cruise[e, i][1]:
                 state.active[b, i] = Presence.AWAKE
     state.touch[b, i] = mask
+
+
+@wp.kernel(enable_backward=False)
+def contact(bank: EpisodeArrays, state: State, work: Work, agents: int, threads: int):
+    """Contacts of all agents; wakes sleeping traffic."""
+    b, first = wp.tid()
+    if b == 0 and first == 0:
+        work.count[0] = 0  # for the next step's `sight`
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            look_for_contacts(bank, state, b, i, agents)
 
 
 @wp.func
@@ -219,15 +224,9 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     state.end[b] = end
 
 
-@wp.kernel(enable_backward=False)
-def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int):
-    """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
-    b, i = wp.tid()
-    go = mask[b] == 1
-    if ended_too == 1 and state.end[b] != End.RUNNING:
-        go = True
-    if not go:
-        return
+@wp.func
+def put_back(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
+    """Put an agent back to where its episode begins."""
     e = state.episode[b]
     start = bank.start[e, i]
     pose = wp.vec3(start[0], start[1], start[2])
@@ -259,19 +258,37 @@ def restart(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.
     elif bank.cruise[e, i][1] > 0.0:
         awake = Presence.ASLEEP
     state.active[b, i] = awake
-    far = start[3] * STRIDE * float(HORIZON)
-    tip = wp.vec2(pose[0] + far * wp.cos(pose[2]), pose[1] + far * wp.sin(pose[2]))
-    state.span[b, i] = wp.vec4(
-        wp.min(pose[0], tip[0]), wp.min(pose[1], tip[1]), wp.max(pose[0], tip[0]), wp.max(pose[1], tip[1])
-    )
-    for k in range(HORIZON):
-        ahead = start[3] * STRIDE * float(k + 1)
-        state.forecast[b, i, k] = wp.vec3(pose[0] + ahead * wp.cos(pose[2]), pose[1] + ahead * wp.sin(pose[2]), pose[2])
+
+
+@wp.kernel(enable_backward=False)
+def restart(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    mask: wp.array(dtype=wp.int32),
+    ended_too: int,
+    agents: int,
+    threads: int,
+):
+    """Put scenes back to the start of their episode: where mask is 1, or (ended_too) where the episode has ended."""
+    b, first = wp.tid()
+    go = mask[b] == 1
+    if ended_too == 1 and state.end[b] != End.RUNNING:
+        go = True
+    if go:
+        for i in range(first, agents, threads):
+            put_back(bank, roads, state, b, i)
 
 
 @wp.kernel(enable_backward=False)
 def restart_record(
-    bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, mask: wp.array(dtype=wp.int32), ended_too: int
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    ego: Ego,
+    mask: wp.array(dtype=wp.int32),
+    ended_too: int,
 ):
     """The scene's own part of `restart`; runs after it, since it clears why the episode ended."""
     b = wp.tid()
@@ -283,6 +300,7 @@ def restart_record(
     mask[b] = 0
     state.step[b] = 0
     state.end[b] = End.RUNNING
+    seen.believes[b] = 0
     ego.contact[b] = 0
     ego.contact_agent[b] = -1
     ego.touching[b] = wp.int64(0)

@@ -8,13 +8,25 @@ predicted conflict that it must yield to (here).
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller, SignalState
-from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, State, TurnRank, Work
+from ssad.world.kernels.belief import light
+from ssad.world.kernels.data import (
+    FAR,
+    HORIZON,
+    STRIDE,
+    End,
+    EpisodeArrays,
+    Presence,
+    Roads,
+    Seen,
+    State,
+    TurnRank,
+    Work,
+)
 from ssad.world.kernels.shared import (
     IDM_ACCEL,
     boxes_touch,
     route_frame,
     sign_line,
-    signal_state,
 )
 
 IDM_BRAKE = wp.constant(3.0)
@@ -39,24 +51,24 @@ def idm_gap(v: float, lead: float, gap: float) -> float:
 @wp.func
 def lead_gap(
     roads: Roads,
-    state: State,
+    seen: Seen,
     b: int,
     j: int,
     route: wp.vec2i,
     u0: float,
     lon: float,
     own: wp.vec4,
-    other: wp.vec4,
+    other: wp.vec2,
     heading: wp.vec2,
     margin: float,
     bend: float,
 ) -> wp.vec2:
-    """Where agent j stands on a route that begins `u0` metres along: (gap bumper to bumper m or FAR, speed along it).
+    """Where the agent of row j stands on a route that begins `u0` metres along: (gap of bumpers or FAR, its speed).
 
     lon: metres j is ahead in the follower's frame, the first guess of its place; heading: j's unit heading; bend:
     metres that the route ahead leaves its straight line.
     """
-    q = state.pose[b, j]
+    q = seen.pose[b, j]
     u = wp.clamp(lon, 0.0, SIGHT)
     lateral = float(0.0)
     rest = float(0.0)
@@ -80,7 +92,7 @@ def lead_gap(
     sweep = wp.min(0.5 * wp.abs(roads.path[spot][3]) * own[0] * own[0], 1.0)
     # `rest` stays large where j is beside or beyond the ends of the stretch: a projection says nothing there
     if u > 0.0 and u < SIGHT and wp.abs(rest) < 1.0 and wp.abs(lateral) < own[1] + across + margin + sweep:
-        result = wp.vec2(u - own[0] - along, state.speed[b, j] * c)
+        result = wp.vec2(u - own[0] - along, seen.speed[b, j] * c)
     if result[0] >= FAR and bend > 1.5 and lon < 20.0:
         # in a tight bend a projection need not converge, and a long body leaves its corridor: drive it along and see
         # 0.2 m of room to either side, checked every metre
@@ -89,7 +101,7 @@ def lead_gap(
             at = route_frame(roads, route[0], route[1], u0 + u)
             body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
             if result[0] >= FAR and boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
-                result = wp.vec2(u - 1.0, state.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
+                result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
     return result
 
 
@@ -104,61 +116,63 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
 
 @wp.func
-def inside(roads: Roads, first: int, half: float) -> bool:
-    """Whether the front of a body at a route point has entered the junction."""
-    return roads.rule[first][2] < half - 1.0
+def inside(seen: Seen, b: int, j: int) -> bool:
+    """Whether somebody's front has entered the junction."""
+    return seen.way[b, j][1] < seen.half[b, j][0] - 1.0
 
 
 @wp.func
-def waits(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int, dt: float) -> bool:
+def waits(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, i: int, j: int, e: int, dt: float
+) -> bool:
     """Whether i, who is still before the junction, lets j go first, who is inside.
 
-    Not if it can no longer stop with 4 m/s^2, nor on green for someone who turns left from the other side.
+    Not if it can no longer stop with 4 m/s^2, nor on green (as `me` sees it) for someone who turns left from the other
+    side.
     """
-    first = bank.route[e, i][0] + state.progress[b, i]
-    rule = roads.rule[first]
-    v = state.speed[b, i]
-    line = line_ahead(roads, first, 0.0, bank.body[bank.model[e, i]][0])
+    way = seen.way[b, i]
+    v = seen.speed[b, i]
+    line = way[0] - seen.half[b, i][0]
     lets = v * v < 8.0 * (wp.max(line, 0.0) + 1.5)
-    index = roads.path_signal[first]
-    turns = roads.rule[bank.route[e, j][0] + state.progress[b, j]][3] > rule[3]
-    if turns and index >= 0 and wp.cos(state.pose[b, i][2] - state.pose[b, j][2]) < -0.5:
-        if signal_state(bank, roads, e, index, float(state.step[b]) * dt) == SignalState.GREEN:
+    index = seen.signal[b, i]
+    turns = seen.way[b, j][2] > way[2]
+    if turns and index >= 0 and wp.cos(seen.pose[b, i][2] - seen.pose[b, j][2]) < -0.5:
+        if light(bank, roads, state, seen, b, me, e, index, dt) == SignalState.GREEN:
             lets = False
     return lets
 
 
 @wp.func
-def has_priority(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, j: int, e: int, dt: float) -> bool:
-    """Whether i goes before j where their paths cross; of each two exactly one goes first.
+def has_priority(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, j: int, e: int, dt: float
+) -> bool:
+    """Whether i goes before j (rows of `seen`) where their paths cross; of each two exactly one goes first.
 
     Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
     test. Scripted actors and walkers are not. Whoever is inside the junction goes first (see `waits`), then whoever has
     no stop or yield sign, straight before right before left, then whoever is nearer to it, then the lower number.
     """
-    if j != 0 and (state.controller[b, j] != Controller.AUTOPILOT or state.active[b, j] != Presence.AWAKE):
+    if seen.gives_way[b, j] == 0:
         return False
-    ri = bank.route[e, i]
-    rj = bank.route[e, j]
-    a = roads.rule[ri[0] + state.progress[b, i]]
-    c = roads.rule[rj[0] + state.progress[b, j]]
-    inside_i = inside(roads, ri[0] + state.progress[b, i], bank.body[bank.model[e, i]][0])
-    inside_j = inside(roads, rj[0] + state.progress[b, j], bank.body[bank.model[e, j]][0])
-    if inside_i and not inside_j and waits(bank, roads, state, b, j, i, e, dt):
+    a = seen.way[b, i]
+    c = seen.way[b, j]
+    inside_i = inside(seen, b, i)
+    inside_j = inside(seen, b, j)
+    if inside_i and not inside_j and waits(bank, roads, state, seen, b, i, j, i, e, dt):
         return True
-    if inside_j and not inside_i and waits(bank, roads, state, b, i, j, e, dt):
+    if inside_j and not inside_i and waits(bank, roads, state, seen, b, i, i, j, e, dt):
         return False
-    if a[3] != c[3]:
-        return a[3] < c[3]
-    if wp.abs(a[2] - c[2]) > 1.0:
+    if a[2] != c[2]:
         return a[2] < c[2]
+    if wp.abs(a[1] - c[1]) > 1.0:
+        return a[1] < c[1]
     return i < j
 
 
 @wp.func
 def conflict_gap(
     roads: Roads,
-    state: State,
+    seen: Seen,
     b: int,
     j: int,
     route: wp.vec2i,
@@ -166,7 +180,7 @@ def conflict_gap(
     v: float,
     target: float,
     own: wp.vec4,
-    other: wp.vec4,
+    other: wp.vec2,
     lat_margin: float,
 ) -> float:
     """Metres from i's front bumper to the near edge of its predicted conflict with j within 4 s, or FAR.
@@ -185,9 +199,9 @@ def conflict_gap(
         w = after
         at = route_frame(roads, route[0], route[1], u0 + u)
         for n in range(k - 1, wp.min(k + 2, HORIZON)):
-            q = state.pose[b, j]
+            q = seen.pose[b, j]
             if n >= 0:
-                q = state.forecast[b, j, n]
+                q = seen.forecast[b, j, n]
             rx = q[0] - at[0]
             ry = q[1] - at[1]
             if rx * rx + ry * ry < reach2:
@@ -209,7 +223,7 @@ def conflict_gap(
 
 @wp.func
 def apart(
-    state: State,
+    seen: Seen,
     b: int,
     j: int,
     pose: wp.vec3,
@@ -224,7 +238,7 @@ def apart(
 
     lon, lat: where j is now; ahead: metres I can go; off: what bent paths and the bodies' reach add.
     """
-    q = state.forecast[b, j, HORIZON - 1]
+    q = seen.forecast[b, j, HORIZON - 1]
     dx = q[0] - pose[0]
     dy = q[1] - pose[1]
     lon1 = dx * c + dy * s
@@ -234,7 +248,7 @@ def apart(
 
 
 @wp.kernel(enable_backward=False)
-def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, dt: float):
+def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Work, agents: int, rows: int, dt: float):
     """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
 
     The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
@@ -263,7 +277,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     index = roads.path_signal[first]
     lit = int(SignalState.OFF)
     if index >= 0 and rule[1] - part < SIGHT + 40.0:
-        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+        lit = light(bank, roads, state, seen, b, i, e, index, dt)
     if lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         ahead = roads.ahead[first][0] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
@@ -302,12 +316,17 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
     pad = own[0] + LONGEST + 4.0
     low = wp.vec2(low[0] - pad, low[1] - pad)
     high = wp.vec2(high[0] + pad, high[1] + pad)
-    for j in range(agents):
-        if j != i and state.active[b, j] != Presence.ABSENT:
-            box = state.span[b, j]
+    from_row = int(0)
+    to_row = agents
+    if i == 0 and seen.believes[b] == 1:
+        from_row = agents
+        to_row = rows
+    for j in range(from_row, to_row):
+        if j != i and seen.kind[b, j] != AgentKind.NONE:
+            box = seen.span[b, j]
             if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
-                other = bank.body[bank.model[e, j]]
-                q = state.pose[b, j]
+                other = seen.half[b, j]
+                q = seen.pose[b, j]
                 dx = q[0] - pose[0]
                 dy = q[1] - pose[1]
                 lon = dx * c + dy * s
@@ -320,23 +339,31 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: i
                 near = q[0] < high[0] and q[0] > low[0] and q[1] < high[1] and q[1] > low[1]
                 if near and lon > -bend - own[0] and wp.abs(lat) < bend + wide:
                     flags = 1
-                if wp.abs(state.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5 or wp.abs(lat) > wide):
+                if wp.abs(seen.speed[b, j]) > 0.2 and (lon >= 0.0 or facing <= 0.5 or wp.abs(lat) > wide):
                     # who is behind me in my lane and goes my way keeps its distance itself
-                    bend_j = float(0.0)
+                    bend_j = seen.way[b, j][3]
                     reach = wide
-                    if bank.route[e, j][1] > 1:
-                        bend_j = roads.bend[bank.route[e, j][0] + state.progress[b, j]] + 0.5
                     if bend_j > 1.0 or bend > 2.0:
                         reach = own[0] + other[0] + 2.0
-                    if not apart(state, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
+                    if not apart(seen, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
                         flags = flags + 2
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
-                    work.pair[slot] = ((b * agents + i) * agents + j) * 4 + flags
+                    work.pair[slot] = ((b * agents + i) * rows + j) * 4 + flags
 
 
 @wp.kernel(enable_backward=False)
-def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, workers: int, dt: float):
+def meet(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    work: Work,
+    agents: int,
+    rows: int,
+    workers: int,
+    dt: float,
+):
     """Reactions of Autopilots to those whom `sight` listed: following, stopping for, and giving way."""
     tid = wp.tid()
     total = work.count[0]
@@ -345,18 +372,18 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
         code = work.pair[slot]
         flags = code % 4
         code = code / 4
-        j = code % agents
-        code = code / agents
+        j = code % rows
+        code = code / rows
         i = code % agents
         b = code / agents
         e = state.episode[b]
         route = bank.route[e, i]
         pose = state.pose[b, i]
-        q = state.pose[b, j]
+        q = seen.pose[b, j]
         v = wp.max(state.speed[b, i], 0.0)
         own = bank.body[bank.model[e, i]]
-        other = bank.body[bank.model[e, j]]
-        walks = bank.kind[bank.model[e, j]] == AgentKind.WALKER
+        other = seen.half[b, j]
+        walks = seen.kind[b, j] == AgentKind.WALKER
         aim = state.aim[b, i]
         react = float(0.0)
         leads = int(0)
@@ -368,23 +395,18 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
             s = wp.sin(pose[2])
             heading = wp.vec2(wp.cos(q[2]), wp.sin(q[2]))
             lon = (q[0] - pose[0]) * c + (q[1] - pose[1]) * s
-            stands = wp.abs(state.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
+            stands = wp.abs(seen.speed[b, j]) < STANDS and heading[0] * c + heading[1] * s < 0.7
             margin = 0.3
             if walks:
                 margin = 0.6
             bend = roads.bend[route[0] + state.progress[b, i]]
-            lead = lead_gap(roads, state, b, j, route, aim[0], lon, own, other, heading, margin, bend)
+            lead = lead_gap(roads, seen, b, j, route, aim[0], lon, own, other, heading, margin, bend)
             if lead[0] < FAR:
                 react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
-                if (
-                    stands
-                    and lead[0] < NOSE_TO_NOSE
-                    and state.waited[b, i] > BACK_OUT
-                    and state.waited[b, j] > BACK_OUT
-                ):
-                    if not has_priority(bank, roads, state, b, i, j, e, dt):
+                if stands and lead[0] < NOSE_TO_NOSE and state.waited[b, i] > BACK_OUT and seen.waited[b, j] > BACK_OUT:
+                    if not has_priority(bank, roads, state, seen, b, i, j, e, dt):
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 room = roads.ahead[first][2] - part - own[0] + 2.0 * own[0] + 2.0
@@ -394,23 +416,21 @@ def meet(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: in
             margin = 0.4
             if walks:
                 margin = 1.0
-            gap = conflict_gap(roads, state, b, j, route, aim[0], v, aim[1], own, other, margin)
+            gap = conflict_gap(roads, seen, b, j, route, aim[0], v, aim[1], own, other, margin)
             if gap < FAR:
-                goes_first = has_priority(bank, roads, state, b, i, j, e, dt)
+                goes_first = has_priority(bank, roads, state, seen, b, i, j, e, dt)
                 if not goes_first and line > -1.0 and not walks and v * v < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
                     lit = int(SignalState.OFF)
                     if index >= 0 and roads.rule[first][1] < roads.rule[first][2] + 1.0:
-                        lit = signal_state(bank, roads, e, index, float(state.step[b]) * dt)
-                    entered = False
-                    if bank.route[e, j][1] > 1:
-                        entered = inside(roads, bank.route[e, j][0] + state.progress[b, j], other[0])
+                        lit = light(bank, roads, state, seen, b, i, e, index, dt)
+                    entered = inside(seen, b, j)
                     crosses = wp.abs(wp.cos(q[2] - pose[2])) < 0.7
                     if lit == SignalState.OFF or lit == SignalState.RED or entered or crosses:
                         gap = wp.min(gap, wp.max(line, 0.0) + 1.0)
                 # whoever stands and has to wait is not expected to go after all
-                if not goes_first or (gap < 0.5 * v and wp.abs(state.speed[b, j]) > STANDS):
+                if not goes_first or (gap < 0.5 * v and wp.abs(seen.speed[b, j]) > STANDS):
                     react = wp.min(react, idm_gap(v, 0.0, gap))
         if react < 0.0:
             wp.atomic_min(state.react, b, i, react)

@@ -1,0 +1,120 @@
+"""What the Autopilot loses when it knows less: collisions and route completion over poorer and poorer beliefs.
+
+`python benchmarks/belief.py` drives the 32 pre-crash and the 150 natural scenarios; `--scenarios safebench,frea` the
+imported ones instead; `--repetitions 5` draws five episodes of each. Intervals count episodes of a scenario as one
+cluster. `--json FILE` writes the figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ssad.core.driving import Belief, Driver, Observation
+from ssad.core.seeding import seed32
+from ssad.core.traces import trace_hash
+from ssad.core.types import Episode, EpisodeTrace
+from ssad.drivers.belief import DegradedBelief, LineOfSight
+from ssad.drivers.builtin import Autopilot, Blind
+from ssad.metrics.intervals import Clusters, bounded_limits
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.rollout import rollout
+from ssad.world.world import World
+
+
+class TruthHandedIn(Autopilot):
+    """The Autopilot over the truth, which it gets through the door of beliefs."""
+
+    sensors = ("truth",)
+
+    def believe(self, view: Observation) -> Belief:
+        """The truth as it is."""
+        belief: Belief = view.readings["truth"]
+        return belief
+
+
+class SeenOnly(LineOfSight):
+    """Line of sight without what only the world knows: paths, turns and who gives way are made up from the lanes."""
+
+    def believe(self, view: Observation) -> Belief:
+        """Pose, speed, size and kind of what is in sight."""
+        belief = super().believe(view)
+        return replace(belief, forecast=None, way=None, line_signal=None, stood=None, gives_way=None)
+
+
+SYSTEMS: dict[str, Driver] = {
+    "autopilot": Autopilot(),
+    "truth handed in": TruthHandedIn(),
+    "line-of-sight": LineOfSight(),
+    "line of sight, pose and speed alone": SeenOnly(),
+    "delay 0.5 s": DegradedBelief(0.0, delay=5),
+    "position noise 0.5 m": DegradedBelief(0.0, noise=0.5),
+    "30 % missed, 0.5 s at a time": DegradedBelief(0.3, burst=5.0),
+    "30 % missed, 2 s at a time": DegradedBelief(0.3, burst=20.0),
+    "all missed": DegradedBelief(1.0),
+    "blind": Blind(),
+}
+
+
+def make_episodes(name: str, repetitions: int) -> tuple[list[Episode], dict[str, object]]:
+    """Episodes of a set, scenario by scenario, and the towns."""
+    scenarios = load_scenarios(name)
+    graphs = {s.town: load_town(s.town) for s in scenarios}
+    seeds = [(s, seed32("belief", s.name, k)) for s in scenarios for k in range(repetitions)]
+    return [build_episode(s, graphs[s.town], seed=seed) for s, seed in seeds], graphs
+
+
+def share(values: np.ndarray, repetitions: int) -> dict[str, float]:
+    """Mean of values in [0, 1] of all episodes, and its 95 % interval."""
+    sums = values.reshape(-1, repetitions).sum(1)
+    clusters = Clusters(np.full(len(sums), float(repetitions)), np.zeros(len(sums), np.intp))
+    whole = bool(np.isin(values, (0.0, 1.0)).all())
+    found = bounded_limits(sums, clusters, cap=2.0 * len(values) if whole else float("inf"))
+    return {"mean": float(found.mean), "low": float(found.low), "high": float(found.high)}
+
+
+def row(traces: list[EpisodeTrace], repetitions: int) -> dict[str, dict[str, float]]:
+    """Collision rate and route completion."""
+    hit = np.array([trace.end == "collision" for trace in traces], np.float64)
+    complete = np.array([float(trace.route_complete[-1]) for trace in traces]) / 100.0
+    return {"CR": share(hit, repetitions), "RC": share(complete, repetitions)}
+
+
+def text(value: dict[str, float]) -> str:
+    """A mean with its interval."""
+    return f"{value['mean']:.3f} [{value['low']:.3f}, {value['high']:.3f}]"
+
+
+def main() -> None:
+    """Drive, print, and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenarios", default="precrash,natural", help="sets, with commas")
+    parser.add_argument("--repetitions", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    figures: dict[str, dict[str, object]] = {}
+    for name in given.scenarios.split(","):
+        episodes, graphs = make_episodes(name, given.repetitions)
+        figures[name] = {"episodes": len(episodes)}
+        print(f"\n{name}: {len(episodes)} episodes")
+        print("| Autopilot over | CR | RC | episodes driven otherwise |\n|---|---|---|---|")
+        first: list[str] = []
+        for system, driver in SYSTEMS.items():
+            traces = rollout(World(episodes, graphs), driver)
+            told = [trace_hash(trace) for trace in traces]
+            first = first or told
+            other = sum(a != b for a, b in zip(first, told, strict=True))
+            found = row(traces, given.repetitions)
+            figures[name][system] = found | {"other": other}
+            print(f"| {system} | {text(found['CR'])} | {text(found['RC'])} | {other} |", flush=True)
+    if given.json:
+        given.json.write_text(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""What can be known of everybody at the start of a step: the rows of `Seen` that hold the truth.
+
+Nobody knows where anybody wants to go, the ego included. Who keeps to its route shows by its turn signal how it leaves
+the next junction, and from there its lane leads it to the junction after; beyond, it is expected to go straight on.
+Walkers and who has left its route have only their pose, speed and rate of turn.
+"""
+
+import warp as wp
+
+from ssad.core.types import AgentKind, Controller
+from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, Seen, State, TurnRank
+from ssad.world.kernels.shared import route_at, signal_state, wrap
+
+KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
+ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
+CLEARING = wp.constant(3.0)  # m/s
+STRAIGHT_TURN = wp.constant(1.0e-3)  # 1/m, or rad: less is straight on
+LARGEST_TURN = wp.constant(1.57)  # rad that one who has left its route is expected to turn
+
+
+@wp.func
+def light(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
+) -> int:
+    """State of a signal as i sees it."""
+    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] >= 0:
+        return seen.light[b, index]
+    return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
+
+
+@wp.func
+def keeps_route(roads: Roads, route: wp.vec2i, at: int, pose: wp.vec3) -> bool:
+    """Whether somebody is where its route is, and goes its way."""
+    p = roads.path[route[0] + at]
+    dx = pose[0] - p[0]
+    dy = pose[1] - p[1]
+    return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - p[2])) < ALONG
+
+
+@wp.func
+def shown(roads: Roads, route: wp.vec2i, at: int) -> float:
+    """Place along a route (m) up to which one who keeps to it shows where it goes: the second junction ahead."""
+    last = route[1] - 1
+    end = float(at) + roads.ahead[route[0] + at][2]
+    if end < float(last):
+        end = end + roads.rule[route[0] + int(end)][2]
+    return wp.min(end, float(last))
+
+
+@wp.func
+def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
+    """Pose after `distance` metres at a constant curvature, which ends after a quarter of a turn."""
+    angle = wp.clamp(curvature * distance, -LARGEST_TURN, LARGEST_TURN)
+    arc = distance
+    rest = float(0.0)
+    if wp.abs(curvature * distance) > LARGEST_TURN:
+        arc = angle / curvature
+        rest = distance - arc
+    chord = arc
+    if wp.abs(angle) > STRAIGHT_TURN:
+        chord = 2.0 * arc / angle * wp.sin(0.5 * angle)
+    yaw = pose[2] + angle
+    x = pose[0] + chord * wp.cos(pose[2] + 0.5 * angle) + rest * wp.cos(yaw)
+    y = pose[1] + chord * wp.sin(pose[2] + 0.5 * angle) + rest * wp.sin(yaw)
+    return wp.vec3(x, y, yaw)
+
+
+@wp.func
+def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, dt: float):
+    """Fill an agent's own row."""
+    if state.active[b, i] == Presence.ABSENT:
+        seen.kind[b, i] = AgentKind.NONE
+        return
+    e = state.episode[b]
+    m = bank.model[e, i]
+    body = bank.body[m]
+    seen.kind[b, i] = bank.kind[m]
+    pose = state.pose[b, i]
+    speed = state.speed[b, i]
+    seen.pose[b, i] = pose
+    seen.speed[b, i] = speed
+    seen.half[b, i] = wp.vec2(body[0], body[1])
+    # traffic does not know who is under test: the ego is relied on like anybody, whoever drives it
+    relied = int(0)
+    if i == 0 or (state.controller[b, i] == Controller.AUTOPILOT and state.active[b, i] == Presence.AWAKE):
+        relied = 1
+    seen.gives_way[b, i] = relied
+    seen.waited[b, i] = state.waited[b, i]
+    way = wp.vec4(FAR, FAR, float(TurnRank.STRAIGHT), 0.0)
+    signal = int(-1)
+    route = bank.route[e, i]
+    at = state.progress[b, i]
+    follows = route[1] > 1 and bank.kind[m] != AgentKind.WALKER
+    if follows:
+        follows = keeps_route(roads, route, at, pose)
+    if follows:
+        point = route[0] + at
+        rule = roads.rule[point]
+        way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[point] + 0.5)
+        signal = roads.path_signal[point]
+    goes = speed
+    if follows and relied == 1 and way[1] < body[0] - 1.0:
+        goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
+    low = wp.vec2(pose[0], pose[1])
+    high = low
+    if wp.abs(goes) > 0.1:
+        known = float(0.0)
+        curvature = float(0.0)
+        if follows:
+            known = shown(roads, route, at)
+        elif wp.abs(speed) > 1.0:
+            curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
+            if wp.abs(curvature) > STRAIGHT_TURN:
+                way[3] = 0.36 * wp.abs(goes) * STRIDE * float(HORIZON)  # no quarter of a turn leaves its chord further
+        for k in range(HORIZON):
+            ahead = goes * STRIDE * float(k + 1)
+            q = pose
+            if not follows:
+                q = turned(pose, ahead, curvature)
+            else:
+                q = route_at(roads, route[0], route[1], wp.min(float(at) + ahead, known))
+                over = float(at) + ahead - known
+                if over > 0.0:
+                    q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
+            seen.forecast[b, i, k] = q
+            low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
+            high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
+    else:
+        for k in range(HORIZON):
+            seen.forecast[b, i, k] = pose
+    seen.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])
+    seen.way[b, i] = way
+    seen.signal[b, i] = signal
+
+
+@wp.kernel(enable_backward=False)
+def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, threads: int, dt: float):
+    """Fill every agent's own row."""
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            look_at(bank, roads, state, seen, b, i, dt)
