@@ -9,7 +9,8 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, Seen, State, TurnRank
-from ssad.world.kernels.shared import route_at, signal_state, wrap
+from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
+from ssad.world.kernels.shared import signal_state, wrap
 
 KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
 ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
@@ -29,9 +30,9 @@ def light(
 
 
 @wp.func
-def keeps_route(roads: Roads, route: wp.vec2i, at: int, pose: wp.vec3) -> bool:
+def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp.vec3) -> bool:
     """Whether somebody is where its route is, and goes its way."""
-    p = roads.path[route[0] + at]
+    p = way_at(roads, route[0], route[1], shift, float(at))
     dx = pose[0] - p[0]
     dy = pose[1] - p[1]
     return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - p[2])) < ALONG
@@ -93,14 +94,21 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
     signal = int(-1)
     route = bank.route[e, i]
     at = state.progress[b, i]
+    shift = state.shift[b, i]
+    change = wp.vec2i(0, 0)
     follows = route[1] > 1 and bank.kind[m] != AgentKind.WALKER
     if follows:
-        follows = keeps_route(roads, route, at, pose)
+        follows = keeps_route(roads, route, shift, at, pose)
     if follows:
         point = route[0] + at
         rule = roads.rule[point]
         way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[point] + 0.5)
         signal = roads.path_signal[point]
+        if changes(shift) and state.controller[b, i] == Controller.AUTOPILOT:
+            change[0] = indicates(shift, state.aim[b, i][0])
+            if on_oncoming_lane(roads, point, shift):
+                change[1] = 1
+            way[3] = way[3] + ASIDE
     goes = speed
     if follows and relied == 1 and way[1] < body[0] - 1.0:
         goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
@@ -112,7 +120,7 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
         begin = pose
         if follows:
             known = shown(roads, route, at)
-            begin = route_at(roads, route[0], route[1], known)
+            begin = way_at(roads, route[0], route[1], shift, known)
         elif wp.abs(speed) > 1.0:
             curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
             if wp.abs(curvature) > STRAIGHT_TURN:
@@ -125,7 +133,7 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
             elif float(at) + ahead > known:
                 q = turned(begin, float(at) + ahead - known, 0.0)
             else:
-                q = route_at(roads, route[0], route[1], float(at) + ahead)
+                q = way_at(roads, route[0], route[1], shift, float(at) + ahead)
             seen.forecast[b, i, k] = q
             low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
             high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
@@ -135,3 +143,4 @@ def see(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, dt: float):
     seen.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])
     seen.way[b, i] = way
     seen.signal[b, i] = signal
+    seen.change[b, i] = change
