@@ -17,7 +17,7 @@ from ssad.world.check import check_simulator
 from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.world import World
-from tests.world.worlds import GRAPHS, ego, episode, line_route
+from tests.world.worlds import GRAPHS, NO_PASSING, ego, episode, line_route
 
 
 def run(world: World, steps: int, action=(0.0, 0.0, 0.0)) -> None:
@@ -115,7 +115,7 @@ def test_autopilot_stops_behind_a_standing_car_and_follows_a_slow_one() -> None:
             episode(ego(controller=Controller.AUTOPILOT), standing),
             episode(ego(controller=Controller.AUTOPILOT), slow),
         ],
-        GRAPHS,
+        NO_PASSING,
     )
     for _ in range(250):
         world.step()

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import LaneGraph, Marking
 from ssad.core.types import (
     Controller,
     Episode,
@@ -102,3 +102,4 @@ def episode(*agents: EpisodeAgent, key: str = "test", **more) -> Episode:
 
 
 GRAPHS = {"Straight": straight_graph()}
+NO_PASSING = {"Straight": replace(GRAPHS["Straight"], left_marking=np.full(3, Marking.SOLID, np.uint8))}

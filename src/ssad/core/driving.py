@@ -200,6 +200,8 @@ class Belief:
         line_signal: [B, K] signal of the stop line before it, -1 none.
         stood: [B, K] s that it has been at rest while wanting to go.
         gives_way: [B, K] whether it can be relied on to give way to those who go first.
+        change: [B, K, 2] turn signal of a lane change (1 left, -1 right, 0 none), and 1 while it passes somebody on an
+            oncoming lane. None: nobody changes lane.
         signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: as it is. None: all as
             they are.
     """
@@ -213,6 +215,7 @@ class Belief:
     line_signal: I32 | None = None
     stood: F32 | None = None
     gives_way: Bool | None = None
+    change: I32 | None = None
     signal: npt.NDArray[np.int8] | None = None
 
     def keep(self, mask: Bool) -> Self:

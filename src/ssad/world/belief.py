@@ -39,7 +39,8 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
     kind = np.asarray(belief.kind)
     if kind.ndim != 2 or kind.shape[0] != batch:
         raise ConfigError(f"belief: kind has shape {kind.shape}; expected ({batch}, K): K objects in each scene")
-    tails: dict[str, tuple[int, ...]] = {"pose": (3,), "size": (2,), "forecast": (int(HORIZON), 3), "way": (4,)}
+    tails: dict[str, tuple[int, ...]] = {"pose": (3,), "size": (2,), "change": (2,)}
+    tails |= {"forecast": (int(HORIZON), 3), "way": (4,)}
     used = (kind != AgentKind.NONE) & scenes[:, None]
     if not ((kind >= 0) & (kind < len(AgentKind)))[scenes].all():
         raise ConfigError(f"belief: kind must be an AgentKind, 0 to {len(AgentKind) - 1}")
@@ -97,6 +98,8 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     out["way"] = np.asarray(way, np.float32)
     out["signal"] = np.asarray(signal, np.int32)
     out["waited"] = np.zeros(kind.shape, np.float32) if belief.stood is None else np.asarray(belief.stood, np.float32)
+    change = np.zeros((*kind.shape, 2), np.int32) if belief.change is None else np.asarray(belief.change, np.int32)
+    out["change"] = change
     places = np.concatenate([pose[:, :, None, :2], out["forecast"][..., :2]], 2)
     out["span"] = np.concatenate([places.min(2), places.max(2)], -1)
     return out

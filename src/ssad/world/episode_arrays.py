@@ -11,8 +11,8 @@ import warp as wp
 
 from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
-from ssad.core.lane_graph import LaneGraph, SignKind
-from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, Model, Route
+from ssad.core.lane_graph import LaneGraph, Marking, SignKind
+from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
 from ssad.roads.query import CELL, DRIVABLE, build_grid
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
 
@@ -20,6 +20,8 @@ MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
 SLOW_DOWN = 2.0  # m/s^2 at which a route's speed profile falls towards a bend
 GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
+ON_AND_ON = 1000.0  # m that a lane goes on beyond the end of a route
+FADE = 30  # m over which a lane that ends is led back to the route
 TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 
 
@@ -28,7 +30,7 @@ class PathTable:
     """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
     line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m that the next 64 m leave the
     straight line along the point's heading; ahead [N, 3] m to the line of the next stop sign and the route point there
-    (FAR: none), m to the end of the next junction; lane [N] of the town, -1 none."""
+    (FAR: none), m to the end of the next junction; lane [N] of the town, -1 none; beside [N, 4] as in `Roads`."""
 
     path: F32
     rule: F32
@@ -36,6 +38,7 @@ class PathTable:
     bend: F32
     ahead: F32
     lane: npt.NDArray[np.int32]
+    beside: F32
     town: str
 
 
@@ -73,6 +76,7 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
         _bend(route),
         np.stack([distance, line, leave], 1).astype(np.float32),
         route.lane.astype(np.int32),
+        _beside(route, graph),
         graph.name,
     )
 
@@ -128,6 +132,71 @@ def _junctions(
         entry[start:stop] = 0.0
         rank[start:stop] = kind
     return entry, leave, rank
+
+
+def _lane_left(
+    route: Route, part: npt.NDArray[np.intp], graph: LaneGraph, lane: int
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """How far the centre of a lane is to the left of some points of a route (negative: right), and its width there."""
+    span = graph.points(lane)
+    xy = graph.xy[span].astype(np.float64)
+    step = np.diff(xy, axis=0)
+    from_start = route.xy[part, None].astype(np.float64) - xy[:-1]
+    t = np.clip((from_start * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12), 0.0, 1.0)
+    off = from_start - t[..., None] * step
+    rows, best = np.arange(len(part)), np.hypot(off[..., 0], off[..., 1]).argmin(1)
+    t, off = t[rows, best], off[rows, best]
+    width = graph.width[span].astype(np.float64)
+    yaw = route.yaw[part].astype(np.float64)
+    left = off[:, 0] * np.sin(yaw) - off[:, 1] * np.cos(yaw)
+    return np.copysign(np.hypot(off[:, 0], off[:, 1]), left), width[best] + t * (width[best + 1] - width[best])
+
+
+def _beside(route: Route, graph: LaneGraph) -> F32:
+    """Lanes to both sides that a vehicle may use: `Roads.beside`.
+
+    To the left a lane of the same direction or, where the line may be crossed, an oncoming one; to the right only one
+    of the same direction. A lane is given up where a junction begins. Where the route ends, a lane of the same
+    direction goes on.
+    """
+    n = len(route.xy)
+    out = np.zeros((n, 4))
+    edges = np.flatnonzero(np.diff(route.lane)) + 1
+    for part in np.split(np.arange(n), edges):
+        lane = int(route.lane[part[0]])
+        if lane < 0 or graph.junction[lane] >= 0 or graph.kind[lane] != LaneType.DRIVING:
+            continue
+        for column, other, marking in (
+            (0, int(graph.left[lane]), int(graph.left_marking[lane])),
+            (2, int(graph.right[lane]), int(graph.right_marking[lane])),
+        ):
+            if other < 0 or graph.kind[other] != LaneType.DRIVING or marking not in (Marking.NONE, Marking.BROKEN):
+                continue
+            same = graph.same_direction(lane, other)
+            if column == 2 and not same:
+                continue
+            away, width = _lane_left(route, part, graph, other)
+            # not where the route itself changes lane
+            there = np.abs(np.abs(away) - 0.5 * (route.width[part] + width)) < 0.4
+            out[part, column] = np.where(there, np.abs(away), 0.0)
+            out[part, column + 1] = 1.0 if same else -1.0
+    for column in (0, 2):
+        away, way = out[:, column].copy(), out[:, column + 1].copy()
+        out[:, column + 1] = 0.0
+        run = ON_AND_ON if way[-1] > 0.0 else 0.0
+        for k in range(n - 1, -1, -1):
+            goes_on = k == n - 1 or (away[k + 1] != 0.0 and abs(away[k + 1] - away[k]) < 0.3 and way[k] == way[k + 1])
+            run = (run + route.spacing if k < n - 1 else run) if goes_on else 0.0
+            if away[k] == 0.0:
+                run = 0.0
+            out[k, column + 1] = way[k] * run
+        # who has not come back in time is led back to the route
+        for k in np.flatnonzero((away[:-1] != 0.0) & (away[1:] == 0.0)).tolist():
+            fade = np.arange(1, min(FADE, n - 1 - k) + 1)
+            rest = away[k + 1 : k + 1 + len(fade)] == 0.0
+            stop = len(fade) if rest.all() else int(np.argmin(rest))
+            out[k + 1 : k + 1 + stop, column] = away[k] * (1.0 - fade[:stop] / FADE)
+    return out.astype(np.float32)
 
 
 def signal_programs(graph: LaneGraph) -> F32:
@@ -344,6 +413,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
     parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]
+    parts["beside"] = [t.beside for t in pool.tables]
     parts["ahead"] = [t.ahead for t in pool.tables]
     for name, array in array_types(Roads).items():
         joined = np.concatenate(parts[name])

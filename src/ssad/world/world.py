@@ -22,11 +22,12 @@ from ssad.world.kernels.belief import see
 from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
+from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 
-VERSION = "3"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "4"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
 
@@ -94,6 +95,7 @@ class World:
         self._mask = wp.zeros(self.batch, dtype=wp.int32, device=device)
         self.work = Work()
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
         self._settings = (dt, substeps, autoreset)
         self._assign(order.astype(np.int32))
         self._make_room(0)
@@ -141,6 +143,7 @@ class World:
             self._see,
             self.launch(sight, flat, [bank, roads, state, seen, self.work, self.agents, rows, dt]),
             self.launch(meet, workers, [bank, roads, state, seen, self.work, self.agents, rows, workers, dt]),
+            self.launch(change_lanes, flat, [bank, roads, state, seen, self.work, self.agents, rows]),
             self.launch(drive, flat, [bank, roads, state, seen, self.agents, rows, dt]),
         ]
         self._advance = [
@@ -380,6 +383,7 @@ class World:
             line_signal=own["signal"],
             stood=own["waited"],
             gives_way=own["gives_way"] != 0,
+            change=own["change"],
         )
 
     def state(self) -> WorldState:

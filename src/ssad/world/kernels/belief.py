@@ -8,8 +8,21 @@ Walkers and who has left its route have only their pose, speed and rate of turn.
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import FAR, HORIZON, STRIDE, End, EpisodeArrays, Presence, Roads, Seen, State, TurnRank
-from ssad.world.kernels.shared import route_at, signal_state, wrap
+from ssad.world.kernels.data import (
+    AS_IT_IS,
+    FAR,
+    HORIZON,
+    STRIDE,
+    End,
+    EpisodeArrays,
+    Presence,
+    Roads,
+    Seen,
+    State,
+    TurnRank,
+)
+from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
+from ssad.world.kernels.shared import signal_state, wrap
 
 KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
 ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
@@ -23,15 +36,15 @@ def light(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
 ) -> int:
     """State of a signal as i sees it."""
-    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] >= 0:
+    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] != AS_IT_IS:
         return seen.light[b, index]
     return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
 
 
 @wp.func
-def keeps_route(roads: Roads, route: wp.vec2i, at: int, pose: wp.vec3) -> bool:
+def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp.vec3) -> bool:
     """Whether somebody is where its route is, and goes its way."""
-    p = roads.path[route[0] + at]
+    p = way_at(roads, route[0], route[1], shift, float(at))
     dx = pose[0] - p[0]
     dy = pose[1] - p[1]
     return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - p[2])) < ALONG
@@ -90,14 +103,21 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     signal = int(-1)
     route = bank.route[e, i]
     at = state.progress[b, i]
+    shift = state.shift[b, i]
+    change = wp.vec2i(0, 0)
     follows = route[1] > 1 and bank.kind[m] != AgentKind.WALKER
     if follows:
-        follows = keeps_route(roads, route, at, pose)
+        follows = keeps_route(roads, route, shift, at, pose)
     if follows:
         point = route[0] + at
         rule = roads.rule[point]
         way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[point] + 0.5)
         signal = roads.path_signal[point]
+        if changes(shift) and state.controller[b, i] == Controller.AUTOPILOT:
+            change[0] = indicates(shift, state.aim[b, i][0])
+            if on_oncoming_lane(roads, point, shift):
+                change[1] = 1
+            way[3] = way[3] + ASIDE
     goes = speed
     if follows and relied == 1 and way[1] < body[0] - 1.0:
         goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
@@ -118,7 +138,7 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
             if not follows:
                 q = turned(pose, ahead, curvature)
             else:
-                q = route_at(roads, route[0], route[1], wp.min(float(at) + ahead, known))
+                q = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
                 over = float(at) + ahead - known
                 if over > 0.0:
                     q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
@@ -131,6 +151,7 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     seen.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])
     seen.way[b, i] = way
     seen.signal[b, i] = signal
+    seen.change[b, i] = change
 
 
 @wp.kernel(enable_backward=False)

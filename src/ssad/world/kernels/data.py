@@ -11,6 +11,9 @@ from ssad.core.types import End  # noqa: F401  kernels take all their codes from
 HORIZON = wp.constant(8)  # forecast points
 STRIDE = wp.constant(0.5)  # seconds between forecast points
 FAR = wp.constant(1.0e6)
+AS_IT_IS = wp.constant(-1)  # the state of a signal of which a belief says nothing
+NO_LEADER = wp.constant(1 << 30)
+LEADERS = wp.constant(1 << 12)
 
 
 class When(IntEnum):
@@ -78,6 +81,8 @@ class Roads:
     rule: wp.array(dtype=wp.vec4)  # [N] speed cap, m to next stop line, m to next junction, TurnRank there
     bend: wp.array(dtype=wp.float32)  # [N] m that the next 64 m of path leave the straight line along its heading
     ahead: wp.array(dtype=wp.vec3)  # [N] m to the next stop sign's line, its route point, m to the next junction's end
+    # [N] m to the lane's centre on the left (0: none) and how far it goes on (negative: oncoming lane); right likewise
+    beside: wp.array(dtype=wp.vec4)
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     track: wp.array(dtype=wp.vec4)  # [N] s, x, y, yaw: trajectories
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
@@ -114,6 +119,9 @@ class State:
     halted: wp.array2d(dtype=wp.int32)  # [B, A] route point at whose stop sign it has stopped, -1 none
     stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out
     waited: wp.array2d(dtype=wp.float32)  # [B, A] s at rest while wanting to go
+    # [B, A] an Autopilot's lane change: where along its route it begins and ends (m), and how many lanes left of the
+    # route it leads from and to
+    shift: wp.array2d(dtype=wp.vec4)
     control: wp.array2d(dtype=wp.vec4)  # [B, A] throttle, brake, steer, reverse
     aim: wp.array2d(dtype=wp.vec2)  # [B, A] an Autopilot's place along its route m, and target speed m/s
     react: wp.array2d(dtype=wp.float32)  # [B, A] an Autopilot's hardest interaction term, m/s^2 (negative)
@@ -137,6 +145,8 @@ class Seen:
     # [B, rows] m from the centre to where it would wait (its stop line, or the junction) and to the next junction (FAR:
     # none), TurnRank there, and m that its path ahead leaves the straight line along its heading
     way: wp.array2d(dtype=wp.vec4)
+    # [B, rows] turn signal of a lane change (1 left, -1 right, 0 none), and whether it is on an oncoming lane (1)
+    change: wp.array2d(dtype=wp.vec2i)
     signal: wp.array2d(dtype=wp.int32)  # [B, rows] signal of its next stop line, -1 none
     waited: wp.array2d(dtype=wp.float32)  # [B, rows] s at rest while wanting to go
     gives_way: wp.array2d(dtype=wp.int32)  # [B, rows] 1: can be relied on to give way
@@ -170,6 +180,8 @@ class Work:
 
     count: wp.array(dtype=wp.int32)  # [1]
     pair: wp.array(dtype=wp.int32)  # ((scene * A + who) * A + whom) * 4 + flags (1 may lead, 2 may conflict)
+    # [B, A] whom an Autopilot follows: gap in cm * LEADERS + row of `Seen`, or NO_LEADER
+    leader: wp.array2d(dtype=wp.int32)
 
 
 def array_types(struct: Any) -> dict[str, Any]:

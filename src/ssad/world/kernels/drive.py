@@ -7,6 +7,7 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, Seen, State, When
+from ssad.world.kernels.lanes import changes, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, wrap
 
 
@@ -53,10 +54,20 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     v0 = wp.max(v, 0.0)
     here = wp.clamp(at + int(wp.floor(part + 0.15 * v0 + 0.5)), 0, route[1] - 1)
     k_ref = roads.path[route[0] + here][3]
+    shift = state.shift[b, i]
+    u = float(at) + part
+    if changes(shift):
+        left = left - metres_left(roads, route[0], route[1], shift, u)
+        then = u + 0.15 * v0
+        more = way_slope(roads, route[0], route[1], shift, then + 0.5)
+        k_ref = k_ref + more - way_slope(roads, route[0], route[1], shift, then - 0.5)
     body = bank.body[bank.model[e, i]]
     # on the path the body lags by the slip of its curvature; taking the present slip would feed back on itself
     slip = wp.asin(wp.clamp(0.5 * k_ref * body[2], -0.95, 0.95))
-    off = wp.clamp(wrap(pose[2] + slip - p[2] - p[3] * (part + 0.1 * v0)), -1.2, 1.2)
+    yaw = p[2] + p[3] * (part + 0.1 * v0)
+    if changes(shift):
+        yaw = yaw + wp.atan(way_slope(roads, route[0], route[1], shift, u + 0.1 * v0))
+    off = wp.clamp(wrap(pose[2] + slip - yaw), -1.2, 1.2)
     soft = 1.0 / (1.0 + 0.05 * v * v / 10.0)
     k = k_ref - 0.25 * soft * wp.clamp(left, -3.0, 3.0) - 0.9 * soft * off
     # curvature k of the box centre: sin(slip) = k L / 2, tan(wheel) = 2 tan(slip)

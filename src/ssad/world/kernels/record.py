@@ -245,6 +245,7 @@ def put_back(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
     state.waited[b, i] = 0.0
     state.halted[b, i] = -1
     state.stalled[b, i] = 0
+    state.shift[b, i] = wp.vec4(0.0, 0.0, 0.0, 0.0)
     state.touch[b, i] = wp.int64(0)
     state.lateral[b, i] = wp.vec2(0.0, 0.0)
     state.lane[b, i] = -1

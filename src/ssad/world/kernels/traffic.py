@@ -12,6 +12,8 @@ from ssad.world.kernels.belief import light
 from ssad.world.kernels.data import (
     FAR,
     HORIZON,
+    LEADERS,
+    NO_LEADER,
     STRIDE,
     End,
     EpisodeArrays,
@@ -22,10 +24,10 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
+from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, changes, way_frame
 from ssad.world.kernels.shared import (
     IDM_ACCEL,
     boxes_touch,
-    route_frame,
     sign_line,
 )
 
@@ -55,6 +57,7 @@ def lead_gap(
     b: int,
     j: int,
     route: wp.vec2i,
+    shift: wp.vec4,
     u0: float,
     lon: float,
     own: wp.vec4,
@@ -74,7 +77,7 @@ def lead_gap(
     rest = float(0.0)
     at = wp.vec4(0.0, 0.0, 1.0, 0.0)
     for _ in range(4):
-        at = route_frame(roads, route[0], route[1], u0 + u)
+        at = way_frame(roads, route[0], route[1], shift, u0 + u)
         rx = q[0] - at[0]
         ry = q[1] - at[1]
         rest = rx * at[2] + ry * at[3]
@@ -98,7 +101,7 @@ def lead_gap(
         # 0.2 m of room to either side, checked every metre
         for k in range(14):
             u = float(k + 1)
-            at = route_frame(roads, route[0], route[1], u0 + u)
+            at = way_frame(roads, route[0], route[1], shift, u0 + u)
             body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
             if result[0] >= FAR and boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
                 result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
@@ -176,6 +179,7 @@ def conflict_gap(
     b: int,
     j: int,
     route: wp.vec2i,
+    shift: wp.vec4,
     u0: float,
     v: float,
     target: float,
@@ -197,7 +201,7 @@ def conflict_gap(
         after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
         u = u + 0.5 * (w + after) * STRIDE
         w = after
-        at = route_frame(roads, route[0], route[1], u0 + u)
+        at = way_frame(roads, route[0], route[1], shift, u0 + u)
         for n in range(k - 1, wp.min(k + 2, HORIZON)):
             q = seen.pose[b, j]
             if n >= 0:
@@ -270,7 +274,8 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Wor
     p = roads.path[first]
     part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
-    target = wp.min(state.cruise[b, i], cap)
+    shift = state.shift[b, i]
+    target = wp.min(wp.min(state.cruise[b, i], cap), change_speed(shift, float(at) + part))
     state.aim[b, i] = wp.vec2(float(at) + part, target)
     react = float(0.0)
 
@@ -298,6 +303,7 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Wor
                 react = wp.min(react, idm_gap(v, 0.0, ahead + 1.0))
     state.react[b, i] = react
     state.stalled[b, i] = 0
+    work.leader[b, i] = NO_LEADER
 
     c = wp.cos(pose[2])
     s = wp.sin(pose[2])
@@ -306,14 +312,18 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Wor
     sees = wp.min(wp.max(goes, 15.0 + 3.0 * v), SIGHT)
     # a path that is not followed exactly leaves the straight line a little more
     bend = roads.bend[first] + 1.0
+    if changes(shift):
+        bend = bend + ASIDE + SIGHT * wp.abs(wp.sin(pose[2] - p[2]))
     low = wp.vec2(pose[0], pose[1])
     high = low
     for k in range(5):
-        at_k = route_frame(roads, route[0], route[1], float(at) + part + 0.2 * float(k + 1) * sees)
+        at_k = way_frame(roads, route[0], route[1], shift, float(at) + part + 0.2 * float(k + 1) * sees)
         low = wp.vec2(wp.min(low[0], at_k[0]), wp.min(low[1], at_k[1]))
         high = wp.vec2(wp.max(high[0], at_k[0]), wp.max(high[1], at_k[1]))
     # room for both bodies (LONGEST: of any model), and 2 m each that bends leave the chords between the five places
     pad = own[0] + LONGEST + 4.0
+    if changes(shift):
+        pad = pad + ASIDE
     low = wp.vec2(low[0] - pad, low[1] - pad)
     high = wp.vec2(high[0] + pad, high[1] + pad)
     from_row = int(0)
@@ -378,6 +388,7 @@ def meet(
         b = code / agents
         e = state.episode[b]
         route = bank.route[e, i]
+        shift = state.shift[b, i]
         pose = state.pose[b, i]
         q = seen.pose[b, j]
         v = wp.max(state.speed[b, i], 0.0)
@@ -400,9 +411,12 @@ def meet(
             if walks:
                 margin = 0.6
             bend = roads.bend[route[0] + state.progress[b, i]]
-            lead = lead_gap(roads, seen, b, j, route, aim[0], lon, own, other, heading, margin, bend)
+            if aim[0] < shift[1]:
+                bend = bend + ASIDE
+            lead = lead_gap(roads, seen, b, j, route, shift, aim[0], lon, own, other, heading, margin, bend)
             if lead[0] < FAR:
                 react = idm_gap(v, wp.max(lead[1], 0.0), lead[0])
+                wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(lead[0], 0.0, SIGHT)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
                 if stands and lead[0] < NOSE_TO_NOSE and state.waited[b, i] > BACK_OUT and seen.waited[b, j] > BACK_OUT:
@@ -416,9 +430,10 @@ def meet(
             margin = 0.4
             if walks:
                 margin = 1.0
-            gap = conflict_gap(roads, seen, b, j, route, aim[0], v, aim[1], own, other, margin)
+            gap = conflict_gap(roads, seen, b, j, route, shift, aim[0], v, aim[1], own, other, margin)
             if gap < FAR:
                 goes_first = has_priority(bank, roads, state, seen, b, i, j, e, dt)
+                goes_first = change_priority(seen, b, i, j, goes_first)
                 if not goes_first and line > -1.0 and not walks and v * v < 8.0 * (line + 1.5):
                     # it is waited before the junction, not in it, but to turn left on green
                     index = roads.path_signal[first]
