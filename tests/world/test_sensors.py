@@ -77,6 +77,8 @@ def test_readings_do_not_depend_on_the_other_rows() -> None:
     world = after_a_step(episode(ego(speed=5.0), car(20.0, 3.5, np.pi)), episode(ego(), car(15.0)))
     everybody = agents((0, 0), (0, 1), (1, 0), (1, 1))
     for name, sensor in SENSORS.items():
+        if name == "truth":
+            continue  # a belief, for egos alone; see test_belief
         together = sensor(world, everybody).copy()
         for k, row in enumerate(everybody):
             np.testing.assert_array_equal(sensor(world, row[None])[0], together[k], err_msg=name)

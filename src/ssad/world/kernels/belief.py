@@ -23,8 +23,11 @@ def light(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, index: int, dt: float
 ) -> int:
     """State of a signal as i sees it."""
-    if i == 0 and seen.believes[b] == 1 and seen.light[b, index] >= 0:
-        return seen.light[b, index]
+    told = int(-1)
+    if i == 0 and seen.believes[b] == 1:
+        told = seen.light[b, index]
+    if told >= 0:
+        return told
     return signal_state(bank, roads, e, index, float(state.step[b]) * dt)
 
 
