@@ -1,7 +1,8 @@
 """What the Autopilot loses when it knows less: collisions and route completion over poorer and poorer beliefs.
 
-`python benchmarks/belief.py` drives the 32 pre-crash and the 150 natural scenarios; `--scenarios safebench,frea` the
-imported ones instead; `--repetitions 5` draws five episodes of each. Intervals count episodes of a scenario as one
+`python -m benchmarks.belief` drives the 32 pre-crash and the 150 natural scenarios; `--scenarios safebench,frea` the
+imported ones instead; `crowd` is dense traffic: 40 vehicles in Oldmarket and Crossgate for 90 s, 32 scenes each.
+`--repetitions 5` draws five episodes of each scenario. Intervals count episodes of a scenario as one
 cluster. `--json FILE` writes the figures.
 """
 
@@ -14,10 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.traffic import ROUTES, town_routes, traffic
 from ssad.core.driving import Belief, Driver, Observation
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import seed32
 from ssad.core.traces import trace_hash
-from ssad.core.types import Episode, EpisodeTrace
+from ssad.core.types import Episode, EpisodeTrace, Limits
 from ssad.drivers.belief import DegradedBelief, LineOfSight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.metrics.intervals import Clusters, bounded_limits
@@ -61,8 +64,22 @@ SYSTEMS: dict[str, Driver] = {
 }
 
 
-def make_episodes(name: str, repetitions: int) -> tuple[list[Episode], dict[str, object]]:
+def crowd(repetitions: int) -> tuple[list[Episode], dict[str, LaneGraph]]:
+    """Dense traffic, in which the ego is one of many."""
+    graphs = {name: load_town(name) for name in ("Oldmarket", "Crossgate")}
+    limits = Limits(max_steps=10**6, max_time=90.0, max_distance=1e9)
+    episodes = []
+    for graph in graphs.values():
+        routes = town_routes(graph, ROUTES, 1500.0)
+        scenes = [traffic(graph, routes, 40, key=10_000 + k, green=False) for k in range(32 * repetitions)]
+        episodes += [replace(scene, limits=limits) for scene in scenes]
+    return episodes, graphs
+
+
+def make_episodes(name: str, repetitions: int) -> tuple[list[Episode], dict[str, LaneGraph]]:
     """Episodes of a set, scenario by scenario, and the towns."""
+    if name == "crowd":
+        return crowd(repetitions)
     scenarios = load_scenarios(name)
     graphs = {s.town: load_town(s.town) for s in scenarios}
     seeds = [(s, seed32("belief", s.name, k)) for s in scenarios for k in range(repetitions)]

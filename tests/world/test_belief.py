@@ -19,6 +19,7 @@ from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.belief import Lanes
 from ssad.world.rollout import Loop, rollout
+from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode, line_route
 
@@ -422,6 +423,10 @@ def test_a_believer_drives_egos_alone_and_is_named_when_it_errs() -> None:
         rollout(World([scene], GRAPHS), Outside())
     with pytest.raises(ConfigError, match="egos alone"):
         rollout(World([scene], GRAPHS), {1: Truth()})
+    two = World([scene, scene], GRAPHS)
+    assert SENSORS["truth"](two, np.array([[1, 0]], np.int32)).kind.tolist() == [[AgentKind.NONE, AgentKind.CAR]]
+    with pytest.raises(ConfigError, match="is for egos"):
+        SENSORS["truth"](two, np.array([[0, 1]], np.int32))
     assert isinstance(make_system("line-of-sight"), Believer)
     assert not isinstance(make_system("autopilot"), Believer)
     assert not isinstance(Blind(), Believer)

@@ -75,6 +75,8 @@ def truth(simulator: Any, agents: I32) -> Belief:
     """What the Autopilot of the background traffic knows of everybody, for egos [N, 2]; see `Planner.truth`."""
     if not isinstance(simulator, Planner):
         raise ConfigError("this simulator's Autopilot plans over no belief: it cannot tell the truth as one")
+    if agents[:, 1].any():
+        raise ConfigError("the sensor 'truth' is for egos, who plan over a belief; other agents have none")
     return simulator.truth().rows(agents[:, 0])
 
 
