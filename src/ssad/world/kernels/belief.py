@@ -44,7 +44,10 @@ def light(
 @wp.func
 def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp.vec3) -> bool:
     """Whether somebody is where its route is, and goes its way."""
-    p = way_at(roads, route[0], route[1], shift, float(at))
+    point = roads.path[route[0] + at]
+    p = wp.vec3(point[0], point[1], point[2])
+    if changes(shift):
+        p = way_at(roads, route[0], route[1], shift, float(at))
     dx = pose[0] - p[0]
     dy = pose[1] - p[1]
     return dx * dx + dy * dy < KEEPS * KEEPS and wp.abs(wrap(pose[2] - p[2])) < ALONG
