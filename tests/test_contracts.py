@@ -59,21 +59,10 @@ def test_no_pickle_and_no_bare_yaml_or_xml() -> None:
     assert found == []
 
 
-# Where Ruff does not look at docstrings yet. This list only shrinks; what is new keeps the rules from the start.
-WITHOUT_DOCSTRING_RULES = {"drivers", "recording", "world"}
-
-
-def test_ever_more_packages_keep_the_rules_for_docstrings() -> None:
+def test_the_rules_for_docstrings_hold_for_all_source() -> None:
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["ruff"]["lint"]
     assert "D" in settings["select"]
     assert {rule for rule in settings["ignore"] if rule.startswith("D")} == {"D105", "D107"}
-    found = set()
     for pattern, rules in settings["per-file-ignores"].items():
-        if pattern.startswith("src/") and any(rule.startswith("D") for rule in rules):
-            assert rules == ["D"], pattern
-            before, _, rest = pattern.removeprefix("src/ssad/").partition("{")
-            names, _, after = rest.partition("}")
-            found |= {f"{before}{name}{after.removesuffix('/**')}" for name in names.split(",")}
-    assert found == WITHOUT_DOCSTRING_RULES
-    assert all((ROOT / "src" / "ssad" / name).exists() for name in found)
+        assert not (pattern.startswith("src/") and any(rule.startswith("D") for rule in rules)), pattern
     assert not [path.name for path in SOURCE if "noqa: D" in path.read_text()]

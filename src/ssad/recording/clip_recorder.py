@@ -78,12 +78,14 @@ NEAR: Final = 0.2  # largest share of the picture that something right before th
 
 @dataclass(frozen=True, slots=True)
 class Clips:
-    """What to record. images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one
-    in each part), or the stop sign that an orbit shows; behind, height: m of the following camera; distances (m),
-    azimuths, elevations (degrees) of an orbit, those of the target where none are given (round a sign: one elevation,
-    0, which stands for the heights of cameras of cars);
-    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`. ConfigError for what
-    cannot be."""
+    """What to record.
+
+    images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one in each part), or
+    the stop sign that an orbit shows; behind, height: m of the following camera; distances (m), azimuths, elevations
+    (degrees) of an orbit, those of the target where none are given (round a sign: one elevation, 0, which stands for
+    the heights of cameras of cars); quality: of JPEG files; device: where pictures are rendered; streets: see
+    `drive_street`. ConfigError for what cannot be.
+    """
 
     out: Path
     images: tuple[tuple[str, int], ...] = tuple(IMAGES.items())
@@ -158,8 +160,17 @@ def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str,
 
 @dataclass(frozen=True, slots=True)
 class _Set:
-    """A drive to take pictures of: its trace, who is there, the bodies that play the target in turn; places: where a
-    target that stands can be."""
+    """A drive to take pictures of.
+
+    Attributes:
+        clips: What is recorded.
+        key: Of all draws.
+        trace: The drive.
+        cast: Who is there.
+        stage: Street and bodies, ready to be rendered.
+        targets: The bodies that play the target in turn.
+        places: Where a target that stands can be.
+    """
 
     clips: Clips
     key: tuple[object, ...]

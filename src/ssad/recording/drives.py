@@ -41,8 +41,11 @@ def check_streets(streets: str) -> None:
 
 
 def drive_street(graph: LaneGraph, streets: str, *, key: tuple[object, ...]) -> Street:
-    """What stands along the roads in a drive. "town": what always stands there; "any": built for this key alone, in any
-    style, so that a detector cannot learn a town by heart. ConfigError: neither."""
+    """What stands along the roads in a drive.
+
+    "town": what always stands there; "any": built for this key alone, in any style, so that a detector cannot learn a
+    town by heart. ConfigError: neither.
+    """
     check_streets(streets)
     if streets == "town":
         return cached_street(graph)

@@ -66,9 +66,12 @@ GPU_STEPS: Final = 4  # whose pictures are rendered in one call on a GPU
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What to record. scenes: of each town; seconds: of each scene; width: of the pictures (16:9); sweeps: frames
-    between key frames that are written too (0 to 4); quality: of JPEG files; device: where pictures are rendered (it
-    decides bits, though few: see docs/camera.md); streets: see `drive_street`. ConfigError for what cannot be."""
+    """What to record.
+
+    scenes: of each town; seconds: of each scene; width: of the pictures (16:9); sweeps: frames between key frames that
+    are written too (0 to 4); quality: of JPEG files; device: where pictures are rendered (it decides bits, though few:
+    see docs/camera.md); streets: see `drive_street`. ConfigError for what cannot be.
+    """
 
     out: Path
     towns: tuple[str, ...] = TOWNS
@@ -259,8 +262,11 @@ class _Moment:
 def _look(
     stage: Scene, moments: Sequence[_Moment], files: _Files, number: int, *, together: bool
 ) -> Iterator[tuple[_Moment, dict[int, float]]]:
-    """Renders and writes the pictures of some moments, all of them in one call or one by one; each moment with the
-    largest share of each thing that a camera sees (of key frames)."""
+    """Render and write the pictures of some moments, all of them in one call or one by one.
+
+    Yields:
+        Each moment with the largest share of each thing that a camera sees (of key frames).
+    """
     flat = [(moment, c) for moment in moments for c in range(len(moment.views))]
     found: list[dict[int, float]] = [{} for _ in moments]
     count = len(flat) if together else 1

@@ -1,5 +1,7 @@
-"""Who is in a recorded drive: bodies of the agents, trailers, parked vehicles, walkers, building sites; where each is
-at any moment."""
+"""Who is in a recorded drive, and where each is at any moment.
+
+Agents, trailers, parked vehicles, walkers, building sites, signs.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +52,20 @@ LONG = 7.0  # m; what takes more is placed first, along streets alone: between o
 
 @dataclass(frozen=True, slots=True)
 class ObjectBody:
-    """Somebody or something: kind, size, paint, tag (1 and more), meshes (one, or those of a cycle of `STRIDE` m),
-    track [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it stands still; active [T]; driven [T] m so far;
-    style tells what its attribute is."""
+    """Somebody or something in a drive.
+
+    Attributes:
+        tag: Number that masks and boxes name it by, 1 and more.
+        kind: Of the body; "" for what has no label.
+        style: Of the body; it decides the nuScenes attribute.
+        size: Length, width, height, m.
+        paint: Linear RGB.
+        meshes: Numbers of its meshes: one, or those of a cycle of `STRIDE` m.
+        track: [T, 4] x, y, yaw, z at steps of the world, or [1, 4] if it stands still.
+        active: [T] whether it is there.
+        driven: [T] m so far.
+        parked: Whether nobody drives it.
+    """
 
     tag: int
     kind: str
@@ -199,8 +212,17 @@ def place_objects(
     trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1,
     streets: str = "town", many_signs: bool = False,
 ) -> SceneObjects:  # fmt: skip
-    """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way; streets:
-    see `ssad.recording.drives.thinned`; many_signs: see `ssad.recording.street_signs.street_signs`."""
+    """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way.
+
+    Args:
+        trace: The drive.
+        graph: The town.
+        street: What stands along its roads.
+        key: Of all draws.
+        detail: Of the meshes, see `make_body`.
+        streets: See `ssad.recording.drives.thinned`.
+        many_signs: See `ssad.recording.street_signs.street_signs`.
+    """
     cast = SceneObjects(trace.dt, key, detail)
     _agents(cast, trace)
     way = np.stack([trace.x[:, 0], trace.y[:, 0]], -1)[::5].astype(np.float64)
@@ -337,8 +359,11 @@ def _site(
 
 
 def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, steps: int) -> None:
-    """People who walk along sidewalks, alone or in pairs, or stand, also at corners; parked two-wheelers side by side,
-    groups of cones, rows of barriers."""
+    """What is on sidewalks.
+
+    People who walk alone or in pairs, or stand, also at corners; parked two-wheelers side by side, groups of cones,
+    rows of barriers.
+    """
     draws = generator("record sidewalks", *cast.key)
     people, standing = [], []
     for k, style in enumerate(WALKING):
@@ -409,8 +434,10 @@ def _sidewalks(cast: SceneObjects, graph: LaneGraph, way: F64, clear: Clear, ste
 
 
 def _stroller(cast: SceneObjects, walker: Size, draws: np.random.Generator) -> tuple[str, str, Size, tuple[int, ...]]:
-    """A stroller whose handle is where the hands of a walker of a size (m) are. nuScenes does not count it to the
-    walker, and the detection task leaves it out."""
+    """A stroller whose handle is where the hands of a walker of a size (m) are.
+
+    nuScenes does not count it to the walker, and the detection task leaves it out.
+    """
     style = draw_style("stroller", generator=draws)
     length, width, _ = draw_size("stroller", style, generator=draws)
     return cast.make("stroller", style, (length, width, GRIP[1] * walker[2] + 0.03))

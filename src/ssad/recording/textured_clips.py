@@ -99,8 +99,17 @@ class TexturedClip:
 
 @dataclass(frozen=True, slots=True)
 class Wearing:
-    """A picture that waits for textures: where its part lies, its shape, window, radiance, exposure and taps by number,
-    and the whole picture before."""
+    """A picture that waits for textures.
+
+    Attributes:
+        corner: Row and column at which the part that changes begins.
+        shape: Of this part: 1, height, width.
+        window: What is developed anew.
+        part: Radiance of the window, without the textures.
+        exposure: What radiance is multiplied by.
+        taps: What pixels see of each texture, by its number.
+        before: The whole picture as it was recorded [1, 3, H, W] in 0 to 1.
+    """
 
     corner: tuple[int, int]
     shape: tuple[int, int, int]

@@ -1,5 +1,7 @@
-"""Where a camera stands that looks at a target car: 20 m behind it on its own way, or anywhere around it; and whether
-anything but air lies between the two."""
+"""Where a camera stands that looks at a target car, and whether anything but air lies between the two.
+
+It follows 20 m behind on the target's own way, or stands anywhere around it.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,15 @@ Place = tuple[float, float, float, float, float]  # x, y, yaw, z, height of what
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """One picture to take: time s, poses of the camera (x right, y down, z forward) and of the target [4, 4], weather,
-    what is known about it (distance m from the target's middle, azimuth in degrees from its front to its left,
-    elevation in degrees)."""
+    """One picture to take.
+
+    Attributes:
+        time: s.
+        camera: Pose [4, 4], x right, y down, z forward.
+        target: Pose [4, 4].
+        weather: Weather and hour.
+        about: Distance, m from the target's middle; azimuth, degrees from its front to its left; elevation, degrees.
+    """
 
     time: float
     camera: F64
@@ -43,8 +51,10 @@ class Viewpoint:
 
 
 def look_at(eye: F64, point: F64) -> F64:
-    """Pose [4, 4] of an upright camera (x right, y down, z forward) at `eye` that looks at `point`, not straight up or
-    down."""
+    """Pose [4, 4] of an upright camera at `eye` that looks at `point`, which is not straight above or below.
+
+    Its axes are x right, y down, z forward.
+    """
     z = (point - eye) / np.linalg.norm(point - eye)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = x / np.linalg.norm(x)
@@ -196,8 +206,10 @@ def free_sight(stage: Scene, shots: Sequence[Viewpoint], *, at_once: int, height
 
 
 def near_share(view: View, depth: F32, tag: I32, *, within: float) -> float:
-    """Share of a picture's pixels [H, W] that the street covers within so many m of the camera, but for the ground
-    (half a metre from the road up)."""
+    """Share of a picture's pixels [H, W] that the street covers near the camera.
+
+    Within so many m of it, and without the ground: from half a metre above the road.
+    """
     rows, columns = slice(2, None, 4), slice(2, None, 4)
     near = (tag[rows, columns] == 0) & (depth[rows, columns] < within)
     if not near.any():

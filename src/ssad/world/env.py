@@ -42,8 +42,11 @@ def reward_of(reward: str | Reward) -> Reward:
 
 
 def action_space(kind: Action) -> gym.spaces.Box:
-    """`safebench`: [2] acceleration / 3 m/s^2 and steer / 0.3; `frea`: [3] throttle, steer / 0.3, brake; all in
-    [-1, 1]. `controls`: [3] throttle, brake in [0, 1] and steer in [-1, 1]."""
+    """Ranges of the actions.
+
+    `safebench`: [2] acceleration / 3 m/s^2 and steer / 0.3; `frea`: [3] throttle, steer / 0.3, brake; all in [-1, 1].
+    `controls`: [3] throttle, brake in [0, 1] and steer in [-1, 1].
+    """
     if kind == "controls":
         return gym.spaces.Box(np.array([0, 0, -1], np.float32), np.ones(3, np.float32))
     if kind not in ("safebench", "frea"):

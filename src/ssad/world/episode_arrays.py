@@ -27,10 +27,19 @@ TURN = np.deg2rad(25.0)  # heading change over a junction that makes it a turn
 
 @dataclass(frozen=True)
 class PathTable:
-    """A route as the kernels want it: path [N, 4] x, y, yaw, curvature; rule [N, 4] speed cap m/s, m to the next stop
-    line, m to the next junction (0 inside), TurnRank there; signal [N] or -1; bend [N] m that the next 64 m leave the
-    straight line along the point's heading; ahead [N, 3] m to the line of the next stop sign and the route point there
-    (FAR: none), m to the end of the next junction; lane [N] of the town, -1 none; beside [N, 4] as in `Roads`."""
+    """A route as the kernels want it.
+
+    Attributes:
+        path: [N, 4] x, y, yaw, curvature.
+        rule: [N, 4] speed cap m/s, m to the next stop line, m to the next junction (0 inside), TurnRank there.
+        signal: [N] of the next stop line, -1 none.
+        bend: [N] m that the next 64 m leave the straight line along the point's heading.
+        ahead: [N, 3] m to the line of the next stop sign and the route point there (FAR: none), m to the end of the
+            next junction.
+        lane: [N] of the town, -1 none.
+        beside: [N, 4] as in `Roads`.
+        town: Name of the town.
+    """
 
     path: F32
     rule: F32
@@ -84,7 +93,7 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
 def _next_line(
     route: Route, graph: LaneGraph, lanes: I32, along: F32, what: I32
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
-    """m from every route point to the next line (FAR: none) and what stands there (-1: nothing).
+    """M from every route point to the next line (FAR: none) and what stands there (-1: nothing).
 
     Lines lie across `lanes` at the arc lengths `along`; a route may come past one more than once.
     """

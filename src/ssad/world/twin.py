@@ -194,8 +194,10 @@ class RoadField:
         return _strip_gap(flat, segment, half).reshape(points.shape[:-1])
 
     def of_boxes(self, boxes: Tensor) -> Tensor:
-        """The largest distance [...] of the corners of boxes [..., 5] (x, y, yaw, length, width): how far a body leaves
-        the road."""
+        """How far bodies leave the road [...]: the largest distance of the corners of boxes [..., 5].
+
+        A box is x, y, yaw, length, width.
+        """
         return self(_corners(boxes)).amax(-1)
 
     def _nearest(self, points: Any) -> Any:
@@ -279,8 +281,12 @@ def _to_local(boxes: Tensor, points: Tensor) -> Tensor:
 
 
 def _beside(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
-    """Of points [..., n, 2] and a box of half extents [..., 1, 2] at the origin: the least distance [...] from it; and
-    how far the axis of the box that separates them best does so [...], below 0: by how much they overlap there."""
+    """How far points [..., n, 2] are from a box of half extents [..., 1, 2] at the origin.
+
+    Returns:
+        The least distance [...]; and how far the axis of the box that separates them best does so [...], below 0: by
+        how much they overlap there.
+    """
     outside = (points.abs() - half).clamp_min(0.0)
     square = outside.square().sum(-1)
     some = square > 0.0
@@ -291,8 +297,10 @@ def _beside(points: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _strip_gap(points: Tensor, segment: Tensor, half: Tensor) -> Tensor:
-    """Distance [...] of points [..., 2] outside strips about segments [..., 4] of half widths [..., 2] at their ends;
-    below 0 inside."""
+    """Distance [...] of points [..., 2] outside strips about segments [..., 4]; below 0 inside.
+
+    half: Half widths [..., 2] at the ends of the segments.
+    """
     start, way = segment[..., :2], segment[..., 2:] - segment[..., :2]
     to = points - start
     share = ((to * way).sum(-1) / way.square().sum(-1).clamp_min(1e-12)).clamp(0.0, 1.0)

@@ -28,8 +28,14 @@ HOLD = 25.0  # m a swerve is kept
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """From `start` s on drive at `speed` m/s for `hold` s, then at the target speed again; from the place reached
-    at `start` on keep `offset` m left of the route for 25 m."""
+    """What the search tries: another speed for a while, and a swerve.
+
+    Attributes:
+        start: s from which on it is driven.
+        speed: m/s.
+        hold: s for which the speed is held; then the target speed again.
+        offset: m left of the route that are kept for 25 m from the place reached at `start`.
+    """
 
     start: float
     speed: float
@@ -39,11 +45,16 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class Witness:
-    """verdict: `harmless` (the blind driver already stays clear), `avoidable` (a manoeuvre after the trigger does),
-    `anticipation` (only one before it), `autopilot` (only the Autopilot), `unavoidable` (none that was tried).
+    """What the search for a way out of an encounter found.
 
-    trigger s (NaN if nothing is triggered); manoeuvre is the gentlest that stays clear, completes the route if one
-    can; route_complete in percent with it; clear of tried: how many of them stay clear.
+    Attributes:
+        verdict: `harmless` (the blind driver already stays clear), `avoidable` (a manoeuvre after the trigger does),
+            `anticipation` (only one before it), `autopilot` (only the Autopilot), `unavoidable` (none that was tried).
+        trigger: s; NaN if nothing is triggered.
+        manoeuvre: The gentlest one that stays clear; it completes the route if one can.
+        route_complete: Percent with it.
+        clear: How many manoeuvres stay clear.
+        tried: How many were tried.
     """
 
     verdict: Verdict

@@ -1,5 +1,7 @@
-"""Arrays that the kernels share, as Warp structs. Legend: B scenes, A agents, E episodes of the bank, K phases,
-N route points of the pool, M lane segments, S signals."""
+"""Arrays that the kernels share, as Warp structs.
+
+Legend: B scenes, A agents, E episodes of the bank, K phases, N route points of the pool, M lane segments, S signals.
+"""
 
 from enum import IntEnum
 from typing import Any
@@ -132,8 +134,10 @@ class State:
 
 @wp.struct
 class Seen:
-    """What can be known of agents, the same for all who look: the rows from 0 to A - 1 hold the truth about each agent,
-    those from A on what the scene's ego believes to be around it. All that an Autopilot knows of others stands here.
+    """What can be known of agents, the same for all who look; all that an Autopilot knows of others stands here.
+
+    The rows from 0 to A - 1 hold the truth about each agent, those from A on what the scene's ego believes to be around
+    it.
     """
 
     kind: wp.array2d(dtype=wp.int32)  # [B, rows] AgentKind, NONE: nobody

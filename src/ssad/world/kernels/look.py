@@ -68,8 +68,9 @@ def look(
     who: wp.array(dtype=wp.vec2i),
     out: wp.array2d(dtype=wp.float32),
 ):
-    """Write observation rows [N, 28] of the agents `who` (scene, agent): 4 of SafeBench, then the agent itself, the two
-    nearest vehicles within 25 m, and the route (FREA).
+    """Write observation rows [N, 28] of the agents `who` (scene, agent).
+
+    4 numbers of SafeBench, then FREA's rows: the agent itself, the two nearest vehicles within 25 m, and the route.
 
     SafeBench: lateral offset (left positive) to the route point about 4 m ahead, heading error there, speed, 1 if a
     vehicle stands or drives in the same lane within 15 m ahead. Route row: middle, length, ego width, relative yaw and
