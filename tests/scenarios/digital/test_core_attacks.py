@@ -21,6 +21,7 @@ from ssad.scenarios.static.digital.budget import lengths
 from ssad.scenarios.static.digital.check import quality_left, within
 from ssad.scenarios.static.digital.objectives import Margin, Vanish
 from ssad.scenarios.static.digital.victim import Victim
+from ssad.scenarios.static.physical import ATTACKS as PHYSICAL
 
 from .toy_detector import ToyDetector, TrueLogits, best_linf, toy_scene
 
@@ -244,7 +245,8 @@ def test_names_and_options() -> None:
 
 def test_all_names_are_listed_with_what_they_need() -> None:
     rows = _attack_list()
-    assert rows.keys() == {*ATTACKS, "module:object"}
+    assert rows.keys() == {*ATTACKS, *PHYSICAL, "module:object"}
+    assert rows["adv-patch"] == "physical: trains a patch (docs/physical.md)"
     assert rows["pgd"] == "white-box, loss full"
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
     assert [name for name in ATTACKS if needs(name)] == ["transfer", "universal", "expected"]
