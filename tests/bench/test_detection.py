@@ -446,6 +446,7 @@ def test_a_suite_of_an_unknown_kind_is_refused(tmp_path: Path) -> None:
         load_suite(str(path))
 
 
+@pytest.mark.slow
 def test_through_the_command(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     words = ["run", "shifts", "--out", str(out), "--device", "cpu", "--workers", "1"]

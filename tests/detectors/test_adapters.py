@@ -24,8 +24,8 @@ SIZE = (80, 120)
 LITE = "ssdlite320_mobilenet_v3_large"
 ONE_STAGE = [
     "fcos_resnet50_fpn",
-    "retinanet_resnet50_fpn",
     LITE,
+    pytest.param("retinanet_resnet50_fpn", marks=pytest.mark.slow),
     pytest.param("retinanet_resnet50_fpn_v2", marks=pytest.mark.slow),
     pytest.param("ssd300_vgg16", marks=pytest.mark.slow),
 ]

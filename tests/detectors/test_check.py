@@ -28,7 +28,7 @@ Reduction = Literal["batch", "image"]
 # ---------------------------------------------------------------- those that keep their promises
 
 
-@pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
+@pytest.mark.parametrize("config", [TINY, pytest.param(TINY_PGD, marks=pytest.mark.slow)], ids=["fcos3d", "pgd"])
 def test_mono3d_keeps_every_promise(config: Any) -> None:
     check_detector(lively(config))
 
@@ -48,6 +48,7 @@ def test_the_promises_hold_in_float64() -> None:
     check_detector(Yolo(SMALL, CLASSES).double())
 
 
+@pytest.mark.slow
 def test_torchvision_keeps_every_promise() -> None:
     detector = torchvision_detector("ssdlite320_mobilenet_v3_large", classes=CLASSES)
     detector.model.transform.fixed_size = (128, 128)  # in place of 320, to be quick

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, some_truth, truth_of
+from helpers.quick import others_slow
 from torch import Tensor
 from torchvision.ops import box_iou
 
@@ -370,8 +371,10 @@ def scene(seed: int) -> tuple[Tensor, Truth]:
     return image, truth
 
 
-@BOTH
-@pytest.mark.parametrize(("steps", "least"), [(30, 4), pytest.param(100, 8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("config", "steps", "least"),
+    others_slow([(TINY, 30, 4), (TINY_PGD, 30, 4), (TINY, 100, 8), (TINY_PGD, 100, 8)], [(TINY, 30, 4)]),
+)
 def test_it_learns_a_few_pictures(config: Mono3DConfig, steps: int, least: int) -> None:
     """Trained on four pictures, it finds their eight objects, of which it found none, where they are."""
     started = None if config.pgd else (10.0, 3.0, 2.0, 2.0)

@@ -242,6 +242,7 @@ def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monke
     assert asked == [*[first] * 4, ("together", 0, 1, 2, 3), second, ("together", 4)]
 
 
+@pytest.mark.slow
 def test_streets_are_the_towns_own_or_built_anew_for_each_key() -> None:
     graph = load_town("Twinford")
     own = cached_street(graph)

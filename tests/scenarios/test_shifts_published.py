@@ -9,12 +9,13 @@ import cv2
 import numpy as np
 import pytest
 from helpers.published_shifts import NAMES, picture, statistics
+from helpers.quick import others_slow
 
 from ssad.scenarios.static.shifts import ShiftSpec, shift_images
 from ssad.scenarios.static.shifts import parameters as table
 
 
-@pytest.mark.parametrize("name", ["snow", "rain", "fog"])
+@pytest.mark.parametrize("name", others_slow(["snow", "rain", "fog"], ["fog"]))
 def test_published_weather_looks_like_the_originals(name: str) -> None:
     """Statistics of imagecorruptions' snow and fog and imgaug's rain as 3D_Corruptions_AD calls them
     (`benchmarks/make_shift_reference.py`): mean, contrast, and structure by size, within what few pictures can tell."""

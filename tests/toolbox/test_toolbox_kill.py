@@ -103,7 +103,8 @@ def disturb(clean: Path, out: Path, folder: Path, *, kills: int, unbroken: dict[
     return killed
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [2, 20])
 def test_kills_leave_no_trace(clean: Path, tmp_path: Path, unbroken: dict[str, str | bytes], kills: int) -> None:
     out = tmp_path / "o"
     killed = disturb(clean, out, tmp_path, kills=kills, unbroken=unbroken)

@@ -49,7 +49,8 @@ def test_hashes_after_1000_steps_do_not_depend_on_batch_order_or_processes() -> 
         assert _hashes([k]) == {k: batch[k]}
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 4])
 def test_several_processes_give_the_bits_of_one(count: int) -> None:
     here = _hashes(list(range(COUNT)))
     root = str(Path(__file__).parents[2])

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.mono3d import one_thread
+from helpers.quick import others_slow
 from torch import Tensor
 
 from ssad.core.detections import Truth
@@ -118,7 +119,7 @@ def test_the_bump_is_that_of_the_source() -> None:
 
 
 @pytest.mark.parametrize("norm", ["linf", "l2"])
-@pytest.mark.parametrize("name", ["square", "nes", "spsa"])
+@pytest.mark.parametrize("name", others_slow(["square", "nes", "spsa"], ["square"]))
 def test_they_beat_noise_on_a_shipped_detector(name: str, norm: str) -> None:
     with one_thread():
         detector = make_detector("yolov5n")
