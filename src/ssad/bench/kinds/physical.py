@@ -42,13 +42,13 @@ class Physical(Kind):
     name = "physical"
     suite = PhysicalSuite
     columns = (
-        Column("AP50", "AP50 of the target", "", "lower"),
+        Column("AP50", "AP50", "", "lower"),
         Column("AP50_all", "AP50 of all cars", "", "lower"),
-        Column("ASR_25", "targets lost at score 0.25", "", "higher"),
-        Column("ASR_50", "targets lost at score 0.5", "", "higher"),
-        Column("confidence", "mean score of the target", "", "lower"),
+        Column("ASR_25", "ASR at 0.25", "", "higher"),
+        Column("ASR_50", "ASR at 0.5", "", "higher"),
+        Column("confidence", "mean score", "", "lower"),
     )
-    factors = ("test", "detector", "carrier", "attack", "source")
+    factors = ("test", "detector", "attack", "carrier", "source")
 
     def plan(self, suite: PhysicalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Detectors and carriers are built once, so that what is wrong ends here."""
