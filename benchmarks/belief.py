@@ -3,7 +3,7 @@
 `python -m benchmarks.belief` drives the 32 pre-crash and the 150 natural scenarios; `--scenarios safebench,frea` the
 imported ones instead; `crowd` is dense traffic: 40 vehicles in Oldmarket and Crossgate for 90 s, 32 scenes each.
 `--repetitions 5` draws five episodes of each scenario. Intervals count episodes of a scenario as one
-cluster. `--json FILE` writes the figures.
+cluster. `--json FILE` writes the figures, `--page` the table of docs/loop.md.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,6 +65,17 @@ SYSTEMS: dict[str, Driver] = {
 }
 
 
+TITLES = {name: name for name in SYSTEMS} | {
+    "autopilot": "the truth inside the world",
+    "truth handed in": "the truth handed in",
+    "line-of-sight": "line of sight",
+    "all missed": "nothing (all missed)",
+    "blind": "nobody (`blind`, not the Autopilot)",
+}
+DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "loop.md"
+MARKERS = ("<!-- beliefs: begin -->", "<!-- beliefs: end -->")
+
+
 def crowd(repetitions: int) -> tuple[list[Episode], dict[str, LaneGraph]]:
     """Dense traffic, in which the ego is one of many."""
     graphs = {name: load_town(name) for name in ("Oldmarket", "Crossgate")}
@@ -107,14 +119,33 @@ def text(value: dict[str, float]) -> str:
     return f"{value['mean']:.3f} [{value['low']:.3f}, {value['high']:.3f}]"
 
 
+def page(figures: dict[str, dict[str, Any]]) -> None:
+    """Write the table between its markers in the document."""
+    sets = list(figures)
+    heads = [f"CR, {name} (n = {figures[name]['episodes']}) | RC" for name in sets]
+    total = sum(figures[name]["episodes"] for name in sets)
+    lines = [
+        "| Autopilot over | " + " | ".join([*heads, "episodes driven otherwise"]) + " |",
+        "|---" * (2 * len(sets) + 2) + "|",
+    ]
+    for system, title in TITLES.items():
+        rows = [figures[name][system] for name in sets]
+        cells = [f"{text(row['CR'])} | {text(row['RC'])}" for row in rows]
+        lines.append(f"| {title} | {' | '.join(cells)} | {sum(row['other'] for row in rows)} of {total} |")
+    before, _, rest = DOCUMENT.read_text().partition(MARKERS[0])
+    after = rest.partition(MARKERS[1])[2]
+    DOCUMENT.write_text("\n".join([before + MARKERS[0], *lines, MARKERS[1] + after]))
+
+
 def main() -> None:
     """Drive, print, and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenarios", default="precrash,natural", help="sets, with commas")
     parser.add_argument("--repetitions", type=int, default=1)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--page", action="store_true", help="write docs/loop.md")
     given = parser.parse_args()
-    figures: dict[str, dict[str, object]] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for name in given.scenarios.split(","):
         episodes, graphs = make_episodes(name, given.repetitions)
         figures[name] = {"episodes": len(episodes)}
@@ -131,6 +162,8 @@ def main() -> None:
             print(f"| {system} | {text(found['CR'])} | {text(found['RC'])} | {other} |", flush=True)
     if given.json:
         given.json.write_text(json.dumps(figures, indent=1))
+    if given.page:
+        page(figures)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,9 @@ def das(**settings: Any) -> TextureAttack:
     """The dual attention suppression attack: the attention for the target falls into small, weak parts.
 
     The paper runs SGD with a learning rate of 0.01, a weight decay of 1e-4 and at most 200 epochs; the authors' code
-    runs Adam. Adam is the default here, since it takes fewer epochs: attention is scaled to at most one, so the slope of
-    a texel is small, and SGD at that rate moves it by less than a thousandth a step. `optimiser="sgd", rate=0.01` gives
-    the paper's.
+    runs Adam. Adam is the default here, since it takes fewer epochs: attention is scaled to at most one, so the slope
+    of a texel is small, and SGD at that rate moves it by less than a thousandth a step. `optimiser="sgd", rate=0.01`
+    gives the paper's.
 
     Source: Wang et al., Dual Attention Suppression Attack: Generate Adversarial Camouflage in Physical World (2021).
     """
