@@ -97,13 +97,14 @@ def measure(batch: int, device: str, *, observe: bool, repeats: int, budget: flo
 def parts(batch: int, device: str, repeats: int = 5) -> dict[str, float]:
     """Share of the step that each kernel takes, in microseconds."""
     world = make_world(batch, device, min(batch, 150))
-    see = make_look(world)
+    view = make_look(world)
     for _ in range(50):
         world.step()
-    names = ["restart", "restart_record", "sight", "meet", "drive", "move", "contact", "record", "look"]
+    names = ["restart", "restart_record", "see", "sight", "meet", "change_lanes", "drive"]
+    names += ["move", "contact", "record", "look"]
     spent: dict[str, list[float]] = {n: [] for n in names}
     for _ in range(repeats * 10):
-        for name, command in zip(names, [*world._plan, *world._advance, see], strict=True):
+        for name, command in zip(names, [*world._plan, *world._advance, view], strict=True):
             wp.synchronize_device(device)
             start = time.perf_counter()
             command.launch()
