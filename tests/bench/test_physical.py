@@ -65,6 +65,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"target": "stop_sign"}, ConfigError, "only cars are driven"),
         ({"attacks": ["vanish"]}, UnknownNameError, "vanishing"),
         ({"attacks": [{"name": "vanishing", "settings": {"speed": 3}}]}, ConfigError, "no setting 'speed'"),
+        ({"attacks": [{"name": "vanishing", "settings": {"rate": "fast"}}]}, ConfigError, "of a wrong type"),
         ({"attacks": [{"name": "random", "settings": {"rate": 1.0}}]}, ConfigError, "is not trained"),
         ({"attacks": [{"name": "shuffled"}]}, ConfigError, "of which attack"),
         ({"attacks": [{"name": "shuffled", "of": "das"}]}, ConfigError, "there must be one such attack"),
@@ -112,6 +113,7 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert np.array_equal(texture_of(job, cell.spec), colour), "the checkpoint goes on where it ended"
     texture.unlink()
     texture.with_suffix(".checkpoint.npz").unlink()
+    Physical().execute([cell], job)  # which needs no piece of work done before it
     assert np.array_equal(texture_of(job, cell.spec), colour), "trained anew, the same to the bit"
 
 
@@ -121,7 +123,7 @@ def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch:
     from ssad.evaluation.target_scores import Sighting
 
     nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
-    monkeypatch.setattr("ssad.bench.kinds.physical.sightings_of", lambda *given: [nothing])
+    monkeypatch.setattr("ssad.bench.kinds.physical.clean_sightings", lambda *given: (nothing,))
     plan = Physical().plan(suite(floor=0.9))
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
     (clean,) = Physical().execute([plan.cells[0]], job).values()

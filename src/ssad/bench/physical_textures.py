@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,13 @@ from ssad.bench.kind import Job
 from ssad.bench.physical_rows import carrier_of
 from ssad.core import safeio
 from ssad.core.detections import Truth
-from ssad.core.images import save_picture
+from ssad.core.images import read_image, save_picture
 from ssad.core.seeding import digest
 from ssad.detectors import make_detector
 from ssad.evaluation.target_scores import Sighting, sighting
 from ssad.evaluation.target_sheet import texture_picture
 from ssad.jobs.machine import quiet_warp
+from ssad.recording.clip_recorder import clip_rows
 from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.textured_clips import textured_clips
 from ssad.scenarios.static.physical import (
@@ -69,15 +70,32 @@ def views_of(job: Job, town: str, spec: Mapping[str, Any], count: int) -> list[t
         if len(found) == count:
             break
         wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=job.device)
-        objects = sorted(clip.objects, key=lambda one: not one["target"])
-        x, y, width, height = np.array([one["bbox"] for one in objects], np.float64).T
-        truth = Truth(
-            torch.tensor([int(one["category_id"]) - 1 for one in objects]),
-            torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),
-            crowd=torch.tensor([bool(one["iscrowd"]) for one in objects]),
-        )
-        found.append((f"{clip.row['part']}/{clip.row['attempt']}", View(wearing, truth)))
+        found.append((_drive(clip.row), View(wearing, _truth(clip.objects))))
     return found
+
+
+def _drive(row: Mapping[str, Any]) -> str:
+    """Name of the drive that a picture is of."""
+    return f"{row['part']}/{row['attempt']}"
+
+
+def _truth(objects: Sequence[Mapping[str, Any]]) -> Truth:
+    """What is annotated in a picture, the target first."""
+    ordered = sorted(objects, key=lambda one: not one["target"])
+    x, y, width, height = np.array([one["bbox"] for one in ordered], np.float64).T
+    return Truth(
+        torch.tensor([int(one["category_id"]) - 1 for one in ordered]),
+        torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),
+        crowd=torch.tensor([bool(one["iscrowd"]) for one in ordered]),
+    )
+
+
+def clean_images(job: Job, town: str, count: int) -> Iterator[tuple[str, torch.Tensor, Truth]]:
+    """Drive, picture [1, 3, H, W] in 0 to 1 and truth of the pictures of a town, as they were recorded."""
+    folder = job.folder / "data" / town
+    for row, objects in clip_rows(folder)[:count]:
+        image = torch.tensor(read_image(folder / "images" / row["file_name"])).to(job.device)
+        yield _drive(row), image.permute(2, 0, 1)[None].float() / 255, _truth(objects)
 
 
 def texture_name(spec: Mapping[str, Any]) -> str:
@@ -97,7 +115,8 @@ def texture_path(job: Job, spec: Mapping[str, Any]) -> Path:
 def picture_path(job: Job, spec: Mapping[str, Any]) -> Path:
     """The texture of a cell as a picture."""
     if spec["attack"] in CONTROLS and not spec["source"]:
-        return job.folder / "textures" / f"{spec['attack']}-{spec['carrier']}-{spec['number']}.png"
+        where = digest("carrier", safeio.dump_json(carried(spec)))[:8]
+        return job.folder / "textures" / f"{spec['attack']}-{spec['carrier']}-{where}-{spec['number']}.png"
     number = f"-shuffled-{spec['number']}" if spec["attack"] == "shuffled" else ""
     return texture_path(job, spec).with_name(f"{texture_name(spec)}{number}.png")
 
@@ -145,25 +164,39 @@ def about(job: Job, spec: Mapping[str, Any]) -> dict[str, Any]:
     return {"epochs": len(losses), "loss_before": float(losses[0]), "loss_after": float(losses[-1])}
 
 
-@torch.no_grad()
-def sightings_of(job: Job, detector: str, spec: Mapping[str, Any] | None, pair: Mapping[str, Any]) -> list[Sighting]:
-    """What a detector finds in the pictures of the test, clean (None) or under the texture of a cell."""
-    worn = spec or {"carrier": "camouflage", "options": {}}
+def sightings_of(job: Job, detector: str, spec: Mapping[str, Any], pair: Mapping[str, Any]) -> list[Sighting]:
+    """What a detector finds in the pictures of the test under the texture of a cell."""
     made = make_detector(detector, device=job.device)
-    colour = None if spec is None else albedo_of(texture_of(job, spec)).to(job.device)
+    colour = albedo_of(texture_of(job, spec)).to(job.device)  # may be trained now, so gradients are on
     found = []
-    for drive, view in views_of(job, pair["test"], worn, pair["test_images"]):
-        image = view.picture.before if colour is None else view.picture.show({0: colour})  # type: ignore[attr-defined]
-        (boxes,) = made.predict(image, threshold=THRESHOLD)
-        found.append(sighting(drive, boxes, view.truth))
+    with torch.no_grad():
+        for drive, view in views_of(job, pair["test"], spec, pair["test_images"]):
+            (boxes,) = made.predict(view.picture.show({0: colour}), threshold=THRESHOLD)
+            found.append(sighting(drive, boxes, view.truth))
     return found
 
 
-@torch.no_grad()
+def clean_sightings(job: Job, detector: str, pair: Mapping[str, Any]) -> tuple[Sighting, ...]:
+    """What a detector finds in the pictures of the test as they were recorded; kept, since every cell needs it."""
+    return _clean_sightings(job.folder, job.device, detector, pair["test"], pair["test_images"])
+
+
+@lru_cache(maxsize=8)
+def _clean_sightings(folder: Path, device: str, detector: str, town: str, count: int) -> tuple[Sighting, ...]:
+    made = make_detector(detector, device=device)
+    found = []
+    for drive, image, truth in clean_images(Job(folder, device, {}), town, count):
+        (boxes,) = made.predict(image, threshold=THRESHOLD)
+        found.append(sighting(drive, boxes, truth))
+    return tuple(found)
+
+
 def clip_image(job: Job, town: str, spec: Mapping[str, Any] | None) -> torch.Tensor:
     """The first picture of a town [1, 3, H, W], clean (None) or under the texture of a cell."""
-    worn = spec or {"carrier": "camouflage", "options": {}}
-    ((_, view),) = views_of(job, town, worn, 1)
     if spec is None:
-        return view.picture.before  # type: ignore[attr-defined,no-any-return]
-    return view.picture.show({0: albedo_of(texture_of(job, spec)).to(job.device)})
+        ((_, image, _),) = clean_images(job, town, 1)
+        return image
+    colour = albedo_of(texture_of(job, spec)).to(job.device)
+    ((_, view),) = views_of(job, town, spec, 1)
+    with torch.no_grad():
+        return view.picture.show({0: colour})

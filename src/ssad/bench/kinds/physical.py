@@ -12,6 +12,7 @@ from ssad.bench.physical_rows import Pair, PhysicalSuite, carrier_of, row_of, ta
 from ssad.bench.physical_textures import (
     about,
     carried,
+    clean_sightings,
     clip_image,
     picture_path,
     see,
@@ -160,7 +161,7 @@ class Physical(Kind):
         found = {}
         for cell in cells:
             spec = cell.spec
-            clean = sightings_of(job, cell.system, None, spec["pair"])
+            clean = clean_sightings(job, cell.system, spec["pair"])
             before = target_scores(clean, replicates=job.settings["replicates"], seed=job.settings["seed"])
             if spec["attack"] is None:
                 found[cell.key] = before

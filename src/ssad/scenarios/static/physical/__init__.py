@@ -46,7 +46,10 @@ def make_physical(name: str, **settings: Any) -> TextureAttack:
     for setting in settings:
         if setting not in known:
             raise ConfigError(f"attack {name}: there is no setting '{setting}'; it has {', '.join(known)}")
-    made = build(**settings) if callable(build) else build
+    try:
+        made = build(**settings) if callable(build) else build
+    except TypeError as error:
+        raise ConfigError(f"attack {name}: a setting of a wrong type ({error})") from None
     if not isinstance(made, TextureAttack):
         raise ConfigError(f"attack {name}: expected a TextureAttack, not {type(made).__name__}")
     return made
