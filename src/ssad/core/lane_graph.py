@@ -207,6 +207,17 @@ class LaneGraph:
         return bool(self.lane_id[lane] * self.lane_id[other] > 0 and self.road[lane] == self.road[other])
 
 
+def no_signals() -> dict[str, Any]:
+    """The arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
+    none = np.zeros(0, np.int32)
+    return {
+        "signal_xy": np.zeros((0, 2), np.float32), "signal_yaw": np.zeros(0, np.float32), "signal_junction": none,
+        "signal_phase": none, "signal_virtual": np.zeros(0, bool), "stop_signal": none, "stop_lane": none,
+        "stop_s": np.zeros(0, np.float32), "crosswalk_offset": np.zeros(1, np.int32),
+        "crosswalk_xy": np.zeros((0, 2), np.float32),
+    }  # fmt: skip
+
+
 _DTYPES = array_dtypes(LaneGraph)
 _PER = {
     "P": ("z", "yaw", "width", "s"),

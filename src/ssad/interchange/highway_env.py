@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
-from ssad.core.lane_graph import LaneGraph, Marking
+from ssad.core.lane_graph import LaneGraph, Marking, no_signals
 from ssad.core.types import (
     F32,
     I32,
@@ -146,7 +146,6 @@ def highway_town(name: str) -> LaneGraph:
     inside = [len(graph[a]) > 1 and ways_in[b] > 1 for a, b, _ in index]
     marks = {0: Marking.NONE, 1: Marking.BROKEN, 2: Marking.SOLID, 3: Marking.SOLID}
     count = len(lanes)
-    empty = np.zeros(0, np.int32)
     return LaneGraph(
         name=name,
         xy=np.concatenate([p[0] for p in parts]),
@@ -167,16 +166,7 @@ def highway_town(name: str) -> LaneGraph:
         right_marking=np.array([marks[lane.line_types[1]] for lane in lanes], np.uint8),
         succ_offset=np.cumsum([0, *(len(s) for s in succ)]).astype(np.int32),
         succ=np.array([k for s in succ for k in s], np.int32),
-        signal_xy=np.zeros((0, 2), np.float32),
-        signal_yaw=np.zeros(0, np.float32),
-        signal_junction=empty,
-        signal_phase=empty,
-        signal_virtual=np.zeros(0, bool),
-        stop_signal=empty,
-        stop_lane=empty,
-        stop_s=np.zeros(0, np.float32),
-        crosswalk_offset=np.zeros(1, np.int32),
-        crosswalk_xy=np.zeros((0, 2), np.float32),
+        **no_signals(),
     )
 
 

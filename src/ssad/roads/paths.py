@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ssad.core.errors import MapError
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import LaneGraph, no_signals
 from ssad.core.types import F64, Bool, LaneType
 
 WIDTH: Final = 3.5  # m
@@ -75,16 +75,7 @@ def graph_of_paths(name: str, paths: Sequence[F64], *, speeds: Sequence[float], 
         right_marking=np.zeros(amount, np.uint8),
         succ_offset=np.zeros(amount + 1, np.int32),
         succ=none,
-        signal_xy=np.zeros((0, 2), np.float32),
-        signal_yaw=np.zeros(0, np.float32),
-        signal_junction=none,
-        signal_phase=none,
-        signal_virtual=np.zeros(0, bool),
-        stop_signal=none,
-        stop_lane=none,
-        stop_s=np.zeros(0, np.float32),
-        crosswalk_offset=np.zeros(1, np.int32),
-        crosswalk_xy=np.zeros((0, 2), np.float32),
+        **no_signals(),
     )
 
 
