@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.physical import Physical
-from ssad.bench.physical_rows import PhysicalSuite
-from ssad.bench.physical_textures import texture_name, texture_of
+from ssad.bench.kinds.physical import Physical, texture_of
+from ssad.bench.physical_suite import PhysicalSuite
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.images import read_image
+from ssad.scenarios.static.physical import TextureSpec
 
 PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
 
@@ -42,7 +42,7 @@ def test_cells_are_attacks_by_detector_and_towns() -> None:
         ("yolov5n", "shuffled vanishing", "yolov3-tiny", 0),
     ]  # fmt: skip
     assert len({cell.key for cell in plan.cells}) == len(plan.cells) == 2 * 9
-    trained = {texture_name(cell.spec) for cell in plan.cells if cell.spec["source"]}
+    trained = {TextureSpec.of_row(cell.spec).name for cell in plan.cells if cell.spec["source"]}
     assert len(trained) == 2, "a texture for each detector, shown to both and shuffled"
 
 
@@ -97,7 +97,8 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert "epochs" not in random
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
     cell = next(cell for cell in plan.cells if cell.fields["attack"] == "vanishing")
-    colour = texture_of(job, cell.spec)
+    spec = TextureSpec.of_row(cell.spec)
+    colour = texture_of(job, spec)
     picture = read_image(tmp_path / trained["artefacts"]["texture"])
     assert picture.shape == (128, 128, 3)
     kept = np.abs(picture / 255 - colour.permute(1, 2, 0).numpy()).max(2) < 0.005
@@ -110,11 +111,11 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert (tmp_path / "results.jsonl").read_bytes() == results
     texture = tmp_path / trained["artefacts"]["texture"].replace(".png", ".npz")
     texture.unlink()
-    assert np.array_equal(texture_of(job, cell.spec), colour), "the checkpoint goes on where it ended"
+    assert np.array_equal(texture_of(job, spec), colour), "the checkpoint goes on where it ended"
     texture.unlink()
     texture.with_suffix(".checkpoint.npz").unlink()
     Physical().execute([cell], job)  # which needs no piece of work done before it
-    assert np.array_equal(texture_of(job, cell.spec), colour), "trained anew, the same to the bit"
+    assert np.array_equal(texture_of(job, spec), colour), "trained anew, the same to the bit"
 
 
 def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,7 +124,7 @@ def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch:
     from ssad.evaluation.target_scores import Sighting
 
     nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
-    monkeypatch.setattr("ssad.bench.kinds.physical.clean_sightings", lambda *given: (nothing,))
+    monkeypatch.setattr("ssad.bench.kinds.physical._clean_sightings", lambda *given: (nothing,))
     plan = Physical().plan(suite(floor=0.9))
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
     (clean,) = Physical().execute([plan.cells[0]], job).values()

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from ssad.core.detections import Detections, Truth
+from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
 from ssad.core.types import F64, I32, Bool
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
 
 IOU = 0.5
+THRESHOLD = 0.001  # least score of a box that AP counts
 CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
 
 
@@ -55,6 +58,18 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
         drive, found.box.cpu()[own].double().numpy(), found.score.cpu()[own].double().numpy(),
         truth.box.cpu()[same].double().numpy(), crowd[same.numpy()],
     )  # fmt: skip
+
+
+def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[Sighting]:
+    """What a detector finds in pictures, one after another.
+
+    Args:
+        detector: A 2D detector.
+        pictures: Drive, picture [1, 3, H, W] in 0 to 1, and truth, the target first.
+    """
+    for drive, image, truth in pictures:
+        (found,) = detector.predict(image, threshold=THRESHOLD)
+        yield sighting(drive, found, truth)
 
 
 def target_scores(

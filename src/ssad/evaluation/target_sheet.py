@@ -1,4 +1,4 @@
-"""Pictures of physical attacks: a scene under several textures with what a detector finds, and the textures."""
+"""Pictures of physical attacks: a scene under several textures with what a detector finds."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ssad.core.images import captioned
 from ssad.core.protocols import Detector
-from ssad.core.types import U8, Bool
+from ssad.core.types import U8
 from ssad.evaluation.pictures import FOUND
 
 COLUMNS, WIDTH, LEAST = 3, 640, 0.25
@@ -45,14 +45,3 @@ def target_sheet(detector: Detector, shown: Sequence[tuple[str, Tensor]], device
         tiles.append(np.full_like(tiles[0], 255))
     rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]
     return np.concatenate(rows)
-
-
-def texture_picture(colour: Tensor, mask: Bool) -> U8:
-    """A texture as it is printed, RGB [H, W, 3]; mid-grey where nothing is on the body.
-
-    Args:
-        colour: sRGB [3, H, W] in 0 to 1.
-        mask: Texels [H, W] that are on the body.
-    """
-    whole = np.where(mask[..., None], colour.permute(1, 2, 0).numpy(), 0.5)
-    return np.asarray((whole * 255).round(), np.uint8)

@@ -15,8 +15,8 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
-from ssad.scenarios.static.physical.attention import Distraction, Redistribution, _parts, attention
 from ssad.scenarios.static.physical.carrier import Surface, albedo_of
+from ssad.scenarios.static.physical.invasive.attention import Distraction, Redistribution, _parts, attention
 from ssad.scenarios.static.physical.optimise import TARGET, TextureAttack, View, train_texture
 from ssad.scenarios.static.physical.printing import NOMINAL, Expectation
 from ssad.scenarios.static.physical.textures import control

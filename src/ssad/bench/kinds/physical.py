@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
-from ssad.bench.physical_rows import Pair, PhysicalSuite, carrier_of, row_of, target_of
-from ssad.bench.physical_textures import (
-    about,
-    carried,
-    clean_sightings,
-    clip_image,
-    picture_path,
-    see,
-    sightings_of,
-    texture_name,
-    texture_of,
-    texture_path,
-)
+from ssad.bench.physical_suite import Pair, PhysicalSuite, row_of, target_of
 from ssad.core import safeio
+from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.detectors import make_detector
-from ssad.evaluation.target_scores import target_scores
+from ssad.evaluation.target_scores import Sighting, sightings, target_scores
 from ssad.evaluation.target_sheet import target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.target import TargetCar, parse_target
+from ssad.recording.target_views import clean_images, target_views
+from ssad.recording.textured_clips import textured_clips
 from ssad.roads import town_names
-from ssad.scenarios.static.physical import CONTROLS
+from ssad.scenarios.static.physical import CONTROLS, Surface, TextureSpec, View, albedo_of, make_carrier
+from ssad.scenarios.static.physical.kept import TextureFolder
 
 CLEAN = "clean"
 
@@ -66,7 +63,7 @@ class Physical(Kind):
                     raise ConfigError(f"suite {suite.name}: unknown town '{town}' (see: ssad list towns)")
         rows = [row_of(suite, entry) for entry in suite.attacks]
         for row in rows:
-            carrier_of(row).on(target.mesh())
+            make_carrier(row["carrier"], row["options"]).on(target.mesh())
         cells: dict[str, Cell] = {}
         for pair in suite.pairs:
             for detector in suite.detectors:
@@ -126,16 +123,14 @@ class Physical(Kind):
             )  # fmt: skip
             with Live(f"recording {town}", count, 0, console=resources.console, unit="parts") as live:
                 record_clips(clips, workers=resources.workers, ray=resources.ray, progress=live.show)
-        surfaces = {safeio.dump_json(carried(c.spec)): carried(c.spec) for c in plan.cells if c.spec["attack"]}
+        surfaces = dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"])
         tasks = [
-            (str(folder / "data" / town), suite.target, row, plan.device)
-            for town in images
-            for row in surfaces.values()
+            (folder / "data" / town, suite.target, surface, plan.device) for town in images for surface in surfaces
         ]
         if tasks:
             pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
             with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
-                run_all(pool, see, tasks, progress=live.show)
+                run_all(pool, _see, tasks, progress=live.show)
         return {
             "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
         }  # fmt: skip
@@ -147,23 +142,25 @@ class Physical(Kind):
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """The training of the cell's texture, unless it is done."""
-        spec = cell.spec
-        if not spec["source"] or texture_path(job, spec).is_file():
+        if cell.spec["attack"] is None:
             return {}
-        return {f"texture {texture_name(spec)}": dict(spec)}
+        spec = TextureSpec.of_row(cell.spec)
+        if not spec.source or _textures(job).kept(spec).is_file():
+            return {}
+        return {f"texture {spec.name}": dict(cell.spec)}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """Train a texture."""
-        texture_of(job, data)
+        texture_of(job, TextureSpec.of_row(data))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
         """Scores in the town of the test."""
         found = {}
         for cell in cells:
-            spec = cell.spec
-            clean = clean_sightings(job, cell.system, spec["pair"])
+            pair = cell.spec["pair"]
+            clean = _clean_sightings(job.folder, job.device, cell.system, pair["test"], pair["test_images"])
             before = target_scores(clean, replicates=job.settings["replicates"], seed=job.settings["seed"])
-            if spec["attack"] is None:
+            if cell.spec["attack"] is None:
                 found[cell.key] = before
                 continue
             floor, have = job.settings["floor"], before["metrics"]["AP50"] or 0.0
@@ -171,12 +168,14 @@ class Physical(Kind):
                 raise CellError(
                     f"{cell.system} finds the clean car with AP50 {have:.3f}, which is less than the floor of {floor:g}"
                 )
+            spec = TextureSpec.of_row(cell.spec)
             own = target_scores(
-                sightings_of(job, cell.system, spec, spec["pair"]), clean, replicates=job.settings["replicates"],
+                _sightings(job, cell.system, spec), clean, replicates=job.settings["replicates"],
                 seed=job.settings["seed"],
             )  # fmt: skip
-            artefacts = {"texture": str(picture_path(job, spec).relative_to(job.folder))}
-            found[cell.key] = {**own, "clean_AP50": have, "artefacts": artefacts, **about(job, spec)}
+            kept = _textures(job)
+            artefacts = {"texture": str(kept.picture(spec).relative_to(job.folder))}
+            found[cell.key] = {**own, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
         return found
 
     def finish(self, plan: Plan, folder: Path) -> None:
@@ -184,16 +183,18 @@ class Physical(Kind):
         suite: PhysicalSuite = plan.suite
         job = Job(folder, plan.device, {"target": suite.target, "seed": suite.seed})
         path, pair, name = folder / "pictures" / "textures.jpg", suite.pairs[0], suite.detectors[0]
-        chosen: dict[str, dict[str, Any]] = {}
+        chosen: dict[str, TextureSpec] = {}
         for cell in plan.cells:
             mine = cell.system == name and cell.spec["pair"] == pair.model_dump() and cell.spec["source"] in ("", name)
             if mine and cell.spec["attack"] and cell.spec["number"] == 0:
-                if cell.spec["source"] and not texture_path(job, cell.spec).is_file():
+                spec = TextureSpec.of_row(cell.spec)
+                if spec.source and not _textures(job).kept(spec).is_file():
                     continue
-                chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", dict(cell.spec))
+                chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", spec)
         if not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
-            shown = [(CLEAN, clip_image(job, pair.test, None))]
-            shown += [(title, clip_image(job, pair.test, spec)) for title, spec in chosen.items()]
+            ((_, clean, _),) = clean_images(folder / "data" / pair.test, 1, device=plan.device)
+            shown = [(CLEAN, clean)]
+            shown += [(title, next(_worn(job, pair.test, spec, 1))[1]) for title, spec in chosen.items()]
             save_picture(path, target_sheet(make_detector(name, device=plan.device), shown, plan.device))
         if path.is_file():
             caption = (
@@ -202,3 +203,61 @@ class Physical(Kind):
             safeio.write_atomic(
                 path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n"
             )
+
+
+@lru_cache(maxsize=16)
+def _surface(target: str, surface: str) -> Surface:
+    """Where a texture goes, from plain data."""
+    car, row = parse_target(target), safeio.parse_json(surface)
+    assert isinstance(car, TargetCar)
+    return make_carrier(row["carrier"], row["options"]).on(car.mesh())
+
+
+def _see(task: tuple[Path, str, str, str]) -> None:
+    """In a worker: render what all pictures of a recording see of a carrier, and keep it."""
+    folder, target, surface, device = task
+    quiet_warp()
+    for _ in textured_clips(folder, (_surface(target, surface).layer,), device=device):
+        pass
+
+
+def _textures(job: Job) -> TextureFolder:
+    """The textures of a run."""
+    return TextureFolder(job.folder / "textures", job.settings["seed"], job.device)
+
+
+def _views(job: Job, town: str, spec: TextureSpec, count: int) -> list[tuple[str, View]]:
+    """Pictures of a town whose target waits for a texture."""
+    surface = _surface(job.settings["target"], spec.surface)
+    return target_views(job.folder / "data" / town, surface, count, device=job.device)
+
+
+def texture_of(job: Job, spec: TextureSpec) -> Tensor:
+    """A texture of a run [3, H, W], sRGB; trained now if it has to be."""
+    return _textures(job).texture(
+        spec,
+        _surface(job.settings["target"], spec.surface),
+        views=lambda: [view for _, view in _views(job, spec.pair["train"], spec, spec.pair["train_images"])],
+        detector=lambda: make_detector(spec.source, device=job.device),
+    )
+
+
+def _worn(job: Job, town: str, spec: TextureSpec, count: int) -> Iterator[tuple[str, Tensor, Truth]]:
+    """Drive, picture and truth of the first pictures of a town under a texture."""
+    colour = albedo_of(texture_of(job, spec)).to(job.device)  # may be trained now, so gradients are on
+    for drive, view in _views(job, town, spec, count):
+        with torch.no_grad():
+            yield drive, view.picture.show({0: colour}), view.truth
+
+
+def _sightings(job: Job, detector: str, spec: TextureSpec) -> list[Sighting]:
+    """What a detector finds in the pictures of the test under a texture."""
+    pictures = _worn(job, spec.pair["test"], spec, spec.pair["test_images"])
+    return list(sightings(make_detector(detector, device=job.device), pictures))
+
+
+@lru_cache(maxsize=8)
+def _clean_sightings(folder: Path, device: str, detector: str, town: str, count: int) -> tuple[Sighting, ...]:
+    """What a detector finds in the pictures of the test as they were recorded; kept, since every cell needs it."""
+    pictures = clean_images(folder / "data" / town, count, device=device)
+    return tuple(sightings(make_detector(detector, device=device), pictures))

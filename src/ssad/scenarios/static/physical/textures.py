@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.seeding import generator
+from ssad.core.types import U8, Bool
 
 CELL = 8  # texels of a side of the patches of a random texture: a car's colours are not white noise at 20 m
 CONTROLS = ("random", "noise", "grey", "shuffled")
@@ -49,3 +50,14 @@ def control(name: str, size: tuple[int, int], *, seed: int = 0, trained: Tensor 
     blocks = blocks[torch.from_numpy(draws.permutation(len(blocks)))]
     whole = blocks.reshape(rows, columns, 3, CELL, CELL).permute(2, 0, 3, 1, 4)
     return whole.reshape(3, rows * CELL, columns * CELL)[:, :height, :width].contiguous()
+
+
+def texture_picture(colour: Tensor, mask: Bool) -> U8:
+    """A texture as it is printed, RGB [H, W, 3]; mid-grey where nothing is on the body.
+
+    Args:
+        colour: sRGB [3, H, W] in 0 to 1.
+        mask: Texels [H, W] that are on the body.
+    """
+    whole = np.where(mask[..., None], colour.permute(1, 2, 0).numpy(), 0.5)
+    return np.asarray((whole * 255).round(), np.uint8)

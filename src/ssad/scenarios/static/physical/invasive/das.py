@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from ssad.scenarios.static.physical.attention import Distraction
+from ssad.scenarios.static.physical.invasive.attention import Distraction
 from ssad.scenarios.static.physical.optimise import TextureAttack
 
 

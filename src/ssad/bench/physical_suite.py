@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -11,7 +10,7 @@ from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
 from ssad.core.errors import ConfigError
 from ssad.recording.target import TargetCar, parse_target
-from ssad.scenarios.static.physical import CARRIERS, CONTROLS, Carrier, default_carrier, make_physical
+from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_physical
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -114,11 +113,3 @@ def target_of(suite: PhysicalSuite) -> TargetCar:
     if not isinstance(target, TargetCar):
         raise ConfigError(f"suite {suite.name}: target {suite.target}: only cars are driven")
     return target
-
-
-def carrier_of(row: Mapping[str, Any]) -> Carrier:
-    """The carrier of a row. ConfigError: an option that it does not have."""
-    try:
-        return CARRIERS[row["carrier"]](**row["options"])
-    except TypeError as error:
-        raise ConfigError(f"{row['carrier']}: {str(error).partition(') ')[2] or error}") from None

@@ -1,0 +1,52 @@
+"""The table of attacks that train a texture."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from ssad.core.errors import ConfigError
+from ssad.core.registry import names, resolve
+from ssad.scenarios.static.physical.optimise import TextureAttack
+
+ATTACKS: dict[str, str] = {
+    "adv-patch": "ssad.scenarios.static.physical.invasive.adv_patch:adv_patch",
+    "das": "ssad.scenarios.static.physical.invasive.das:das",
+    "tpa": "ssad.scenarios.static.physical.invasive.tpa:tpa",
+    "vanishing": "ssad.scenarios.static.physical.invasive.vanishing:vanishing",
+}
+
+
+def physical_names() -> dict[str, str]:
+    """All names of attacks that train a texture -> where they come from."""
+    return names("physical-attack", ATTACKS)
+
+
+def make_physical(name: str, **settings: Any) -> TextureAttack:
+    """An attack that trains a texture, by name.
+
+    Args:
+        name: Of `ATTACKS`, or "module:object".
+        **settings: Fields of `TextureAttack` that differ from the attack's own.
+
+    Raises:
+        UnknownNameError: There is no such attack.
+        ConfigError: A setting that it does not have, or a value that it refuses.
+    """
+    build = resolve("physical-attack", ATTACKS, name)
+    known = inspect.signature(TextureAttack).parameters
+    for setting in settings:
+        if setting not in known:
+            raise ConfigError(f"attack {name}: there is no setting '{setting}'; it has {', '.join(known)}")
+    try:
+        made = build(**settings) if callable(build) else build
+    except TypeError as error:
+        raise ConfigError(f"attack {name}: a setting of a wrong type ({error})") from None
+    if not isinstance(made, TextureAttack):
+        raise ConfigError(f"attack {name}: expected a TextureAttack, not {type(made).__name__}")
+    return made
+
+
+def default_carrier(name: str) -> str:
+    """What a texture is printed on if a suite does not say."""
+    return "patch" if name == "adv-patch" else "camouflage"

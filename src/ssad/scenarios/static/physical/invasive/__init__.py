@@ -1,0 +1,1 @@
+"""Physical attacks that touch their target: patches and camouflages, printed and stuck on (paper III.A.1)."""

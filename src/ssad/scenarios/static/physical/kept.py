@@ -1,0 +1,101 @@
+"""The textures of a folder: each trained once and kept, as numbers and as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.images import save_picture
+from ssad.core.protocols import Detector
+from ssad.scenarios.static.physical.attacks import make_physical
+from ssad.scenarios.static.physical.carrier import Surface
+from ssad.scenarios.static.physical.optimise import View, train_texture
+from ssad.scenarios.static.physical.spec import TextureSpec
+from ssad.scenarios.static.physical.textures import control, texture_picture
+
+
+@dataclass(frozen=True, slots=True)
+class TextureFolder:
+    """Textures that are kept.
+
+    Attributes:
+        path: The folder.
+        seed: Root of the random numbers of trainings.
+        device: Where textures are trained.
+    """
+
+    path: Path
+    seed: int = 0
+    device: str = "cpu"
+
+    def kept(self, spec: TextureSpec) -> Path:
+        """Where a trained texture is when it is done."""
+        return self.path / f"{spec.name}.npz"
+
+    def picture(self, spec: TextureSpec) -> Path:
+        """Where a texture is as a picture."""
+        return self.path / spec.picture
+
+    def texture(
+        self,
+        spec: TextureSpec,
+        surface: Surface,
+        *,
+        views: Callable[[], Sequence[View]],
+        detector: Callable[[], Detector],
+    ) -> Tensor:
+        """A texture; trained now if it has to be. Written as a picture too.
+
+        Args:
+            spec: Which.
+            surface: What it is printed on.
+            views: Makes the pictures of the training.
+            detector: Makes the detector that is attacked.
+
+        Returns:
+            sRGB [3, H, W] in 0 to 1.
+
+        Raises:
+            ConfigError: It cannot be trained (see `train_texture`).
+        """
+        if spec.source:
+            colour = self._trained(spec, surface, views, detector)
+            if spec.attack == "shuffled":
+                colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
+        else:
+            colour = control(spec.attack, surface.size, seed=spec.number)
+        if not self.picture(spec).is_file():
+            save_picture(self.picture(spec), texture_picture(colour, surface.mask))
+        return colour
+
+    def _trained(
+        self,
+        spec: TextureSpec,
+        surface: Surface,
+        views: Callable[[], Sequence[View]],
+        detector: Callable[[], Detector],
+    ) -> Tensor:
+        path = self.kept(spec)
+        if not path.is_file():
+            trained = train_texture(
+                make_physical(spec.trained, **spec.settings), detector(), surface, views(),
+                start=control("grey", surface.size), device=self.device, key=(self.seed, spec.name),
+                checkpoint=path.with_suffix(".checkpoint.npz"),
+            )  # fmt: skip
+            losses, gradients = np.array(trained.losses), np.array(trained.gradients)
+            safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})
+        return torch.from_numpy(safeio.load_npz(path)["colour"].copy())
+
+    def history(self, spec: TextureSpec) -> dict[str, Any]:
+        """How a texture was trained, for records; empty for what is not trained."""
+        if not spec.source:
+            return {}
+        losses = safeio.load_npz(self.kept(spec))["losses"]
+        return {"epochs": len(losses), "loss_before": float(losses[0]), "loss_after": float(losses[-1])}

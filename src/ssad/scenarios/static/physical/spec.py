@@ -1,0 +1,78 @@
+"""A texture as plain data: which attack or control, on what, against whom; and the carrier that follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import digest
+from ssad.scenarios.static.physical.carrier import Camouflage, Carrier, Patch
+from ssad.scenarios.static.physical.textures import CONTROLS
+
+CARRIERS: dict[str, type[Patch] | type[Camouflage]] = {"patch": Patch, "camouflage": Camouflage}
+
+
+@dataclass(frozen=True, slots=True)
+class TextureSpec:
+    """All that decides a texture.
+
+    Attributes:
+        attack: Name of an attack (`ssad list attacks`) or of a control.
+        carrier: Name of what it is printed on.
+        options: Of the carrier.
+        settings: Fields of `TextureAttack` that differ from the attack's own.
+        of: Of the control shuffled: the attack whose texture is shuffled.
+        source: The detector that is attacked; "" for what is not trained.
+        number: Of a control that is drawn at random.
+        pair: What it is trained on, as the suite says it.
+    """
+
+    attack: str
+    carrier: str
+    options: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    of: str | None
+    source: str
+    number: int
+    pair: Mapping[str, Any]
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any]) -> Self:
+        """From plain data with these keys, among others."""
+        return cls(**{one.name: row[one.name] for one in fields(cls)})
+
+    @property
+    def trained(self) -> str:
+        """The attack that is trained, also for what is shuffled afterwards; "" for a control that learns nothing."""
+        return (self.of or self.attack) if self.source else ""
+
+    @property
+    def name(self) -> str:
+        """What the training of the texture depends on, in short."""
+        attack = self.of or self.attack
+        about = attack, self.source, self.carrier, safeio.dump_json(self.options)
+        rest = safeio.dump_json(self.settings), safeio.dump_json(self.pair)
+        return f"{attack}-{digest('texture', *about, *rest)[:12]}"
+
+    @property
+    def picture(self) -> str:
+        """File name of the texture as a picture."""
+        if self.attack in CONTROLS and not self.source:
+            return f"{self.attack}-{self.carrier}-{digest('carrier', self.surface)[:8]}-{self.number}.png"
+        return f"{self.name}{f'-shuffled-{self.number}' if self.attack == 'shuffled' else ''}.png"
+
+    @property
+    def surface(self) -> str:
+        """What decides the surface, as JSON."""
+        return safeio.dump_json({"carrier": self.carrier, "options": self.options})
+
+
+def make_carrier(name: str, options: Mapping[str, Any]) -> Carrier:
+    """A carrier by name. ConfigError: there is none, or an option that it does not have."""
+    try:
+        return CARRIERS[name](**options)
+    except TypeError as error:
+        raise ConfigError(f"{name}: {str(error).partition(') ')[2] or error}") from None
