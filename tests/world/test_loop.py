@@ -339,6 +339,12 @@ def test_sensors_are_read_for_who_asks_and_pictures_are_perturbed() -> None:
     rollout(World(short[1:2], GRAPHS), Watcher(), sensors={"camera": camera}, perturbation=Darker())
     np.testing.assert_array_equal(np.array(shown)[:, 0], together[:, 1])
     shown[:] = []
+    by_name = {"camera": Darker()}
+    rollout(World(short[1:2], GRAPHS), Watcher(), sensors={"camera": camera}, perturbation=by_name)
+    np.testing.assert_array_equal(np.array(shown)[:, 0], together[:, 1])
+    rollout(World(short[1:2], GRAPHS), Watcher(), sensors={"camera": camera}, perturbation={"rear": Darker()})
+    assert (np.array(shown[-3:]) == 1.0).all(), "another sensor is attacked"
+    shown[:] = []
     everybody = lambda state: state.active  # noqa: E731
     rollout(World(short[1:2], GRAPHS), {everybody: Watcher()}, sensors={"camera": camera}, perturbation=Darker())
     assert len(np.unique(np.concatenate(shown))) == 2 * 3  # a number of its own for every agent and step

@@ -39,7 +39,7 @@ class Loop:
     says. All that changes lies in the simulator, so that a snapshot of it continues to the bit if its drivers do.
     An episode may also name an agent's driver (`EpisodeAgent.policy`), which `policies` makes; whoever is in `drivers`
     goes before it. `sensors` adds to those of `ssad.world.sensors`; only what a driver asks for is computed.
-    `perturbation` changes the pictures ([N, C, H, W]) that drivers get.
+    `perturbation` changes the pictures ([N, C, H, W]) that drivers get; a mapping those of sensors it names.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Loop:
         drivers: Drivers,
         *,
         sensors: Mapping[str, Sensor] | None = None,
-        perturbation: Perturbation | None = None,
+        perturbation: Perturbation | Mapping[str, Perturbation] | None = None,
         policies: Policies | None = None,
     ) -> None:
         self.simulator = simulator
@@ -177,14 +177,15 @@ class Loop:
 
     def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> Any:
         reading = self.sensors[name](self.simulator, agents)
-        if self.perturbation is None or getattr(reading, "ndim", 0) != 4:
+        perturbation = self.perturbation.get(name) if isinstance(self.perturbation, Mapping) else self.perturbation
+        if perturbation is None or getattr(reading, "ndim", 0) != 4:
             return reading
         episodes, assigned = self.simulator.episodes, self.simulator.assigned
         generators = []
         for scene, agent in agents.tolist():
             episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
             generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
-        return self.perturbation.apply(reading, driver, state, generators)
+        return perturbation.apply(reading, driver, state, generators)
 
 
 def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
@@ -232,7 +233,7 @@ def rollout(
     drivers: Drivers | Driver,
     *,
     sensors: Mapping[str, Sensor] | None = None,
-    perturbation: Perturbation | None = None,
+    perturbation: Perturbation | Mapping[str, Perturbation] | None = None,
     policies: Policies | None = None,
 ) -> list[EpisodeTrace]:
     """Drive all scenes of a simulator from their starts to their ends.
@@ -241,7 +242,7 @@ def rollout(
         simulator: Where: `World(episodes, graphs)`, or another simulator.
         drivers: Who drives whom, as `Loop` takes it; a driver alone drives the egos.
         sensors: What drivers may ask for besides `ssad.world.sensors.SENSORS`.
-        perturbation: What changes the pictures that drivers get.
+        perturbation: What changes the pictures that drivers get; a mapping: of each sensor by its name.
         policies: Makes the drivers that episodes name, such as `ssad.drivers.make_system`.
 
     Returns:

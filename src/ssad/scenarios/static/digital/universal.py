@@ -13,7 +13,7 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access
 from ssad.scenarios.static.digital.budget import Budget
-from ssad.scenarios.static.digital.victim import Victim, steady
+from ssad.scenarios.static.digital.victim import Pictures, Victim, steady
 
 Batches = Iterable[Victim] | Callable[[], Iterable[Victim]]
 
@@ -38,7 +38,7 @@ class Universal:
         if len(shape) != 4 or shape[:2] != (1, 3) or not bool(self.change.isfinite().all()):
             raise ConfigError(f"universal: the change must be finite and of shape [1, 3, H, W], not {list(shape)}")
 
-    def perturb(self, victim: Victim, budget: Budget) -> Tensor:
+    def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
         """See `Attack`."""
         _check_size(tuple(self.change.shape), victim)
         return budget.project(victim.clean + self.change.to(victim.clean), victim.clean)
@@ -117,7 +117,7 @@ def _summed(batches: Iterable[Victim], change: Tensor) -> tuple[float, Tensor]:
     return total, gradient
 
 
-def _check_size(shape: tuple[int, ...], victim: Victim) -> None:
+def _check_size(shape: tuple[int, ...], victim: Victim | Pictures) -> None:
     wanted = tuple(victim.clean.shape[1:])
     if shape[1:] != wanted:
         raise ConfigError(

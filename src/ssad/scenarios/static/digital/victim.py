@@ -35,6 +35,27 @@ class Cost:
     queries: int = 0
 
 
+class NothingToAttackError(ConfigError):
+    """A loss or an aim needs objects, and there is none in any of the images."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """Clean images and their random numbers: all that an attack is given which asks no detector anything.
+
+    Attributes:
+        clean: [B, 3, H, W] in [0, 1].
+        keys: For each image what its random draws come from.
+    """
+
+    clean: Tensor
+    keys: Sequence[tuple[object, ...]]
+
+    def draw(self, kind: str, *use: object) -> Tensor:
+        """See `draw`."""
+        return draw(self.clean, self.keys, kind, *use)
+
+
 class Victim:
     """A detector, the images under attack with a frozen target assignment, and the loss that is ascended.
 
@@ -91,7 +112,7 @@ class Victim:
             self.idle = ~aim.places(detector, assignment).any(1) if needed else torch.zeros(len(images)) > 0
         self.idle = self.idle.to(images.device)
         if bool(self.idle.all()):
-            raise ConfigError(
+            raise NothingToAttackError(
                 f"loss '{objective.name}' attacks objects, and no location of these images is assigned to one"
             )
 
@@ -130,28 +151,35 @@ class Victim:
         return loss.detach(), found[0]
 
     def draw(self, kind: str, *use: object) -> Tensor:
-        """Random numbers [B, 3, H, W] of each image, from its own key: the same in any batch.
-
-        Args:
-            kind: "uniform" in [-1, 1], or "gaussian".
-            *use: What they are for.
-        """
-        draws = np.empty(tuple(self.clean.shape), np.float32)
-        for own, key in zip(draws, self.keys, strict=True):
-            chance = self.generator(key, *use)
-            if kind == "uniform":
-                chance.random(dtype=np.float32, out=own)
-            else:
-                chance.standard_normal(dtype=np.float32, out=own)
-        found = torch.from_numpy(draws)
-        if kind == "uniform":
-            found.mul_(2).sub_(1)
-        return found.to(self.clean).contiguous(memory_format=torch.channels_last)
+        """Random numbers [B, 3, H, W] of each image; see `draw`."""
+        return draw(self.clean, self.keys, kind, *use)
 
     @staticmethod
     def generator(key: tuple[object, ...], *use: object) -> np.random.Generator:
         """The generator of an image's key for one use."""
         return generator("digital attack", *key, *use)
+
+
+def draw(clean: Tensor, keys: Sequence[tuple[object, ...]], kind: str, *use: object) -> Tensor:
+    """Random numbers [B, 3, H, W] of each image, from its own key: the same in any batch.
+
+    Args:
+        clean: [B, 3, H, W]: shape, type and device of what is drawn.
+        keys: Of each image.
+        kind: "uniform" in [-1, 1], or "gaussian".
+        *use: What they are for.
+    """
+    draws = np.empty(tuple(clean.shape), np.float32)
+    for own, key in zip(draws, keys, strict=True):
+        chance = Victim.generator(key, *use)
+        if kind == "uniform":
+            chance.random(dtype=np.float32, out=own)
+        else:
+            chance.standard_normal(dtype=np.float32, out=own)
+    found = torch.from_numpy(draws)
+    if kind == "uniform":
+        found.mul_(2).sub_(1)
+    return found.to(clean).contiguous(memory_format=torch.channels_last)
 
 
 @contextmanager
