@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from ssad.core.checkpoints import Card, save_weights
 from ssad.core.detections import Detections, Truth
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.detectors import make_detector
@@ -17,7 +18,6 @@ from ssad.detectors.adapters.torchvision_models import MODELS, torchvision_detec
 from ssad.detectors.adapters.two_stage import TwoStage
 from ssad.detectors.adapters.ultralytics import ultralytics_detector
 from ssad.detectors.check import check_detector
-from ssad.detectors.checkpoints import Card, save_weights
 
 CLASSES = ("car", "person", "dog")
 SIZE = (80, 120)

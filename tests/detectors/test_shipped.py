@@ -11,11 +11,11 @@ from helpers.bodies import two_phases
 from helpers.quick import others_slow
 from helpers.sharing import Shared
 
+from ssad.core.checkpoints import read_card
 from ssad.core.errors import FormatError
 from ssad.core.images import read_image
 from ssad.datasets.coco import CocoSet, read_coco
 from ssad.detectors import SHIPPED, make_detector
-from ssad.detectors.checkpoints import read_card
 from ssad.evaluation.detection import score_2d, score_3d
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes

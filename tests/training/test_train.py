@@ -14,9 +14,9 @@ from helpers.sharing import Shared
 from torch.multiprocessing.spawn import spawn
 
 from ssad.cli import main
+from ssad.core.checkpoints import read_card
 from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import make_detector
-from ssad.detectors.checkpoints import read_card
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.target import parse_target
 from ssad.training import detector as training

@@ -33,7 +33,7 @@ def make_detector(
     Args:
         name: Name of the detector.
         weights: None: the shipped ones if there are any, else fresh ones; "random": fresh ones from `seed`; else a file
-            (see `ssad.detectors.checkpoints.load_weights`; darknet's .weights for YOLOv3).
+            (see `ssad.core.checkpoints.load_weights`; darknet's .weights for YOLOv3).
         device: Where it is put.
         seed: Of fresh weights.
         **options: What its builder takes.
@@ -47,7 +47,7 @@ def make_detector(
     if name not in DETECTORS:
         made = build(**options) if callable(build) else build
         return made.to(device) if hasattr(made, "to") else made
-    from ssad.detectors.checkpoints import fit_state, load_weights
+    from ssad.core.checkpoints import fit_state, load_weights
 
     if weights is None and (SHIPPED / f"{name}.json").is_file():
         weights = SHIPPED / f"{name}.safetensors"
@@ -71,15 +71,15 @@ def make_detector(
 
 def _classes_of(path: Path) -> dict[str, Any]:
     """The classes that the card beside weights names, if there is one."""
-    from ssad.detectors.checkpoints import read_card
+    from ssad.core.checkpoints import read_card
 
     return {"classes": read_card(path).classes} if path.with_suffix(".json").is_file() else {}
 
 
 def _check_hash(path: Path, state: dict[str, Any]) -> None:
     """FormatError: shipped weights that are not those of their card."""
+    from ssad.core.checkpoints import hash_state, read_card
     from ssad.core.errors import FormatError
-    from ssad.detectors.checkpoints import hash_state, read_card
 
     if hash_state(state) != read_card(path).hash:
         raise FormatError(f"{path}: not the weights that their card describes (another hash); install SSAD anew")

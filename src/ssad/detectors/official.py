@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from ssad.core.boxes import bottom_centre
+from ssad.core.checkpoints import fit_state, load_weights
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
-from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.fcos3d import fcos3d
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.pgd_det import pgd_det
@@ -35,7 +35,7 @@ def load(name: str, state_dict: Mapping[str, Any] | str | Path) -> Mono3D:
     Args:
         name: "fcos3d" or "pgd".
         state_dict: Tensors (or arrays) by mmdetection3d's names (backbone., neck., bbox_head.), also inside
-            {"state_dict": ...}; or a file that `ssad.detectors.checkpoints.load_weights` reads. Names and shapes must
+            {"state_dict": ...}; or a file that `ssad.core.checkpoints.load_weights` reads. Names and shapes must
             match one to one.
 
     Raises:

@@ -19,6 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
+from ssad.core.checkpoints import Card, fit_state, hash_state, load_weights, save_weights
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -26,7 +27,6 @@ from ssad.core.seeding import digest
 from ssad.datasets.coco import CocoSet, read_coco
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
-from ssad.detectors.checkpoints import Card, fit_state, hash_state, load_weights, save_weights
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.detection import score_2d, score_3d
 from ssad.training.batches import Item, PictureSet, fill

@@ -16,13 +16,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
 from ssad.bench.source import source_version
 from ssad.core import safeio
+from ssad.core.checkpoints import hash_state
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.detectors import DETECTORS, SHIPPED
-from ssad.detectors.checkpoints import hash_state
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.pictures import STRONG, detection_sheet
 from ssad.evaluation.scene_boxes import (

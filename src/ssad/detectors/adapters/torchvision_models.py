@@ -14,10 +14,10 @@ from torchvision import models
 from torchvision.models import detection
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
+from ssad.core.checkpoints import COUNTER, fit_state, load_weights
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.detectors.adapters.torchvision import OneStage
 from ssad.detectors.adapters.two_stage import TwoStage
-from ssad.detectors.checkpoints import COUNTER, fit_state, load_weights
 
 MODELS = (
     "fasterrcnn_mobilenet_v3_large_320_fpn", "fasterrcnn_mobilenet_v3_large_fpn", "fasterrcnn_resnet50_fpn",

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ssad.core.checkpoints import fit_state, load_weights
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError, install_extra
 from ssad.detectors.adapters.common import (
@@ -39,7 +40,6 @@ from ssad.detectors.adapters.common import (
     size_inside,
     sums,
 )
-from ssad.detectors.checkpoints import fit_state, load_weights
 from ssad.detectors.yolo.assign import Targets
 from ssad.detectors.yolo.classes import COCO
 from ssad.detectors.yolo.decode import select

@@ -17,9 +17,7 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from ssad.core.errors import ConfigError, FormatError, SSADError
-from ssad.core.safeio import MIB
-from ssad.detectors.checkpoints import (
+from ssad.core.checkpoints import (
     Card,
     fit_state,
     hash_state,
@@ -28,6 +26,8 @@ from ssad.detectors.checkpoints import (
     read_card,
     save_weights,
 )
+from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.safeio import MIB
 
 CARD = Card(data="drawn", command="ssad train detector toy", seed=3, classes=("car",), metrics={"AP50": 0.5})
 

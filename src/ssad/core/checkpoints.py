@@ -1,7 +1,7 @@
 """The only door for weights: files in, files out, and into a detector; each error is one line.
 
 Nothing in a file is ever executed: safetensors holds numbers alone, and PyTorch's pickles are read by
-`ssad.detectors.pickled`, which builds tensors and nothing else.
+`ssad.core.pickled`, which builds tensors and nothing else.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from safetensors.torch import save as dump_safetensors
 from torch import Tensor, nn
 
 from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.pickled import MAX_BYTES, read_pickled
 from ssad.core.safeio import dump_json, make_folder, read_bytes, read_json, write_atomic
 from ssad.core.version import __version__
-from ssad.detectors.pickled import MAX_BYTES, read_pickled
 
 PICKLED = (".pth", ".pt", ".ckpt", ".bin", ".tar")
 SHARD = re.compile(r"(?P<stem>.+)-(?P<number>\d{5})-of-(?P<count>\d{5})\.safetensors")

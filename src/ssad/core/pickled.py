@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from ssad.core.errors import FormatError
+from ssad.core.pickle_walk import RefusedError, Steps, walk
 from ssad.core.safeio import MIB, read_bytes
-from ssad.detectors.pickle_walk import RefusedError, Steps, walk
 
 MAX_BYTES = 4096 * MIB
 MAX_PICKLE = 256 * MIB
