@@ -427,6 +427,12 @@ def _attack_list() -> dict[str, str]:
     return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
 
 
+def _generator_list() -> dict[str, str]:
+    from ssad.scenarios.dynamic.generate import generator_list
+
+    return generator_list() | {"module:object": "a generator of your own (see ssad.core.generators)"}
+
+
 def _detector_list() -> dict[str, str]:
     from ssad.detectors import SHIPPED, detector_names
 
@@ -453,6 +459,7 @@ LISTS = {
     "suites": _suite_list,
     "kinds": _kind_list,
     "scenarios": _scenario_list,
+    "generators": _generator_list,
     "systems": _system_list,
     "detectors": _detector_list,
     "recipes": _recipe_list,

@@ -18,10 +18,11 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 from ssad.drivers import make_system
-from ssad.interchange.drive_log import AXLE_TO_MIDDLE, model_of, scenario_of_drive, thinned
+from ssad.interchange.drive_log import AXLE_TO_MIDDLE, model_of, scenario_of_drive
 from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, read_scenarios
+from ssad.scenarios.dynamic.frozen import thinned
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -43,7 +43,7 @@ class FormatError(SSADError):
     """A data file that is broken, malicious or in another format."""
 
 
-LISTED = ("suite", "kind", "scenario", "system", "detector", "recipe", "shift", "attack", "town")
+LISTED = ("suite", "kind", "scenario", "generator", "system", "detector", "recipe", "shift", "attack", "town")
 """What `ssad list` can list, in the singular: `ssad list suites` and so on."""
 
 

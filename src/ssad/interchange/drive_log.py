@@ -23,6 +23,7 @@ from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.roads import load_town, route_along, town_names
 from ssad.roads.paths import graph_of_paths
 from ssad.scenarios.dynamic import build_episode, parameter_box
+from ssad.scenarios.dynamic.frozen import Rows, told_rows
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
 
@@ -33,7 +34,6 @@ KEY_POINT: Final = 25.0  # m between key points of the ego's route
 OFF: Final = 5.0  # m from its route that the logged ego is at most: it may be about to change lanes
 LEAST_WAY: Final = 10.0  # m that the ego drives at least
 MOVED: Final = 10.0  # m that a vehicle drives at least to show where a lane is
-CLOSE: Final = 0.002, 0.001  # m and rad that a row may be off the line between its neighbours to be left out
 CARS: Final = ("car", "suv", "coupe", "compact", "van")
 LARGE: Final = ("truck", "bus", "van")
 # nuScenes category (or what it begins with) -> the models that may play it, by size
@@ -43,8 +43,6 @@ MODELS_OF: Final[Mapping[str, tuple[str, ...]]] = {
     "vehicle.bicycle": ("bicycle",), "human.pedestrian": ("walker",), "movable_object.barrier": ("barrier",),
     "movable_object.trafficcone": ("cone",),
 }  # fmt: skip
-
-Rows = tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,24 +289,5 @@ def _actor(track: _Track) -> Actor:
     if len(rows) == 1:  # seen in one key frame: there for that moment
         rows = np.concatenate([rows, rows])
         rows[1, 0] += STEP
-    told: Rows = tuple(
-        (round(t, 3), round(x, 3), round(y, 3), round(float(wrap_angle(yaw)), 4)) for t, x, y, yaw in thinned(rows)
-    )
+    told: Rows = told_rows(rows)
     return Actor(track.name, track.model, Pose(*told[0][1:]), trajectory=told)
-
-
-def thinned(rows: F64) -> list[list[float]]:
-    """Rows [T, 4] of time, x, y and yaw without those that lie on the line between their neighbours."""
-    unwrapped = rows.copy()
-    unwrapped[:, 3] = np.unwrap(rows[:, 3])
-    kept, last = [0], 0
-    for n in range(2, len(rows)):
-        between = unwrapped[last + 1 : n]
-        share = (between[:, :1] - unwrapped[last, 0]) / (unwrapped[n, 0] - unwrapped[last, 0])
-        off = np.abs(unwrapped[last] + share * (unwrapped[n] - unwrapped[last]) - between)
-        if off[:, 1:3].max() > CLOSE[0] or off[:, 3].max() > CLOSE[1]:
-            last = n - 1
-            kept.append(last)
-    kept.append(len(rows) - 1)
-    found: list[list[float]] = rows[kept].tolist()
-    return found

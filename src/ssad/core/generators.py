@@ -1,0 +1,164 @@
+"""The seam of adversarial scenario generation: what a generator starts from, what it proposes, what came of it.
+
+A generator is asked for proposals and told their outcomes, over and over, until the budget of rollouts is used up. It
+knows neither the driving system nor the simulator: whoever runs it owns budget, seeds and records
+(`ssad.scenarios.dynamic.generate`). What it finds is a `Scenario` that can be saved, listed and replayed.
+
+A package offers its generators by name through entry points; without a package, a name of the form "module:object" is
+imported from the working folder:
+
+    [project.entry-points."ssad.generators"]
+    my-search = "my_package.search:MySearch"
+
+What every implementation owes its callers: the same bases, seeds and outcomes give the same proposals, to the bit, and
+what it proposes for one base does not depend on which others share its batch. A search can therefore be resumed: it is
+asked again, and told what is already known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from ssad.core.driving import Driver, Selector
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Episode, EpisodeTrace, Scenario
+
+
+@dataclass(frozen=True)
+class Base:
+    """What a generator starts from: a scenario, and what happens in it when nobody interferes.
+
+    Attributes:
+        episode: The scenario made concrete, with the seed that all its rollouts share.
+        graph: Lane graph of its town.
+        trace: The episode driven by the system under test.
+    """
+
+    episode: Episode
+    graph: LaneGraph
+    trace: EpisodeTrace
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario, with what its author left at the defaults filled in."""
+        return self.episode.scenario
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Something to be tried: a scenario, or drivers that take agents of it over.
+
+    Attributes:
+        scenario: The scenario.
+        adversaries: Names of the agents whose motion the generator has chosen; with none named, and no drivers, all
+            others of the ego's that move.
+        drivers: Whom to drive -> who drives. Who is taken over at any moment is an adversary. Proposals that run side
+            by side share a driver by sharing this mapping; its selectors see the scenes of all of them.
+    """
+
+    scenario: Scenario
+    adversaries: tuple[str, ...] = ()
+    drivers: Mapping[Selector, Driver] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a proposal. What was not measured is None.
+
+    Attributes:
+        proposal: What was tried.
+        failure: Why it could not be run, in one line ("": it was).
+        trace: What happened.
+        adversaries: Numbers of the agents that are adversaries in the trace.
+        collision: Whether the ego touched an adversary.
+        time: Of that contact, s.
+        impact_speed: How fast the two bodies moved against each other then, m/s.
+        ego_speed: Of the ego then, m/s.
+        gap: Least distance of the ego's body from an adversary's, m; 0 if they touched. None: no adversary was there.
+        off_road: Whether an adversary that is a vehicle was on the road and left it.
+        hit_others: Whether an adversary touched somebody else than the ego.
+        acceleration: Largest of an adversary that is a vehicle, along its heading or across, m/s^2, as a mean over half
+            a second.
+        jerk: Largest change of that along its heading, likewise, m/s^3.
+        within_limits: Whether all of them kept to what their bodies and a hard-braking driver can do.
+    """
+
+    proposal: Proposal
+    failure: str = ""
+    trace: EpisodeTrace | None = None
+    adversaries: tuple[int, ...] = ()
+    collision: bool = False
+    time: float | None = None
+    impact_speed: float | None = None
+    ego_speed: float | None = None
+    gap: float | None = None
+    off_road: bool = False
+    hit_others: bool = False
+    acceleration: float | None = None
+    jerk: float | None = None
+    within_limits: bool | None = None
+
+    @property
+    def valid(self) -> bool:
+        """Whether the ego touched an adversary that stayed on the road and hit nobody else."""
+        return self.collision and not self.off_road and not self.hit_others
+
+    @property
+    def danger(self) -> float:
+        """One number for searches that want one, more is worse for the ego.
+
+        At a distance it is minus the least gap in m (at least -100; also what failed). A collision adds a tenth of the
+        impact speed in m/s, but one off the road or with others besides counts as a gap of 1 m.
+        """
+        if self.collision:
+            return 0.1 * (self.impact_speed or 0.0) if self.valid else -1.0
+        return -100.0 if self.gap is None else max(-self.gap, -100.0)
+
+
+@runtime_checkable
+class Generator(Protocol):
+    """A search for dangerous scenarios, in B bases side by side.
+
+    Attributes:
+        name: What tables call it.
+    """
+
+    name: str
+
+    def ask(self, count: int) -> Sequence[Sequence[Proposal]]:
+        """Propose what to try next.
+
+        Args:
+            count: How many rollouts each base may spend on it at most.
+
+        Returns:
+            For each of the B bases 0 to `count` proposals; none: it has nothing more to try there.
+        """
+
+    def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
+        """Learn what came of it; called once after each `ask`.
+
+        Args:
+            outcomes: For each base, those of its proposals in their order.
+        """
+
+
+class GeneratorFactory(Protocol):
+    """Makes a generator: what the names of generators mean. A class with this constructor is one."""
+
+    def __call__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> Generator:
+        """Begin a search.
+
+        Args:
+            bases: B of them.
+            seeds: Root of the random numbers of each base.
+            budget: Rollouts that each base has in all.
+
+        Returns:
+            The generator, which has not been asked yet.
+
+        Raises:
+            ConfigError: There is nothing in a base that it could change.
+        """

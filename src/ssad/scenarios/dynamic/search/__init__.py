@@ -1,0 +1,1 @@
+"""Searches over a scenario's parameter box: what every other generator must beat."""

@@ -1,0 +1,1 @@
+"""Generators that change how others move from step to step: in their kinematic states, or as whole trajectories."""
