@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ssad.cli import LISTS
 from ssad.core.errors import LISTED, install_extra, unknown_name
+from ssad.listing import LISTS
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = sorted((ROOT / "src" / "ssad").rglob("*.py"))

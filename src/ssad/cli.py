@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ssad.core.errors import ConfigError, SSADError, unknown_name
+from ssad.listing import ALIASES, LISTS
 
 app = typer.Typer(
     help="SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?",
@@ -362,112 +362,6 @@ def train_detector(
     )  # fmt: skip
     for line in run_training(plan, say=lambda text: print(text, flush=True)):
         print(line)
-
-
-def _scenario_list() -> dict[str, str]:
-    from ssad.core.registry import names
-    from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
-    from ssad.scenarios.dynamic.sets import SHIPPED
-
-    sets = {name: load_scenarios(name) for name in set_names()}
-    rows = {name: f"set of {len(found)} scenarios" for name, found in sets.items()}
-    shipped = Counter(s.type for name in SHIPPED for s in sets[name])
-    for name, where in names("scenario", SCENARIOS).items():
-        rows[name] = f"class with {shipped[name]} scenarios" if name in SCENARIOS else f"class of your own: {where}"
-    return rows | {s.name: f"{s.type} in {s.town}" for found in sets.values() for s in found}
-
-
-def _system_list() -> dict[str, str]:
-    from ssad.core.registry import names
-    from ssad.drivers import SYSTEMS
-
-    return names("system", SYSTEMS) | {"module:object": "a driving system of your own (README.md)"}
-
-
-def _kind_list() -> dict[str, str]:
-    from ssad.bench.suite import KINDS
-    from ssad.core.registry import names
-
-    return names("kind", KINDS) | {"module:class": "a kind of your own (ARCHITECTURE.md)"}
-
-
-def _town_list() -> dict[str, str]:
-    from ssad.roads import town_names
-
-    return town_names()
-
-
-def _suite_list() -> dict[str, str]:
-    from ssad.bench.suite import load_suite, suite_files
-
-    return {name: load_suite(name).title for name in suite_files()}
-
-
-def _shift_list() -> dict[str, str]:
-    from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
-
-    beside = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
-    return {name: f"{family}: {text}{beside.get(name, '')}" for name, (family, text) in KNOWN.items()}
-
-
-def _attack_list() -> dict[str, str]:
-    from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
-    from ssad.scenarios.static.physical import default_carrier, physical_names
-
-    def about(name: str, where: str) -> str:
-        if name not in ATTACKS:
-            return where
-        if needs(name):
-            return f"made in Python: needs {', '.join(needs(name))} (docs/attacks.md)"
-        access = make_attack(name).access
-        return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
-
-    rows = {name: about(name, where) for name, where in attack_names().items()}
-    rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
-    return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
-
-
-def _generator_list() -> dict[str, str]:
-    from ssad.scenarios.dynamic.generate import generator_list
-
-    return generator_list() | {"module:object": "a generator of your own (see ssad.core.generators)"}
-
-
-def _detector_list() -> dict[str, str]:
-    from ssad.detectors import SHIPPED, detector_names
-
-    def about(name: str, where: str) -> str:
-        if where.startswith("ssad."):
-            kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
-            return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
-        return where
-
-    rows = {name: about(name, where) for name, where in detector_names().items()}
-    return rows | {"module:object": "a detector of your own (docs/detectors.md)"}
-
-
-def _recipe_list() -> dict[str, str]:
-    from ssad.training.recipe import RECIPES
-
-    return {
-        name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
-        for name, r in RECIPES.items()
-    }
-
-
-LISTS = {
-    "suites": _suite_list,
-    "kinds": _kind_list,
-    "scenarios": _scenario_list,
-    "generators": _generator_list,
-    "systems": _system_list,
-    "detectors": _detector_list,
-    "recipes": _recipe_list,
-    "shifts": _shift_list,
-    "attacks": _attack_list,
-    "towns": _town_list,
-}
-ALIASES = {"agents": "systems"}
 
 
 @app.command("list")

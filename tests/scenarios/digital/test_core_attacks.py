@@ -11,10 +11,10 @@ import torch
 from helpers.mono3d import one_thread
 from torch import Tensor
 
-from ssad.cli import _attack_list
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
+from ssad.listing import LISTS
 from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
@@ -244,7 +244,7 @@ def test_names_and_options() -> None:
 
 
 def test_all_names_are_listed_with_what_they_need() -> None:
-    rows = _attack_list()
+    rows = LISTS["attacks"]()
     assert rows.keys() == {*ATTACKS, *PHYSICAL, "module:object"}
     assert rows["adv-patch"] == "physical: trains a patch (docs/physical.md)"
     assert rows["pgd"] == "white-box, loss full"
