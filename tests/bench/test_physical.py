@@ -63,6 +63,9 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"detectors": ["fcos3d-light"]}, ConfigError, "fcos3d-light is no 2D detector"),
         ({"pairs": [PAIR | {"test": "Nowhere"}]}, ConfigError, "unknown town 'Nowhere'"),
         ({"target": "stop_sign"}, ConfigError, "only cars are driven"),
+        ({"judges": ["yolov5n"]}, ConfigError, "named twice"),
+        ({"grid": {"distances": [1.0]}}, ConfigError, "distances: 3 to 80 m"),
+        ({"grid": {"weathers": ["hail"]}}, UnknownNameError, "hail"),
         ({"attacks": ["vanish"]}, UnknownNameError, "vanishing"),
         ({"attacks": [{"name": "vanishing", "settings": {"speed": 3}}]}, ConfigError, "no setting 'speed'"),
         ({"attacks": [{"name": "vanishing", "settings": {"rate": "fast"}}]}, ConfigError, "of a wrong type"),
@@ -78,6 +81,21 @@ def test_a_wrong_suite_ends_in_one_line(change: Mapping[str, Any], error: type[E
     with pytest.raises(error, match=message) as found:
         Physical().plan(suite(**change))
     assert "\n" not in str(found.value)
+
+
+def test_judges_are_shown_what_is_trained_against_others_and_the_grid_is_scored_apart() -> None:
+    grid = {"distances": [10.0], "azimuths": [0.0, 180.0], "elevations": [15.0], "weathers": ["day", "night"]}
+    plan = Physical().plan(suite(judges=["yolov3-tiny", "fcos3d-light"], grid=grid))
+    rows = [(c.fields["view"], c.fields["detector"], c.fields["attack"], c.fields["source"]) for c in plan.cells]
+    assert len(rows) == 2 * 3 * 4
+    assert ("grid", "fcos3d-light", "vanishing", "yolov5n") in rows
+    assert ("drive", "yolov3-tiny", "shuffled vanishing", "yolov5n") in rows
+    assert {source for *_, source in rows} == {"", "yolov5n"}, "nothing is trained against a judge"
+    drive, other = (
+        {c.key for c in Physical().plan(suite(grid=one)).cells if c.fields["view"] == "drive"}
+        for one in (grid, grid | {"distances": [5.0]})
+    )
+    assert drive == other, "the pictures from behind do not depend on the grid"
 
 
 @pytest.mark.parametrize("name", ["physical", "physical-quick"])

@@ -29,16 +29,26 @@ def test_only_boxes_of_the_targets_class_count() -> None:
     assert one.score.tolist() == pytest.approx([0.8])
     assert one.real.tolist() == [TARGET, OTHER]
     assert one.crowd.tolist() == [False, True]
-    assert one.confidence == 0.0, "the box on the target has another class"
+    assert one.confidences().tolist() == pytest.approx([0.0, 0.8]), "the box on the target has another class"
 
 
 def test_a_target_is_found_where_a_box_covers_half() -> None:
     half = [10.0, 10.0, 30.0, 40.0]
     less = [10.0, 10.0, 29.0, 40.0]
-    assert seen((half, 0.6)).confidence == pytest.approx(0.6)
-    assert seen((less, 0.6)).confidence == 0.0
-    assert seen((TARGET, 0.3), (half, 0.7)).confidence == pytest.approx(0.7)
-    assert seen().confidence == 0.0
+    assert seen((half, 0.6)).confidences().tolist() == pytest.approx([0.6])
+    assert seen((less, 0.6)).confidences().tolist() == [0.0]
+    assert seen((half, 0.7), (TARGET, 0.3)).confidences().tolist() == pytest.approx([0.7])
+    assert seen().confidences().tolist() == [0.0]
+
+
+def test_a_box_finds_one_car_and_a_car_is_found_once() -> None:
+    """Two cars that overlap: the better box takes the car that it covers most, the other one what is left."""
+    near = [32.0, 10.0, 72.0, 40.0]
+    between = [20.0, 10.0, 60.0, 40.0]
+    both = seen((between, 0.9), (TARGET, 0.8), (near, 0.7), real=(TARGET, near))
+    assert both.confidences().tolist() == pytest.approx([0.9, 0.7]), "the second box on the target finds nothing more"
+    alone = seen((between, 0.9), real=(TARGET, near))
+    assert alone.confidences().tolist() == pytest.approx([0.9, 0.0]), "one box is one car"
 
 
 def test_precision_of_the_target_alone_leaves_other_cars_out() -> None:
@@ -48,6 +58,10 @@ def test_precision_of_the_target_alone_leaves_other_cars_out() -> None:
     found = target_scores(pictures)["metrics"]
     assert found["AP50"] == pytest.approx(51 / 101, abs=1e-6), "recall of one half at full precision"
     assert found["AP50_all"] == pytest.approx(76 / 101, abs=1e-6)
+    weak = [seen((TARGET, 0.9), (OTHER, 0.2), real=both), seen((OTHER, 0.95), real=both)]
+    found = target_scores(weak)["metrics"]
+    assert found["AP50_all"] == pytest.approx(76 / 101, abs=1e-6)
+    assert found["AP50_all_25"] == pytest.approx(51 / 101, abs=1e-6), "the weak box does not count"
     wrong = [seen(([200.0, 10.0, 240.0, 40.0], 0.99), (TARGET, 0.9), real=both)]
     assert target_scores(wrong)["metrics"]["AP50"] == pytest.approx(0.5, abs=1e-6)
 
@@ -60,6 +74,9 @@ def test_targets_lost_are_those_that_were_found_before() -> None:
     assert found["ASR_50"] == pytest.approx(1 / 2, abs=1e-6)
     assert found["found_25"] == pytest.approx(3 / 4)
     assert found["confidence"] == pytest.approx((0.3 + 0.55 + 0.9) / 4)
+    others = [seen((TARGET, 0.9), (OTHER, 0.9), real=(TARGET, OTHER))]
+    gone = [seen((OTHER, 0.9), real=(TARGET, OTHER))]
+    assert target_scores(gone, others)["metrics"]["ASR_all_25"] == pytest.approx(1 / 2), "of two cars one is lost"
     nothing = target_scores([seen()], [seen()])["metrics"]
     assert nothing["ASR_25"] is None, "nothing could be lost"
     assert "ASR_25" not in target_scores(clean)["metrics"]

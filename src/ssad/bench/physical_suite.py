@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
 from ssad.core.errors import ConfigError
+from ssad.recording.clip_recorder import AZIMUTHS, ELEVATIONS
+from ssad.recording.nuscenes_recorder import WEATHERS
 from ssad.recording.target import TargetCar, parse_target
 from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_physical
 
@@ -24,6 +26,29 @@ class Pair(BaseModel):
     test: str
     train_images: int = Field(default=600, ge=1)
     test_images: int = Field(default=400, ge=1)
+
+
+class Grid(BaseModel):
+    """Views from all around the target: each combination once in each town of a test.
+
+    Attributes:
+        distances: m.
+        azimuths: degrees from the front to the left of the target.
+        elevations: degrees.
+        weathers: kinds (`ssad.recording.nuscenes_recorder.WEATHERS`).
+    """
+
+    model_config = _STRICT
+
+    distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0, 30.0], min_length=1)
+    azimuths: list[float] = Field(default=list(AZIMUTHS), min_length=1)
+    elevations: list[float] = Field(default=list(ELEVATIONS), min_length=1)
+    weathers: list[str] = Field(default=list(WEATHERS), min_length=1)
+
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return len(self.distances) * len(self.azimuths) * len(self.elevations) * len(self.weathers)
 
 
 class Entry(BaseModel):
@@ -57,6 +82,9 @@ class PhysicalSuite(SuiteBase):
         epochs: of all trained textures, in place of their own; None: their own.
         seeds: of each control that is drawn at random.
         transfer: whether a texture is shown to the other detectors too.
+        judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to; of 3D
+            detectors the hulls of their boxes in the picture count.
+        grid: views from all around, beside those from behind; None: none.
         behind: m from the camera to the target.
         size: of the pictures, px a side.
         floor: least AP50 of the clean pictures, below which no attack is reported.
@@ -71,6 +99,8 @@ class PhysicalSuite(SuiteBase):
     epochs: int | None = Field(default=None, ge=1)
     seeds: int = Field(default=3, ge=1)
     transfer: bool = False
+    judges: list[str] = Field(default=[])
+    grid: Grid | None = None
     behind: float = Field(default=20.0, ge=3.0, le=60.0)
     size: int = Field(default=640, ge=64)
     floor: float = Field(default=0.9, ge=0.0, le=1.0)

@@ -17,6 +17,7 @@ from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
 
 IOU = 0.5
+PRECISIONS = {"AP50": (True, 0.0), "AP50_25": (True, 0.25), "AP50_all": (False, 0.0), "AP50_all_25": (False, 0.25)}
 THRESHOLD = 0.001  # least score of a box that AP counts
 CONFIDENCES = (0.25, 0.5)  # from which score on a box counts as a detection
 
@@ -39,14 +40,24 @@ class Sighting:
     real: F64
     crowd: Bool
 
-    @property
-    def confidence(self) -> float:
-        """The best score of a box on the target (IoU of one half at least); 0 without one."""
-        side = np.minimum(self.box[:, 2:], self.real[0, 2:]) - np.maximum(self.box[:, :2], self.real[0, :2])
-        both = np.where((side > 0.0).all(1), side.prod(1), 0.0)
-        union = (self.box[:, 2:] - self.box[:, :2]).prod(1) + (self.real[0, 2:] - self.real[0, :2]).prod() - both
-        on = both >= IOU * union
-        return float(self.score[on].max()) if on.any() else 0.0
+    def confidences(self) -> F64:
+        """The score with which each true box is found [Q], 0 without.
+
+        From the best box to the worst, each takes the true box that it covers most of those not yet taken, with an IoU
+        of one half at least; so none is counted twice, and it is found at every confidence below its score.
+        """
+        found = np.zeros(len(self.real))
+        low, high = self.box[:, None], self.real[None]
+        side = np.minimum(low[..., 2:], high[..., 2:]) - np.maximum(low[..., :2], high[..., :2])
+        both = np.where((side > 0.0).all(-1), side.prod(-1), 0.0)
+        area = (low[..., 2:] - low[..., :2]).prod(-1) + (high[..., 2:] - high[..., :2]).prod(-1) - both
+        overlap = both / np.maximum(area, 1e-9)
+        for row, score in zip(overlap, self.score.tolist(), strict=True):
+            free = np.where(found > 0.0, 0.0, row)
+            best = int(free.argmax())
+            if free[best] >= IOU:
+                found[best] = score
+        return found
 
 
 def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
@@ -64,11 +75,14 @@ def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]])
     """What a detector finds in pictures, one after another.
 
     Args:
-        detector: A 2D detector.
-        pictures: Drive, picture [1, 3, H, W] in 0 to 1, and truth, the target first.
+        detector: Of a 3D detector the hulls of its boxes in the picture count.
+        pictures: Drive, picture [1, 3, H, W] in 0 to 1, and truth in the classes of the detector, the target first; for
+            a 3D detector with the camera matrix.
     """
     for drive, image, truth in pictures:
-        (found,) = detector.predict(image, threshold=THRESHOLD)
+        camera = truth.intrinsic if detector.task == "3d" else None
+        intrinsic = None if camera is None else camera[None].to(image)
+        (found,) = detector.predict(image, intrinsic, threshold=THRESHOLD)
         yield sighting(drive, found, truth)
 
 
@@ -77,9 +91,10 @@ def target_scores(
 ) -> dict[str, Any]:
     """Scores of a set of pictures.
 
-    AP50 counts the target alone, AP50_all every vehicle of its class. found_25 and found_50 are shares of the pictures
-    in which the target is found with that score; ASR_25 and ASR_50 the share of those where it is found without the
-    attack and is not with it (no match is counted twice).
+    AP50 counts the target alone and boxes of any score, AP50_25 boxes above a score of 0.25; AP50_all and AP50_all_25
+    count every vehicle of its class. found_25 and found_50 are shares of the pictures in which the target is found with
+    that score; ASR_25 and ASR_50 the share of those where it is found without the attack and is not with it; ASR_all_25
+    that of all vehicles (no match is counted twice).
 
     Args:
         sightings: With the attack.
@@ -94,34 +109,42 @@ def target_scores(
     of = np.array([drives.index(one.drive) for one in sightings], np.int32)
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float] | None] = {}
-    for name, target_only in (("AP50", True), ("AP50_all", False)):
-        value = metrics[name] = _precision(sightings, target_only=target_only)
+    for name, (target_only, least) in PRECISIONS.items():
+        value = metrics[name] = precision(sightings, target_only=target_only, least=least)
         if len(drives) >= MIN_CLUSTERS and replicates and value is not None:
             draws, values = generator("target scores", seed, name), []
             for _ in range(replicates):
                 drawn = draws.integers(len(drives), size=len(drives))
                 picked = np.concatenate([np.flatnonzero(of == drive) for drive in drawn])
-                values.append(_precision([sightings[k] for k in picked], target_only=target_only))
+                values.append(precision([sightings[k] for k in picked], target_only=target_only, least=least))
             spread = np.asarray(np.var([v for v in values if v is not None], ddof=1))
             low, high = replicate_limits(np.asarray(value), spread, len(drives), bounded=True)
             intervals[name] = [float(low), float(high)]
-    best = np.array([one.confidence for one in sightings])
-    before = best if clean is None else np.array([one.confidence for one in clean])
+    scores = [one.confidences() for one in sightings]
+    scores_before = scores if clean is None else [one.confidences() for one in clean]
+    best, before = np.array([one[0] for one in scores]), np.array([one[0] for one in scores_before])
     for level in CONFIDENCES:
         percent = round(100 * level)
         found = best > level
         metrics[f"found_{percent}"], intervals[f"found_{percent}"] = _share(found, np.ones(len(best), bool), of)
         if clean is not None:
             metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
+    if clean is not None:
+        real = np.concatenate([~one.crowd for one in sightings])
+        every, every_before = np.concatenate(scores)[real], np.concatenate(scores_before)[real]
+        drive = np.repeat(of, [len(one.real) for one in sightings])[real]
+        lost = every <= CONFIDENCES[0], every_before > CONFIDENCES[0]
+        metrics["ASR_all_25"], intervals["ASR_all_25"] = _share(*lost, drive)
     metrics["confidence"] = float(best.mean())
     kept = {name: limits for name, limits in intervals.items() if limits is not None}
     rounded = {name: None if value is None else round(value, 6) for name, value in metrics.items()}
     return {"metrics": rounded, "intervals": kept, "n": len(sightings), "drives": len(drives)}
 
 
-def _precision(sightings: Sequence[Sighting], *, target_only: bool) -> float | None:
-    """AP50 of the target alone (other vehicles count neither way), or of all vehicles of its class."""
+def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
+    """AP50 of boxes above a score: of the target alone (others count neither way), or of all vehicles of its class."""
     crowd = []
+    own_boxes = [(one.box[one.score > least], one.score[one.score > least]) for one in sightings]
     for one in sightings:
         own = one.crowd.copy()
         own[0] = False
@@ -130,7 +153,7 @@ def _precision(sightings: Sequence[Sighting], *, target_only: bool) -> float | N
         crowd.append(own)
     value = average_precision(
         _boxes([s.real for s in sightings], ignore=crowd),
-        _boxes([s.box for s in sightings], score=[s.score for s in sightings]),
+        _boxes([box for box, _ in own_boxes], score=[score for _, score in own_boxes]),
         labels=1,
         threshold=IOU,
     )[0]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -26,7 +26,7 @@ from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.scene import Layer, Scene, Thing
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError, StoreError
+from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -38,7 +38,7 @@ from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
-from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, draw_weather, drive, run_parts
+from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, WEATHERS, draw_weather, drive, run_parts
 from ssad.recording.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
 from ssad.recording.street_signs import free_places, plate_and_post
 from ssad.recording.target import TargetCar, TargetSign
@@ -83,8 +83,9 @@ class Clips:
     images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one in each part), or
     the stop sign that an orbit shows; behind, height: m of the following camera; distances (m), azimuths, elevations
     (degrees) of an orbit, those of the target where none are given (round a sign: one elevation, 0, which stands for
-    the heights of cameras of cars); quality: of JPEG files; device: where pictures are rendered; streets: see
-    `drive_street`. ConfigError for what cannot be.
+    the heights of cameras of cars); weathers: of an orbit, a further factor of its cells (none: drawn as they come);
+    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`.
+    ConfigError for what cannot be.
     """
 
     out: Path
@@ -102,6 +103,7 @@ class Clips:
     quality: int = 92
     device: str = "cpu"
     streets: str = "town"
+    weathers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for town in (*(t for t, _ in self.images), *self.held_out):
@@ -126,6 +128,11 @@ class Clips:
             raise ConfigError("an orbit needs distances")
         if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
             raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
+        for weather in self.weathers:
+            if weather not in WEATHERS:
+                raise unknown_name("weather", weather, WEATHERS)
+        if self.weathers and self.mode != "orbit":
+            raise ConfigError("weathers are those of an orbit; a drive has its own")
         if not np.isfinite(self.azimuths).all():
             raise ConfigError("azimuths: finite numbers of degrees")
         if sign and (np.cos(np.radians(self.azimuths)) < np.cos(np.radians(BEHIND))).any():
@@ -143,7 +150,8 @@ class Clips:
     def identity(self) -> dict[str, Any]:
         """What decides the bytes."""
         found = asdict(replace(self, out=Path())) | {"clips": self.mode, "images": [list(pair) for pair in self.images]}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in ("out", "mode")}
+        skipped = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in skipped}
 
 
 def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:
@@ -253,7 +261,7 @@ def _rounds(
         return
     if isinstance(clips.target, TargetSign) and not made.places:
         return
-    grid = [(d, a, e) for d in clips.distances for a in clips.azimuths for e in clips.elevations]
+    grid = list(product(clips.distances, clips.azimuths, clips.elevations, clips.weathers or ("",)))
     wanted = turn_of(slots, len(grid), key=(clips.seed, town))
     if attempt >= 3:
         wanted = generator("clips cells", *key).integers(len(grid), size=len(slots)).tolist()
@@ -262,13 +270,13 @@ def _rounds(
     for turn, tries in enumerate(TRIES):
         proposed: list[tuple[int, Viewpoint]] = []
         for n in missing():
-            weather = draw_weather(("clips", *key, turn, n))
-            cell = grid[wanted[n]]
+            *cell, kind = grid[wanted[n]]
+            weather = draw_weather(("clips", *key, turn, n), kind)
             if isinstance(clips.target, TargetSign):
                 seconds = (len(made.trace.x) - 1) * made.trace.dt
-                views = orbit_sign(made.places, seconds, weather, cell[:2], draws)
+                views = orbit_sign(made.places, seconds, weather, (cell[0], cell[1]), draws)
             else:
-                views = orbit(made.trace, weather, cell, draws)
+                views = orbit(made.trace, weather, (cell[0], cell[1], cell[2]), draws)
             proposed += [(n, s) for s in islice(views, tries)]
         clear = free_sight(made.stage, [s for _, s in proposed], at_once=batch_size(clips.device), height=height)
         first = dict(reversed([pair for pair, ok in zip(proposed, clear, strict=True) if ok]))

@@ -47,6 +47,7 @@ from ssad.roads import load_town, town_names
 
 TOWNS: Final = ("Twinford", "Crossgate", "Oldmarket", "Larkhill")
 HELD_OUT: Final = ("Oldmarket", "Larkhill")
+WEATHERS: Final = ("day", "overcast", "low", "fog", "wet", "night")
 KEY: Final = 5  # steps of the world (0.1 s) from one key frame to the next
 START: Final = 1_600_000_000_000_000  # us
 REACH: Final = 80.0  # m within which things are annotated
@@ -101,10 +102,10 @@ class Recording:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items() if k != "out"}
 
 
-def draw_weather(key: tuple[object, ...]) -> Weather:
-    """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads."""
+def draw_weather(key: tuple[object, ...], kind: str = "") -> Weather:
+    """Weather and hour of a scene: mostly day, some dusk and night, some fog and wet roads; or all of one kind."""
     draws = generator("record weather", *key)
-    kind = draws.choice(["day", "overcast", "low", "fog", "wet", "night"], p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
+    drawn = draws.choice(WEATHERS, p=[0.36, 0.2, 0.16, 0.08, 0.1, 0.1])
     heading, turn = float(draws.uniform(-np.pi, np.pi)), float(draws.uniform(0, 50))
     high = float(draws.uniform(0.4, 1.2))
     found = {
@@ -115,7 +116,7 @@ def draw_weather(key: tuple[object, ...]) -> Weather:
         "wet": Weather(high, heading, 0.95, wet=float(draws.uniform(0.4, 1.0)), turn=turn),
         "night": Weather(float(draws.uniform(-0.3, -0.05)), heading, float(draws.uniform(0, 0.9)), turn=turn),
     }
-    return found[str(kind)]
+    return found[kind or str(drawn)]
 
 
 def depth_bytes(depth: Any) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,46 +13,84 @@ import torch
 from torch import Tensor
 
 from ssad.core.detections import Truth
+from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import clip_rows
+from ssad.recording.clip_recorder import CLASSES, clip_rows
 from ssad.recording.textured_clips import textured_clips
 from ssad.scenarios.static.physical import Surface, View
 
 
-def target_views(folder: Path, surface: Surface, count: int, *, device: str = "cpu") -> list[tuple[str, View]]:
-    """Pictures of a recording whose target wears a surface, each with the name of its drive.
+@dataclass(frozen=True, slots=True)
+class TargetClips:
+    """The first pictures of a recording, for a detector.
+
+    Attributes:
+        folder: What `record_clips` wrote.
+        count: Number of pictures.
+        classes: Names of the detector's classes, in its order.
+        device: Where pictures are rendered and shown.
+    """
+
+    folder: Path
+    count: int
+    classes: tuple[str, ...] = CLASSES
+    device: str = "cpu"
+
+    def rows(self) -> list[Mapping[str, Any]]:
+        """What the annotation file says of each picture. FormatError: no recording of this version."""
+        return [row for row, _ in clip_rows(self.folder)[: self.count]]
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, as they were recorded. FormatError as for `rows`."""
+        for row, objects in clip_rows(self.folder)[: self.count]:
+            image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
+            yield _drive(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(row, objects, self.classes)
+
+    def wearing(self, surface: Surface) -> list[tuple[str, View]]:
+        """Drive and picture with a target that waits for a texture.
+
+        Args:
+            surface: What the target wears.
+
+        Raises:
+            FormatError: No recording of this version.
+            ConfigError: None of the pictures shows any of the texture.
+        """
+        found, seen = [], 0
+        for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
+            wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
+            seen += bool(len(wearing.taps[0].pixel))
+            found.append((_drive(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))))
+        if not seen:
+            raise ConfigError(
+                f"the texture is never in view in the {len(found)} pictures of {self.folder.name}; choose a panel that "
+                "the camera sees, or another camera"
+            )
+        return found
+
+
+def target_truth(row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> Truth:
+    """What is annotated in a picture, the target first, in a detector's classes; what it does not know is left out.
 
     Args:
-        folder: What `record_clips` wrote.
-        surface: What the target wears.
-        count: Number of pictures, from the first.
-        device: Where they are rendered and shown.
+        row: Of the picture.
+        objects: What is in it.
+        classes: Names of the detector's classes.
 
     Raises:
-        FormatError: No recording of this version.
+        ConfigError: The detector does not know the target's class.
     """
-    found = []
-    for clip in islice(textured_clips(folder, (surface.layer,), device=device), count):
-        wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=device)
-        found.append((_drive(clip.row), View(wearing, target_truth(clip.objects))))
-    return found
-
-
-def clean_images(folder: Path, count: int, *, device: str = "cpu") -> Iterator[tuple[str, Tensor, Truth]]:
-    """Drive, picture [1, 3, H, W] in 0 to 1 and truth of the first pictures of a recording, as they were recorded."""
-    for row, objects in clip_rows(folder)[:count]:
-        image = torch.tensor(read_image(folder / "images" / row["file_name"])).to(device)
-        yield _drive(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(objects)
-
-
-def target_truth(objects: Sequence[Mapping[str, Any]]) -> Truth:
-    """What is annotated in a picture, the target first."""
     ordered = sorted(objects, key=lambda one: not one["target"])
-    x, y, width, height = np.array([one["bbox"] for one in ordered], np.float64).T
+    names = [CLASSES[int(one["category_id"]) - 1] for one in ordered]
+    if names[0] not in classes:
+        raise ConfigError(f"a detector without a class {names[0]} cannot find the target")
+    known = [k for k, name in enumerate(names) if name in classes]
+    x, y, width, height = np.array([ordered[k]["bbox"] for k in known], np.float64).T
     return Truth(
-        torch.tensor([int(one["category_id"]) - 1 for one in ordered]),
+        torch.tensor([list(classes).index(names[k]) for k in known]),
         torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),
-        crowd=torch.tensor([bool(one["iscrowd"]) for one in ordered]),
+        intrinsic=torch.tensor(row["intrinsic"], dtype=torch.float32),
+        crowd=torch.tensor([bool(ordered[k]["iscrowd"]) for k in known]),
     )
 
 

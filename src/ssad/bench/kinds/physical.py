@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.detectors import make_detector
+from ssad.evaluation.target_grid import grid_scores
 from ssad.evaluation.target_scores import Sighting, sightings, target_scores
 from ssad.evaluation.target_sheet import target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
@@ -25,13 +27,14 @@ from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import Clips, record_clips
 from ssad.recording.target import TargetCar, parse_target
-from ssad.recording.target_views import clean_images, target_views
+from ssad.recording.target_views import TargetClips
 from ssad.recording.textured_clips import textured_clips
 from ssad.roads import town_names
 from ssad.scenarios.static.physical import CONTROLS, Surface, TextureSpec, View, albedo_of, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
 
-CLEAN = "clean"
+CLEAN, GRID = "clean", "grid"
+VIEWS = ("drive", GRID)
 
 
 class Physical(Kind):
@@ -41,21 +44,28 @@ class Physical(Kind):
     suite = PhysicalSuite
     columns = (
         Column("AP50", "AP50", "", "lower"),
+        Column("AP50_25", "AP50 above 0.25", "", "lower"),
         Column("AP50_all", "AP50 of all cars", "", "lower"),
+        Column("AP50_all_25", "AP50 of all cars above 0.25", "", "lower"),
         Column("ASR_25", "ASR at 0.25", "", "higher"),
         Column("ASR_50", "ASR at 0.5", "", "higher"),
+        Column("ASR_all_25", "ASR of all cars at 0.25", "", "higher"),
         Column("confidence", "mean score", "", "lower"),
     )
-    factors = ("test", "detector", "attack", "carrier", "source")
+    factors = ("test", "view", "detector", "attack", "carrier", "source")
 
     def plan(self, suite: PhysicalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Detectors and carriers are built once, so that what is wrong ends here."""
         target = target_of(suite)
         weights = {}
-        for name in suite.detectors:
+        for name in [*suite.detectors, *suite.judges]:
+            if name in weights:
+                raise ConfigError(f"suite {suite.name}: {name} is named twice among detectors and judges")
             detector = make_detector(name)
-            if detector.task != "2d" or "car" not in detector.classes:
-                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector with a class car")
+            if "car" not in detector.classes:
+                raise ConfigError(f"suite {suite.name}: {name} has no class car")
+            if detector.task != "2d" and name in suite.detectors:
+                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector; 3D detectors can be judges")
             weights[name] = state_hash(detector)
         for pair in suite.pairs:
             for town in (pair.train, pair.test):
@@ -65,17 +75,19 @@ class Physical(Kind):
         for row in rows:
             make_carrier(row["carrier"], row["options"]).on(target.mesh())
         cells: dict[str, Cell] = {}
-        for pair in suite.pairs:
-            for detector in suite.detectors:
-                for row in [{"attack": None}, *rows]:
-                    for cell in self._cells(suite, pair, detector, row, weights, device):
-                        cells.setdefault(cell.key, cell)
+        if suite.grid is not None:
+            _grid_clips(suite, Path(), suite.pairs[0].test, device)
+        for pair, view, detector in product(suite.pairs, VIEWS[: 2 if suite.grid else 1], weights):
+            for row in [{"attack": None}, *rows]:
+                for cell in self._cells(suite, pair, view, detector, row, weights, device):
+                    cells.setdefault(cell.key, cell)
         return Plan(self, suite, device, tuple(cells.values()), {"weights": weights}, {}, None)
 
     def _cells(  # noqa: PLR0917
         self,
         suite: PhysicalSuite,
         pair: Pair,
+        view: str,
         detector: str,
         row: Mapping[str, Any],
         weights: Mapping[str, str],
@@ -84,19 +96,30 @@ class Physical(Kind):
         """The cells of an attack on a detector in a pair of towns."""
         attack = row["attack"]
         trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
-        sources = suite.detectors if trained and suite.transfer else [detector]
+        moved = trained and (suite.transfer or detector in suite.judges)
+        sources = suite.detectors if moved else [detector]
         seeds = range(suite.seeds) if attack in ("random", "noise", "shuffled") else (0,)
         found = []
         for source in sources:
             for seed in seeds:
-                spec = {**row, "pair": pair.model_dump(), "source": source if trained else "", "number": seed}
+                spec = {
+                    **row,
+                    "pair": pair.model_dump(),
+                    "source": source if trained else "",
+                    "number": seed,
+                    "view": view,
+                }
                 fields = {
-                    "test": pair.test, "train": pair.train, "detector": detector, "carrier": row.get("carrier", ""),
+                    "test": pair.test, "train": pair.train, "view": view, "detector": detector,
+                    "carrier": row.get("carrier", ""),
                     "attack": CLEAN if attack is None else attack if not row["of"] else f"shuffled {row['of']}",
                     "source": source if trained else "", "number": seed,
                 }  # fmt: skip
                 title = "/".join([detector, pair.test, fields["attack"], str(fields["carrier"]), source, str(seed)])
-                inputs = suite.target, suite.behind, suite.size, suite.floor, suite.replicates, device
+                if view == GRID:
+                    title += f"/{GRID}"
+                grid = suite.grid.model_dump_json() if suite.grid and view == GRID else ""
+                inputs = suite.target, suite.behind, suite.size, suite.floor, suite.replicates, grid, device
                 found.append(
                     self.make_cell(
                         title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights[source]
@@ -116,23 +139,28 @@ class Physical(Kind):
             for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
                 images[town] = max(images.get(town, 0), count)
         target = target_of(suite)
-        for town, count in images.items():
-            clips = Clips(
+        recordings = [
+            Clips(
                 folder / "data" / town, ((town, count),), (), target=target, behind=suite.behind, size=suite.size,
                 seed=suite.seed, device=plan.device,
-            )  # fmt: skip
-            with Live(f"recording {town}", count, 0, console=resources.console, unit="parts") as live:
+            )
+            for town, count in images.items()
+        ]  # fmt: skip
+        if suite.grid is not None:
+            tests = dict.fromkeys(pair.test for pair in suite.pairs)
+            recordings += [_grid_clips(suite, folder, town, plan.device) for town in tests]
+        for clips in recordings:
+            with Live(f"recording {clips.out.name}", 1, 0, console=resources.console, unit="parts") as live:
                 record_clips(clips, workers=resources.workers, ray=resources.ray, progress=live.show)
         surfaces = dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"])
-        tasks = [
-            (folder / "data" / town, suite.target, surface, plan.device) for town in images for surface in surfaces
-        ]
+        tasks = [(clips.out, suite.target, surface, plan.device) for clips in recordings for surface in surfaces]
         if tasks:
             pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
             with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
                 run_all(pool, _see, tasks, progress=live.show)
         return {
             "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
+            "grid": suite.grid.count if suite.grid else 0,
         }  # fmt: skip
 
     def start(self, job: Job) -> None:
@@ -155,28 +183,29 @@ class Physical(Kind):
 
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
         """Scores in the town of the test."""
-        found = {}
-        for cell in cells:
-            pair = cell.spec["pair"]
-            clean = _clean_sightings(job.folder, job.device, cell.system, pair["test"], pair["test_images"])
-            before = target_scores(clean, replicates=job.settings["replicates"], seed=job.settings["seed"])
-            if cell.spec["attack"] is None:
-                found[cell.key] = before
-                continue
-            floor, have = job.settings["floor"], before["metrics"]["AP50"] or 0.0
-            if have < floor:
-                raise CellError(
-                    f"{cell.system} finds the clean car with AP50 {have:.3f}, which is less than the floor of {floor:g}"
-                )
-            spec = TextureSpec.of_row(cell.spec)
-            own = target_scores(
-                _sightings(job, cell.system, spec), clean, replicates=job.settings["replicates"],
-                seed=job.settings["seed"],
-            )  # fmt: skip
-            kept = _textures(job)
-            artefacts = {"texture": str(kept.picture(spec).relative_to(job.folder))}
-            found[cell.key] = {**own, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
-        return found
+        return {cell.key: self._score(cell, job) for cell in cells}
+
+    def _score(self, cell: Cell, job: Job) -> dict[str, Any]:
+        """Scores of a cell. CellError: the detector does not find the clean car."""
+        settings, detector, grid = job.settings, cell.system, cell.spec["view"] == GRID
+        clips = _test_clips(job, cell.spec, detector)
+        clean = _clean_sightings(clips, detector)
+        draws = {"replicates": settings["replicates"], "seed": settings["seed"]}
+        before = target_scores(clean, **draws)
+        if cell.spec["attack"] is None:
+            return before | (grid_scores(clips.rows(), clean, None, floor=settings["floor"]) if grid else {})
+        floor, have = settings["floor"], before["metrics"]["AP50"] or 0.0
+        if have < floor:
+            raise CellError(
+                f"{detector} finds the clean car with AP50 {have:.3f}, which is less than the floor of {floor:g}"
+            )
+        spec, kept = TextureSpec.of_row(cell.spec), _textures(job)
+        attacked = list(sightings(make_detector(detector, device=job.device), _worn(job, clips, spec)))
+        found = target_scores(attacked, clean, **draws)
+        if grid:
+            found |= grid_scores(clips.rows(), clean, attacked, floor=floor)
+        artefacts = {"texture": str(kept.picture(spec).relative_to(job.folder))}
+        return {**found, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """One picture of the first test town under each texture: DIR/pictures/textures.jpg."""
@@ -192,9 +221,9 @@ class Physical(Kind):
                     continue
                 chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", spec)
         if not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
-            ((_, clean, _),) = clean_images(folder / "data" / pair.test, 1, device=plan.device)
-            shown = [(CLEAN, clean)]
-            shown += [(title, next(_worn(job, pair.test, spec, 1))[1]) for title, spec in chosen.items()]
+            clips = TargetClips(folder / "data" / pair.test, 1, device=plan.device)
+            shown = [(CLEAN, next(clips.clean())[1])]
+            shown += [(title, next(_worn(job, clips, spec))[1]) for title, spec in chosen.items()]
             save_picture(path, target_sheet(make_detector(name, device=plan.device), shown, plan.device))
         if path.is_file():
             caption = (
@@ -226,38 +255,49 @@ def _textures(job: Job) -> TextureFolder:
     return TextureFolder(job.folder / "textures", job.settings["seed"], job.device)
 
 
-def _views(job: Job, town: str, spec: TextureSpec, count: int) -> list[tuple[str, View]]:
-    """Pictures of a town whose target waits for a texture."""
-    surface = _surface(job.settings["target"], spec.surface)
-    return target_views(job.folder / "data" / town, surface, count, device=job.device)
-
-
 def texture_of(job: Job, spec: TextureSpec) -> Tensor:
     """A texture of a run [3, H, W], sRGB; trained now if it has to be."""
+    surface = _surface(job.settings["target"], spec.surface)
+
+    def views() -> list[View]:
+        town, count = spec.pair["train"], spec.pair["train_images"]
+        classes = tuple(make_detector(spec.source).classes)
+        clips = TargetClips(job.folder / "data" / town, count, classes, job.device)
+        return [view for _, view in clips.wearing(surface)]
+
     return _textures(job).texture(
-        spec,
-        _surface(job.settings["target"], spec.surface),
-        views=lambda: [view for _, view in _views(job, spec.pair["train"], spec, spec.pair["train_images"])],
-        detector=lambda: make_detector(spec.source, device=job.device),
+        spec, surface, views=views, detector=lambda: make_detector(spec.source, device=job.device)
     )
 
 
-def _worn(job: Job, town: str, spec: TextureSpec, count: int) -> Iterator[tuple[str, Tensor, Truth]]:
-    """Drive, picture and truth of the first pictures of a town under a texture."""
+def _test_clips(job: Job, spec: Mapping[str, Any], detector: str) -> TargetClips:
+    """The pictures that a cell is scored on, for a detector."""
+    town, grid = spec["pair"]["test"], spec["view"] == GRID
+    count = job.settings["grid"] if grid else spec["pair"]["test_images"]
+    classes = tuple(make_detector(detector).classes)
+    return TargetClips(job.folder / "data" / (f"{town}-grid" if grid else town), count, classes, job.device)
+
+
+def _worn(job: Job, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
+    """Drive, picture and truth of clips under a texture."""
     colour = albedo_of(texture_of(job, spec)).to(job.device)  # may be trained now, so gradients are on
-    for drive, view in _views(job, town, spec, count):
+    for drive, view in clips.wearing(_surface(job.settings["target"], spec.surface)):
         with torch.no_grad():
             yield drive, view.picture.show({0: colour}), view.truth
 
 
-def _sightings(job: Job, detector: str, spec: TextureSpec) -> list[Sighting]:
-    """What a detector finds in the pictures of the test under a texture."""
-    pictures = _worn(job, spec.pair["test"], spec, spec.pair["test_images"])
-    return list(sightings(make_detector(detector, device=job.device), pictures))
-
-
 @lru_cache(maxsize=8)
-def _clean_sightings(folder: Path, device: str, detector: str, town: str, count: int) -> tuple[Sighting, ...]:
-    """What a detector finds in the pictures of the test as they were recorded; kept, since every cell needs it."""
-    pictures = clean_images(folder / "data" / town, count, device=device)
-    return tuple(sightings(make_detector(detector, device=device), pictures))
+def _clean_sightings(clips: TargetClips, detector: str) -> tuple[Sighting, ...]:
+    """What a detector finds in pictures as they were recorded; kept, since every cell needs it."""
+    return tuple(sightings(make_detector(detector, device=clips.device), clips.clean()))
+
+
+def _grid_clips(suite: PhysicalSuite, folder: Path, town: str, device: str) -> Clips:
+    """The recording of a suite's grid in a town. ConfigError, UnknownNameError: a value that cannot be."""
+    assert suite.grid is not None
+    grid = suite.grid
+    return Clips(
+        folder / "data" / f"{town}-grid", ((town, grid.count),), (), mode="orbit", target=target_of(suite),
+        size=suite.size, seed=suite.seed, device=device, distances=tuple(grid.distances),
+        azimuths=tuple(grid.azimuths), elevations=tuple(grid.elevations), weathers=tuple(grid.weathers),
+    )  # fmt: skip

@@ -20,6 +20,7 @@ from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, 
 from ssad.scenarios.static.digital.victim import steady
 from ssad.scenarios.static.physical.carrier import Surface, albedo_of
 from ssad.scenarios.static.physical.printing import Expectation, non_printability, total_variation
+from ssad.scenarios.static.physical.zoom import STEP, around_target
 
 TARGET = Aim(objects=(0,))
 """The target is the first object of each picture's truth."""
@@ -62,6 +63,7 @@ class TextureAttack:
         expectation: What differs from print to print.
         worst: Share of the pictures of an epoch that are drawn by how badly the attack does on them, in place of once
             each; 0: none.
+        window: Side of the square part around the target that the detector is shown, px; None: the whole picture.
     """
 
     name: str
@@ -75,6 +77,7 @@ class TextureAttack:
     printed: float = 0.01
     expectation: Expectation = field(default_factory=Expectation)
     worst: float = 0.0
+    window: int | None = None
 
     def __post_init__(self) -> None:
         if self.epochs < 1 or self.batch < 1 or self.rate <= 0.0:
@@ -83,6 +86,8 @@ class TextureAttack:
             raise ConfigError(f"attack {self.name}: optimiser '{self.optimiser}'; choose adam or sgd")
         if not 0.0 <= self.worst <= 1.0:
             raise ConfigError(f"attack {self.name}: worst is a share from 0 to 1")
+        if self.window is not None and (self.window < 4 * STEP or self.window % STEP):
+            raise ConfigError(f"attack {self.name}: a window is a multiple of {STEP} px, {4 * STEP} at least")
 
 
 @dataclass(slots=True)
@@ -202,8 +207,11 @@ def _ascended(  # noqa: PLR0917
     for number in chosen:
         draws = torch.Generator().manual_seed(int(digest("texture draw", *key, number)[:15], 16))
         printed = attack.expectation.draw(colour, draws)
-        shown.append(views[number].picture.show({0: albedo_of(printed)}, draws))
-        truth.append(views[number].truth)
+        picture, seen = views[number].picture.show({0: albedo_of(printed)}, draws), views[number].truth
+        if attack.window is not None:
+            picture, seen = around_target(picture, seen, attack.window, draws)
+        shown.append(picture)
+        truth.append(seen)
     dense = detector.dense(torch.cat(shown))
     with torch.no_grad():
         assignment = detector.assign(dense, truth)

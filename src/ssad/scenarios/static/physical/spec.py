@@ -27,7 +27,7 @@ class TextureSpec:
         of: Of the control shuffled: the attack whose texture is shuffled.
         source: The detector that is attacked; "" for what is not trained.
         number: Of a control that is drawn at random.
-        pair: What it is trained on, as the suite says it.
+        pair: What it is trained and tested on, as the suite says it.
     """
 
     attack: str
@@ -54,7 +54,7 @@ class TextureSpec:
         """What the training of the texture depends on, in short."""
         attack = self.of or self.attack
         about = attack, self.source, self.carrier, safeio.dump_json(self.options)
-        rest = safeio.dump_json(self.settings), safeio.dump_json(self.pair)
+        rest = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
         return f"{attack}-{digest('texture', *about, *rest)[:12]}"
 
     @property

@@ -1,4 +1,4 @@
-"""Losses on where a detector looks (DAS, TPA): attention of its last feature maps for the score of the target.
+"""Losses on where a detector looks (DAS, TPA): attention of its feature maps for the scores of the target.
 
 Attention is Grad-CAM's: feature maps weighted by how the target's score depends on them. The weights are constants of
 a step, as in the sources; what is ascended moves the maps.
@@ -26,6 +26,8 @@ class Distraction:
 
     The attention for the target in a window around it, on a grid of 7 x 7, is cut into 4-connected parts where it is
     above its mean; each part counts with its attention over the cells that it leaves free, and their mean goes down.
+    The source takes the last feature map of a classifier. A detector reads each target from the level of its size, so
+    the mean over the levels goes down: the coarsest alone has no slope for a car of 60 px.
 
     Source: Wang et al., Dual Attention Suppression Attack (CVPR 2021), the distraction loss; the classifier's attention
     there is the detector's here.
@@ -42,11 +44,11 @@ class Distraction:
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """See `Objective`."""
-        maps = attention(dense, situation, dense.features[-1:])
+        maps = attention(dense, situation, dense.features)
         values = []
         for k, box in enumerate(_targets(situation)):
-            local = _crop(maps[0][k], box, dense.size, self.window)
-            values.append(-_parts(local))
+            parts = [_parts(_crop(level[k], box, dense.size, self.window)) for level in maps]
+            values.append(-torch.stack(parts).mean())
         return torch.stack(values)
 
 
@@ -81,7 +83,9 @@ class Redistribution:
 
 
 def attention(dense: Dense, situation: Situation, features: tuple[Tensor, ...]) -> list[Tensor]:
-    """Grad-CAM maps [B, h, w] of feature maps for the score of each image's target, from 0 up.
+    """Grad-CAM maps [B, h, w] of feature maps for the scores of each image's target, from 0 up.
+
+    The scores are the best of the places that are the target's, on each level: a map of which no score is read is 0.
 
     A map is scaled so that its greatest value would be 1 if the weights stayed and the maps did not move.
 
@@ -93,16 +97,18 @@ def attention(dense: Dense, situation: Situation, features: tuple[Tensor, ...]) 
     chosen = situation.aim.places(situation.detector, situation.assignment)
     label = situation.assignment.label.clamp_min(0)
     score = log_scores(dense).gather(-1, label[..., None])[..., 0]
-    best = torch.where(chosen, score, -torch.inf).amax(1)
-    best = torch.where(best.isfinite(), best, 0.0)
-    slopes = torch.autograd.grad(best.sum(), features, retain_graph=True, allow_unused=True)
+    total = score.sum() * 0.0
+    for number in range(int(dense.level.max()) + 1):
+        best = torch.where(chosen & (dense.level == number), score, -torch.inf).amax(1)
+        total = total + torch.where(best.isfinite(), best, 0.0).sum()
+    slopes = torch.autograd.grad(total, features, retain_graph=True, allow_unused=True)
     found = []
-    for level, slope in zip(features, slopes, strict=True):
+    for feature, slope in zip(features, slopes, strict=True):
         if slope is None:
-            found.append(level.sum(1) * 0.0)
+            found.append(feature.sum(1) * 0.0)
             continue
         weight = slope.mean((2, 3), keepdim=True)
-        cam = functional.relu((weight * level).sum(1))
+        cam = functional.relu((weight * feature).sum(1))
         greatest = cam.detach().amax((1, 2), keepdim=True)
         found.append(cam / greatest.clamp_min(1e-12))
     if all(slope is None for slope in slopes):
