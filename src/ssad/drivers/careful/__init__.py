@@ -1,0 +1,6 @@
+"""Careful drivers: the models by which regulators judge whether a collision could have been avoided."""
+
+from ssad.drivers.careful.encounter import Encounter
+from ssad.drivers.careful.models import MODELS, CarefulModel, careful_model, react
+
+__all__ = ["MODELS", "CarefulModel", "Encounter", "careful_model", "react"]
