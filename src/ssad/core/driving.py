@@ -160,7 +160,8 @@ class Observation:
         signal: [N, 2] state of the next signal on the route (`ssad.core.types.SignalState`) and metres to its stop
             line. Without a signal: 0 (off) and 1e6.
         done: [N] whether the episode has ended; the control is then ignored.
-        readings: What the sensors that the driver asked for show, [N, ...] each; `truth` a `Belief` of N rows.
+        readings: What the sensors that the driver asked for show, [N, ...] each; `truth` a `Belief` of N rows. Each is
+            read when it is first looked up, which must be before the driver returns.
     """
 
     scene: I32

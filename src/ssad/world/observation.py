@@ -39,7 +39,7 @@ def observe(state: WorldState, agents: I32, ended: Bool, readings: Mapping[str, 
         others_lane=relation,
         signal=_signal(state, scene, at),
         done=ended[scene],
-        readings=dict(readings or {}),
+        readings={} if readings is None else readings,
     )
 
 

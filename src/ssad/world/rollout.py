@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -153,8 +153,9 @@ class Loop:
         assert isinstance(driver, Believer)
         assert isinstance(self.simulator, Planner)
         ended = self.simulator.ended() != End.RUNNING
-        readings = {name: self._read(name, driver, state, egos) for name in getattr(driver, "sensors", ())}
+        readings = self._readings(driver, state, egos)
         belief = driver.believe(observe(state, egos, ended, readings))
+        readings.close()
         try:
             self.simulator.believe(belief, ~ended)
         except ConfigError as error:
@@ -163,8 +164,9 @@ class Loop:
     def _act(self, driver: Driver, state: WorldState, agents: I32) -> F32:
         """Controls [N, 3|4] of the agents; 0 where the episode has ended."""
         ended = self.simulator.ended() != End.RUNNING
-        readings = {name: self._read(name, driver, state, agents) for name in getattr(driver, "sensors", ())}
+        readings = self._readings(driver, state, agents)
         given = np.asarray(driver.act(observe(state, agents, ended, readings)), np.float32)
+        readings.close()
         if given.ndim != 2 or given.shape[0] != len(agents) or given.shape[1] not in (3, 4):
             raise ConfigError(
                 f"system {driver.name}: act returned shape {given.shape}, expected ({len(agents)}, 3): "
@@ -174,6 +176,10 @@ class Loop:
         if not np.isfinite(given[running]).all():
             raise ConfigError(f"system {driver.name}: act returned a control that is not finite")
         return np.where(running[:, None], given, np.float32(0.0))
+
+    def _readings(self, driver: Driver, state: WorldState, agents: I32) -> _Readings:
+        names = tuple(getattr(driver, "sensors", ()))
+        return _Readings(names, lambda name: self._read(name, driver, state, agents))
 
     def _read(self, name: str, driver: Driver, state: WorldState, agents: I32) -> Any:
         reading = self.sensors[name](self.simulator, agents)
@@ -186,6 +192,33 @@ class Loop:
             episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
             generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
         return perturbation.apply(reading, driver, state, generators)
+
+
+class _Readings(Mapping[str, Any]):
+    """What sensors show, each read when it is first asked for: a camera that nobody looks through renders nothing."""
+
+    def __init__(self, names: tuple[str, ...], read: Callable[[str], Any]) -> None:
+        self._names, self._read, self._found = names, read, dict[str, Any]()
+        self._open = True
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._names:
+            raise KeyError(name)
+        if name not in self._found:
+            if not self._open:
+                raise ConfigError(f"sensor '{name}' was not read in its step: ask for it while the driver is called")
+            self._found[name] = self._read(name)
+        return self._found[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def close(self) -> None:
+        """The step is over: what was not read cannot be read any more."""
+        self._open = False
 
 
 def _told_to(simulator: Simulator, policy: str, number: int) -> Selector:
