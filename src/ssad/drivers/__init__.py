@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import cast
 
 from ssad.core.driving import Believer, Driver
 from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
 from ssad.core.types import Controller
 
 SYSTEMS: dict[str, str] = {
     "autopilot": "ssad.drivers.builtin:Autopilot",
     "blind": "ssad.drivers.builtin:Blind",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
+    "perceiving-perfect": "ssad.drivers.perceiving.systems:Perfect",
+    "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",
+    "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",
+    "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
 }
 
 
@@ -42,5 +48,8 @@ class _Named:
         self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset
         self.act = system.act
+        self.cameras: Mapping[str, Camera] = getattr(system, "cameras", {})
         if isinstance(system, Believer):
             self.believe = system.believe
+        if callable(getattr(system, "to", None)):
+            self.to = system.to  # type: ignore[attr-defined]

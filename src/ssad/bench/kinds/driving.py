@@ -306,19 +306,24 @@ def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[Ep
     simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
     system = system_of(cells[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
+    for driver in (system, *policies.values()):
+        if callable(getattr(driver, "to", None)):
+            driver.to(device)  # type: ignore[attr-defined]
     sensors = onboard_sensors([system, *policies.values()], device)
     return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
 
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
-    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one."""
+    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own cameras."""
     asked = {name for driver in drivers for name in getattr(driver, "sensors", ())}
-    if not asked & {*CAMERAS, LIDAR}:
+    own = {name: camera for driver in drivers for name, camera in getattr(driver, "cameras", {}).items()}
+    if not asked & {*CAMERAS, LIDAR, *own}:
         return {}
     from ssad.recording.loop_sensors import Onboard
 
     onboard = Onboard(device=device)
-    return {**onboard.rig(), LIDAR: onboard.lidar()}
+    cameras = {name: onboard.camera(camera) for name, camera in own.items()}
+    return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras}
 
 
 def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:

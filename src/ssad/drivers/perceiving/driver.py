@@ -1,0 +1,163 @@
+"""The driving system that knows of traffic only what its cameras show.
+
+    cameras -> detector -> world -> tracker -> belief -> the Autopilot's planner and controller
+
+Route, lane map and its own pose are given, signals and signs are those of the map; other road users are told by
+detected objects and nothing else. All else is the Autopilot, so that what it drives worse is what it sees worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ssad.core.driving import Belief, Observation
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.rotations import upright_pose
+from ssad.core.types import F32, F64, Controller, Episode
+from ssad.drivers.perceiving.eyes import Eyes
+from ssad.drivers.perceiving.lift import Lifting, lift, merged
+from ssad.drivers.perceiving.objects import I64, Objects, no_objects
+from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks, believed
+
+LATE = 1e-4  # s, less than a step: times are 32-bit numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One look of a scene, for who watches.
+
+    Attributes:
+        scene: Which scene.
+        time: s when the pictures were taken.
+        found: What was found in them, in the world; None: no camera had a picture.
+    """
+
+    scene: int
+    time: float
+    found: Objects | None
+
+
+class Perceiving:
+    """The Autopilot over what its eyes see.
+
+    Args:
+        eyes: What looks.
+        lifting: How detections become places.
+        tracking: How places become tracks.
+        rate: Looks a second; the world has 10 steps a second.
+        latency: s from a picture to its detections. Tracks are moved on to the present, so what is late is not
+            misplaced, but unknown for so long.
+        watch: Told of each look.
+
+    Raises:
+        ConfigError: A value is out of its range.
+    """
+
+    name = "perceiving"
+    controller = Controller.AUTOPILOT
+
+    def __init__(
+        self,
+        eyes: Eyes,
+        *,
+        lifting: Lifting | None = None,
+        tracking: Tracking | None = None,
+        rate: float = 5.0,
+        latency: float = 0.1,
+        watch: Callable[[Sighting], None] | None = None,
+    ) -> None:
+        if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
+            raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
+        self.eyes, self.lifting, self.tracking = eyes, lifting or Lifting(), tracking or Tracking()
+        self.rate, self.latency, self.watch = rate, latency, watch
+        self.sensors: tuple[str, ...] = tuple(eyes.sensors)
+        self._tracker = Tracker(self.tracking, 0)
+        self._looks = np.zeros(0, np.int64)
+        self._waiting: list[Sighting] = []
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """The cameras among its sensors, which the engine makes."""
+        return {name: camera for name, camera in self.eyes.cameras.items() if name in self.sensors}
+
+    def to(self, device: str) -> None:
+        """Compute on another device, if its eyes can."""
+        move = getattr(self.eyes, "to", None)
+        if move is not None:
+            move(device)
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Forget the past."""
+        self._tracker = Tracker(self.tracking, len(episodes))
+        self._looks = np.full(len(episodes), -1)
+        self._waiting = []
+        self.eyes.reset(episodes)
+
+    def snapshot(self) -> Any:
+        """All that changes; with a snapshot of the simulator, `restore` goes on from there to the bit."""
+        return self._tracker.snapshot(), self._looks.copy(), list(self._waiting), self.eyes.snapshot()
+
+    def restore(self, snapshot: Any) -> None:
+        """Go on from an earlier moment of the same batch."""
+        tracks, looks, waiting, eyes = snapshot
+        self._tracker.restore(tracks)
+        self._looks, self._waiting = looks.copy(), list(waiting)
+        self.eyes.restore(eyes)
+
+    def act(self, view: Observation) -> F32:
+        """Never called: the planner runs inside the world."""
+        raise RuntimeError("the Autopilot runs inside the world")
+
+    def believe(self, view: Observation) -> Belief:
+        """What is around the egos, as far as it has been seen."""
+        now = view.time.astype(np.float64)
+        looks = np.floor((now + LATE) * self.rate).astype(np.int64)
+        due = np.flatnonzero(~view.done & (looks > self._looks[view.scene]))
+        if len(due):
+            self._looks[view.scene[due]] = looks[due]
+            self._waiting += self._sightings(view, due, now)
+        self._take_in(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
+        return believed(self.tracks(view.scene, now), view.scene)
+
+    def tracks(self, scenes: Any, times: F64) -> Tracks:
+        """The confirmed tracks of scenes [N] at times [N]."""
+        return self._tracker.confirmed(scenes, times)
+
+    def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
+        """What is seen now in some rows."""
+        looked = self.eyes.look(view, rows)
+        sightings = []
+        for k, row in enumerate(rows.tolist()):
+            scene, parts = int(view.scene[row]), []
+            ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
+            for name, camera in self.eyes.cameras.items():
+                one = looked[name][k]
+                if one is not None:
+                    found = lift(one, camera, ego @ camera.to_ego, self.eyes.classes, settings=self.lifting)
+                    parts.append(replace(found, scene=np.full(len(found), scene)))
+            all_ = merged(Objects.joined(parts), self.lifting.merge) if parts else None
+            sightings.append(Sighting(scene, float(now[row]), all_))
+            if self.watch is not None:
+                self.watch(sightings[-1])
+        return sightings
+
+    def _take_in(self, now: Mapping[int, float]) -> None:
+        """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""
+        ready = [s for s in self._waiting if s.scene in now and s.time + self.latency <= now[s.scene] + LATE]
+        self._waiting = [s for s in self._waiting if not any(s is one for one in ready)]
+        while ready:
+            first: dict[int, Sighting] = {}
+            for sighting in ready:
+                first.setdefault(sighting.scene, sighting)
+            ready = [s for s in ready if first[s.scene] is not s]
+            batch = [s for s in first.values() if s.found is not None]
+            if batch:
+                scenes = np.array([s.scene for s in batch])
+                times = np.array([s.time for s in batch])
+                found = Objects.joined([no_objects(), *(s.found for s in batch if s.found is not None)])
+                self._tracker.update(scenes, times, found)

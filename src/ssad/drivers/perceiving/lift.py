@@ -1,0 +1,151 @@
+"""From what a detector reports in a camera's picture to objects in the world.
+
+3D boxes are moved by the pose of the camera. 2D boxes are lifted by the ground plane: the middle of a box's lower edge
+is taken for the point where the object meets a level road.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssad.core.boxes import camera_axes
+from ssad.core.detections import Detections
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.types import F64, Bool
+from ssad.drivers.perceiving.objects import I64, KINDS, LARGE, SIZES, Objects, no_objects
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lifting:
+    """Settings.
+
+    Attributes:
+        reach: m from the camera beyond which nothing is reported.
+        along: Standard deviation of an object's place along the line of sight: m, and m per m of distance.
+        across: The same across it.
+        merge: Share of the longer of two large objects' lengths within which their middles belong to one object.
+    """
+
+    reach: float = 60.0
+    along: tuple[float, float] = (0.4, 0.05)
+    across: tuple[float, float] = (0.2, 0.01)
+    merge: float = 0.5
+
+
+def lift(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, settings: Lifting) -> Objects:
+    """Objects in the world; classes that do not matter to a driver are left out.
+
+    Args:
+        found: What was found in a picture.
+        camera: The camera.
+        pose: Of the camera in the world when the picture was taken, [4, 4].
+        classes: Names of the labels.
+        settings: Settings.
+
+    Returns:
+        The objects, best first, `scene` 0.
+
+    Raises:
+        ConfigError: The detector returned a number that is not finite, or a label that is none of its classes.
+    """
+    score, label = (v.detach().cpu().numpy() for v in (found.score, found.label))
+    label = label.astype(np.int64)
+    _check(score, label, classes)
+    names = [classes[k] for k in label.tolist()]
+    kind = np.array([KINDS.get(name, 0) for name in names], np.int64)
+    rows = np.flatnonzero(kind > 0)
+    if not len(rows):
+        return no_objects()
+    kind = kind[rows]
+    if found.solid is None:
+        box = found.box.detach().cpu().double().numpy()[rows]
+        _finite(box)
+        place, yaw, known = _on_ground(box, kind, camera, pose)
+        size: F64 = SIZES[kind, :2]
+        velocity: F64 = np.full((len(rows), 2), np.nan)
+        rows, kind, place, yaw = rows[known], kind[known], place[known], yaw[known]
+        size, velocity = size[known], velocity[known]
+    else:
+        solid = found.solid
+        centre, lhw, turn, speed = (
+            v.detach().cpu().double().numpy()[rows] for v in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
+        )
+        _finite(centre, lhw, turn)
+        place = (centre @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+        ahead = (pose[:3, :3] @ camera_axes(turn))[:, :, 0]
+        yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+        size = np.maximum(lhw[:, [0, 2]], 0.2)
+        velocity = (np.stack([speed[:, 0], np.zeros(len(rows)), speed[:, 1]], 1) @ pose[:3, :3].T)[:, :2]
+    spread, away = _spread(place, pose, settings)
+    near = away <= settings.reach
+    none = np.zeros(len(rows), np.int64)
+    found_here = Objects(none, place, spread, yaw, size, velocity, kind, score[rows].astype(np.float64)).take(near)
+    return found_here.take(np.argsort(-found_here.score, kind="stable"))
+
+
+def merged(found: Objects, share: float) -> Objects:
+    """Without the large objects of a scene that a better one stands in: those seen by two cameras, or as two kinds.
+
+    Args:
+        found: Objects of some scenes.
+        share: See `Lifting.merge`.
+    """
+    order = np.lexsort((-found.score, found.scene))
+    found = found.take(order)
+    large = np.isin(found.kind, LARGE)
+    keep = np.ones(len(found), bool)
+    for scene in np.unique(found.scene):
+        rows = np.flatnonzero((found.scene == scene) & large)
+        gap = np.linalg.norm(found.place[rows][:, None] - found.place[rows][None], axis=-1)
+        close = gap < share * np.maximum(found.size[rows, 0][:, None], found.size[rows, 0][None])
+        for k, row in enumerate(rows):
+            keep[row] = not (close[k, :k] & keep[rows[:k]]).any()
+    return found.take(keep)
+
+
+def _check(score: F64, label: I64, classes: Sequence[str]) -> None:
+    _finite(score)
+    if len(label) and not (label.min() >= 0 and label.max() < len(classes)):
+        raise ConfigError(f"the detector returned a label that is none of its {len(classes)} classes")
+
+
+def _finite(*arrays: F64) -> None:
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ConfigError("the detector returned a number that is not finite")
+
+
+def _spread(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
+    """Covariances [N, 2, 2] of places as seen from a camera, and distances [N]."""
+    line = place - pose[:2, 3]
+    away = np.linalg.norm(line, axis=1)
+    one = line / np.maximum(away, 1e-6)[:, None]
+    other = np.stack([-one[:, 1], one[:, 0]], 1)
+    along, across = ((own[0] + own[1] * away) ** 2 for own in (settings.along, settings.across))
+    return along[:, None, None] * one[:, :, None] * one[:, None, :] + across[:, None, None] * (
+        other[:, :, None] * other[:, None, :]
+    ), away
+
+
+def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64) -> tuple[F64, F64, Bool]:
+    """Middles [N, 2], headings [N] and whether they lie on the road [N] of objects in 2D boxes [N, 4].
+
+    A box about as wide as the object's end shows it from front or back, so its heading is along the line of sight and
+    its middle half a length behind what is seen; a wider one shows its side.
+    """
+    foot = np.stack([0.5 * (box[:, 0] + box[:, 2]), box[:, 3], np.ones(len(box))], 1)
+    ray = foot @ np.linalg.inv(camera.intrinsic).T @ pose[:3, :3].T
+    down = -ray[:, 2]
+    known = down > 1e-3
+    where = pose[:3, 3] + ray * (pose[2, 3] / np.where(known, down, 1.0))[:, None]
+    line = where[:, :2] - pose[:2, 3]
+    line = line / np.maximum(np.linalg.norm(line, axis=1), 1e-6)[:, None]
+    length, width, height = SIZES[kind].T
+    shape = (box[:, 2] - box[:, 0]) / np.maximum(box[:, 3] - box[:, 1], 1e-6)
+    aside = shape > np.sqrt(length * width) / height
+    course = np.arctan2(line[:, 1], line[:, 0])
+    middle = where[:, :2] + 0.5 * np.where(aside, width, length)[:, None] * line
+    return middle, course + np.where(aside, 0.5 * np.pi, 0.0), known

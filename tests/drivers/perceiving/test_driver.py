@@ -1,0 +1,205 @@
+"""The perceiving driver in the loop: what it asks for and when, what it believes, and what goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ssad import World, build_episode, load_scenarios, load_town, make_system, rollout
+from ssad.core.detections import Detections, Solids
+from ssad.core.driving import Observation
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.traces import trace_hash
+from ssad.core.types import AgentKind, Episode, Limits
+from ssad.drivers.perceiving.driver import Perceiving, Sighting
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
+from ssad.drivers.perceiving.tracker import Tracking
+from ssad.world.rollout import Loop
+
+CAMERA = Camera.typical(64, 36)
+
+
+def episodes(name: str = "StraightObstacle", count: int = 2, steps: int = 60) -> tuple[list[Episode], Any]:
+    scenarios = load_scenarios(name)[:count]
+    town = load_town(scenarios[0].town)
+    made = [build_episode(scenario, town, seed=0) for scenario in scenarios]
+    return [replace(one, limits=Limits(max_steps=steps)) for one in made], town
+
+
+def run(driver: Any, made: list[Episode], town: Any, **more: Any) -> list[Any]:
+    return rollout(World(made, {town.name: town}), driver, **more)
+
+
+def steady_view(time: float, scenes: int = 1, **readings: Any) -> Observation:
+    none = np.zeros(scenes, np.float32)
+    return Observation(
+        scene=np.arange(scenes, dtype=np.int32), agent=np.zeros(scenes, np.int32), time=none + np.float32(time),
+        speed=none, accel=none, pose=np.zeros((scenes, 3), np.float32), target_speed=none,
+        route=np.zeros((scenes, 40, 2), np.float32), lane_offset=none, heading_error=none,
+        others=np.zeros((scenes, 16, 7), np.float32), others_lane=np.zeros((scenes, 16), np.uint8),
+        signal=np.zeros((scenes, 2), np.float32), done=np.zeros(scenes, bool), readings=readings,
+    )  # fmt: skip
+
+
+class OneCar:
+    """A detector that finds one car 15 m ahead where the picture is bright."""
+
+    name, task, classes = "one-car", "3d", ("pedestrian", "car")
+
+    def __init__(self, change: Callable[[Detections], Detections] = lambda found: found) -> None:
+        self.change = change
+
+    def predict(self, images: Any, intrinsic: Any = None, *, threshold: float | None = None) -> list[Detections]:
+        found = []
+        for image in images:
+            n = int(image.mean() > 0.5)
+            solid = Solids(
+                torch.tensor([[0.0, 0.8, 15.0]])[:n], torch.tensor([[4.5, 1.6, 1.9]])[:n], torch.zeros(1)[:n],
+                torch.zeros(1, 2)[:n], torch.zeros(1, dtype=torch.int64)[:n],
+            )  # fmt: skip
+            one = Detections(torch.ones(1)[:n], torch.ones(1, dtype=torch.int64)[:n], torch.zeros(1, 4)[:n], solid)
+            found.append(self.change(one))
+        return found
+
+
+def seeing(times: list[float], driver: Perceiving, picture: Callable[[float], int]) -> list[int]:
+    """How many objects are believed at each time, where the camera shows one value everywhere."""
+    driver.reset([None])  # type: ignore[list-item]
+    counts = []
+    for time in times:
+        pictures = np.full((1, 3, CAMERA.height, CAMERA.width), picture(time), np.uint8)
+        belief = driver.believe(steady_view(time, front=pictures))
+        counts.append(int((belief.kind != AgentKind.NONE).sum()))
+    return counts
+
+
+def test_a_perfect_detector_lets_it_stop_where_the_blind_one_hits() -> None:
+    made, town = episodes(count=1, steps=100)
+    ends = [trace.end for trace in run(make_system("perceiving-perfect"), made, town)]
+    assert "collision" not in ends
+    assert all(trace.end == "collision" for trace in run(make_system("blind"), made, town))
+
+
+def test_it_looks_at_its_rate_and_nothing_is_rendered_in_between() -> None:
+    made, town = episodes(count=1, steps=20)
+    calls = []
+
+    def camera(simulator: Any, agents: Any) -> Any:
+        calls.append(float(simulator.state().time[0]))
+        return np.full((len(agents), 3, CAMERA.height, CAMERA.width), 9, np.uint8)
+
+    driver = Perceiving(CameraEyes(OneCar(), {"front": CAMERA}), rate=2.5)
+    run(driver, made, town, sensors={"front": camera})
+    np.testing.assert_allclose(calls, [0.0, 0.4, 0.8, 1.2, 1.6], atol=1e-5)
+
+
+def test_a_car_is_believed_after_its_hits_and_the_latency_and_where_it_is() -> None:
+    times = [0.1 * k for k in range(8)]
+    for confirm, latency, first in ((1, 0.0, 0), (3, 0.0, 4), (1, 0.3, 3), (2, 0.1, 3)):
+        eyes = CameraEyes(OneCar(), {"front": CAMERA})
+        driver = Perceiving(eyes, rate=5.0, latency=latency, tracking=Tracking(confirm=confirm))
+        counts = seeing(times, driver, lambda _: 200)
+        assert counts.index(1) == first
+    belief = driver.believe(steady_view(0.8, front=np.zeros((1, 3, CAMERA.height, CAMERA.width), np.uint8)))
+    np.testing.assert_allclose(belief.pose[0, 0, :2], [15.0 + CAMERA.to_ego[0, 3], 0.0], atol=1e-3)
+
+
+def test_a_dark_picture_is_a_miss_and_a_lost_signal_is_not() -> None:
+    times = [0.2 * k for k in range(12)]
+    for value, left in ((1, 0), (0, 1)):
+        eyes = CameraEyes(OneCar(), {"front": CAMERA})
+        driver = Perceiving(eyes, rate=5.0, latency=0.0, tracking=Tracking(confirm=1, reserve=3))
+        counts = seeing(times, driver, lambda time, value=value: 200 if time < 0.5 else value)  # type: ignore[misc]
+        assert counts[2] == 1
+        assert counts[-1] == left
+
+
+def test_its_scenes_do_not_depend_on_their_batch_and_runs_are_equal_to_the_bit() -> None:
+    made, town = episodes("TurningObstacle", count=2, steps=24)
+
+    def driver() -> Perceiving:
+        return Perceiving(PerfectEyes(missed=0.4, noise=0.05, phantoms=0.3))
+
+    together = [trace_hash(trace) for trace in run(driver(), made, town)]
+    assert [trace_hash(trace) for trace in run(driver(), made, town)] == together
+    assert [trace_hash(run(driver(), [one], town)[0]) for one in made[1:]] == together[1:]
+
+
+def test_with_snapshots_of_world_and_driver_it_goes_on_to_the_bit() -> None:
+    made, town = episodes(count=2, steps=40)
+    driver = Perceiving(PerfectEyes(missed=0.3, noise=0.05, phantoms=0.3), latency=0.15)
+    loop = Loop(World(made, {town.name: town}), {0: driver})
+    loop.reset()
+    for _ in range(13):
+        loop.step()
+    kept = loop.simulator.snapshot(), driver.snapshot()  # type: ignore[attr-defined]
+    ends = []
+    for _ in range(2):
+        for _ in range(13):
+            loop.step()
+        ends.append(loop.simulator.hashes())  # type: ignore[attr-defined]
+        loop.simulator.restore(kept[0])  # type: ignore[attr-defined]
+        driver.restore(kept[1])
+    assert ends[0] == ends[1]
+
+
+def test_missed_and_phantom_objects_are_missed_and_there() -> None:
+    made, town = episodes(count=1, steps=41)
+    counts = {}
+    for name, change in (("none", {}), ("missed", {"missed": 0.5, "burst": 2.0}), ("phantoms", {"phantoms": 1.0})):
+        seen: list[Sighting] = []
+        run(Perceiving(PerfectEyes(**change), watch=seen.append), made, town)  # type: ignore[arg-type]
+        counts[name] = float(np.mean([len(one.found) for one in seen[:20] if one.found is not None]))
+    assert counts["missed"] < counts["none"] < counts["phantoms"]
+
+
+@pytest.mark.parametrize("field", ["score", "label"])
+def test_a_detector_that_returns_nonsense_fails_with_a_line(field: str) -> None:
+    made, town = episodes(count=1, steps=10)
+
+    def spoilt(found: Detections) -> Detections:
+        return replace(found, **{field: found.score * torch.nan if field == "score" else found.label + 7})
+
+    def camera(simulator: Any, agents: Any) -> Any:
+        return np.full((len(agents), 3, CAMERA.height, CAMERA.width), 200, np.uint8)
+
+    driver = Perceiving(CameraEyes(OneCar(spoilt), {"front": CAMERA}))
+    with pytest.raises(ConfigError, match="the detector returned"):
+        run(driver, made, town, sensors={"front": camera})
+
+
+def test_what_is_read_after_the_step_is_a_line() -> None:
+    made, town = episodes(count=1, steps=3)
+    kept: list[Observation] = []
+
+    class Late:
+        name, controller, sensors = "late", make_system("perceiving-perfect").controller, ("truth", "above")
+
+        def reset(self, episodes: Any) -> None: ...
+
+        def act(self, view: Any) -> Any: ...
+
+        def believe(self, view: Observation) -> Any:
+            kept.append(view)
+            return view.readings["truth"]
+
+    run(Late(), made, town)
+    assert kept[0].readings["truth"].kind.shape[0] == 1
+    with pytest.raises(ConfigError, match="was not read in its step"):
+        kept[0].readings["above"]
+
+
+def test_settings_out_of_range_are_one_line() -> None:
+    with pytest.raises(ConfigError, match="rate above 0"):
+        Perceiving(PerfectEyes(), rate=0.0)
+    with pytest.raises(ConfigError, match="missed in"):
+        PerfectEyes(missed=1.0)
+    eyes = CameraEyes(OneCar(), {"front": CAMERA})
+    with pytest.raises(ConfigError, match="expected"):
+        eyes.look(steady_view(0.0, front=np.ones((1, 3, 5, 5), np.uint8)), np.array([0]))
