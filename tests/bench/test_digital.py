@@ -316,7 +316,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no radius": ({"attacks": [{"name": "pgd", "radius": 0}]}, "the radius must be above 0"),
     "an empty sweep": ({"sweeps": ["pgd"]}, "neither radii nor steps"),
     "no such data": ({"data": "/nowhere"}, "is no folder"),
-    "a 2D detector": ({"detectors": ["helpers.oracle3d:build_flat"]}, "build_flat finds 2D boxes"),
+    "twice in transfer": ({"transfer_detectors": [LINEAR]}, "appears twice"),
+    "a detector of nothing": ({"detectors": ["helpers.linear3d:build_stranger"]}, "none of the ten classes"),
 }  # fmt: skip
 
 
@@ -347,7 +348,7 @@ def test_what_no_suite_may_say(root: Path, changes: dict[str, Any]) -> None:
 def test_the_shipped_suites_load_and_their_command_repeats_them() -> None:
     full, quick = load_suite("digital"), load_suite("digital-quick")
     assert {one.name for one in quick.attacks} == {"fgsm", "pgd", "cw"}
-    assert {one.name for one in full.attacks} == {"fgsm", "pgd", "cw", "ensemble", "square"}
+    assert {one.name for one in full.attacks} == {"fgsm", "pgd", "cw", "ensemble", "square", "nes", "universal"}
     assert {one.defence.name for one in full.attacks if one.defence and one.aware} == {"jpeg", "bits", "blur", "resize"}
     assert (full.radius, full.steps, full.data) == (5, 10, "recorded")
     changed = load_suite("digital", ["attacks=[{name: pgd, steps: 3, options: {restarts: 1}}, fgsm]", "steps=4"])
@@ -365,7 +366,7 @@ def test_the_suite_digital_takes_100_000_passes_of_a_detector_at_most() -> None:
     every = {one.name + one.source: one for cell in plan.cells for one in Digital().scenes(cell, job)
              if isinstance(one, AttackedScene)}  # fmt: skip
     images = 6 * int(2 * suite.recorded.seconds)
-    passes = images * sum(one.spec.passes for one in every.values())
+    passes = sum(one.spec.passes_in(images) for one in every.values())
     assert 50_000 < passes / len(suite.detectors) <= 100_000
 
 

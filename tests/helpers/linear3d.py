@@ -4,6 +4,7 @@ closed form."""
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, cast
 
@@ -106,6 +107,45 @@ class Blind(Linear):
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """Detached."""
         return super().dense(images.detach())
+
+
+class Flat(Linear):
+    """Finds the boxes in the picture alone; it knows one class more, and not all of the others."""
+
+    name = "flat"
+    task = "2d"  # type: ignore[assignment]
+    classes = ("kiosk", *MMDET3D_CLASSES[::-1])
+
+    def __init__(self, root: Path, seed: int = 0) -> None:
+        super().__init__(root, seed)
+        place = [self.classes.index(name) for name in MMDET3D_CLASSES]
+        for truth in self.known.truth:
+            truth.label[:] = torch.tensor(place)[truth.label]
+
+    def predict(
+        self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        """Without what 3D boxes have."""
+        return [replace(one, solid=None) for one in super().predict(images, intrinsic, threshold=threshold)]
+
+
+class Stranger(Flat):
+    """Knows none of nuScenes's classes."""
+
+    classes = tuple(f"thing {k}" for k in range(11))
+
+    def __init__(self, root: Path, seed: int = 0) -> None:
+        Linear.__init__(self, root, seed)
+
+
+def build_flat() -> Detector:
+    """A 2D detector with the pattern of `build`: what fools one fools the other."""
+    return cast(Detector, Flat(Path(os.environ["LINEAR_DATA"])))
+
+
+def build_stranger() -> Detector:
+    """A 2D detector of things that nuScenes does not have."""
+    return cast(Detector, Stranger(Path(os.environ["LINEAR_DATA"])))
 
 
 def build() -> Detector:

@@ -105,12 +105,15 @@ def named(value: Any) -> Any:
 
 
 class DigitalSuite(DetectorSuite):
-    """One table: 3D detectors x digital attacks, beside the clean data and random noise of the same size.
+    """One table: detectors x digital attacks, beside the clean data and random noise of the same size.
+
+    2D detectors are scored by AP50 of their boxes in the images; what a 3D box needs is absent.
 
     Attributes:
         attacks: names, or mappings with the keys of `Entry`.
         sweeps: curves.
         transfer: attacks whose pictures, made against each detector, are shown to every other.
+        transfer_detectors: detectors that take part in the transfer alone, as `detectors` names them.
         radius: 8-bit code values that a picture may be moved by, where an attack does not say it.
         steps: gradient steps, likewise.
         batch: camera images that are attacked at once on a GPU; where memory does not suffice they are fewer.
@@ -123,6 +126,7 @@ class DigitalSuite(DetectorSuite):
     )
     sweeps: list[Sweep] = Field(default=[])
     transfer: list[Row] = Field(default=[])
+    transfer_detectors: list[str] = Field(default=[])
     radius: Radius = Field(default=5.0, gt=0.0)
     steps: Steps = 10
     batch: int = Field(default=12, ge=1)
@@ -242,6 +246,16 @@ def points_of(suite: DigitalSuite) -> list[Point]:
     ]  # fmt: skip
     clean = [Point(scenes=one.scenes, defence=one.defence) for one in [*rows, *curves, *moved]]
     return list(dict.fromkeys([Point(row=True), *clean, *noise, *rows, *curves, *moved]))
+
+
+def bystander_points(suite: DigitalSuite) -> list[Point]:
+    """The conditions of a detector that takes part in the transfer alone: clean data, and the attacks made against it.
+
+    Raises:
+        ConfigError: An attack does not exist or refuses a setting.
+    """
+    moved = transfers_of(suite)
+    return list(dict.fromkeys([*(Point(scenes=one.scenes) for one in moved), *moved]))
 
 
 def transfers_of(suite: DigitalSuite) -> list[Point]:

@@ -5,7 +5,8 @@ Scores by distance, the success of a targeted attack, and the worst of several a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,6 +20,25 @@ from ssad.metrics.detection_boxes import BoxTable
 BANDS: Mapping[str, tuple[float, float]] = {"0-20": (0.0, 20.0), "20-40": (20.0, 40.0), "40+": (40.0, np.inf)}
 NEAR = 2.0  # metres within which a box is taken for that of an object, as for the true-positive errors of nuScenes
 SEEN = 0.1  # least score of a box that counts as a detection of an object
+
+
+class Matched(Protocol):
+    """Boxes against the truth: `ssad.metrics.detection.Matches`, or `PictureMatches` of 2D detectors."""
+
+    @property
+    def samples(self) -> int:
+        """How many there are."""
+
+    @property
+    def truth_counts(self) -> Any:
+        """True boxes by class and sample [C, S]."""
+
+    def scores(self, weights: Any = None) -> Any:
+        """Scores with `ap` [C, ...] and `mean_ap`, where samples count as often as their weights say."""
+
+
+Match = Callable[[Sequence[Any]], Matched]
+"""From the boxes of all samples under an attack to what they match."""
 
 
 def by_distance(found: Sequence[SampleBoxes], truth: GroundTruth) -> dict[str, float]:
@@ -104,25 +124,27 @@ def _taken_for(real: BoxTable, boxes: BoxTable) -> F64:
     return found
 
 
-def worst_by_sample(found: Sequence[Sequence[SampleBoxes]], truth: GroundTruth) -> list[SampleBoxes]:
+def worst_by_sample(found: Sequence[Sequence[Any]], tokens: Sequence[str], match: Match) -> list[Any]:
     """At each moment the boxes under the attack that leaves the detector least.
 
     Args:
         found: Boxes of all samples under each attack.
-        truth: Of the same samples.
+        tokens: Of all samples.
+        match: Matches them with the truth.
 
     Returns:
         For each sample the boxes of the attack with the least mAP over this sample alone; of equal ones those with the
         larger sum of scores, as there is more among them that is false.
     """
-    tokens = list(truth.samples)
     tables = [{one.token: one for one in boxes} for boxes in found]
-    left = np.stack([_by_sample(match_boxes(boxes, truth)) for boxes in found])
+    left = np.stack([_by_sample(match(boxes)) for boxes in found])
     noise = np.array([[float(np.sum(table[token].boxes.score)) for token in tokens] for table in tables])
     return [tables[min(range(len(found)), key=lambda m: (left[m, k], -noise[m, k]))][t] for k, t in enumerate(tokens)]
 
 
-def worst_of(candidates: Mapping[str, Sequence[SampleBoxes]], truth: GroundTruth) -> tuple[str, list[SampleBoxes]]:
+def worst_of(
+    candidates: Mapping[str, Sequence[Any]], truth: GroundTruth, match: Match | None = None
+) -> tuple[str, list[Any]]:
     """The boxes that score least over the whole set: those of one of the attacks, or the worst of each moment.
 
     The mixture of moments alone guarantees nothing, as mAP over a set is no mean over moments.
@@ -130,17 +152,19 @@ def worst_of(candidates: Mapping[str, Sequence[SampleBoxes]], truth: GroundTruth
     Args:
         candidates: Boxes of all samples under each attack, by its name.
         truth: Of the same samples.
+        match: Matches boxes with the truth; None: as the official evaluation of 3D detectors does.
 
     Returns:
         A name, "mixture" for the worst of each moment, and its boxes: their mAP is at most that of each attack.
     """
-    every = {**candidates, "mixture": worst_by_sample(list(candidates.values()), truth)}
-    left = {name: match_boxes(boxes, truth).scores().mean_ap for name, boxes in every.items()}
+    against: Match = match or (lambda boxes: match_boxes(boxes, truth))
+    every = {**candidates, "mixture": worst_by_sample(list(candidates.values()), truth.samples, against)}
+    left = {name: against(boxes).scores().mean_ap for name, boxes in every.items()}
     name = min(left, key=lambda one: left[one])
     return name, list(every[name])
 
 
-def _by_sample(matches: Matches) -> F64:
+def _by_sample(matches: Matched) -> F64:
     """Mean AP of each sample alone [S], over the classes that are in it."""
     found = np.zeros(matches.samples)
     for k in range(matches.samples):

@@ -10,7 +10,7 @@ import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -41,7 +41,9 @@ from ssad.scenarios.static.digital.budget import LEVELS, Norm
 from ssad.scenarios.static.digital.defences import RandomResize
 from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
-from ssad.scenarios.static.digital.victim import Victim, steady
+from ssad.scenarios.static.digital.transfer import translate
+from ssad.scenarios.static.digital.universal import UniversalFit
+from ssad.scenarios.static.digital.victim import NothingToAttackError, Victim, steady
 
 CAMERAS = 6  # of a sample, as nuScenes has them
 _INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
@@ -102,6 +104,11 @@ class AttackSpec:
         """Forward and backward passes that an image takes."""
         restarts = int(dict(self.options).get("restarts", 0))
         return self.steps * (1 + restarts) * max(self.draws, 1) if self.make().access == "white-box" else 0
+
+    def passes_in(self, images: int) -> int:
+        """Forward and backward passes that all images of a scene take."""
+        made = self.make()
+        return made.passes if isinstance(made, UniversalFit) else self.passes * images
 
     def make(self) -> Attack:
         """The attack.
@@ -218,6 +225,7 @@ class SceneAttacker:
         try:
             if not self.tally.images:
                 self._inspect()
+                self._fit()
             for size in sorted({picture.shape[:2] for picture in pictures}):
                 rows = [k for k, picture in enumerate(pictures) if picture.shape[:2] == size]
                 for k, image in zip(
@@ -231,8 +239,10 @@ class SceneAttacker:
     def _read(self, frame: SensorFrame) -> U8:
         return read_image(self.examination.root / frame.filename)
 
-    def _truth(self, frame: SensorFrame) -> Truth:
-        return camera_truth(frame, self.scene.annotations(frame.sample_token))
+    def _truth(self, frame: SensorFrame, scene: SceneData | None = None) -> Truth:
+        """What is in a frame, with the labels of the attacked detector; objects that it does not know are left out."""
+        truth = camera_truth(frame, (scene or self.scene).annotations(frame.sample_token))
+        return translate(truth, MMDET3D_CLASSES, self.watched.classes)[0]
 
     def _all(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
         """Pictures of one size, in batches; smaller ones from where memory does not suffice."""
@@ -297,9 +307,9 @@ class SceneAttacker:
         coupling is how much this image's loss changes with what else is in the batch. Attacks on the same loss of the
         same system share the results.
         """
-        if tuple(getattr(self.watched.detector, "classes", ())) != MMDET3D_CLASSES:
+        if self.watched.task == "3d" and self.watched.classes != MMDET3D_CLASSES:
             raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
-        frames = [frame for frame in self.scene.frames if frame.modality == "camera" and frame.key_frame]
+        frames = _key_frames(self.scene)
         if self.attack.access == "none":
             return
         own, spec = self.examination, self.view.spec
@@ -311,10 +321,48 @@ class SceneAttacker:
             _INSPECTED[asked] = self._inspected(frames)
         self.tally.gradient_error, self.tally.coupling = _INSPECTED[asked]
 
+    def _fit(self) -> None:
+        """Find the change of a universal attack, on frames of this drive or of others."""
+        fit, spec = self.attack, self.view.spec
+        if not isinstance(fit, UniversalFit):
+            return
+        detector, budget = self.watched.detector, Budget(px(spec.radius), spec.norm)
+        victims = []
+        with steady(detector):
+            for frames, scene in self._fitted_to(fit):
+                for k in range(0, len(frames), self.batch):
+                    some = frames[k : k + self.batch]
+                    truth = [self._truth(frame, scene) for frame in some]
+                    images, lens = self._tensors(some, [self._read(frame) for frame in some])
+                    objective = make_objective(spec.loss)
+                    try:
+                        victim = Victim(detector, images, truth, objective, intrinsic=lens, aim=spec.aim)
+                    except NothingToAttackError:
+                        continue
+                    if self.tally.gradient_error is None:
+                        self.tally.gradient_error = check_gradient(victim)
+                    victims.append(victim)
+        self.attack = fit.fit(victims, budget)
+        self.tally.gradients += sum(map(len, victims)) * (fit.steps + 1)
+
+    def _fitted_to(self, fit: UniversalFit) -> list[tuple[list[SensorFrame], SceneData]]:
+        """Frames spread evenly over this drive, or over others of the data set; ConfigError: there are no others."""
+        own = self.scene.record.name
+        if fit.over == "drive":
+            return [(_spread(_key_frames(self.scene), fit.frames), self.scene)]
+        with NuScenes(self.examination.root, self.examination.version) as data:
+            names = _spread([one.name for one in data.scenes() if one.name != own], fit.frames)
+            if not names:
+                raise ConfigError(f"universal: there is no drive besides {own}; use over: drive, or more scenes")
+            shares = [fit.frames * (k + 1) // len(names) - fit.frames * k // len(names) for k in range(len(names))]
+            scenes = [data.scene(name) for name in names]
+        return [(_spread(_key_frames(s), count), s) for s, count in zip(scenes, shares, strict=True)]
+
     def _inspected(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
         """Error of the gradient and coupling; None where there is nothing to look at."""
         names = [*self.view.spec.classes, *dict(self.view.spec.becomes)] or MMDET3D_CLASSES
-        wanted = torch.tensor([MMDET3D_CLASSES.index(name) for name in names])
+        known = self.watched.classes
+        wanted = torch.tensor([known.index(name) for name in names if name in known])
         counted = sorted(frames, key=lambda frame: -int(torch.isin(self._truth(frame).label, wanted).sum()))
         first = counted[0]
         alike = [f for f in counted[1:] if (f.width, f.height) == (first.width, first.height)][:1]
@@ -339,3 +387,16 @@ class SceneAttacker:
                 other = float(both.loss(both.clean)[0])
                 coupling = abs(other - own) / max(abs(own), 1e-6)
         return error, coupling
+
+
+def _key_frames(scene: SceneData) -> list[SensorFrame]:
+    return [frame for frame in scene.frames if frame.modality == "camera" and frame.key_frame]
+
+
+T = TypeVar("T")
+
+
+def _spread(values: Sequence[T], count: int) -> list[T]:
+    """So many of some values, spread evenly; all if there are fewer."""
+    many = min(count, len(values))
+    return [values[(2 * k + 1) * len(values) // (2 * many)] for k in range(many)]

@@ -22,6 +22,7 @@ from ssad.datasets.nuscenes.results import with_ego
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes, merge_cameras
+from ssad.evaluation.picture_scores import gather_pictures
 from ssad.metrics.detection import DetectionScores, Matches, filter_boxes, match
 from ssad.metrics.detection2d import Boxes2D, average_precision
 from ssad.metrics.detection_boxes import BoxTable
@@ -98,7 +99,7 @@ def detect_scene(
 def detect_with(
     detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None,
     ahead: bool = True, at_once: int = AT_ONCE,
-) -> list[list[SampleBoxes]]:  # fmt: skip
+) -> list[list[Any]]:  # fmt: skip
     """As `detect_scene`, for several detectors that are shown the same pictures.
 
     Args:
@@ -112,13 +113,14 @@ def detect_with(
         at_once: Samples that a GPU is shown at once.
 
     Returns:
-        Boxes of each sample, one list for each detector.
+        Boxes of each sample, one list for each detector; `SamplePictures` of 2D detectors, which have no place in the
+        world.
     """
     by_sample: dict[str, list[SensorFrame]] = {}
     for frame in scene.frames:
         if frame.modality == "camera" and frame.key_frame:
             by_sample.setdefault(frame.sample_token, []).append(frame)
-    found: list[list[SampleBoxes]] = [[] for _ in detectors]
+    found: list[list[Any]] = [[] for _ in detectors]
     step = at_once if device != "cpu" else 1
     with ThreadPoolExecutor(4) as pool:
 
@@ -134,8 +136,14 @@ def detect_with(
             for number, block in enumerate(blocks):
                 pictures = waiting[number].result() if ahead else read(flat[number])
                 waiting += [maker.submit(read, frames) for frames in (flat[number + 2 : number + 3] if ahead else [])]
-                for k, boxes in enumerate(_predict(detectors, flat[number], pictures, device)):
-                    found[k] += _merged(block, by_sample, boxes)
+                seen = _predict(detectors, flat[number], pictures, device)
+                for kept, detector, boxes in zip(found, detectors, seen, strict=True):
+                    two = detector.task == "2d"
+                    kept.extend(
+                        gather_pictures(block, by_sample, boxes, detector.classes)
+                        if two
+                        else _merged(block, by_sample, boxes)
+                    )
     return found
 
 
@@ -157,7 +165,7 @@ def _predict(
 def _fitting(detector: Detector, images: torch.Tensor, lens: torch.Tensor) -> list[Detections]:
     """`predict`, of half as many pictures at a time where memory does not suffice."""
     try:
-        return list(detector.predict(images, lens))
+        return list(detector.predict(images, lens, threshold=FLOOR if detector.task == "2d" else None))
     except torch.OutOfMemoryError:
         if len(images) == 1:
             raise

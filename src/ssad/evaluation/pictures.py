@@ -86,8 +86,12 @@ def tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, 
     scale = WIDTH / image.shape[1]
     canvas = cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     intrinsic = np.asarray(frame.intrinsic, np.float64)
-    _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
-    _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
+    if found.solid is None:
+        _draw_flat(canvas, truth.box, scale, colour=TRUE, width=1)
+        _draw_flat(canvas, found.box, scale, colour=FOUND, width=2)
+    else:
+        _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
+        _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
     text = f"{title.replace('_', ' ')} ({KNOWN[title][0]})" if title in KNOWN else title
     title_on(canvas, text)
     return np.asarray(canvas)
@@ -97,6 +101,12 @@ def title_on(canvas: U8, text: str) -> None:
     """Writes a name into the upper left corner."""
     cv2.rectangle(canvas, (0, 0), (12 + 11 * len(text), 26), (0, 0, 0), -1)
     cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+
+
+def _draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[int, int, int], width: int) -> None:
+    """2D boxes."""
+    for box in np.rint(boxes.cpu().double().numpy() * scale * 8).astype(int).tolist():
+        cv2.rectangle(canvas, tuple(box[:2]), tuple(box[2:]), colour, width, cv2.LINE_AA, 3)
 
 
 def _draw(

@@ -32,6 +32,14 @@ from ssad.detectors import make_detector
 from ssad.detectors.check import promises
 from ssad.detectors.mono3d.multi_camera import DetectedBoxes
 from ssad.evaluation.detection import AT_ONCE, Look, SampleBoxes, detect_with, match_boxes, numbers, to_host
+from ssad.evaluation.picture_scores import (
+    PictureBoxes,
+    PictureTruth,
+    SamplePictures,
+    match_pictures,
+    picture_figures,
+    read_picture_truth,
+)
 from ssad.evaluation.scene_shifter import SceneShifter
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.metrics.uncertainty import replicate_estimate
@@ -39,6 +47,7 @@ from ssad.scenarios.static.digital.defences import Defence, Defended
 from ssad.scenarios.static.shifts import Calibration, ShiftSpec
 
 FOLDER = "detections"
+_FLAT = ("camera", "box", "score", "label")  # of 2D detectors
 _COLUMNS = ("translation", "size", "rotation", "velocity", "score", "label", "attribute")  # as nuScenes has them
 
 
@@ -166,6 +175,16 @@ class Watched:
     def __init__(self, detector: Any, name: str = "") -> None:
         self.detector, self.name, self.reason = detector, name, ""
 
+    @property
+    def task(self) -> str:
+        """That of the detector."""
+        return str(getattr(self.detector, "task", "3d"))
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Those of the detector."""
+        return tuple(self.detector.classes)
+
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
     ) -> list[Detections]:
@@ -179,7 +198,9 @@ class Watched:
             except Exception as error:  # whatever a stranger's detector raises
                 self.failed(error)
         nothing, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-        solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
+        solid = None
+        if self.task != "2d":
+            solid = Solids(nothing.reshape(0, 3), nothing.reshape(0, 3), nothing, nothing.reshape(0, 2), whole)
         return [Detections(nothing, whole, nothing.reshape(0, 4), solid)] * len(images)
 
     def failed(self, error: Exception) -> None:
@@ -193,7 +214,7 @@ class Watched:
         if len(found) != images:
             return "broken promise: predict answers for each image"
         for one in found:
-            for kept, promise in promises(one, classes=len(self.detector.classes), three=True):
+            for kept, promise in promises(one, classes=len(self.detector.classes), three=self.task != "2d"):
                 if not kept:
                     return f"broken promise: {promise}"
         return ""
@@ -253,16 +274,18 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
             ahead=shown.ahead, at_once=shown.at_once,
         )  # fmt: skip
     for name, samples, one in zip(names, found, watched, strict=True):
-        _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes())
+        _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes(), flat=one.task == "2d")
 
 
-def _write(path: Path, samples: Sequence[SampleBoxes], reason: str, notes: Mapping[str, Any]) -> None:
+def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, flat: bool) -> None:
     columns: dict[str, Any] = {"failed": np.array(reason)} if reason else {}
     if not reason:
         boxes = [sample.boxes for sample in samples]
         columns["sample"] = np.array([sample.token for sample in samples])
         columns["count"] = np.array([len(b) for b in boxes], np.int32)
-        for name, parts in zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True):
+        for name in _FLAT if flat else ():
+            columns[name] = np.concatenate([getattr(one, name) for one in boxes])
+        for name, parts in () if flat else zip(_COLUMNS, zip(*map(_to_columns, boxes), strict=True), strict=True):
             columns[name] = np.concatenate(parts)
         columns["applied"] = np.array(safeio.dump_json(dict(sorted(notes.items()))))
     file = io.BytesIO()
@@ -287,8 +310,8 @@ class DetectorFailed(SSADError):
     """A detector failed on a scene; why."""
 
 
-def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, Any]]:
-    """Boxes by sample, and what the condition noted: of a shift, how often it was applied.
+def read_boxes(path: Path) -> tuple[list[Any], dict[str, Any]]:
+    """Boxes by sample (`SampleBoxes`, or `SamplePictures` of a 2D detector), and what the condition noted.
 
     Raises:
         DetectorFailed: it has a reason instead.
@@ -299,12 +322,16 @@ def read_boxes(path: Path) -> tuple[list[SampleBoxes], dict[str, Any]]:
             if "failed" in file:
                 raise DetectorFailed(str(file["failed"]))
             ends = np.cumsum(file["count"])
-            parts = [np.split(file[c], ends[:-1]) for c in _COLUMNS]
+            flat = "camera" in file
+            parts = [np.split(file[c], ends[:-1]) for c in (_FLAT if flat else _COLUMNS)]
             tokens = [str(token) for token in file["sample"]]
             notes = safeio.parse_json(str(file["applied"]))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise FormatError(f"{path}: broken ({type(error).__name__}); remove it and run again") from None
-    found = [SampleBoxes(token, _from_columns(*(part[k] for part in parts))) for k, token in enumerate(tokens)]
+    found: list[Any] = []
+    for k, token in enumerate(tokens):
+        own = [part[k] for part in parts]
+        found.append(SamplePictures(token, PictureBoxes(*own)) if flat else SampleBoxes(token, _from_columns(*own)))
     return found, {str(k): v for k, v in notes.items()}
 
 
@@ -370,7 +397,7 @@ def truth_of(examination: Examination, scenes: Sequence[str]) -> GroundTruth:
 
 def read_scenes(
     examination: Examination, detector: str, scenes: Sequence[Condition]
-) -> tuple[list[SampleBoxes], list[dict[str, Any]]]:
+) -> tuple[list[Any], list[dict[str, Any]]]:
     """Boxes of a system in scenes, and what was noted in each.
 
     Args:
@@ -381,7 +408,7 @@ def read_scenes(
     Raises:
         DetectorFailed: it failed on a scene.
     """
-    found: list[SampleBoxes] = []
+    found: list[Any] = []
     noted = []
     for one in scenes:
         try:
@@ -405,17 +432,50 @@ def score_found(
         replicates: of the bootstrap over scenes.
     """
     matches = match_boxes(found, truth)
+    figures = lambda weights, few: numbers(matches.scores(weights), few=few)  # noqa: E731
+    return _resampled(examination, figures, truth, replicates)
+
+
+def score_pictures(
+    examination: Examination, detector: Any, found: Sequence[SamplePictures], truth: GroundTruth, *, replicates: int
+) -> dict[str, Any]:
+    """As `score_found`, of a 2D detector's boxes in the images.
+
+    Args:
+        examination: of the run.
+        detector: which found them.
+        found: boxes of all samples.
+        truth: of the same samples; it says which scenes are copies.
+        replicates: of the bootstrap over scenes.
+    """
+    matches = match_pictures(found, picture_truth_of(examination, truth), detector.classes)
+    figures = lambda weights, few: picture_figures(matches.scores(weights), few=few)  # noqa: E731
+    return _resampled(examination, figures, truth, replicates)
+
+
+def picture_truth_of(examination: Examination, truth: GroundTruth) -> PictureTruth:
+    """The true boxes in the images of the samples of a truth."""
+    return read_picture_truth(examination.root, examination.version, truth.scenes, truth.samples)
+
+
+Figures = Callable[[Any, bool], dict[str, float]]
+"""From weights of the samples (None: each once), and whether a few are enough, to figures by name."""
+
+
+def _resampled(examination: Examination, figures: Figures, truth: GroundTruth, replicates: int) -> dict[str, Any]:
+    """Figures, and their intervals by the bootstrap over scenes."""
     case = distinct_scenes(truth)
     count = int(case.max()) + 1
     draws: list[dict[str, float]] = []
     if count > 1:
         chance = generator("detection suite", examination.seed, count)  # the same draws for every cell
         for draw in chance.multinomial(count, np.full(count, 1.0 / count), size=replicates):
-            draws.append(numbers(matches.scores(draw[case[truth.scene]]), few=True))
-    values = {name: [round(d[name], 5) for d in draws] for name in (draws[0] if draws else {})}
+            draws.append(figures(draw[case[truth.scene]], True))
+    common = [name for name in (draws[0] if draws else {}) if all(name in draw for draw in draws)]
+    values = {name: [round(d[name], 5) for d in draws] for name in common}
     first = np.unique(case, return_index=True)[1]
     samples = int(np.isin(truth.scene, first).sum())
-    metrics = numbers(matches.scores())
+    metrics = figures(None, False)
     limits = {k: replicate_estimate(metrics[k], v, n=samples, clusters=count) for k, v in values.items()}
     return {
         "metrics": metrics,

@@ -38,12 +38,16 @@ class Boxes2D:
 
 @dataclass(frozen=True)
 class Matched2D:
-    """Detections from best to worst: label, hit (took a box), ignored (lies in a crowd region); truth [L]."""
+    """Detections from best to worst: label, hit (took a box), ignored (lies in a crowd region); truth [L].
+
+    `row` is the place of each in the table that was matched; None where nobody asked.
+    """
 
     label: I32
     hit: Bool
     ignored: Bool
     truth: I64
+    row: I64 | None = None
 
     def average_precision(self) -> F64:
         """AP [L] of each label, NaN for one without ground truth."""
@@ -96,7 +100,7 @@ def match_2d(
     hit = np.zeros(len(rank), np.bool_)
     hit[took] = True
     counts = np.bincount(truth.label[real[~crowd]], minlength=labels)
-    return Matched2D(detections.label[rank], hit, ignored & ~hit, counts)
+    return Matched2D(detections.label[rank], hit, ignored & ~hit, counts, rank)
 
 
 def average_precision(

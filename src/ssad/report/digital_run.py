@@ -11,7 +11,10 @@ from ssad.report.kinds.detection import cell_of, replicates_of, score_cell
 from ssad.report.load import Run
 from ssad.report.tables import Cell
 
-TITLES = {"fgsm": "FGSM", "pgd": "PGD", "cw": "C&W", "cw-min": "C&W, least change", "apgd": "APGD", "noise": "noise"}
+TITLES = {
+    "fgsm": "FGSM", "pgd": "PGD", "cw": "C&W", "cw-min": "C&W, least change", "apgd": "APGD", "square": "Square",
+    "nes": "NES", "spsa": "SPSA",
+}  # fmt: skip
 DEFENCES = {"jpeg": "JPEG", "bits": "bit depth", "blur": "blur", "resize": "random resizing"}
 
 
@@ -72,6 +75,28 @@ class DigitalRun:
     def detectors(self) -> list[str]:
         """In the order of the suite."""
         return [text.partition("=")[0] for text in self.suite["detectors"]]
+
+    @property
+    def everyone(self) -> list[str]:
+        """Those, and the detectors that take part in the transfer alone."""
+        others = [text.partition("=")[0] for text in self.suite.get("transfer_detectors", [])]
+        return [*self.detectors, *others]
+
+    def flat(self, detector: str) -> bool:
+        """Whether a detector finds 2D boxes."""
+        return any(name == detector and record.get("task") == "2d" for (name, _), record in self.records.items())
+
+    def metrics(self, detector: str) -> tuple[str, ...]:
+        """The headline metrics of a detector."""
+        return ("mAP",) if self.flat(detector) else ("mAP", "NDS")
+
+    @property
+    def about_flat(self) -> str:
+        """What a note says about 2D detectors; "" where there is none."""
+        names = [name for name in self.everyone if self.flat(name)]
+        if not names:
+            return ""
+        return f" mAP of {' and '.join(names)}: AP50 of 2D boxes in the images, mean over the classes that are there."
 
     @property
     def settings(self) -> list[Setting]:

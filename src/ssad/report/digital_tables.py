@@ -24,18 +24,18 @@ def transfer_table(run: DigitalRun) -> Table:
     """For each attack a matrix: mAP of the detector in the column under pictures made against that in the row."""
     rows = []
     for own in dict.fromkeys(s._replace(source="") for s in run.settings if s.source):
-        clean = tuple(metric_cell(run.clean(d, own), "mAP") for d in run.detectors)
+        clean = tuple(metric_cell(run.clean(d, own), "mAP") for d in run.everyone)
         rows.append(Row((title_of(own), size_of(own), scenes_of(own), "nothing: clean"), clean))
-        for source in run.detectors:
-            seen = [run.record(d, own if d == source else own._replace(source=source)) for d in run.detectors]
+        for source in run.everyone:
+            seen = [run.record(d, own if d == source else own._replace(source=source)) for d in run.everyone]
             head = (title_of(own), size_of(own), scenes_of(own), source)
             rows.append(Row(head, tuple(metric_cell(one, "mAP") for one in seen)))
     note = (
         "mAP in percent. Where row and column are of one detector the attack is white-box; elsewhere nothing was asked "
-        "of the detector that is shown the pictures."
+        f"of the detector that is shown the pictures.{run.about_flat}"
     )
     heads = ("Attack", "Budget", "Scenes", "Made against")
-    return Table("transfer", "Transfer between detectors", heads, tuple(run.detectors), tuple(rows), note)
+    return Table("transfer", "Transfer between detectors", heads, tuple(run.everyone), tuple(rows), note)
 
 
 def defence_table(run: DigitalRun) -> Table:
@@ -130,7 +130,7 @@ def distance_table(run: DigitalRun) -> Table:
     names = [f"{metric}_{band}" for band in BANDS for metric in ("mAP", "recall")]
     rows = [
         Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), name) for name in names))
-        for d in run.detectors for s in run.rows
+        for d in run.detectors if not run.flat(d) for s in run.rows
     ]  # fmt: skip
     columns = tuple(f"{metric}, {text}" for text in BANDS.values() for metric in ("mAP", "recall"))
     note = (

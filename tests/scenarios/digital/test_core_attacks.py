@@ -249,7 +249,7 @@ def test_all_names_are_listed_with_what_they_need() -> None:
     assert rows["adv-patch"] == "physical: trains a patch (docs/physical.md)"
     assert rows["pgd"] == "white-box, loss full"
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
-    assert [name for name in ATTACKS if needs(name)] == ["transfer", "universal", "expected"]
+    assert [name for name in ATTACKS if needs(name)] == ["transfer", "expected"]
 
 
 def test_checkpoints_shrink() -> None:

@@ -27,7 +27,7 @@ def test_it_raises_the_loss_of_pictures_that_it_was_not_fitted_to(budget: Budget
     size = change.abs().max() if budget.norm == "linf" else change.norm()
     assert 0.9 * budget.radius < float(size) <= budget.radius * (1 + 1e-6)
     fresh, fresh_truth = toy_scene(4, seed=1)
-    attack = make_attack("universal", change=change)
+    attack = Universal(change)
     found = run_attack(attack, detector, fresh, fresh_truth, budget, objective=Fabricate())
     noise = run_attack(make_attack("noise"), detector, fresh, fresh_truth, budget, objective=Fabricate())
     own = run_attack(make_attack("pgd"), detector, fresh, fresh_truth, budget, objective=Fabricate())

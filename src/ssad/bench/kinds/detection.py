@@ -19,6 +19,7 @@ from ssad.core import safeio
 from ssad.core.checkpoints import hash_state
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData
@@ -272,11 +273,22 @@ class Detection(DetectorKind):
         return lambda: detection_sheet(examination, suite.split, suite.shifts, severity), caption
 
 
-def detectors_of(suite: DetectorSuite) -> tuple[dict[str, str], dict[str, str]]:
-    """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones)."""
+def detectors_of(
+    suite: DetectorSuite, names: Sequence[str] | None = None, *, flat: bool = False
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones).
+
+    Args:
+        suite: Which names them.
+        names: Those that are meant, as a suite writes them; None: `suite.detectors`.
+        flat: Whether 2D detectors with a class of nuScenes are welcome too.
+
+    Raises:
+        ConfigError: A detector appears twice, has no weights, or is not of the kind that is welcome.
+    """
     weights: dict[str, str] = {}
     files: dict[str, str] = {}
-    for text in suite.detectors:
+    for text in suite.detectors if names is None else names:
         name, _, file = text.partition("=")
         if name in files:
             raise ConfigError(
@@ -292,7 +304,10 @@ def detectors_of(suite: DetectorSuite) -> tuple[dict[str, str], dict[str, str]]:
             )
         detector = detector_of(name, path, "cpu")
         if getattr(detector, "task", None) != "3d":
-            raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
+            if not flat:
+                raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
+            if not set(detector.classes) & set(MMDET3D_CLASSES):
+                raise ConfigError(f"suite {suite.name}: {name} knows none of the ten classes of nuScenes")
         own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
         weights[name], files[name] = state_hash(detector) + own, path
     return weights, files

@@ -1,4 +1,4 @@
-"""Kind `digital`: 3D detectors x digital attacks x losses x budgets x steps over a data set in the nuScenes schema."""
+"""Kind `digital`: detectors x digital attacks x losses x budgets x steps over a data set in the nuScenes schema."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from ssad.bench.digital_points import (
     ENSEMBLE,
     DigitalSuite,
     Point,
+    bystander_points,
     guard_of,
     points_of,
     rows_of,
@@ -22,20 +23,27 @@ from ssad.bench.kinds.detection import DetectorKind, data_of, detectors_of
 from ssad.core import safeio
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
-from ssad.evaluation.attack_scores import by_distance, target_success, worst_of
+from ssad.datasets.nuscenes.truth import GroundTruth
+from ssad.evaluation.attack_scores import Match, by_distance, target_success, worst_of
 from ssad.evaluation.attack_sheet import attack_sheet
 from ssad.evaluation.attack_tally import sum_notes
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec
+from ssad.evaluation.picture_scores import match_pictures
 from ssad.evaluation.scene_boxes import (
     Condition,
     Examination,
     ShiftedScene,
     boxes_path,
+    detector_of,
     find_boxes,
+    picture_truth_of,
     read_scenes,
     score_found,
+    score_pictures,
+    system_of,
     truth_of,
 )
+from ssad.scenarios.static.digital.universal import UniversalFit
 
 
 class Digital(DetectorKind):
@@ -52,13 +60,15 @@ class Digital(DetectorKind):
     def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Attacks, defences and detectors are built once, the data set is looked at."""
         points = points_of(suite)
-        weights, detectors = detectors_of(suite)
+        weights, detectors = detectors_of(suite, [*suite.detectors, *suite.transfer_detectors], flat=True)
+        main = [text.partition("=")[0] for text in suite.detectors]
+        tasks = {name: detector_of(name, file, "cpu").task for name, file in detectors.items()}
         data = data_of(suite)
         cells = []
         for detector in detectors:
             others = [other for other in detectors if other != detector]
             moved = [replace(one, source=other) for one in transfers_of(suite) for other in others]
-            for point in [*points, *moved]:
+            for point in [*(points if detector in main else bystander_points(suite)), *moved]:
                 system = system_name(detector, point.defence)
                 source = point.source or (system if point.aware or not point.defence else detector)
                 about = point.specs[0].name if len(point.specs) == 1 else ENSEMBLE if point.specs else "clean"
@@ -67,7 +77,7 @@ class Digital(DetectorKind):
                 inputs: list[Any] = [weights[detector], safeio.dump_json(data), device, suite.replicates]
                 inputs += [weights[point.source]] if point.source else []
                 told = {"attacks": [_told(one) for one in point.specs], "source": source, "scenes": point.scenes}
-                fields = {"detector": detector, **_fields(point)}
+                fields = {"detector": detector, **_fields(point), "task": tasks[detector]}
                 cells.append(self.make_cell(title, system, suite.seed, fields, told, *inputs))
         return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, {}, detectors)
 
@@ -76,7 +86,7 @@ class Digital(DetectorKind):
         settings = super().prepare(plan, folder, resources, retry=retry)
         job, images = Job(folder, plan.device, settings), settings["images"]
         passes: dict[str, Any] = {
-            f"{one.source}/{one.name}": one.spec.passes * images[one.scene]
+            f"{one.source}/{one.name}": one.spec.passes_in(images[one.scene])
             for cell in plan.cells for one in self.scenes(cell, job) if isinstance(one, AttackedScene)
         }  # fmt: skip
         count = len(plan.details)
@@ -145,25 +155,27 @@ class Digital(DetectorKind):
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
         """Metrics, what the attack took, and which share of the system's clean mAP it took away."""
         count, specs = job.settings["replicates"], [_told_spec(one) for one in cell.spec["attacks"]]
+        eye = Eye(examination, cell.system)
         whole = [ShiftedScene(None, 0, one.scene) for one in scenes[: len(scenes) // max(len(specs), 1)]]
         for one in whole:
             find_boxes(examination, one, [cell.system])
         truth = truth_of(examination, [one.scene for one in whole])
         clean, _ = read_scenes(examination, cell.system, whole)
-        before = score_found(examination, clean, truth, replicates=count if not specs else 0)
+        before = eye.score(clean, truth, replicates=count if not specs else 0)
         if not specs:
-            return {**before, "metrics": before["metrics"] | by_distance(clean, truth)}
+            return {**before, "metrics": before["metrics"] | eye.by_distance(clean, truth)}
         parts = [scenes[k : k + len(whole)] for k in range(0, len(scenes), len(whole))]
         found, noted = zip(*(read_scenes(examination, cell.system, part) for part in parts), strict=True)
         told: dict[str, Any] = {}
         boxes = found[0]
         if len(specs) > 1:
-            told["worst"], boxes = worst_of(dict(zip((spec.name for spec in specs), found, strict=True)), truth)
-        after = score_found(examination, boxes, truth, replicates=count)
-        metrics = after["metrics"] | by_distance(boxes, truth)
+            candidates = dict(zip((spec.name for spec in specs), found, strict=True))
+            told["worst"], boxes = worst_of(candidates, truth, eye.match(truth))
+        after = eye.score(boxes, truth, replicates=count)
+        metrics = after["metrics"] | eye.by_distance(boxes, truth)
         clean_score = before["metrics"]["mAP"]
         metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
-        if specs[0].classes or specs[0].becomes:
+        if (specs[0].classes or specs[0].becomes) and not eye.flat:
             metrics |= target_success(
                 clean, boxes, truth, classes=specs[0].classes, becomes=dict(specs[0].becomes)
             )  # fmt: skip
@@ -171,12 +183,42 @@ class Digital(DetectorKind):
 
     def sheet(self, examination: Examination, suite: DigitalSuite) -> tuple[Callable[[], U8], str]:
         """One moment under the attacks of the table."""
-        specs = list(dict.fromkeys(one.specs[0] for one in rows_of(suite) if one.row and len(one.specs) == 1))
+        rows = [one.specs[0] for one in rows_of(suite) if one.row and len(one.specs) == 1]
+        specs = [one for one in dict.fromkeys(rows) if not isinstance(one.make(), UniversalFit)]
         caption = (
             f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the "
             "largest change is black or white), what it finds (orange, score at least 0.3) and what is there (white)."
         )
         return lambda: attack_sheet(examination, suite.split, specs), caption
+
+
+class Eye:
+    """How the boxes of a system are scored: in the world those of 3D detectors, in the images those of 2D detectors.
+
+    Attributes:
+        flat: Whether it finds 2D boxes.
+    """
+
+    def __init__(self, examination: Examination, system: str) -> None:
+        self._examination, self._detector = examination, system_of(examination, system)
+        self.flat = self._detector.task == "2d"
+
+    def score(self, boxes: Sequence[Any], truth: GroundTruth, *, replicates: int) -> dict[str, Any]:
+        """See `score_found` and `score_pictures`."""
+        if self.flat:
+            return score_pictures(self._examination, self._detector, boxes, truth, replicates=replicates)
+        return score_found(self._examination, boxes, truth, replicates=replicates)
+
+    def match(self, truth: GroundTruth) -> Match | None:
+        """What `worst_of` compares by."""
+        if not self.flat:
+            return None
+        pictures = picture_truth_of(self._examination, truth)
+        return lambda boxes: match_pictures(boxes, pictures, self._detector.classes)
+
+    def by_distance(self, boxes: Sequence[Any], truth: GroundTruth) -> dict[str, float]:
+        """See `by_distance`; boxes in images are at no distance."""
+        return {} if self.flat else by_distance(boxes, truth)
 
 
 def _fields(point: Point) -> dict[str, Any]:

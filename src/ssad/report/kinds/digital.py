@@ -36,8 +36,8 @@ EPSILON = 5.0
 FURTHEST = 32.0  # radius up to which curves are drawn: what lies beyond is for the audit
 
 
-def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[tuple[float, float]]] | None:
-    """The paper's row beside one of ours: its name and budget, and mAP and NDS for each detector; None: it has none."""
+def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[tuple[float, ...]]] | None:
+    """The paper's row beside one of ours: its name and budget, and the metrics of each detector; None: it has none."""
     attack, loss, norm, radius, _, options = setting[:6]
     told = PAPER.get((attack, loss))
     if told is None or not run.suite.get("reference") or options or (attack and (norm, radius) != ("linf", EPSILON)):
@@ -47,7 +47,8 @@ def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], l
         return None
     size = size_of(Setting("told", "", "linf", EPSILON, DIGITAL_STEPS[told])) if told else ""
     head = (told or title_of(setting), size)
-    return head, [PUBLISHED[told].get(name, (math.nan, math.nan)) for name in names]
+    pairs = zip(run.detectors, names, strict=True)
+    return head, [PUBLISHED[told].get(name, (math.nan, math.nan))[: len(run.metrics(d))] for d, name in pairs]
 
 
 def main_table(run: DigitalRun) -> Table:
@@ -55,13 +56,14 @@ def main_table(run: DigitalRun) -> Table:
     rows = []
     for setting in run.rows:
         head = (title_of(setting), size_of(setting))
-        cells = [metric_cell(run.record(d, setting), metric) for d in run.detectors for metric in ("mAP", "NDS")]
+        cells = [metric_cell(run.record(d, setting), metric) for d in run.detectors for metric in run.metrics(d)]
         rows.append(Row(head, tuple(cells)))
         told = published_row(run, setting)
         if told:
             rows.append(Row(told[0], tuple(Cell(v) for pair in told[1] for v in pair), published=True))
-    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS"))
+    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in run.metrics(d))
     note = f"Percent; each camera image is attacked by itself, its stored 8-bit picture is scored; {interval_note(run)}"
+    note += run.about_flat
     if any(row.published for row in rows):
         note += (
             f" Shaded rows: {SOURCE}; ours are other pictures and other detectors, so the share of the clean score "
@@ -76,14 +78,14 @@ def lost_table(run: DigitalRun) -> Table:
     clean = published_row(run, Setting())
     for setting in (s for s in run.rows if s[0]):
         head = (title_of(setting), size_of(setting))
-        cells = [lost_cell(run, d, setting, metric) for d in run.detectors for metric in ("mAP", "NDS")]
+        cells = [lost_cell(run, d, setting, metric) for d in run.detectors for metric in run.metrics(d)]
         rows.append(Row(head, tuple(cells)))
         told = published_row(run, setting)
         if told and clean:
             shares = [100 * (1 - a / b) for after, before in zip(told[1], clean[1], strict=True)
                       for a, b in zip(after, before, strict=True)]  # fmt: skip
             rows.append(Row(told[0], tuple(Cell(share) for share in shares), published=True))
-    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in ("mAP", "NDS"))
+    columns = tuple(f"{d} {metric}" for d in run.detectors for metric in run.metrics(d))
     note = "Percent of each detector's own clean score; more is a stronger attack."
     return Table("lost", "What an attack takes away", ("Attack", "Budget"), columns, tuple(rows), note, SOURCE)
 

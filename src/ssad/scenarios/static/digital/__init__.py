@@ -27,7 +27,7 @@ ATTACKS: dict[str, str] = {
     "nes": f"{_HERE}.nes:NES",
     "spsa": f"{_HERE}.nes:spsa",
     "transfer": f"{_HERE}.transfer:Transfer",
-    "universal": f"{_HERE}.universal:Universal",
+    "universal": f"{_HERE}.universal:UniversalFit",
     "expected": f"{_HERE}.expectation:Expected",
     "noise": f"{_HERE}.noise:RandomNoise",
 }

@@ -58,8 +58,8 @@ class LiveAttack:
         budget: How far a picture may be moved.
         objective: The loss to ascend, or its name.
         aim: Which objects are attacked; numbers of objects count what the detector finds, best first.
-        detector: What is attacked; None: the victim's attribute `detector`, or the victim itself if it has none. To
-            attack another one than the driver's is a transfer attack.
+        detector: What is attacked; None: the victim, if it is a detector, or else its attribute `detector`. To attack
+            another one than the driver's is a transfer attack.
         intrinsic: Camera matrix [3, 3] of the pictures, for 3D. A driver with several cameras needs an attack for each:
             `rollout` takes a mapping from names of sensors.
         batch: Pictures at once; it changes no result.
@@ -182,12 +182,12 @@ def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
 
 
 def attacked_detector(victim: Any) -> Detector:
-    """The detector of a driver, or the victim itself if it is one.
+    """The victim itself if it is a detector, or else the detector that it has.
 
     Raises:
         ConfigError: There is none.
     """
-    found: Any = getattr(victim, "detector", victim)
+    found: Any = victim if callable(getattr(victim, "dense", None)) else getattr(victim, "detector", None)
     if not callable(getattr(found, "dense", None)):
         name = getattr(victim, "name", type(victim).__name__)
         raise ConfigError(f"{name} has no detector to attack: it must have an attribute detector, or be given one")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,6 +42,52 @@ class Universal:
         """See `Attack`."""
         _check_size(tuple(self.change.shape), victim)
         return budget.project(victim.clean + self.change.to(victim.clean), victim.clean)
+
+
+@dataclass(frozen=True, slots=True)
+class UniversalFit:
+    """How a change is found for many pictures of a drive: what a suite calls `universal`.
+
+    It asks nothing of the pictures that it is added to; whoever runs it first finds the change (`fit`).
+
+    Attributes:
+        over: "others": the change is fitted to frames of other drives, so that it is new to the pictures it is added
+            to. "drive": to frames of the same drive, which shows what the best fixed change could do there.
+        frames: How many frames, spread evenly.
+        steps: Passes over all of them.
+        step: See `fit_universal`.
+        method: See `fit_universal`.
+
+    Raises:
+        ConfigError: There is no such choice, or a number is below 1; later: it was not fitted.
+    """
+
+    over: Literal["others", "drive"] = "others"
+    frames: int = 24
+    steps: int = 10
+    step: float = 0.25
+    method: Literal["sign", "adam"] = "sign"
+    name: str = "universal"
+    access: Access = "none"
+
+    def __post_init__(self) -> None:
+        if self.over not in ("others", "drive"):
+            raise ConfigError(f"universal: over '{self.over}'; choose others or drive")
+        if self.frames < 1 or self.steps < 1 or self.step <= 0 or self.method not in ("sign", "adam"):
+            raise ConfigError("universal: frames and steps must be 1 or more, step above 0, method sign or adam")
+
+    @property
+    def passes(self) -> int:
+        """Forward and backward passes that `fit` takes."""
+        return self.frames * (self.steps + 1)
+
+    def fit(self, victims: Sequence[Victim], budget: Budget) -> Universal:
+        """The attack that adds the change that was found for some pictures."""
+        return Universal(fit_universal(victims, budget, epochs=self.steps, step=self.step, method=self.method))
+
+    def perturb(self, victim: Victim | Pictures, budget: Budget) -> Tensor:
+        """See `Attack`. Raises ConfigError: what it adds must be found first."""
+        raise ConfigError("universal: find the change first (fit, or fit_universal)")
 
 
 def fit_universal(
