@@ -23,6 +23,9 @@ MIN_CLUSTERS = 5
 MIN_DIFFERENT = 8
 """A mean without bounds has an interval only if so many clusters differ from the commonest value."""
 
+_ROOM = 0.3
+"""Part of a cluster that each end of an interval of a mean leaves room for: of the intervals simulated, at least
+93.4 % hold in every case (93.9 with 0.5), and at most 97.5 % where clusters are normal (97.8 with 0.5)."""
 _Z = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
 _TAIL = 0.5 - 0.5 * LEVEL
 
@@ -99,8 +102,8 @@ def bounded_limits(sums: F64, clusters: Clusters, *, cap: float = math.inf) -> L
 def mean_limits(sums: F64, clusters: Clusters) -> Limits:
     """Interval of the mean of values without bounds: Student's, wider at both ends and on the side of the skew.
 
-    The degrees of freedom fall with the kurtosis of the clusters; each end leaves room for half a cluster more that
-    pulls as much as the strongest one; the longer tail gets the skewness term of Johnson (1978).
+    The degrees of freedom fall with the kurtosis of the clusters; each end leaves room for 0.3 of a cluster more
+    that pulls as much as the strongest one; the longer tail gets the skewness term of Johnson (1978).
 
     Args:
         sums: [..., K] sum of the values of each cluster.
@@ -114,8 +117,8 @@ def mean_limits(sums: F64, clusters: Clusters) -> Limits:
     t = t_quantile(spread.freedom)
     error = np.sqrt(spread.variance)
     skewed = spread.skew * (2.0 * t * t + 1.0) / 6.0 * error
-    low = mean - t * error - np.maximum(-skewed, 0.0) + 0.5 * part.min(axis=-1)
-    high = mean + t * error + np.maximum(skewed, 0.0) + 0.5 * part.max(axis=-1)
+    low = mean - t * error - np.maximum(-skewed, 0.0) + _ROOM * part.min(axis=-1)
+    high = mean + t * error + np.maximum(skewed, 0.0) + _ROOM * part.max(axis=-1)
     known = (_different(sums / clusters.size) >= MIN_DIFFERENT) & ~_flat(spread.variance, mean)
     return Limits(mean, np.where(known, low, np.nan), np.where(known, high, np.nan), "t")
 
