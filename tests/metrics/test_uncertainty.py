@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.metrics.intervals import Clusters, bounded_limits, mean_limits, replicate_limits
-from ssad.metrics.uncertainty import CaseValue, estimate, paired_difference, replicate_estimate
+from ssad.metrics.uncertainty import (
+    CaseValue,
+    estimate,
+    paired_difference,
+    replicate_estimate,
+    sign_flip_test,
+)
 
 NAN = math.nan
 
@@ -138,6 +144,53 @@ def test_paired_difference_follows_the_rules():
     lost = replace(second["4"], value=NAN, failed=True)
     other = paired_difference(first | {"only": first["0"]}, second | {"4": lost, "5": replace(lost, failed=False)})
     assert (other.n, other.failed) == (18, 3)
+
+
+def shares(ones: int, count: int, name: str) -> dict[str, CaseValue]:
+    return {str(k): CaseValue(float(k < ones), str(k), f"{name}{k}") for k in range(count)}
+
+
+def test_a_difference_of_shares_has_an_interval_also_where_no_cell_differs():
+    same = paired_difference(shares(6, 40, "a"), shares(6, 40, "b"), kind="share")
+    assert (same.mean, same.n, same.failed, same.method) == (0.0, 40, 0, "beta")
+    # nothing in 40 cells: exact limit of the cells that only one has, both ways, joined
+    limit = 1.0 - 0.025 ** (1 / 40)
+    assert (same.low, same.high) == (pytest.approx(-limit), pytest.approx(limit))
+    more = paired_difference(shares(16, 40, "a"), shares(6, 40, "b"), kind="share")
+    assert more.mean == pytest.approx(0.25)
+    assert 0.05 < more.low < 0.2 < 0.3 < more.high < 0.45
+    turned = paired_difference(shares(6, 40, "b"), shares(16, 40, "a"), kind="share")
+    assert (turned.low, turned.high) == (pytest.approx(-more.high), pytest.approx(-more.low))
+    few = paired_difference(shares(2, 4, "a"), shares(1, 4, "b"), kind="share")
+    assert few.method == "range"
+
+
+def test_limits_of_a_difference_of_shares_hold():
+    random = np.random.Generator(np.random.Philox(9))
+    held = 0
+    for _ in range(200):
+        drawn = random.choice(3, p=[0.15, 0.05, 0.8], size=60)
+        first = {str(k): CaseValue(float(v == 0), str(k), f"a{k}") for k, v in enumerate(drawn)}
+        second = {str(k): CaseValue(float(v == 1), str(k), f"b{k}") for k, v in enumerate(drawn)}
+        e = paired_difference(first, second, kind="share")
+        held += e.low <= 0.1 <= e.high
+    assert 180 <= held <= 199
+
+
+def test_sign_flips():
+    # five cells that only the first has, none that only the second has: McNemar's exact test
+    assert sign_flip_test(shares(11, 40, "a"), shares(6, 40, "b")) == pytest.approx(2 * 0.5**5)
+    assert sign_flip_test(shares(6, 40, "a"), shares(6, 40, "b")) == 1.0
+    assert math.isnan(sign_flip_test({}, {}))
+    values = [1.0, -2.0, 4.0]  # sums of signs: 3, 7, 5, 1 and their negatives
+    first = {str(k): CaseValue(v, str(k), f"a{k}") for k, v in enumerate(values)}
+    second = {str(k): CaseValue(0.0, str(k), f"b{k}") for k in range(3)}
+    assert sign_flip_test(first, second) == pytest.approx(6 / 8)
+    # drawn signs agree with the exact ones, and clusters count, not cases
+    many, none = shares(30, 40, "a"), shares(12, 40, "b")
+    assert sign_flip_test(many, none) == pytest.approx(1 / 20_001, abs=2e-4)
+    one = {k: replace(v, cluster="one") for k, v in many.items()}
+    assert sign_flip_test(one, none | {}) == 1.0
 
 
 def test_scores_by_replicates():

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from ssad.core.seeding import generator
 from ssad.core.types import F64
 from ssad.metrics.intervals import (
     MIN_CLUSTERS,
@@ -136,23 +137,90 @@ def replicate_estimate(
     return Estimate(value, float(low), float(high), n, 0, "beta" if bounded else "t", clusters)
 
 
-def paired_difference(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> Estimate:
+def paired_difference(
+    first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, kind: Literal["share", "mean"] = "mean"
+) -> Estimate:
     """Mean of first - second over the cells that both have, by the rules of `estimate`.
+
+    A mean has Student limits of the differences. A share has limits also where hardly any cell differs: the difference
+    is that of two shares, the cells where only the first is 1 and those where only the second is, whose limits are
+    joined (MOVER, with the correlation that two shares of one multinomial have).
 
     Args:
         first: values of one system by what was put to it (scenario and repetition); the clusters count, strata do not.
         second: those of the other system. Two pairs are copies if both halves are.
+        kind: "share": values are 0 or 1. "mean": any values.
 
     Returns:
         The estimate; failed: cells that only one has, or that failed or were not measured in either.
+
+    Source:
+        Donner and Zou, "Closed-form confidence intervals for functions of the normal mean and standard deviation"
+        (2012); Newcombe, "Improved confidence intervals for the difference between binomial proportions based on
+        paired data" (1998).
     """
+    pairs, missing = _pairs(first, second)
+    if kind == "mean":
+        return replace(estimate(pairs, "mean"), failed=missing)
+    only_first, only_second = (
+        estimate([replace(pair, value=float(sign * pair.value > 0.0)) for pair in pairs], "share") for sign in (1, -1)
+    )
+    p, q = only_first.mean, only_second.mean
+    if not pairs or "beta" not in (only_first.method, only_second.method):
+        return replace(estimate(pairs, "mean"), failed=missing)
+    correlation = 0.0 if p * q == 0.0 else -math.sqrt(p * q / ((1.0 - p) * (1.0 - q)))
+
+    def room(a: float, b: float) -> float:
+        return math.sqrt(max(a * a + b * b - 2.0 * correlation * a * b, 0.0))
+
+    low = p - q - room(p - only_first.low, only_second.high - q)
+    high = p - q + room(only_first.high - p, q - only_second.low)
+    return replace(only_first, mean=p - q, low=max(low, -1.0), high=min(high, 1.0), failed=missing)
+
+
+def sign_flip_test(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, draws: int = 20_000) -> float:
+    """Test whether first and second differ: how often chance alone makes a mean difference as large.
+
+    If they do not, each cluster's difference is as likely to have the other sign. All signs are tried for up to 14
+    clusters that differ (for shares with a case a cluster this is McNemar's exact test), else as many as `draws`.
+
+    Args:
+        first: As for `paired_difference`.
+        second: As for `paired_difference`.
+        draws: Random draws of signs beyond 14 clusters.
+
+    Returns:
+        Two-sided p-value; 1 where no cluster differs, NaN without a pair.
+
+    Source:
+        Fisher, "The Design of Experiments" (1935), section 21.
+    """
+    pairs, _ = _pairs(first, second)
+    if not pairs:
+        return math.nan
+    distinct = _distinct(pairs)
+    _, index = _clusters(distinct)
+    sums = np.bincount(index, np.array([v.value for v in distinct]))
+    sums = sums[sums != 0.0]
+    if not len(sums):
+        return 1.0
+    exact = len(sums) <= 14
+    if exact:
+        signs = 1.0 - 2.0 * ((np.arange(2 ** len(sums))[:, None] >> np.arange(len(sums))) & 1)
+    else:
+        signs = generator("sign flip test", len(sums), draws).choice([-1.0, 1.0], size=(draws, len(sums)))
+    reached = int((np.abs(signs @ sums) >= np.abs(sums.sum()) * (1.0 - 1e-9)).sum())
+    return reached / len(signs) if exact else (reached + 1) / (draws + 1)
+
+
+def _pairs(first: Mapping[str, CaseValue], second: Mapping[str, CaseValue]) -> tuple[list[CaseValue], int]:
+    """Differences of the cells that both have, and how many cells give none."""
     pairs = [
         CaseValue(a.value - b.value, a.cluster, f"{a.case}\n{b.case}")
         for key in sorted(set(first) & set(second))
         if not ((a := first[key]).failed or (b := second[key]).failed or math.isnan(a.value - b.value))
     ]
-    missing = len(set(first) | set(second)) - len(pairs)
-    return replace(estimate(pairs, "mean"), failed=missing)
+    return pairs, len(set(first) | set(second)) - len(pairs)
 
 
 def _distinct(values: Iterable[CaseValue]) -> list[CaseValue]:
