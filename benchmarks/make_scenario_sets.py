@@ -10,7 +10,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -32,6 +32,8 @@ PRECRASH_TOWN = "ProvingGround"
 NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 7, "Crossgate": 8}
 """Town -> number of junction routes, as FREA has on Town02 and Town05."""
 REPETITIONS = 10
+TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
+"""Learned drivers are trained here, on none of the towns that the other sets are in."""
 Turn = Literal["left", "straight", "right"]
 # Trigger distances, m, at which an ego that does not react is hit at any speed from 8 to 10 m/s on these roads. The
 # others keep SafeBench's value, which is the default of their class.
@@ -194,15 +196,15 @@ def _spread(
     return chosen
 
 
-def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
-    """The eight classes, `routes` scenarios each."""
+def precrash(graph: LaneGraph, routes: int = 4, *, prefix: str = "", least: int | None = None) -> list[Scenario]:
+    """The eight classes, `routes` scenarios each; where the town has no more, at least `least` (default: `routes`)."""
     result = []
     for kind in PRECRASH:
 
         def scenario(stretch: Stretch, number: int, kind: str = kind) -> Scenario:
             tuned = _TRIGGERS.get((kind, stretch.turn))
             return Scenario(
-                name=f"{kind}/{number:02d}",
+                name=f"{prefix}{kind}/{number:02d}",
                 type=kind,
                 town=graph.name,
                 route=stretch.points,
@@ -219,7 +221,7 @@ def precrash(graph: LaneGraph, routes: int = 4) -> list[Scenario]:
             return True
 
         chosen = _spread(_pool(graph, kind), lambda p: _look(graph, p), routes, works)
-        if len(chosen) < routes:
+        if len(chosen) < (routes if least is None else least):
             raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} roads for {kind}")
         result += [scenario(stretch, i, kind) for i, stretch in enumerate(chosen)]
     return result
@@ -253,8 +255,18 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
     ]
 
 
+def training() -> dict[str, str]:
+    """What drivers learn from, as `make`: the eight classes as far as the towns have roads for them, and junctions."""
+    found = []
+    for town in TRAINING_TOWNS:
+        graph = load_town(town)
+        drives = [replace(s, name=f"training/{s.name}") for s in natural(graph, 12, repetitions=1)]
+        found += [*precrash(graph, 6, prefix=f"training/{town}/", least=0), *drives]
+    return {"training.yaml": scenario_text(found)}
+
+
 def make() -> dict[str, str]:
-    """File name -> text of every shipped set."""
+    """File name -> text of the shipped sets that systems are tested on."""
     drives = [s for town, routes in NATURAL_TOWNS.items() for s in natural(load_town(town), routes)]
     return {
         "precrash.yaml": scenario_text(precrash(load_town(PRECRASH_TOWN))),
@@ -264,7 +276,7 @@ def make() -> dict[str, str]:
 
 def main(folder: Path = DATA) -> None:
     """Write the shipped sets."""
-    for name, text in make().items():
+    for name, text in (make() | training()).items():
         write_atomic(folder / name, text)
 
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.make_scenario_sets import make
+from benchmarks.make_scenario_sets import TRAINING_TOWNS, make, training
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode, LaneType, Scenario, SignalState
@@ -46,6 +46,21 @@ def boxes(e: Episode) -> np.ndarray:
 def test_the_generator_makes_the_shipped_files() -> None:
     for name, text in make().items():
         assert (DATA / name).read_text() == text, f"{name}: run python benchmarks/make_scenario_sets.py"
+
+
+@pytest.mark.slow
+def test_the_generator_makes_the_training_set() -> None:
+    (text,) = training().values()
+    assert (DATA / "training.yaml").read_text() == text
+
+
+def test_nothing_is_tested_where_drivers_were_trained() -> None:
+    trained = load_scenarios("training")
+    assert {s.town for s in trained} == set(TRAINING_TOWNS)
+    assert not {s.town for s in SHIPPED + NATURAL} & set(TRAINING_TOWNS)
+    assert {s.type for s in trained} == {*PRECRASH, "NaturalJunction"}
+    # a class names the scenarios that systems are tested on
+    assert all(s.town == "ProvingGround" for kind in PRECRASH for s in load_scenarios(kind))
 
 
 @pytest.mark.parametrize("name", [s.name for s in SHIPPED])

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import Limits
-from ssad.world.env import SingleEnv, VectorEnv, to_controls
+from ssad.world.env import SingleEnv, VectorEnv
 from tests.world.test_world import bank
 from tests.world.worlds import GRAPHS, ego, episode
 
@@ -54,12 +54,6 @@ def test_vector_env_is_seeded() -> None:
     other = [tuple(env.reset(seed=k)[1]["episode"]) for k in range(5)]
     assert tuple(first) == tuple(again)
     assert len(set(other)) > 1
-
-
-def test_safebench_action_rule() -> None:
-    given = np.array([[1.0, 1.0], [-1.0, -1.0], [0.5, 0.0]], np.float32)
-    expected = np.array([[1.0, 0.0, 0.3], [0.0, 0.375, -0.3], [0.5, 0.0, 0.0]], np.float32)
-    np.testing.assert_allclose(to_controls("safebench", given), expected, rtol=1e-6)
 
 
 def test_unknown_spaces_and_sizes_are_refused() -> None:

@@ -46,6 +46,8 @@ class RoadTables:
         lane: [R] lane of the point, -1 none.
         left: [L] lane on the left of a lane as seen in its own direction, -1 none.
         right: [L] lane on its right.
+        side: [L] 1 or -1, the sign of its OpenDRIVE id: lanes of a road that go the same way have the same.
+        junction: [L] whether it lies inside a junction.
     """
 
     path: F32
@@ -54,6 +56,8 @@ class RoadTables:
     lane: I32
     left: I32
     right: I32
+    side: I32
+    junction: Bool
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class WorldState:
         lane_invasion: [B] lane markings crossed in this step.
         red_light: [B] red lights run in this step.
         stop_sign: [B] stop signs run in this step; None in a world without stop signs.
+        note: [B, A] what a selector has noted on an agent (`Choice.note`), 0 at the start; None in a simulator that
+            keeps no notes.
     """
 
     time: F64
@@ -119,6 +125,7 @@ class WorldState:
     lane_invasion: U8
     red_light: U8
     stop_sign: U8 | None = None
+    note: I32 | None = None
 
     @cached_property
     def signal(self) -> U8:
@@ -447,8 +454,43 @@ class Reproducible(Protocol):
         """
 
 
-Selector = Callable[[WorldState], Bool]
-"""Whom a driver drives at the next step: from the state to [B, A]. It decides from the state alone."""
+@dataclass(frozen=True)
+class Choice:
+    """What a selector with a memory decides at one step; its memory is in the simulator, with the rest of the state.
+
+    Attributes:
+        agents: [B, A] whom its driver drives at the next step.
+        note: [B, A] what it finds in `WorldState.note` at the step after.
+        remove: [B, A] who leaves the scene.
+    """
+
+    agents: Bool
+    note: I32
+    remove: Bool
+
+
+@runtime_checkable
+class NoteKeeper(Protocol):
+    """A simulator that keeps notes of selectors on agents, in its snapshots and hashes, until a scene starts again."""
+
+    def keep_note(self, note: I32) -> None:
+        """Keep a note on every agent.
+
+        Args:
+            note: [B, A].
+        """
+
+    def remove(self, agents: Bool) -> None:
+        """Take agents out of their scenes, until these start again.
+
+        Args:
+            agents: [B, A].
+        """
+
+
+Selector = Callable[[WorldState], Bool | Choice]
+"""Whom a driver drives at the next step: from the state to [B, A]. It decides from the state alone; one that has to
+remember something says so with a `Choice`, in a simulator that is a `NoteKeeper`."""
 
 Policies = Callable[[str], Driver]
 """The driver of a name that an episode gives to an agent (`ssad.core.types.Actor.policy`), a new one at each call."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -14,22 +14,22 @@ from ssad.core.driving import Policies
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import ENDS, Controller, End, Episode
+from ssad.world.policy import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import REWARDS, Reward
 from ssad.world.rollout import Drivers, Loop
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 
-Observation = Literal["safebench", "frea"]
-Action = Literal["safebench", "frea", "controls"]
-_SIZE = {"safebench": 4, "frea": 24}
+Observation = Literal["safebench", "frea", "traffic"]
+Action = Literal["safebench", "frea", "pedals", "controls"]
 _BOUND = np.float32(1.0e4)
 
 
 def observation_space(kind: Observation) -> gym.spaces.Box:
-    """`safebench`: [4] lateral offset m, heading error rad, speed m/s, hazard 0/1; `frea`: [24], see world.sensors."""
-    if kind not in _SIZE:
-        raise ConfigError(f"unknown observation '{kind}'; known: {', '.join(_SIZE)}")
-    return gym.spaces.Box(-_BOUND, _BOUND, (_SIZE[kind],), np.float32)
+    """`safebench` [4], `frea` [24] and `traffic` [69]: the sensors of that name, see `ssad.world.sensors.SENSORS`."""
+    if kind not in get_args(Observation):
+        raise ConfigError(f"unknown observation '{kind}'; known: {', '.join(get_args(Observation))}")
+    return gym.spaces.Box(-_BOUND, _BOUND, (WIDTHS[kind],), np.float32)
 
 
 def reward_of(reward: str | Reward) -> Reward:
@@ -44,35 +44,14 @@ def reward_of(reward: str | Reward) -> Reward:
 def action_space(kind: Action) -> gym.spaces.Box:
     """Ranges of the actions.
 
-    `safebench`: [2] acceleration / 3 m/s^2 and steer / 0.3; `frea`: [3] throttle, steer / 0.3, brake; all in [-1, 1].
-    `controls`: [3] throttle, brake in [0, 1] and steer in [-1, 1].
+    `safebench` [2], `frea` [3] and `pedals` [2] in [-1, 1]: see `ssad.world.policy.to_controls`. `controls`: [3]
+    throttle, brake in [0, 1] and steer in [-1, 1].
     """
     if kind == "controls":
         return gym.spaces.Box(np.array([0, 0, -1], np.float32), np.ones(3, np.float32))
-    if kind not in ("safebench", "frea"):
-        raise ConfigError(f"unknown action '{kind}'; known: safebench, frea, controls")
-    return gym.spaces.Box(-1.0, 1.0, (2 if kind == "safebench" else 3,), np.float32)
-
-
-def to_controls(kind: Action, action: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float32]:
-    """Policy actions [B, n] to throttle, brake, steer [B, 3], by the rules of SafeBench and FREA."""
-    a = np.asarray(action, np.float32)
-    out = np.zeros((len(a), 3), np.float32)
-    if kind != "controls":
-        a = np.minimum(np.maximum(a, -1.0), 1.0)
-    if kind == "controls":
-        out[:] = a
-    elif kind == "safebench":
-        push = a[:, 0] * 3.0
-        out[:, 0] = np.minimum(np.maximum(push / 3.0, 0.0), 1.0)
-        out[:, 1] = np.maximum(-push / 8.0, 0.0)
-        out[:, 2] = a[:, 1] * 0.3
-    else:
-        throttle = a[:, 0] * 0.5 + 0.5
-        brake = a[:, 2] * 0.5 + 0.5
-        brake = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
-        out[:, 0], out[:, 1], out[:, 2] = throttle, brake, a[:, 1] * 0.3
-    return out
+    if kind not in get_args(Action):
+        raise ConfigError(f"unknown action '{kind}'; known: {', '.join(get_args(Action))}")
+    return gym.spaces.Box(-1.0, 1.0, (ACTIONS[kind],), np.float32)
 
 
 class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
@@ -151,7 +130,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         dict[str, Any],
     ]:
         """One step of 0.1 s in every scene."""
-        self._controls[:, 0] = to_controls(self._action, actions)
+        given = np.asarray(actions, np.float32)
+        self._controls[:, 0] = given if self._action == "controls" else to_controls(self._action, given)[:, :3]
         self._loop.step(self._controls)
         end = self.world.ended().copy()
         reward = self._reward(self.world.state())

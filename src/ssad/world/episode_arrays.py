@@ -393,6 +393,8 @@ def _tables(graphs: Sequence[LaneGraph], pool: _Pool) -> RoadTables:
         lane=np.concatenate([shifted(t.lane, t.town) for t in pool.tables]),
         left=np.concatenate([shifted(g.left, g.name) for g in graphs]),
         right=np.concatenate([shifted(g.right, g.name) for g in graphs]),
+        side=np.concatenate([np.sign(g.lane_id).astype(np.int32) for g in graphs]),
+        junction=np.concatenate([g.junction >= 0 for g in graphs]),
     )
 
 

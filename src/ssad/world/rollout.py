@@ -10,7 +10,9 @@ import numpy.typing as npt
 
 from ssad.core.driving import (
     Believer,
+    Choice,
     Driver,
+    NoteKeeper,
     Perturbation,
     Planner,
     Policies,
@@ -129,7 +131,8 @@ class Loop:
                 state = self.simulator.state() if state is None else state
             if agents is None and not isinstance(who, int):
                 assert state is not None
-                chosen = np.asarray(who(state), bool) & (self.simulator.ended() == End.RUNNING)[:, None]
+                chosen, state = self._choose(who, state)
+                chosen = chosen & (self.simulator.ended() == End.RUNNING)[:, None]
                 had = state.policy == policy
                 if (chosen != had).any():
                     if (had & ~chosen).any():
@@ -147,6 +150,22 @@ class Loop:
                 assert state is not None
                 self._believe(driver, state, agents)
         self.simulator.step(self._controls if asked else None)
+
+    def _choose(self, who: Selector, state: WorldState) -> tuple[Bool, WorldState]:
+        """Whom a selector chooses [B, A], and the state after it has noted what it remembers and removed whom it does.
+
+        Raises ConfigError if it remembers something and the simulator keeps no notes.
+        """
+        choice = who(state)
+        if not isinstance(choice, Choice):
+            return np.asarray(choice, bool), state
+        if not isinstance(self.simulator, NoteKeeper):
+            raise ConfigError("a selector keeps notes on agents, which this simulator does not")
+        self.simulator.keep_note(choice.note)
+        if choice.remove.any():
+            self.simulator.remove(choice.remove)
+            state = self.simulator.state()
+        return np.asarray(choice.agents, bool), state
 
     def _believe(self, driver: Driver, state: WorldState, egos: I32) -> None:
         """Hand what the driver believes to the planner; scenes that have ended keep what they had."""

@@ -11,6 +11,7 @@ from ssad.core.driving import Belief, Planner, Sensor
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, I32
 from ssad.world.kernels.look import CHANNELS, OBSERVATION, look, look_as_adversary, look_from_above
+from ssad.world.kernels.look_traffic import TRAFFIC, look_at_traffic
 from ssad.world.world import World
 
 ABOVE = 64  # pixels a side of the view from above
@@ -80,14 +81,24 @@ def truth(simulator: Any, agents: I32) -> Belief:
     return simulator.truth().rows(agents[:, 0])
 
 
+def traffic(simulator: Any, agents: I32) -> F32:
+    """What the shipped learned drivers see, [N, 69], all numbers around 1; see `SENSORS`."""
+    return _read(simulator, look_at_traffic, agents, (len(agents), TRAFFIC), len(agents), float(simulator.dt)).copy()
+
+
 SENSORS: dict[str, Sensor] = {
     "safebench": _rows(look, OBSERVATION, slice(0, 4)),
     "frea": _rows(look, OBSERVATION, slice(4, OBSERVATION)),
     "adversary": _rows(look_as_adversary, 24, slice(0, 24)),
+    "traffic": traffic,
     "above": from_above(),
     "truth": truth,
 }
 """`safebench` [N, 4]: lateral offset m, heading error rad, speed m/s, 1 if a vehicle is in the same lane within 15 m
 ahead. `frea` [N, 24]: 4 rows of 6, the agent, the two nearest vehicles and the route. `adversary` [N, 24]: FREA's
-adversary, the ego, the nearest other vehicle and the goal. `above`: see `from_above`. `truth`: a `Belief`,
-see `truth`."""
+adversary, the ego, the nearest other vehicle and the goal. `traffic` [N, 69]: speed / 10, acceleration / 5, front-wheel
+angle / 0.5, target speed / 10, offset from the route / 2, heading error, metres to its end / 50; x / 20, y / 20 of the
+route 4, 8, 12, 18, 26 and 34 m ahead; for now and after 1, 2, 3, 4 s, if everybody keeps speed and rate of turn, metres
+along the route to the first body on it / 50 (1: none) and that body's speed along the route / 10; for the five nearest
+within 50 m (those behind count as twice as far) x / 25, y / 25, cosine and sine of the heading, speed / 10, length / 5,
+width / 2, and 1 for who is on two wheels or on foot. `above`: see `from_above`. `truth`: a `Belief`, see `truth`."""

@@ -307,6 +307,10 @@ class World:
                 progress[b, i] = here + int(np.argmin(((rest - pose[b, i, :2]) ** 2).sum(1)))
         return progress
 
+    def keep_note(self, note: I32) -> None:
+        """Keep what a selector notes on agents, [B, A]; 0 again when a scene starts again."""
+        self.put("note", np.asarray(note, np.int32))
+
     def remove(self, agents: Bool) -> None:
         """Take agents [B, A] out of their scenes, until these start again; also those that follow a trajectory."""
         gone, controller = np.asarray(agents, bool), self.array("controller")
@@ -419,6 +423,7 @@ class World:
             # 2 marks a line already counted in the step before
             red_light=(self.array("ego.red_light") == 1).astype(np.uint8),
             stop_sign=self.array("ego.stop_sign").astype(np.uint8),
+            note=self.array("note"),
         )
 
     def ended(self) -> npt.NDArray[np.int32]:

@@ -14,6 +14,8 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
+TRAINING = ("training",)
+"""What learned drivers are trained on, in towns that no other set uses; its scenarios belong to no class's own."""
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
@@ -54,7 +56,7 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
 def set_files() -> dict[str, Path]:
     """Set name -> YAML file: the shipped sets, then the imported ones."""
     found = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
-    return found | {name: DATA / f"{name}.yaml" for name in SHIPPED}
+    return found | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *TRAINING)}
 
 
 def set_names() -> tuple[str, ...]:

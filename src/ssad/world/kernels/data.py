@@ -108,6 +108,7 @@ class State:
     end: wp.array(dtype=wp.int32)  # [B] End
     controller: wp.array2d(dtype=wp.int32)  # [B, A] Controller
     policy: wp.array2d(dtype=wp.int32)  # [B, A] number of the driver that acts for it, -1 none
+    note: wp.array2d(dtype=wp.int32)  # [B, A] what a selector has noted on it, 0 at the start
     cruise: wp.array2d(dtype=wp.float32)  # [B, A] target speed m/s
     pose: wp.array2d(dtype=wp.vec3)  # [B, A]
     previous: wp.array2d(dtype=wp.vec3)  # [B, A]

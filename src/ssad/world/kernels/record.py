@@ -232,6 +232,7 @@ def put_back(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int):
     pose = wp.vec3(start[0], start[1], start[2])
     state.controller[b, i] = bank.controller[e, i]
     state.policy[b, i] = -1
+    state.note[b, i] = 0
     state.cruise[b, i] = bank.cruise[e, i][0]
     state.pose[b, i] = pose
     state.previous[b, i] = pose

@@ -1,0 +1,146 @@
+"""Learned policies: weights with a card, what they look at, and the controls that they give; torch alone runs them.
+
+A policy is a stack of linear layers with ReLU between them, from one sensor of `ssad.world.sensors` to one action of
+`ssad.world.env.to_controls`. Its card says which ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core.checkpoints import Card, load_card
+from ssad.core.errors import FormatError
+from ssad.core.types import F32
+
+WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversary": 24}
+"""Sensors that a policy can look at, and how many numbers they have."""
+ACTIONS: Mapping[str, int] = {"safebench": 2, "frea": 3, "pedals": 2, "adversary": 2}
+"""Actions that a policy can take, and how many numbers they have; see `to_controls`."""
+SQUASHES = ("clip", "tanh")
+_BOUND = 1.0e4
+
+
+def to_controls(kind: str, action: F32) -> F32:
+    """Policy actions [N, n] to throttle, brake, steer and reverse [N, 4].
+
+    `safebench`: acceleration / 3 m/s^2 and steer / 0.3, with at most 3 of 8 m/s^2 of brake. `frea`: throttle,
+    steer / 0.3 and brake. `pedals`: throttle, or below 0 the whole brake, and steer / 0.3. `adversary`: throttle,
+    below 0 in reverse, and steer / 0.3; no brake. All of them in [-1, 1]; beyond that they are cut.
+
+    Source: SafeBench (Xu et al. 2022) and FREA (Chen et al. 2024), their environments.
+    """
+    a = np.minimum(np.maximum(np.asarray(action, np.float32), -1.0), 1.0)
+    out = np.zeros((len(a), 4), np.float32)
+    first = a[:, 0]
+    if kind == "frea":
+        throttle, brake = first * 0.5 + 0.5, a[:, 2] * 0.5 + 0.5
+        out[:, 0] = throttle
+        out[:, 1] = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
+    else:
+        out[:, 0] = np.abs(first) if kind == "adversary" else np.maximum(first, 0.0)
+        if kind != "adversary":
+            out[:, 1] = np.maximum(-first, 0.0) * (3.0 / 8.0 if kind == "safebench" else 1.0)
+        else:
+            out[:, 3] = first <= 0.0
+    out[:, 2] = a[:, 1] * 0.3
+    return out
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A deterministic policy.
+
+    Attributes:
+        observation: Name of the sensor.
+        action: Kind of the action.
+        layers: Weight [out, in] and bias [out] of each layer.
+        squash: How the last layer's numbers come into [-1, 1]: "clip" or "tanh".
+        card: Where it comes from.
+    """
+
+    observation: str
+    action: str
+    layers: tuple[tuple[Tensor, Tensor], ...]
+    squash: str
+    card: Card
+
+    def actions(self, rows: F32) -> F32:
+        """Actions in [-1, 1].
+
+        Args:
+            rows: [N, width] readings of its sensor.
+
+        Returns:
+            [N, n]; the bits of a row do not depend on the others.
+        """
+        x = torch.from_numpy(np.clip(rows, -_BOUND, _BOUND).astype(np.float32))
+        for number, (weight, bias) in enumerate(self.layers):
+            # sums in a fixed order: a matrix product may take another one for another number of rows
+            total = bias.expand(len(x), -1)
+            for k in range(weight.shape[1]):
+                total = total + x[:, k : k + 1] * weight[:, k]
+            x = total if number + 1 == len(self.layers) else total.clamp(min=0.0)
+        x = x.double().tanh().float() if self.squash == "tanh" else x.clamp(-1.0, 1.0)
+        found: F32 = x.numpy()
+        return found
+
+    def controls(self, rows: F32) -> F32:
+        """Throttle, brake, steer and reverse [N, 4] from readings [N, width]."""
+        return to_controls(self.action, self.actions(rows))
+
+
+def load_policy(path: str | Path) -> Policy:
+    """A policy from NAME.safetensors and the card NAME.json beside it.
+
+    Raises:
+        FormatError: A file is missing or broken, the card does not say what the policy looks at and does, or the
+            weights are of another size.
+    """
+    card, state = load_card(path)
+    return policy_of(card, state, str(path))
+
+
+def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
+    """A policy from its card and tensors; `where` names them in messages.
+
+    Raises:
+        FormatError: As `load_policy`.
+    """
+    observation, action, squash = (str(card.config.get(key, "")) for key in ("observation", "action", "squash"))
+    for what, value, known in (
+        ("observation", observation, WIDTHS),
+        ("action", action, ACTIONS),
+        ("squash", squash, SQUASHES),
+    ):
+        if value not in known:
+            raise FormatError(f"{where}: the card of a policy names its {what} ({', '.join(known)}), not '{value}'")
+    count = len(state) // 2
+    names = {f"{k}.{part}" for k in range(count) for part in ("weight", "bias")}
+    if not count or set(state) != names:
+        raise FormatError(f"{where}: not the weights of a policy: expected 0.weight, 0.bias, 1.weight, ...")
+    layers = tuple((state[f"{k}.weight"].float(), state[f"{k}.bias"].float()) for k in range(count))
+    width = WIDTHS[observation]
+    for number, (weight, bias) in enumerate(layers):
+        if weight.ndim != 2 or bias.shape != weight.shape[:1] or weight.shape[1] != width:
+            shape = list(weight.shape)
+            before = f"the observation '{observation}'" if number == 0 else "the layer before it"
+            raise FormatError(f"{where}: layer {number} has the shape {shape}, but {before} has {width} numbers")
+        width = weight.shape[0]
+    if width != ACTIONS[action]:
+        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' has {ACTIONS[action]}")
+    return Policy(observation, action, layers, squash, card)
+
+
+def tensors_of(layers: Any) -> dict[str, Tensor]:
+    """Tensors by name, as `policy_of` reads them, of linear layers in order."""
+    found: dict[str, Tensor] = {}
+    for number, layer in enumerate(layers):
+        found |= {f"{number}.weight": layer.weight.detach().clone(), f"{number}.bias": layer.bias.detach().clone()}
+    return found
