@@ -316,7 +316,7 @@ def render(
             raise ConfigError(f"{count} pieces of textured surfaces, more than {room}; render fewer views at once")
         fragments = out.fragments[:count].numpy() if count else fragments
         fragments = fragments[np.lexsort((fragments["texture"], fragments["slot"], fragments["place"]))]
-    image = _develop(out.radiance, views, exposures)
+    image = develop_radiance(out.radiance, views, exposures)
     arrays = (image, out.radiance, out.tag, out.depth)
     if download:
         arrays = tuple(a.numpy() if linear or a is not out.radiance else a for a in arrays)
@@ -438,8 +438,17 @@ def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality)
     return near
 
 
-def _develop(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:
-    """The pictures uint8 [B, H, W, 3] that the views' sensors make of radiance [B, H, W], on its device."""
+def develop_radiance(radiance: Any, views: Sequence[View], exposures: Sequence[float]) -> Any:
+    """What the sensors of views make of radiance.
+
+    Args:
+        radiance: Linear [B, H, W], a Warp array of vec3.
+        views: The views; their sensors and seeds count.
+        exposures: Of each view.
+
+    Returns:
+        Pictures uint8 [B, H, W, 3], a Warp array on the device of the radiance.
+    """
     device, (count, height, width) = radiance.device, radiance.shape
     rows: Any = []
     for view, exposure in zip(views, exposures, strict=True):
