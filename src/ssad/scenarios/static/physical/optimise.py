@@ -113,6 +113,7 @@ def train_texture(
     *,
     start: Tensor,
     printable: Tensor | None = None,
+    shown: Callable[[Tensor], Tensor] = albedo_of,
     key: tuple[object, ...] = (),
     device: str | torch.device = "cpu",
     checkpoint: Path | None = None,
@@ -127,6 +128,7 @@ def train_texture(
         views: Pictures whose target wears texture 0 on that surface.
         start: The first texture, sRGB [3, H, W].
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
+        shown: What pictures take of a texture's colours: the albedo of print, or the light of a projector.
         key: What all draws come from.
         device: Where the detector is.
         checkpoint: Where the state is kept after each epoch; what is there already is continued, to the bit on the CPU,
@@ -163,7 +165,9 @@ def train_texture(
             total, steepest = 0.0, 0.0
             for step, first in enumerate(range(0, len(order), attack.batch)):
                 chosen = order[first : first + attack.batch]
-                losses = _ascended(attack, objective, detector, views, colour, chosen.tolist(), (*key, epoch, step))
+                losses = _ascended(
+                    attack, objective, detector, views, colour, chosen.tolist(), shown, (*key, epoch, step)
+                )
                 loss = -losses.mean() + attack.smooth * total_variation(colour, mask)
                 if inks is not None and attack.printed > 0.0:
                     loss = loss + attack.printed * non_printability(colour, inks, mask)
@@ -200,19 +204,20 @@ def _ascended(  # noqa: PLR0917
     views: Sequence[View],
     colour: Tensor,
     chosen: list[int],
+    shown: Callable[[Tensor], Tensor],
     key: tuple[object, ...],
 ) -> Tensor:
     """The loss [B] of some pictures, with texture, print and noise of their own."""
-    shown, truth = [], []
+    images, truth = [], []
     for number in chosen:
         draws = torch.Generator().manual_seed(int(digest("texture draw", *key, number)[:15], 16))
         printed = attack.expectation.draw(colour, draws)
-        picture, seen = views[number].picture.show({0: albedo_of(printed)}, draws), views[number].truth
+        picture, seen = views[number].picture.show({0: shown(printed)}, draws), views[number].truth
         if attack.window is not None:
             picture, seen = around_target(picture, seen, attack.window, draws)
-        shown.append(picture)
+        images.append(picture)
         truth.append(seen)
-    dense = detector.dense(torch.cat(shown))
+    dense = detector.dense(torch.cat(images))
     with torch.no_grad():
         assignment = detector.assign(dense, truth)
     return objective(dense, Situation(detector, assignment, TARGET))

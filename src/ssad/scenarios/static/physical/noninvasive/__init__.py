@@ -1,1 +1,57 @@
-"""Physical attacks that leave their target as it is: what falls on it, shadow and light (paper III.A.1)."""
+"""Non-invasive physical attacks (paper III.A.1): light and shadow on a target, which itself stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.scenarios.static.physical.noninvasive.flashlight import Flashlight
+from ssad.scenarios.static.physical.noninvasive.laser import Laser
+from ssad.scenarios.static.physical.noninvasive.light import LightAttack, Target
+from ssad.scenarios.static.physical.noninvasive.lit_picture import LitPicture
+from ssad.scenarios.static.physical.noninvasive.projector import Projector
+from ssad.scenarios.static.physical.noninvasive.search import Budget, Found, LitView, random_settings, search_light
+from ssad.scenarios.static.physical.noninvasive.shadow import Shadow
+
+LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
+    "shadow": Shadow, "laser": Laser, "projector": Projector, "flashlight": Flashlight,
+}  # fmt: skip
+
+
+def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projector | Flashlight:
+    """A light attack by name.
+
+    Args:
+        name: Of `LIGHTS`.
+        options: Its fields that differ; lists stand for pairs.
+
+    Raises:
+        UnknownNameError: There is no such attack.
+        ConfigError: An option that it does not have, or a value that it refuses.
+    """
+    if name not in LIGHTS:
+        raise unknown_name("light attack", name, LIGHTS)
+    given = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    try:
+        return LIGHTS[name](**given)
+    except TypeError as error:
+        raise ConfigError(f"{name}: {str(error).partition(') ')[2] or error}") from None
+
+
+__all__ = [
+    "LIGHTS",
+    "Budget",
+    "Flashlight",
+    "Found",
+    "Laser",
+    "LightAttack",
+    "LitPicture",
+    "LitView",
+    "Projector",
+    "Shadow",
+    "Target",
+    "make_light",
+    "random_settings",
+    "search_light",
+]

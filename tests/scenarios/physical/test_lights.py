@@ -1,0 +1,238 @@
+"""Light attacks: what the quick model says is what is rendered; power is bounded; searches find and repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ssad.assets import mesh as meshes
+from ssad.assets.mesh import Material, build
+from ssad.camera.photometry import per_lux
+from ssad.camera.render import View, Weather, render
+from ssad.camera.scene import Scene, Thing
+from ssad.camera.scene_edit import SceneEdit
+from ssad.camera.sensor import Sensor
+from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.rotations import upright_pose
+from ssad.scenarios.static.physical.noninvasive import (
+    LIGHTS,
+    Budget,
+    Flashlight,
+    Laser,
+    Projector,
+    Shadow,
+    Target,
+    make_light,
+    random_settings,
+    search,
+)
+from ssad.scenarios.static.physical.noninvasive.kept import LightFolder, LightSpec, budget_of
+from ssad.scenarios.static.physical.noninvasive.laser import matching
+from ssad.scenarios.static.physical.noninvasive.light import LightAttack, Ranges, at_values
+from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND, LitPicture, lit_picture
+
+TAG = 5
+TARGET = Target(4.0, 2.0, 1.5)
+GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
+CAMERA = Camera(128, 96, np.array([[220.0, 0, 64.0], [0, 220.0, 48.0], [0, 0, 1]]))
+PLAIN = Sensor(blur=0.0, mosaic=False)
+SEARCHED: tuple[LightAttack, ...] = (Shadow(), Laser(), Flashlight())
+SETTINGS: dict[str, dict[str, float]] = {
+    "shadow": {"left_a": -0.8, "up_a": 0.1, "left_b": 0.8, "up_b": 0.2, "left_c": 0.1, "up_c": 1.3},
+    "laser": {"watts": 0.05, "wavelength": 550.0, "width": 0.3, "angle": 0.3, "aim_left": 0.0, "aim_up": 0.8},
+    "flashlight": {
+        "lumens": 20.0, "distance": 6.0, "height": 1.5, "aside": 0.1, "aim_left": 0.2, "aim_up": 0.8, "beam": 0.12,
+        "red": 1.0, "green": 0.5, "blue": 0.2,
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) * 60
+    ground = build(corners, np.array([[0, 1, 2], [0, 2, 3]]), materials=GREY)
+    block = meshes.box((4.0, 2.0, 1.5), material=GREY, centre=(0.0, 0.0, 0.75))
+    cards = [mesh for name in ("shadow",) for mesh in edit_of(name).meshes()]
+    return Scene(None, [ground, block, BLIND.mesh(), *cards])
+
+
+def edit_of(name: str) -> SceneEdit:
+    attack: Any = next(one for one in SEARCHED if one.name == name)
+    return attack.edit(SETTINGS[name], TARGET)  # type: ignore[no-any-return]
+
+
+def view(weather: Weather) -> View:
+    """From 10 m behind a block that stands turned in the world."""
+    turn = upright_pose(3.0, -2.0, 0.7)
+    ahead = FORWARD.copy()
+    ahead[:3, 3] = -12.0, 0.0, 1.6
+    eye = turn @ ahead
+    return View(CAMERA, eye, (Thing(0, np.eye(4)), Thing(1, turn, tag=TAG)), weather, PLAIN)
+
+
+HOURS = {"shadow": Weather(0.5, 0.7 + np.pi + 0.4, 0.0), "laser": Weather(-0.3), "flashlight": Weather(-0.3)}
+
+
+def lit(scene: Scene, name: str) -> LitPicture:
+    return lit_picture(scene, view(HOURS[name]), TAG, slice(0, 96), slice(0, 128), blind=2)
+
+
+@pytest.mark.parametrize("attack", SEARCHED, ids=lambda one: str(one.name))
+def test_the_quick_model_is_what_is_rendered(scene: Scene, attack: LightAttack) -> None:
+    """But for shadow maps and edges: on the target, the rest of the light is the same within a few percent."""
+    picture, given = lit(scene, attack.name), edit_of(attack.name)
+    seen = given.on(view(HOURS[attack.name]), TAG, cards=range(3, 3 + len(given.cards)))
+    full = render(scene, [seen])
+    change = attack.change(at_values(SETTINGS[attack.name]), picture, TARGET)[0]
+    wanted = full.radiance[0] - picture.radiance.numpy()
+    own = full.tag[0] == TAG
+    assert (np.abs(wanted[own]).max(-1) > 0.02).mean() > 0.04, "it changes the target"
+    error = np.abs(change.numpy() - wanted)[own].max(-1)
+    assert (error < 0.02 + 0.03 * np.abs(wanted[own]).max(-1)).mean() > 0.93
+    image = picture.show(change[None])[0].permute(1, 2, 0).numpy() * 255
+    assert (np.abs(image - full.image[0]).max(-1) < 4).mean() > 0.93
+
+
+def test_a_shadow_takes_what_the_sun_gives_and_no_more(scene: Scene) -> None:
+    picture = lit(scene, "shadow")
+    change = Shadow().change(at_values(SETTINGS["shadow"]), picture, TARGET)[0]
+    assert float(change.max()) <= 0.0
+    assert float((picture.radiance + change).min()) >= -1e-6
+    assert picture.sun_direction is not None
+    night = replace(picture, sun_direction=None)
+    assert not Shadow().change(at_values(SETTINGS["shadow"]), night, TARGET).any()
+
+
+@pytest.mark.parametrize("attack", [Laser(), Flashlight()], ids=lambda one: str(one.name))
+def test_a_lamp_gives_no_more_light_than_its_power(scene: Scene, attack: LightAttack) -> None:
+    """What reaches a plane across the beam, in lumen; and no settings exceed the device."""
+    values = SETTINGS[attack.name]
+    (lamp,) = attack.edit(values, TARGET).lamps
+    away = 5.0
+    half = np.array(lamp.spread) * away
+    x, y = (np.linspace(-s, s, 301)[:-1] + s / 300 for s in 1.05 * half)
+    grid = np.stack([*np.meshgrid(x, y), np.full((300, 300), away)], -1)
+    points = torch.from_numpy(grid @ lamp.pose[:3, :3].T + lamp.pose[:3, 3])
+    normal = torch.from_numpy(np.broadcast_to(-lamp.pose[:3, 2], grid.shape).copy())
+    plane = replace(
+        lit(scene, attack.name), position=points, normal=normal, answer=torch.ones_like(points), fog=0.0,
+        radiance=torch.zeros_like(points),
+    )  # fmt: skip
+    light = attack.change(at_values(values), plane, TARGET)[0].numpy()
+    lumens = (light @ [0.2126, 0.7152, 0.0722]).sum() * (x[1] - x[0]) * (y[1] - y[0]) / per_lux(Weather(-0.3))
+    power = attack.power(values)
+    assert power is not None
+    assert lumens == pytest.approx(power, rel=0.05)
+    most = max(attack.power(random_settings(attack, TARGET, key=(k,))) or 0.0 for k in range(50))
+    assert most <= {"laser": 0.5 * 683.0, "flashlight": 3000.0}[attack.name]
+
+
+def test_a_projector_leaves_no_part_of_its_picture_beyond_its_power() -> None:
+    projector = Projector(lumens=400.0)
+    surface = projector.surface(TARGET)
+    assert surface.size == (22, 32)
+    for colour, lumens in ((1.0, 400.0), (0.0, 0.4), (0.5, 400.0 * 0.2147)):
+        assert projector.power(torch.full((3, *surface.size), colour)) == pytest.approx(lumens, rel=0.01)
+    lamp = projector.lamp(TARGET)
+    middle = np.linalg.inv(lamp.pose) @ [TARGET.rear, 0.0, 0.75, 1.0]
+    assert middle[:2] == pytest.approx(0.0, abs=1e-9), "it looks at the middle of the rear"
+    corner = np.linalg.inv(lamp.pose) @ [TARGET.rear, 1.0, 0.75, 1.0]
+    assert abs(corner[0] / corner[2]) == pytest.approx(lamp.spread[0], rel=0.1)
+
+
+def test_the_eye_sees_green_and_not_infrared() -> None:
+    """Known values of the CIE 1931 functions at 450, 555 and 650 nm."""
+    found = matching(torch.tensor([450.0, 555.0, 650.0])).numpy()
+    assert found == pytest.approx(
+        np.array([[0.336, 0.038, 1.772], [0.512, 1.0, 0.0057], [0.2835, 0.107, 0.0]]), abs=0.03
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Best at 0.2, 0.7 of its ranges; smooth."""
+
+    name: str = "toy"
+    search: Any = "swarm"
+
+    def ranges(self, target: Target) -> Ranges:
+        return {"a": (0.0, 10.0), "b": (-1.0, 1.0)}
+
+    def change(self, values: Mapping[str, Tensor], picture: Any, target: Target) -> Tensor:
+        return torch.stack([values["a"] - 2.0, 5.0 * (values["b"] - 0.4)], -1)
+
+
+class Bowl:
+    """A picture that is the distance from the best settings."""
+
+    def show(self, change: Tensor) -> Tensor:
+        return -change.square().sum(-1)[:, None]
+
+
+@pytest.mark.parametrize("how", ["swarm", "greedy", "gradient"])
+def test_searches_find_repeat_and_count(how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
+    views = [search.LitView(Bowl(), None)] * 2  # type: ignore[arg-type]
+    given = {"detector": None, "target": TARGET, "views": views, "search": how}
+    found = [search.search_light(Toy(), budget=Budget(80, 8, 0.08, None), key=(k,), **given) for k in (0, 0, 1)]  # type: ignore[arg-type]
+    assert found[0] == found[1]
+    assert found[0].values != found[2].values
+    for one in found:
+        assert one.values["a"] == pytest.approx(2.0, abs=0.7)
+        assert one.values["b"] == pytest.approx(0.4, abs=0.15)
+        assert one.loss >= one.before
+        assert (np.diff(one.best) >= 0.0).all()
+        assert one.queries <= 160
+        assert one.queries >= 40
+    assert search.random_settings(Toy(), TARGET, key=(0,)) == search.random_settings(Toy(), TARGET, key=(0,))  # type: ignore[arg-type]
+
+
+def test_what_is_found_is_kept(tmp_path: Path) -> None:
+    """Random settings with their power, an edit that repeats, and nothing searched again."""
+    spec = LightSpec("random", {"watts": 0.2}, {}, "laser", "night", "", 1, {})
+    folder = LightFolder(tmp_path)
+
+    def never(*given: object) -> Any:
+        raise AssertionError
+
+    asked: dict[str, Any] = {"views": never, "projected": never, "detector": never}
+    edit = folder.edit(spec, TARGET, **asked)
+    again = folder.edit(spec, TARGET, **asked)
+    assert edit.lamps[0].power == again.lamps[0].power
+    history = folder.history(spec)
+    assert history["queries"] == 0
+    assert 0.0 < history["lumens"] <= 0.2 * 683.0
+    assert folder.edit(replace(spec, number=2), TARGET, **asked).lamps[0].power != edit.lamps[0].power
+    projected = folder.edit(replace(spec, of="projector", options={}), TARGET, **asked)
+    assert projected.textures[0].shape == (3, 22, 32)
+    assert folder.picture(replace(spec, of="projector", options={})).is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "error", "message"),
+    [
+        ("lazer", {}, UnknownNameError, "laser"),
+        ("laser", {"colour": 1}, ConfigError, "colour"),
+        ("laser", {"watts": -1.0}, ConfigError, "power"),
+        ("laser", {"width": [0.3, 0.1]}, ConfigError, "width"),
+        ("shadow", {"away": 90.0}, ConfigError, r"0\.5 to 20 m"),
+        ("projector", {"texels": 0}, ConfigError, "texels"),
+        ("flashlight", {"beam": [0.0, 0.1]}, ConfigError, "beam"),
+    ],
+)
+def test_a_wrong_light_ends_in_one_line(name: str, options: Any, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message) as found:
+        make_light(name, options)
+    assert "\n" not in str(found.value)
+    for wrong in ({"members": 0}, {"search": "luck"}, {"patience": 3}):
+        with pytest.raises(ConfigError):
+            budget_of(wrong)
+    assert set(LIGHTS) == {"shadow", "laser", "projector", "flashlight"}
