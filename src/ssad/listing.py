@@ -56,6 +56,7 @@ def _shift_list() -> dict[str, str]:
 def _attack_list() -> dict[str, str]:
     from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
     from ssad.scenarios.static.physical import default_carrier, physical_names
+    from ssad.scenarios.static.physical.noninvasive import LIGHTS
 
     def about(name: str, where: str) -> str:
         if name not in ATTACKS:
@@ -67,6 +68,7 @@ def _attack_list() -> dict[str, str]:
 
     rows = {name: about(name, where) for name, where in attack_names().items()}
     rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
+    rows |= dict.fromkeys(LIGHTS, "physical: light on a target, not on its paint (docs/physical.md)")
     return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
 
 

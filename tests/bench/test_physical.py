@@ -75,6 +75,11 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"attacks": [{"name": "adv-patch", "options": {"panel": "wing"}}]}, ConfigError, "no panel 'wing'"),
         ({"attacks": [{"name": "adv-patch", "options": {"width": 9.0}}]}, ConfigError, "does not fit"),
         ({"attacks": [{"name": "adv-patch", "options": {"colour": 1}}]}, ConfigError, "colour"),
+        ({"lights": ["lazer"]}, UnknownNameError, "laser"),
+        ({"lights": [{"name": "laser", "hour": "dawn"}]}, UnknownNameError, "noon"),
+        ({"lights": [{"name": "laser", "options": {"watts": -1.0}}]}, ConfigError, "power"),
+        ({"lights": [{"name": "laser", "settings": {"epochs": 3}}]}, ConfigError, "epochs"),
+        ({"lights": [{"name": "projector", "settings": {"members": 3}}]}, ConfigError, "members"),
     ],
 )
 def test_a_wrong_suite_ends_in_one_line(change: Mapping[str, Any], error: type[Exception], message: str) -> None:
@@ -101,6 +106,54 @@ def test_judges_are_shown_what_is_trained_against_others_and_the_grid_is_scored_
 @pytest.mark.parametrize("name", ["physical", "physical-quick"])
 def test_the_shipped_suites_can_be_planned(name: str) -> None:
     assert len(load_suite(name).attacks) >= 5
+
+
+def test_lights_are_cells_with_a_clean_one_for_each_hour_and_random_ones_beside() -> None:
+    rows = [{"name": "laser", "hour": "night"}, {"name": "shadow", "hour": "noon"}]
+    plan = Physical().plan(suite(attacks=[], lights=rows, seeds=2))
+    fields = [(c.fields["attack"], c.fields["carrier"], c.fields["source"], c.fields["number"]) for c in plan.cells]
+    assert fields == [
+        ("clean", "light, night", "", 0), ("clean", "light, noon", "", 0), ("laser", "light, night", "yolov5n", 0),
+        ("random laser", "light, night", "", 0), ("random laser", "light, night", "", 1),
+        ("shadow", "light, noon", "yolov5n", 0), ("random shadow", "light, noon", "", 0),
+        ("random shadow", "light, noon", "", 1),
+    ]  # fmt: skip
+    other = Physical().plan(suite(attacks=[], lights=[rows[0] | {"options": {"watts": 0.1}}, rows[1]], seeds=2))
+    same = {cell.key for cell in plan.cells} & {cell.key for cell in other.cells}
+    assert len(same) == len(plan.cells) - 3
+    assert len(load_suite("physical-lights").lights) >= 4
+    with_textures = Physical().plan(suite(lights=rows, seeds=1))
+    assert sum(cell.fields["attack"] == "clean" for cell in with_textures.cells) == 3
+
+
+@pytest.mark.slow
+def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
+    settings = {"settings": 4, "members": 2, "window": None}
+    rows = [
+        {"name": "laser", "settings": settings}, {"name": "shadow", "hour": "noon", "settings": settings},
+        {"name": "projector", "options": {"lumens": 50.0}, "settings": {"epochs": 1, "window": None}},
+    ]  # fmt: skip
+    plan = Physical().plan(suite(attacks=[], lights=rows))
+    records = run(plan, tmp_path, Resources(workers=2))
+    assert [(record.get("reason"), record["status"]) for record in records] == [(None, "ok")] * len(records)
+    by_name = {(record["attack"], record["carrier"]): record for record in records}
+    laser = by_name["laser", "light, night"]
+    assert laser["queries"] == 8
+    assert 0.0 <= laser["lumens"] <= 0.5 * 683.0
+    assert laser["loss_after"] >= laser["loss_before"]
+    assert by_name["shadow", "light, noon"]["lumens"] is None
+    assert by_name["random laser", "light, night"]["queries"] == 0
+    assert by_name["projector", "light, night"]["lumens"] <= 50.0
+    assert "ASR_25" not in by_name["clean", "light, night"]["metrics"]
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "lights").glob("*.json")}
+    plan.kind.finish(plan, tmp_path)
+    assert read_image(tmp_path / "pictures" / "lights.jpg").shape[1] == 3 * 644
+    for path in (tmp_path / "lights").iterdir():
+        path.unlink()
+    job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
+    again = Physical().execute(plan.cells, job)
+    assert {cell.key: again[cell.key]["metrics"] for cell in plan.cells} == {r["key"]: r["metrics"] for r in records}
+    assert {path.name: path.read_bytes() for path in (tmp_path / "lights").glob("*.json")} == kept
 
 
 @pytest.mark.slow

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
+from ssad.bench.physical_lights import LightEntry
 from ssad.core.errors import ConfigError
 from ssad.recording.clip_recorder import AZIMUTHS, ELEVATIONS
 from ssad.recording.nuscenes_recorder import WEATHERS
@@ -79,6 +80,7 @@ class PhysicalSuite(SuiteBase):
         target: the car, as for `ssad record --target`.
         pairs: towns.
         attacks: names, or mappings with the keys of `Entry`.
+        lights: names of light attacks, or mappings with the keys of `LightEntry`.
         epochs: of all trained textures, in place of their own; None: their own.
         seeds: of each control that is drawn at random.
         transfer: whether a texture is shown to the other detectors too.
@@ -95,7 +97,8 @@ class PhysicalSuite(SuiteBase):
     detectors: Names = Field(default=["yolov5n", "yolov3-tiny"], min_length=1)
     target: str = "sedan:silver:0"
     pairs: list[Pair] = Field(default=[Pair(train="Twinford", test="Oldmarket")], min_length=1)
-    attacks: list[Entry] = Field(min_length=1)
+    attacks: list[Entry] = Field(default=[])
+    lights: list[LightEntry] = Field(default=[])
     epochs: int | None = Field(default=None, ge=1)
     seeds: int = Field(default=3, ge=1)
     transfer: bool = False
@@ -106,11 +109,18 @@ class PhysicalSuite(SuiteBase):
     floor: float = Field(default=0.9, ge=0.0, le=1.0)
     replicates: int = Field(default=100, ge=0, le=10_000)
 
-    @field_validator("attacks", mode="before")
+    @field_validator("attacks", "lights", mode="before")
     @classmethod
     def _named(cls, value: Any) -> Any:
         """A name alone is an attack with nothing else said."""
         return named(value)
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        """There must be something to test."""
+        if not self.attacks and not self.lights:
+            raise ValueError("name attacks, lights or both")
+        return self
 
 
 def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:

@@ -526,7 +526,12 @@ def recording_of(folder: Path, split: str = "all") -> dict[str, Any]:
 
 
 def clip_views(
-    folder: Path, *, split: str = "all", device: str = "cpu", only: Collection[str] | None = None
+    folder: Path,
+    *,
+    split: str = "all",
+    device: str = "cpu",
+    only: Collection[str] | None = None,
+    hour: Callable[[Weather], Weather] = lambda weather: weather,
 ) -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
 
@@ -537,6 +542,7 @@ def clip_views(
         split: train, test or all.
         device: Where to render.
         only: Names of the files that are wanted; None for all.
+        hour: The weather to show instead of the recorded one.
 
     Raises:
         FormatError: No recording of this version.
@@ -555,7 +561,7 @@ def clip_views(
                 sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
                 sets[key] = _prepare(clips, row["town"], key)
             made = sets[key]
-            weather = Weather(**row["light"])
+            weather = hour(Weather(**row["light"]))
             shot = Viewpoint(row["time"], np.array(row["pose"]), np.array(row["target_pose"]), weather, {})
             around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
             view = _view(made, row["slot"], shot, around, _camera(clips.size))

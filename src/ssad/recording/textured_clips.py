@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 import ssad
-from ssad.camera.render import render
+from ssad.camera.render import Picture, render
 from ssad.camera.scene import Layer
 from ssad.camera.sensor import Sensor
 from ssad.camera.texture import Taps, retexture, taps_of
@@ -175,7 +175,7 @@ def textured_clips(
         file = row["file_name"]
         if file in missing:
             safeio.make_folder(kept)
-            safeio.save_npz(kept / f"{file}.npz", _seen(next(views), layers))
+            safeio.save_npz(kept / f"{file}.npz", _kept(next(views), layers))
         arrays = safeio.load_npz(kept / f"{file}.npz")
         image = read_image(folder / "images" / file)
         corner = int(arrays["corner"][0]), int(arrays["corner"][1])
@@ -183,9 +183,8 @@ def textured_clips(
         yield TexturedClip(file, row, objects, image, corner, arrays["radiance"], exposure, arrays["fragments"])
 
 
-def _seen(clip: ClipView, layers: Sequence[Layer]) -> dict[str, Any]:
-    """What is kept of a picture: the part around what wears the layers."""
-    picture = render(clip.scene, [clip.wearing(*layers)])
+def seen_part(picture: Picture) -> dict[str, Any]:
+    """What is kept of one rendered picture: the part around what shows textures."""
     height, width = picture.radiance.shape[1:3]
     rows, columns = np.divmod(picture.fragments["place"].astype(np.int64), width)
     (top, bottom), (left, right) = _span(rows, height), _span(columns, width)
@@ -195,6 +194,10 @@ def _seen(clip: ClipView, layers: Sequence[Layer]) -> dict[str, Any]:
         "corner": np.array([top, left]), "radiance": picture.radiance[0, top:bottom, left:right],
         "exposure": picture.exposure[0], "fragments": fragments,
     }  # fmt: skip
+
+
+def _kept(clip: ClipView, layers: Sequence[Layer]) -> dict[str, Any]:
+    return seen_part(render(clip.scene, [clip.wearing(*layers)]))
 
 
 def _span(places: Any, most: int) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
+from ssad.bench.physical_lights import light_cells, light_edit, light_pieces, light_result, light_sheet
 from ssad.bench.physical_suite import Pair, PhysicalSuite, row_of, target_of
 from ssad.core import safeio
 from ssad.core.detections import Truth
@@ -78,9 +79,10 @@ class Physical(Kind):
         if suite.grid is not None:
             _grid_clips(suite, Path(), suite.pairs[0].test, device)
         for pair, view, detector in product(suite.pairs, VIEWS[: 2 if suite.grid else 1], weights):
-            for row in [{"attack": None}, *rows]:
+            for row in [{"attack": None}, *rows] if rows or not suite.lights else []:
                 for cell in self._cells(suite, pair, view, detector, row, weights, device):
                     cells.setdefault(cell.key, cell)
+        cells |= {cell.key: cell for cell in light_cells(self, suite, weights, device)}
         return Plan(self, suite, device, tuple(cells.values()), {"weights": weights}, {}, None)
 
     def _cells(  # noqa: PLR0917
@@ -169,7 +171,9 @@ class Physical(Kind):
         quiet_warp()
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
-        """The training of the cell's texture, unless it is done."""
+        """The training of the cell's texture, or the search of its light, unless it is done."""
+        if "light" in cell.spec:
+            return light_pieces(cell, job)
         if cell.spec["attack"] is None:
             return {}
         spec = TextureSpec.of_row(cell.spec)
@@ -178,12 +182,15 @@ class Physical(Kind):
         return {f"texture {spec.name}": dict(cell.spec)}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
-        """Train a texture."""
+        """Train a texture, or search a light."""
+        if "light" in data:
+            light_edit(job, data["light"])
+            return
         texture_of(job, TextureSpec.of_row(data))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
         """Scores in the town of the test."""
-        return {cell.key: self._score(cell, job) for cell in cells}
+        return {cell.key: light_result(cell, job) if "light" in cell.spec else self._score(cell, job) for cell in cells}
 
     def _score(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Scores of a cell. CellError: the detector does not find the clean car."""
@@ -208,8 +215,9 @@ class Physical(Kind):
         return {**found, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
 
     def finish(self, plan: Plan, folder: Path) -> None:
-        """One picture of the first test town under each texture: DIR/pictures/textures.jpg."""
+        """One picture of the first test town under each texture and light: DIR/pictures/{textures,lights}.jpg."""
         suite: PhysicalSuite = plan.suite
+        captions = light_sheet(plan, folder)
         job = Job(folder, plan.device, {"target": suite.target, "seed": suite.seed})
         path, pair, name = folder / "pictures" / "textures.jpg", suite.pairs[0], suite.detectors[0]
         chosen: dict[str, TextureSpec] = {}
@@ -220,18 +228,17 @@ class Physical(Kind):
                 if spec.source and not _textures(job).kept(spec).is_file():
                     continue
                 chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", spec)
-        if not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
+        if chosen and not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
             clips = TargetClips(folder / "data" / pair.test, 1, device=plan.device)
             shown = [(CLEAN, next(clips.clean())[1])]
             shown += [(title, next(_worn(job, clips, spec))[1]) for title, spec in chosen.items()]
             save_picture(path, target_sheet(make_detector(name, device=plan.device), shown, plan.device))
         if path.is_file():
-            caption = (
+            captions[path.name] = (
                 f"What {name} finds (orange, score at least 0.25) in a picture of {pair.test}, clean and attacked."
             )
-            safeio.write_atomic(
-                path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n"
-            )
+        if captions:
+            safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json(captions, indent=1) + "\n")
 
 
 @lru_cache(maxsize=16)

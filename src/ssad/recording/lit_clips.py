@@ -1,0 +1,128 @@
+"""Recorded pictures at another hour, with lamps and shadows on their target: as functions of light, and in full."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from ssad.camera.render import Weather, render
+from ssad.camera.scene import Scene
+from ssad.camera.scene_edit import NO_EDIT, SceneEdit, render_with
+from ssad.core.errors import unknown_name
+from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.types import U8
+from ssad.recording.clip_recorder import TARGET, ClipView, clip_rows, clip_views
+from ssad.recording.textured_clips import BLOCK, MARGIN, TexturedClip, seen_part
+from ssad.scenarios.static.physical.noninvasive.light import Target
+from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND, LitPicture, lit_picture
+
+HOURS: Final = ("recorded", "noon", "low_sun", "night")
+SUN: Final = {"noon": 1.0, "low_sun": 0.25, "night": -0.3}  # height of the sun, rad
+QUALITY: Final = 92  # of JPEG, as it is recorded
+
+
+def at_hour(weather: Weather, hour: str) -> Weather:
+    """A weather at an hour: clear and dry, with the sun where it was to the side; recorded: as it was.
+
+    Raises:
+        UnknownNameError: There is no such hour.
+    """
+    if hour not in HOURS:
+        raise unknown_name("hour", hour, HOURS)
+    if hour == "recorded":
+        return weather
+    return Weather(SUN[hour], weather.sun_heading, min(weather.clouds, 0.3), turn=weather.turn)
+
+
+@dataclass(frozen=True, slots=True)
+class LitClip:
+    """A recorded picture at an hour.
+
+    Attributes:
+        clip: The picture.
+        scene: Its street and bodies, and `BLIND`.
+        cards: Index of `BLIND` in the scene.
+    """
+
+    clip: ClipView
+    scene: Scene
+    cards: int
+
+    @property
+    def target(self) -> Target:
+        """The size of the target."""
+        length, width, height = self.clip.row["target_size"]
+        return Target(length, width, height)
+
+    def render(self, edit: SceneEdit = NO_EDIT) -> U8:
+        """The picture [H, W, 3] with an edit, as the recorder would have written it."""
+        scene, first = self.scene, self.cards + 1
+        if edit.cards:
+            key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
+            scene = self.scene.kept(
+                key, lambda: Scene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device)
+            )
+        view = edit.on(self.clip.view, TARGET, cards=range(first, first + len(edit.cards)))
+        picture = render_with(scene, [view], edit.textures, edit.masks)
+        return decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+
+    def projected(self, edit: SceneEdit) -> TexturedClip:
+        """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
+        picture = render(self.scene, [edit.on(self.clip.view, TARGET)])
+        arrays = seen_part(picture)
+        corner = int(arrays["corner"][0]), int(arrays["corner"][1])
+        image = decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+        return TexturedClip(
+            self.clip.file, self.clip.row, self.clip.objects, image, corner, arrays["radiance"],
+            float(arrays["exposure"]), arrays["fragments"],
+        )  # fmt: skip
+
+    def lit(self, device: str | torch.device = "cpu") -> LitPicture:
+        """The picture as a function of the light on its target."""
+        rows, columns = _part(self.clip)
+        return lit_picture(
+            self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device
+        )  # fmt: skip
+
+
+def _part(clip: ClipView) -> tuple[slice, slice]:
+    """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
+    (x, y, wide, high) = next(one["bbox"] for one in clip.objects if one["target"])
+    height, width = clip.view.camera.height, clip.view.camera.width
+    reach = max(wide, high) / 2 + MARGIN / 2
+    found = []
+    for low, side, most in ((y, high, height), (x, wide, width)):
+        first = max(int(low - reach), 0) // BLOCK * BLOCK
+        found.append(slice(first, min(int(low + side + reach) + 1, most) // 2 * 2))
+    return found[0], found[1]
+
+
+def lit_clips(
+    folder: Path, hour: str, *, device: str = "cpu", count: int | None = None, split: str = "all"
+) -> Iterator[LitClip]:
+    """The pictures of a recording at an hour, in order.
+
+    Args:
+        folder: What `record_clips` wrote.
+        hour: See `HOURS`.
+        device: Where to render.
+        count: How many; None for all.
+        split: train, test or all.
+
+    Raises:
+        FormatError: No recording of this version.
+        UnknownNameError: There is no such hour.
+    """
+    at_hour(Weather(), hour)
+    wanted = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
+    made: tuple[Scene, Scene] | None = None
+    for clip in clip_views(
+        folder, split=split, device=device, only=wanted, hour=lambda weather: at_hour(weather, hour)
+    ):
+        if made is None or made[0] is not clip.scene:
+            made = clip.scene, Scene(clip.scene.street, [*clip.scene.meshes, BLIND.mesh()], device=device)
+        yield LitClip(clip, made[1], len(clip.scene.meshes))

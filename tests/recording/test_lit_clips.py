@@ -1,0 +1,68 @@
+"""Recorded pictures at another hour, lit and shaded: in full, and as functions of light."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.bodies import plain_bodies
+
+from ssad.camera.render import Weather
+from ssad.core.errors import UnknownNameError
+from ssad.core.images import read_image
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.lit_clips import HOURS, LitClip, at_hour, lit_clips
+from ssad.scenarios.static.physical.noninvasive import Flashlight, Projector, Shadow
+from ssad.scenarios.static.physical.noninvasive.light import at_values
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, LitClip]]]:
+    out = tmp_path_factory.mktemp("lit") / "clips"
+    with plain_bodies():
+        record_clips(Clips(out, (("Twinford", 1),), (), size=320, behind=8.0), workers=0)
+        yield out, {hour: next(lit_clips(out, hour)) for hour in ("recorded", "low_sun", "night")}
+
+
+def test_an_hour_is_clear_and_has_the_suns_direction() -> None:
+    rain = Weather(0.7, 2.2, 0.95, fog=0.01, wet=0.5, turn=3.0)
+    assert at_hour(rain, "recorded") == rain
+    for hour in HOURS[1:]:
+        shown = at_hour(rain, hour)
+        assert (shown.sun_heading, shown.turn, shown.fog, shown.wet) == (2.2, 3.0, 0.0, 0.0)
+    assert at_hour(rain, "night").sun_height < -0.2
+    with pytest.raises(UnknownNameError, match="noon"):
+        at_hour(rain, "non")
+
+
+@pytest.mark.slow
+def test_without_light_it_is_the_recorded_picture(clips: tuple[Path, dict[str, LitClip]]) -> None:
+    folder, lit = clips
+    recorded = read_image(next((folder / "images").iterdir()))
+    assert np.array_equal(lit["recorded"].render(), recorded)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hour", ["low_sun", "night"])
+def test_light_on_a_recorded_target(clips: tuple[Path, dict[str, LitClip]], hour: str) -> None:
+    """The quick model and the full picture change alike, around the target; a projector is linear in its picture."""
+    clip = clips[1][hour]
+    target = clip.target
+    light: Shadow | Flashlight = Shadow() if hour == "low_sun" else Flashlight()
+    middle = {name: 0.5 * (low + high) for name, (low, high) in light.ranges(target).items()}
+    middle |= {"left_b": 1.2, "up_c": 2.0, "lumens": 60.0}
+    values = {name: value for name, value in middle.items() if name in light.ranges(target)}
+    before, after = clip.render().astype(int), clip.render(light.edit(values, target)).astype(int)
+    picture = clip.lit()
+    quick = picture.show(light.change(at_values(values), picture, target))[0].permute(1, 2, 0).numpy() * 255
+    x, y, w, h = next(one["bbox"] for one in clip.clip.objects if one["target"])
+    own = (slice(int(y), int(y + h)), slice(int(x), int(x + w)))
+    assert np.abs(quick[own] - after[own]).mean() < 6
+    if hour == "night":
+        assert after[own].mean() > before[own].mean() + 8
+        edit = Projector(lumens=60.0).edit(torch.ones(3, 16, 16), target)
+        shown = clip.projected(edit).prepare({0: 16}).show({0: edit.textures[0]})[0].permute(1, 2, 0).numpy() * 255
+        assert np.abs(shown[own] - clip.render(edit)[own]).mean() < 6
