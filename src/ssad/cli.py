@@ -23,6 +23,8 @@ imports = typer.Typer(
     help="Import OpenDRIVE maps, SafeBench, FREA or leaderboard routes, and logged drives.", no_args_is_help=True
 )
 app.add_typer(imports, name="import")
+exports = typer.Typer(help="Export what a run has made for other programs.", no_args_is_help=True)
+app.add_typer(exports, name="export")
 
 Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of `ssad run`.")]
 Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
@@ -131,6 +133,24 @@ def replay(
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
     print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
     raise typer.Exit(1 if found.difference else 0)
+
+
+@exports.command("texture")
+def export_texture(
+    folder: Dir,
+    cell: Annotated[
+        str, typer.Argument(metavar="CELL", help="Key of a cell of a physical run, the start of one, or its name.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="Folder for print.png, atlas.png, target.obj and texture.json.")
+    ],
+    dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
+) -> None:
+    """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
+    from ssad.bench.texture_export import export_cell_texture
+
+    for path in export_cell_texture(folder, cell, out, dots=dots):
+        print(path)
 
 
 @app.command()

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.command import ssad
 
 from ssad.bench.kind import Job, Resources
 from ssad.bench.kinds.physical import Physical, texture_of
@@ -154,6 +155,22 @@ def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
     again = Physical().execute(plan.cells, job)
     assert {cell.key: again[cell.key]["metrics"] for cell in plan.cells} == {r["key"]: r["metrics"] for r in records}
     assert {path.name: path.read_bytes() for path in (tmp_path / "lights").glob("*.json")} == kept
+
+
+def test_textures_of_a_run_are_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A control can be made any time; what is not trained, or shows no texture, is one line."""
+    attacks = [{"name": "random", "carrier": "patch", "options": {"width": 1.2, "height": 0.3}}, "vanishing"]
+    plan = Physical().plan(suite(attacks=attacks))
+    monkeypatch.setattr("ssad.bench.texture_export.read_plan", lambda folder: plan)
+    clean, random, vanishing = plan.cells
+    done = ssad("export", "texture", str(tmp_path), random.key, str(tmp_path / "out"), "--dots", "400")
+    assert str(tmp_path / "out" / "target.obj") in done.stdout.replace("\n", "")
+    assert read_image(tmp_path / "out" / "print.png").shape == (120, 480, 3)
+    for cell, message in ((clean, "shows no texture"), (vanishing, "is not trained yet")):
+        failed = ssad("export", "texture", str(tmp_path), cell.key, str(tmp_path / "other"))
+        assert failed.returncode == 2
+        assert message in failed.stderr.replace("\n", " ")
+        assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
 from ssad.scenarios.static.physical.attacks import make_physical
 from ssad.scenarios.static.physical.carrier import Surface
+from ssad.scenarios.static.physical.inks import printable_colours
 from ssad.scenarios.static.physical.optimise import View, train_texture
 from ssad.scenarios.static.physical.spec import TextureSpec
 from ssad.scenarios.static.physical.textures import control, texture_picture
@@ -86,8 +87,8 @@ class TextureFolder:
         if not path.is_file():
             trained = train_texture(
                 make_physical(spec.trained, **spec.settings), detector(), surface, views(),
-                start=control("grey", surface.size), device=self.device, key=(self.seed, spec.name),
-                checkpoint=path.with_suffix(".checkpoint.npz"),
+                start=control("grey", surface.size), printable=printable_colours(), device=self.device,
+                key=(self.seed, spec.name), checkpoint=path.with_suffix(".checkpoint.npz"),
             )  # fmt: skip
             losses, gradients = np.array(trained.losses), np.array(trained.gradients)
             safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})
