@@ -93,7 +93,7 @@ class Projector:
     def training(self, **settings: Any) -> TextureAttack:
         """How its picture is trained: no ink, so nothing about printing; it is aimed well, not perfectly."""
         given: dict[str, Any] = {
-            "epochs": 15, "rate": 0.08, "smooth": 0.02, "printed": 0.0, "window": 320,
+            "epochs": 40, "rate": 0.1, "smooth": 0.02, "printed": 0.0, "window": 320,
             "expectation": Expectation((0.9, 1.1), 0.05, 0.02, 0.03, 0.03),
         }  # fmt: skip
         return TextureAttack(self.name, "hide", **(given | settings))
