@@ -185,9 +185,9 @@ def light_sheet(plan: Plan, folder: Path) -> dict[str, str]:
         shown, detector = [], make_detector(name, device=plan.device)
         for title, light in chosen.items():
             pictures = _Pictures(data, light["hour"], 1, plan.device)
-            ((_, image, _),) = pictures.under(light_edit(job, light), detector)
+            ((_, image, truth),) = pictures.under(light_edit(job, light), detector)
             shown.append((title, image))
-        save_picture(path, target_sheet(detector, shown, plan.device))
+        save_picture(path, target_sheet(detector, shown, truth.box[0].tolist(), plan.device))
     if not path.is_file():
         return {}
     return {path.name: f"What {name} finds (orange, score at least 0.25) in a picture of {pair.test} under each light."}

@@ -13,7 +13,8 @@ from ssad.core.errors import ConfigError
 from ssad.recording.clip_recorder import AZIMUTHS, ELEVATIONS
 from ssad.recording.nuscenes_recorder import WEATHERS
 from ssad.recording.target import TargetCar, parse_target
-from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_physical
+from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical
+from ssad.scenarios.static.physical.shipped import load_texture
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
 
@@ -61,6 +62,8 @@ class Entry(BaseModel):
         options: of the carrier.
         settings: fields of `TextureAttack` that differ.
         of: of the control shuffled: the attack whose texture is shuffled.
+        texture: a shipped texture, or the card of one (NAME.json): it is shown in place of training; carrier, options
+            and the detector that it was trained against are those of the card.
     """
 
     model_config = _STRICT
@@ -70,6 +73,7 @@ class Entry(BaseModel):
     options: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     of: str | None = None
+    texture: str | None = None
 
 
 class PhysicalSuite(SuiteBase):
@@ -82,6 +86,8 @@ class PhysicalSuite(SuiteBase):
         attacks: names, or mappings with the keys of `Entry`.
         lights: names of light attacks, or mappings with the keys of `LightEntry`.
         epochs: of all trained textures, in place of their own; None: their own.
+        window: side of the part around the target that trainings show to a detector, px, a multiple of 32; None: whole
+            pictures. A window of 192 takes a sixth of the time.
         seeds: of each control that is drawn at random.
         transfer: whether a texture is shown to the other detectors too.
         judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to; of 3D
@@ -100,6 +106,7 @@ class PhysicalSuite(SuiteBase):
     attacks: list[Entry] = Field(default=[])
     lights: list[LightEntry] = Field(default=[])
     epochs: int | None = Field(default=None, ge=1)
+    window: int | None = None
     seeds: int = Field(default=3, ge=1)
     transfer: bool = False
     judges: list[str] = Field(default=[])
@@ -131,8 +138,11 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     """
     carrier = entry.carrier or default_carrier(entry.of or entry.name)
     found = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}, "of": None}
+    if entry.texture is not None:
+        return found | _ready(suite, entry)
     if entry.name not in CONTROLS:
-        settings = ({"epochs": suite.epochs} if suite.epochs is not None else {}) | entry.settings
+        settings = {"epochs": suite.epochs, "window": suite.window}
+        settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
         make_physical(entry.name, **settings)
         return found | {"settings": settings}
     if entry.settings:
@@ -145,6 +155,24 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     if len(sources) != 1:
         raise ConfigError(f"suite {suite.name}: shuffled of '{entry.of}': there must be one such attack")
     return {**row_of(suite, sources[0]), "attack": "shuffled", "of": entry.of}
+
+
+def _ready(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
+    """What the card of a texture says of a row. ConfigError: the suite says otherwise."""
+    assert entry.texture is not None
+    colour, card = load_texture(entry.texture)
+    if entry.carrier or entry.options or entry.settings or entry.of:
+        raise ConfigError(f"suite {suite.name}: texture {entry.texture}: its card says carrier, options and settings")
+    if (card.attack, card.target) != (entry.name, suite.target):
+        raise ConfigError(
+            f"suite {suite.name}: texture {entry.texture} is of {card.attack} on {card.target}, not of {entry.name} on "
+            f"{suite.target}"
+        )
+    size = make_carrier(card.carrier, card.options).on(target_of(suite).mesh()).size
+    if tuple(colour.shape[1:]) != size:
+        raise ConfigError(f"texture {entry.texture}: {list(colour.shape[1:])} texels, its surface has {list(size)}")
+    about = {"carrier": card.carrier, "options": dict(card.options), "source": card.source}
+    return about | {"file": entry.texture, "hash": card.hash}
 
 
 def target_of(suite: PhysicalSuite) -> TargetCar:

@@ -1,4 +1,4 @@
-"""Pictures of physical attacks: a scene under several textures with what a detector finds."""
+"""Pictures of physical attacks: a target under several textures with what a detector finds."""
 
 from __future__ import annotations
 
@@ -15,16 +15,21 @@ from ssad.core.types import U8
 from ssad.evaluation.pictures import FOUND
 
 COLUMNS, WIDTH, LEAST = 3, 640, 0.25
+AROUND = 4.0  # side of what is shown, in longer sides of the target's box
 
 
 @torch.no_grad()
-def target_sheet(detector: Detector, shown: Sequence[tuple[str, Tensor]], device: str) -> U8:
-    """Pictures side by side, each with its title and the boxes that a detector finds.
+def target_sheet(
+    detector: Detector, shown: Sequence[tuple[str, Tensor]], box: Sequence[float], device: str, columns: int = COLUMNS
+) -> U8:
+    """Parts of pictures side by side, each with its title and the boxes that a detector finds in the whole picture.
 
     Args:
         detector: Whose boxes are drawn.
         shown: Titles and pictures [1, 3, H, W] in 0 to 1.
+        box: The target in them: x1, y1, x2, y2, px; what is around it is shown.
         device: Where the detector is.
+        columns: Pictures in a row.
 
     Returns:
         [H, W, 3] RGB.
@@ -32,16 +37,26 @@ def target_sheet(detector: Detector, shown: Sequence[tuple[str, Tensor]], device
     tiles = []
     for title, image in shown:
         (found,) = detector.predict(image.to(device), threshold=LEAST)
-        picture = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
-        for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
-            low, high = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
-            cv2.rectangle(picture, low, high, FOUND, 2, cv2.LINE_AA)
-            text = f"{detector.classes[label]} {score:.2f}"
-            place = (low[0], max(low[1] - 4, 12))
-            cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
+        whole = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
+        left, top, side = _square(box, whole.shape[1], whole.shape[0])
+        scale = WIDTH / side
+        picture = cv2.resize(whole[top : top + side, left : left + side], (WIDTH, WIDTH), interpolation=cv2.INTER_CUBIC)
+        for own, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
+            x0, y0, x1, y1 = (round((v - o) * scale) for v, o in zip(own, (left, top, left, top), strict=True))
+            cv2.rectangle(picture, (x0, y0), (x1, y1), FOUND, 3, cv2.LINE_AA)
+            text, place = f"{detector.classes[label]} {score:.2f}", (max(x0, 4), max(y0 - 6, 20))
+            for colour, width in (((0, 0, 0), 5), (FOUND, 2)):
+                cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, width, cv2.LINE_AA)
         tiles.append(captioned(picture, title, WIDTH))
-    while len(tiles) % COLUMNS:
+    while len(tiles) % columns:
         tiles.append(np.full_like(tiles[0], 255))
-    rows = [np.concatenate(tiles[k : k + COLUMNS], 1) for k in range(0, len(tiles), COLUMNS)]
+    rows = [np.concatenate(tiles[k : k + columns], 1) for k in range(0, len(tiles), columns)]
     return np.concatenate(rows)
+
+
+def _square(box: Sequence[float], width: int, height: int) -> tuple[int, int, int]:
+    """Left, top and side of the square around a box, inside the picture, px."""
+    side = min(round(AROUND * max(box[2] - box[0], box[3] - box[1])), width, height)
+    left = min(max(round(0.5 * (box[0] + box[2]) - side / 2), 0), width - side)
+    top = min(max(round(0.5 * (box[1] + box[3]) - side / 2), 0), height - side)
+    return left, top, side

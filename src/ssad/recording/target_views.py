@@ -46,27 +46,26 @@ class TargetClips:
             image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
             yield _drive(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(row, objects, self.classes)
 
-    def wearing(self, surface: Surface) -> list[tuple[str, View]]:
-        """Drive and picture with a target that waits for a texture.
+    def wearing(self, surface: Surface) -> Iterator[tuple[str, View]]:
+        """Drive and picture with a target that waits for a texture, one after another.
 
         Args:
             surface: What the target wears.
 
         Raises:
             FormatError: No recording of this version.
-            ConfigError: None of the pictures shows any of the texture.
+            ConfigError: None of the pictures shows any of the texture; said after the last.
         """
-        found, seen = [], 0
+        seen = False
         for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
             wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
-            seen += bool(len(wearing.taps[0].pixel))
-            found.append((_drive(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))))
+            seen |= bool(len(wearing.taps[0].pixel))
+            yield _drive(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))
         if not seen:
             raise ConfigError(
-                f"the texture is never in view in the {len(found)} pictures of {self.folder.name}; choose a panel that "
+                f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
                 "the camera sees, or another camera"
             )
-        return found
 
 
 def target_truth(row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> Truth:

@@ -78,3 +78,24 @@ DIGITAL: dict[str, dict[str, tuple[float, float]]] = {
     "C&W": {"FCOS3D": (2.59, 7.18), "PGD": (2.71, 8.28)},
 }
 DIGITAL_STEPS = {"FGSM": 1, "PGD": 10, "C&W": 10}
+
+# town -> row of the table -> detector -> AP (0.5), ASR in percent (None where the paper has a dash); class car, a
+# camera 20 m behind. Trained on Town06 and Town05.
+PHYSICAL: dict[str, dict[str, dict[str, tuple[float, float | None]]]] = {
+    "Town04": {
+        "Benign": {"YoloV5": (99.8, None), "YoloV3": (99.5, None)},
+        "Random patch": {"YoloV5": (24.3, 75.4), "YoloV3": (45.4, 66.8)},
+        "Adv. Patch": {"YoloV5": (16.5, 86.5), "YoloV3": (36.0, 83.3)},
+        "Random camouflage": {"YoloV5": (98.2, None), "YoloV3": (99.3, None)},
+        "DAS": {"YoloV5": (56.2, 80.3), "YoloV3": (65.8, 74.2)},
+        "TPA": {"YoloV5": (62.5, 75.1), "YoloV3": (63.9, 76.3)},
+    },
+    "Town03": {
+        "Benign": {"YoloV5": (99.1, None), "YoloV3": (99.3, None)},
+        "Random patch": {"YoloV5": (58.2, 64.2), "YoloV3": (95.9, 65.8)},
+        "Adv. Patch": {"YoloV5": (37.2, 74.7), "YoloV3": (73.6, 76.1)},
+        "Random camouflage": {"YoloV5": (95.6, 8.7), "YoloV3": (99.5, None)},
+        "DAS": {"YoloV5": (49.5, 91.5), "YoloV3": (54.9, 88.3)},
+        "TPA": {"YoloV5": (50.6, 87.8), "YoloV3": (56.9, 86.7)},
+    },
+}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,10 +21,12 @@ from ssad.core import safeio
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
+from ssad.core.protocols import Detector
+from ssad.core.types import U8
 from ssad.detectors import make_detector
 from ssad.evaluation.target_grid import grid_scores
 from ssad.evaluation.target_scores import Sighting, sightings, target_scores
-from ssad.evaluation.target_sheet import target_sheet
+from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
@@ -36,6 +40,7 @@ from ssad.scenarios.static.physical.kept import TextureFolder
 
 CLEAN, GRID = "clean", "grid"
 VIEWS = ("drive", GRID)
+SIDES = (0.0, 90.0, 180.0, 270.0)  # of the grid that pictures show
 
 
 class Physical(Kind):
@@ -99,18 +104,13 @@ class Physical(Kind):
         attack = row["attack"]
         trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
         moved = trained and (suite.transfer or detector in suite.judges)
-        sources = suite.detectors if moved else [detector]
+        sources = [row["source"]] if "file" in row else suite.detectors if moved else [detector]
         seeds = range(suite.seeds) if attack in ("random", "noise", "shuffled") else (0,)
         found = []
         for source in sources:
             for seed in seeds:
-                spec = {
-                    **row,
-                    "pair": pair.model_dump(),
-                    "source": source if trained else "",
-                    "number": seed,
-                    "view": view,
-                }
+                spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, **row}
+                spec["source"] = source if trained else ""
                 fields = {
                     "test": pair.test, "train": pair.train, "view": view, "detector": detector,
                     "carrier": row.get("carrier", ""),
@@ -124,7 +124,7 @@ class Physical(Kind):
                 inputs = suite.target, suite.behind, suite.size, suite.floor, suite.replicates, grid, device
                 found.append(
                     self.make_cell(
-                        title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights[source]
+                        title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights.get(source, "")
                     )
                 )
         return found
@@ -177,7 +177,7 @@ class Physical(Kind):
         if cell.spec["attack"] is None:
             return {}
         spec = TextureSpec.of_row(cell.spec)
-        if not spec.source or _textures(job).kept(spec).is_file():
+        if not spec.trained or _textures(job).kept(spec).is_file():
             return {}
         return {f"texture {spec.name}": dict(cell.spec)}
 
@@ -215,30 +215,41 @@ class Physical(Kind):
         return {**found, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
 
     def finish(self, plan: Plan, folder: Path) -> None:
-        """One picture of the first test town under each texture and light: DIR/pictures/{textures,lights}.jpg."""
+        """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
         suite: PhysicalSuite = plan.suite
         captions = light_sheet(plan, folder)
         job = Job(folder, plan.device, {"target": suite.target, "seed": suite.seed})
-        path, pair, name = folder / "pictures" / "textures.jpg", suite.pairs[0], suite.detectors[0]
-        chosen: dict[str, TextureSpec] = {}
-        for cell in plan.cells:
-            mine = cell.system == name and cell.spec["pair"] == pair.model_dump() and cell.spec["source"] in ("", name)
-            if mine and cell.spec["attack"] and cell.spec["number"] == 0:
-                spec = TextureSpec.of_row(cell.spec)
-                if spec.source and not _textures(job).kept(spec).is_file():
+        name = suite.detectors[0]
+        detector = make_detector(name, device=plan.device)
+        for pair in suite.pairs:
+            chosen = self._chosen(plan, job, pair, name)
+            for view, places in (("drive", (None,)), (GRID, SIDES)):
+                path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
+                clips = TargetClips(folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}", 1)
+                shown = chosen if view == "drive" else dict([*chosen.items()][-1:])
+                if path.is_file() or not (clips.folder / "annotations").is_dir() or not chosen:
                     continue
-                chosen.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", spec)
-        if chosen and not path.is_file() and (folder / "data" / pair.test / "annotations").is_dir():
-            clips = TargetClips(folder / "data" / pair.test, 1, device=plan.device)
-            shown = [(CLEAN, next(clips.clean())[1])]
-            shown += [(title, next(_worn(job, clips, spec))[1]) for title, spec in chosen.items()]
-            save_picture(path, target_sheet(make_detector(name, device=plan.device), shown, plan.device))
-        if path.is_file():
-            captions[path.name] = (
-                f"What {name} finds (orange, score at least 0.25) in a picture of {pair.test}, clean and attacked."
-            )
+                save_picture(path, _sheet(job, detector, clips, shown, places))
+            for view, text in (("drive", "from behind"), (GRID, "from the front, the left, the rear and the right")):
+                if (folder / "pictures" / f"{view}-{pair.test.lower()}.jpg").is_file():
+                    captions[f"{view}-{pair.test.lower()}.jpg"] = (
+                        f"What {name} finds (orange, score at least 0.25) in {pair.test}, clean and attacked, {text}."
+                    )
         if captions:
-            safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json(captions, indent=1) + "\n")
+            safeio.write_atomic(folder / "pictures" / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
+
+    def _chosen(self, plan: Plan, job: Job, pair: Pair, detector: str) -> dict[str, TextureSpec]:
+        """The textures of a pair of towns that are there, one of each attack, by title."""
+        found: dict[str, TextureSpec] = {}
+        for cell in plan.cells:
+            spec = cell.spec
+            if spec["attack"] is None or spec["pair"] != pair.model_dump() or spec["number"]:
+                continue
+            if cell.system == detector and spec["source"] in ("", detector):
+                texture = TextureSpec.of_row(spec)
+                if not texture.trained or _textures(job).kept(texture).is_file():
+                    found.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", texture)
+        return found
 
 
 @lru_cache(maxsize=16)
@@ -308,3 +319,35 @@ def _grid_clips(suite: PhysicalSuite, folder: Path, town: str, device: str) -> C
         size=suite.size, seed=suite.seed, device=device, distances=tuple(grid.distances),
         azimuths=tuple(grid.azimuths), elevations=tuple(grid.elevations), weathers=tuple(grid.weathers),
     )  # fmt: skip
+
+
+def _sheet(
+    job: Job, detector: Detector, clips: TargetClips, textures: Mapping[str, TextureSpec], sides: Sequence[float | None]
+) -> U8:
+    """Views under textures below each other: the first one, or one from each side (azimuths in degrees)."""
+    everything = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
+    rows = everything.rows()
+    numbers = [k for side in sides for k in _from(rows, side)] or [0]
+    clean = [one for k, one in enumerate(everything.clean()) if k in numbers]
+    worn = {
+        title: [one for k, one in enumerate(islice(_worn(job, everything, spec), max(numbers) + 1)) if k in numbers]
+        for title, spec in textures.items()
+    }
+    sheets = []
+    for k, (_, image, truth) in enumerate(clean):
+        shown = [(CLEAN, image), *((title, views[k][1]) for title, views in worn.items())]
+        columns = min(len(shown), COLUMNS)
+        sheets.append(target_sheet(detector, shown, truth.box[0].tolist(), job.device, columns))
+    return np.concatenate(sheets)
+
+
+def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:
+    """The number of the first view from a side at some 10 m, by day; of any view where no side is wanted."""
+    if side is None:
+        return [0]
+    near = sorted({abs(float(row["distance"]) - 10.0) for row in rows})[0]
+    own = [
+        k for k, row in enumerate(rows)
+        if float(row["azimuth"]) == side and abs(float(row["distance"]) - 10.0) == near and row["weather"] != "night"
+    ]  # fmt: skip
+    return own[:1]

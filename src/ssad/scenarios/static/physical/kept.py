@@ -12,12 +12,14 @@ import torch
 from torch import Tensor
 
 from ssad.core import safeio
+from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
 from ssad.scenarios.static.physical.attacks import make_physical
 from ssad.scenarios.static.physical.carrier import Surface
 from ssad.scenarios.static.physical.inks import printable_colours
 from ssad.scenarios.static.physical.optimise import View, train_texture
+from ssad.scenarios.static.physical.shipped import load_texture
 from ssad.scenarios.static.physical.spec import TextureSpec
 from ssad.scenarios.static.physical.textures import control, texture_picture
 
@@ -67,7 +69,8 @@ class TextureFolder:
             ConfigError: It cannot be trained (see `train_texture`).
         """
         if spec.source:
-            colour = self._trained(spec, surface, views, detector)
+            trained = spec.file is None
+            colour = self._trained(spec, surface, views, detector) if trained else _read(spec, surface)
             if spec.attack == "shuffled":
                 colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
         else:
@@ -96,7 +99,19 @@ class TextureFolder:
 
     def history(self, spec: TextureSpec) -> dict[str, Any]:
         """How a texture was trained, for records; empty for what is not trained."""
-        if not spec.source:
+        if not spec.trained:
             return {}
         losses = safeio.load_npz(self.kept(spec))["losses"]
         return {"epochs": len(losses), "loss_before": float(losses[0]), "loss_after": float(losses[-1])}
+
+
+def _read(spec: TextureSpec, surface: Surface) -> Tensor:
+    """A texture from its file. ConfigError: it is of another size than the surface."""
+    assert spec.file is not None
+    colour, _ = load_texture(spec.file)
+    if tuple(colour.shape[1:]) != surface.size:
+        raise ConfigError(
+            f"texture {spec.file}: {colour.shape[1]} x {colour.shape[2]} texels, the {spec.carrier} has "
+            f"{surface.size[0]} x {surface.size[1]}"
+        )
+    return colour

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, Self
 
 from ssad.core import safeio
@@ -28,6 +29,7 @@ class TextureSpec:
         source: The detector that is attacked; "" for what is not trained.
         number: Of a control that is drawn at random.
         pair: What it is trained and tested on, as the suite says it.
+        file: A texture that is there already (see `load_texture`); None: it is trained.
     """
 
     attack: str
@@ -38,6 +40,7 @@ class TextureSpec:
     source: str
     number: int
     pair: Mapping[str, Any]
+    file: str | None = None
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> Self:
@@ -47,12 +50,14 @@ class TextureSpec:
     @property
     def trained(self) -> str:
         """The attack that is trained, also for what is shuffled afterwards; "" for a control that learns nothing."""
-        return (self.of or self.attack) if self.source else ""
+        return (self.of or self.attack) if self.source and self.file is None else ""
 
     @property
     def name(self) -> str:
-        """What the training of the texture depends on, in short."""
+        """What the training of the texture depends on, in short; of a file its name."""
         attack = self.of or self.attack
+        if self.file is not None:
+            return f"{attack}-{Path(self.file).stem}"
         about = attack, self.source, self.carrier, safeio.dump_json(self.options)
         rest = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
         return f"{attack}-{digest('texture', *about, *rest)[:12]}"

@@ -1,0 +1,117 @@
+"""Where the time of an attack step goes: python benchmarks/physical_speed.py [--images N] [--device cuda] [--out FILE]
+
+A step shows a car at 20 m with a camouflage (print, light, lens, sensor, JPEG), runs YOLOv5n on the picture and takes
+the gradient back to the texture. Rendering is all but the detector: forward, and backward from the picture. Medians
+over pictures of the process's own time (of the wall clock on a GPU), for whole pictures and for the part around the
+target that a `window` shows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+
+from ssad.detectors import make_detector
+from ssad.jobs.machine import quiet_warp
+from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.target import TargetCar
+from ssad.recording.target_views import TargetClips
+from ssad.scenarios.static.digital.objectives import Situation, make_objective
+from ssad.scenarios.static.digital.victim import steady
+from ssad.scenarios.static.physical import Camouflage, Expectation, View, albedo_of, control
+from ssad.scenarios.static.physical.optimise import TARGET
+from ssad.scenarios.static.physical.zoom import around_target
+
+TOWN, WINDOW, BATCH = "Twinford", 192, 8
+BUDGET = 600 * 200  # pictures that the paper shows in a training: 600 frames, 200 epochs
+
+
+def clock(device: str) -> float:
+    """Now, ms."""
+    if device == "cpu":
+        return 1e3 * time.process_time()
+    torch.cuda.synchronize()
+    return 1e3 * time.perf_counter()
+
+
+def step(
+    detector: Any, views: list[View], colour: torch.Tensor, window: int | None, device: str
+) -> tuple[float, float]:
+    """Ms of rendering and of the detector in one step."""
+    draws, start = torch.Generator().manual_seed(0), clock(device)
+    shown, truths = [], []
+    for view in views:
+        picture = view.picture.show({0: albedo_of(Expectation().draw(colour, draws))}, draws)
+        truth = view.truth
+        if window is not None:
+            picture, truth = around_target(picture, truth, window, draws)
+        shown.append(picture)
+        truths.append(truth)
+    images = torch.cat(shown)
+    forward = clock(device)
+    leaf = images.detach().requires_grad_()
+    dense = detector.dense(leaf)
+    with torch.no_grad():
+        assignment = detector.assign(dense, truths)
+    value = make_objective("hide")(dense, Situation(detector, assignment, TARGET)).mean()
+    (slope,) = torch.autograd.grad(value, leaf)
+    asked = clock(device)
+    images.backward(slope)
+    done = clock(device)
+    return forward - start + done - asked, asked - forward
+
+
+def measure(count: int, device: str) -> dict[str, Any]:
+    """Medians over steps, whole pictures and windows."""
+    target = TargetCar()
+    surface = Camouflage().on(target.mesh())
+    with tempfile.TemporaryDirectory() as folder:
+        record_clips(Clips(Path(folder), ((TOWN, count),), (), target=target, device=device), workers=0)
+        detector = make_detector("yolov5n", device=device)
+        clips = TargetClips(Path(folder), count, tuple(detector.classes), device)
+        views = [view for _, view in clips.wearing(surface)]
+    colour = control("random", surface.size).to(device).requires_grad_()
+    batch = 1 if device == "cpu" else BATCH
+    rows = {}
+    with steady(detector):
+        for name, window in (("whole", None), ("window", WINDOW)):
+            parts = [views[k : k + batch] for k in range(0, count - batch + 1, batch)]
+            step(detector, parts[0], colour, window, device)
+            times = [step(detector, one, colour, window, device) for one in parts]
+            render, detect = (statistics.median(column) / batch for column in zip(*times, strict=True))
+            rows[name] = {
+                "render_ms": render, "detector_ms": detect, "share": render / (render + detect),
+                "paper_minutes": BUDGET * (render + detect) / 60e3,
+            }  # fmt: skip
+    torch_device = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} thread"
+    return {"device": torch_device, "images": count, "window": WINDOW, "batch": batch, "rows": rows}
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--out", type=Path)
+    given = parser.parse_args()
+    quiet_warp()
+    torch.set_num_threads(1)
+    found = measure(given.images, given.device)
+    text = json.dumps(found, indent=1) + "\n"
+    if given.out:
+        given.out.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

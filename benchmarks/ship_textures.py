@@ -1,0 +1,67 @@
+"""Ship the textures of a finished run: python benchmarks/ship_textures.py RUN [--attacks adv-patch,vanishing]
+
+RUN is what `ssad run physical` wrote. For each attack that was trained against a detector and scored on it, NAME.png
+and NAME.json go to src/ssad/scenarios/static/physical/trained; suites then name them (`texture: NAME`). What did not
+beat the controls is left out: the run's own records decide.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ssad.core.images import read_image
+from ssad.core.safeio import make_folder
+from ssad.report.kinds.physical import PhysicalRun, margin_table, title_of
+from ssad.report.load import load_run
+from ssad.scenarios.static.physical.shipped import SHIPPED, TextureCard, save_texture
+
+METRICS = ("AP50", "AP50_25", "ASR_25", "ASR_50")
+
+
+def ship(folder: Path, attacks: set[str]) -> list[str]:
+    """Write the textures; their names."""
+    run = load_run(folder)
+    suite, weights = run.suite, run.header["weights"]
+    margins = {row.head[:3]: row.cells[2].mean for row in margin_table(PhysicalRun(run)).rows}
+    found: dict[str, tuple[dict[str, Any], TextureCard]] = {}
+    for line in run.lines:
+        own = line["status"] == "ok" and line["view"] == "drive" and line["detector"] == line["source"]
+        if not own or "epochs" not in line or (attacks and line["attack"] not in attacks) or line["spec"]["of"]:
+            continue
+        title = title_of((line["attack"], line["carrier"]))
+        margin = margins.get((line["test"], line["detector"], title))
+        if margin is None or margin <= 0:
+            print(f"{title} in {line['test']} is not stronger than the controls: left out")
+            continue
+        pair = line["spec"]["pair"]
+        data = (
+            f"{pair['train_images']} pictures of drives in {pair['train']}, {suite['behind']:g} m behind; metrics: "
+            f"{pair['test_images']} in {pair['test']}; suite {suite['name']}, seed {suite['seed']}"
+        )
+        card = TextureCard(
+            line["attack"], line["carrier"], line["spec"]["options"], line["source"], weights[line["source"]],
+            suite["target"], data, run.command, int(line["epochs"]),
+            {name: line["metrics"][name] for name in METRICS},
+        )  # fmt: skip
+        name = f"{line['attack']}-{line['source']}-{pair['train'].lower()}"
+        found[name] = (line, card)
+    make_folder(SHIPPED)
+    for name, (line, card) in found.items():
+        save_texture(SHIPPED / name, read_image(folder / line["artefacts"]["texture"]), card)
+    return sorted(found)
+
+
+def main() -> None:
+    """Ship, and say what."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--attacks", default="")
+    given = parser.parse_args()
+    print(json.dumps(ship(given.run, {name for name in given.attacks.split(",") if name}), indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,337 @@
+"""The page of a physical run: textures on a car, the paper's two tables beside ours, controls, heat maps, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from ssad.report.artefacts import pictures
+from ssad.report.heatmap import HeatMap, heat_maps
+from ssad.report.load import Run
+from ssad.report.pages import render
+from ssad.report.paper import PHYSICAL as PUBLISHED
+from ssad.report.tables import Cell, Row, Table
+
+SOURCE = "published by the paper: CARLA, YoloV5 and YoloV3 fine-tuned there, a camera 20 m behind"
+TITLES = {"adv-patch": "Adv. Patch", "das": "DAS", "tpa": "TPA", "vanishing": "vanishing (strong)"}
+PAPER = {
+    ("clean", ""): "Benign", ("random", "patch"): "Random patch", ("adv-patch", "patch"): "Adv. Patch",
+    ("random", "camouflage"): "Random camouflage", ("das", "camouflage"): "DAS", ("tpa", "camouflage"): "TPA",
+}  # fmt: skip
+DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name begins -> its column in the paper
+LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
+CONTROLS = ("random", "noise", "grey", "shuffled")
+SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR"}
+OTHERS = {
+    "ASR_50": "ASR at 0.5", "AP50_all": "AP50, all cars", "AP50_all_25": "AP50 > 0.25, all cars",
+    "ASR_all_25": "ASR, all cars", "confidence": "mean score",
+}  # fmt: skip
+
+Line = Mapping[str, Any]
+Shown = tuple[str, str, str]
+"""Attack, carrier, and the detector that it was trained against ("" for what is not trained)."""
+
+
+@dataclass(frozen=True)
+class PhysicalRun:
+    """A physical run and its records, several of a control that was drawn several times."""
+
+    run: Run
+
+    @cached_property
+    def records(self) -> Mapping[tuple[str, str, str, Shown], list[Line]]:
+        """By town of the test, view, detector, and what it was shown."""
+        found: dict[tuple[str, str, str, Shown], list[Line]] = {}
+        for line in self.run.lines:
+            shown = (line["attack"], line["carrier"], line["source"])
+            found.setdefault((line["test"], line["view"], line["detector"], shown), []).append(line)
+        return found
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Towns of training and test."""
+        return list(dict.fromkeys((line["train"], line["test"]) for line in self.run.lines))
+
+    @property
+    def detectors(self) -> list[str]:
+        """Those that textures were trained against."""
+        return list(self.run.suite["detectors"])
+
+    @property
+    def judges(self) -> list[str]:
+        """All that were shown textures."""
+        return list(dict.fromkeys(line["detector"] for line in self.run.lines))
+
+    @property
+    def attacks(self) -> list[tuple[str, str]]:
+        """Attacks and controls with their carriers, in the order of the suite, clean first."""
+        return list(dict.fromkeys((line["attack"], line["carrier"]) for line in self.run.lines))
+
+    def lines(
+        self, test: str, view: str, detector: str, attack: tuple[str, str], source: str | None = None
+    ) -> list[Line]:
+        """Records of an attack on a detector, of a texture that was trained against itself unless a source is said."""
+        for known in ((detector if source is None else source), ""):
+            found = self.records.get((test, view, detector, (*attack, known)))
+            if found:
+                return [line for line in found if line["status"] == "ok"]
+        return []
+
+
+def title_of(attack: tuple[str, str]) -> str:
+    """What people call an attack or control on a carrier."""
+    name, carrier = attack
+    first, _, rest = name.partition(" ")
+    if carrier.startswith(LIGHT):
+        return f"{name}, {carrier.removeprefix(LIGHT)}"
+    if first == "shuffled":
+        return f"shuffled {TITLES.get(rest, rest)}"
+    if name in CONTROLS:
+        return f"{name} {carrier}"
+    return TITLES.get(name, name)
+
+
+def score(lines: Sequence[Line], metric: str) -> Cell:
+    """A metric in percent: with its interval over drives, or the range over several draws of a control."""
+    values = [line["metrics"].get(metric) for line in lines]
+    known = [100.0 * float(value) for value in values if value is not None]
+    if not known:
+        return Cell(math.nan)
+    if len(known) > 1:
+        mean = math.fsum(known) / len(known)
+        return Cell(mean, min(known), max(known), int(lines[0]["n"]), clusters=len(known), method="range")
+    limits = (lines[0].get("intervals") or {}).get(metric) or [math.nan, math.nan]
+    low, high = (100.0 * float(limit) for limit in limits)
+    return Cell(known[0], low, high, int(lines[0]["n"]), clusters=int(lines[0]["drives"]), method="given")
+
+
+def main_table(run: PhysicalRun, number: int) -> Table:
+    """Attack x detector in one pair of towns, as the paper's table, with its rows between ours."""
+    train, test = run.pairs[number]
+    told = list(PUBLISHED)[number] if run.run.suite.get("reference") and number < len(PUBLISHED) else None
+    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    rows = []
+    for attack in run.attacks:
+        cells = [
+            score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in SCORES
+        ]
+        rows.append(Row((title_of(attack),), tuple(cells)))
+        if told and attack in PAPER and any(names):
+            own = PUBLISHED[told][PAPER[attack]]
+            cells = []
+            for name in names:
+                precision, rate = own.get(name, (math.nan, None))
+                cells += [Cell(precision), Cell(math.nan), Cell(math.nan if rate is None else rate)]
+            rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
+    columns = tuple(f"{detector} {title}" for detector in run.detectors for title in SCORES.values())
+    note = (
+        f"Percent, of the target alone, from {float(run.run.suite['behind']):g} m behind it as it drives. AP50 counts "
+        "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
+        "not found attacked. [a, b]: 95 % interval over drives; a–b: the range over several draws of a control."
+    )
+    if told:
+        note += (
+            f" Shaded rows: {SOURCE}, {told}. Other towns, pictures and detectors: what can be compared is the order."
+        )
+    title = f"Trained in {train}, tested in {test}"
+    return Table(f"physical-{test.lower()}", title, ("Attack",), columns, tuple(rows), note, SOURCE)
+
+
+def margin_table(run: PhysicalRun) -> Table:
+    """Each trained texture against the control of its carrier that hides the target best."""
+    rows = []
+    for (_, test), detector in ((pair, d) for pair in run.pairs for d in run.detectors):
+        for attack in run.attacks:
+            name, carrier = attack
+            if name == "clean" or name.split()[0] in CONTROLS:
+                continue
+            own = score(run.lines(test, "drive", detector, attack), "AP50")
+            controls = {
+                other: score(run.lines(test, "drive", detector, other), "AP50") for other in run.attacks
+                if other[1] == carrier and other[0].split()[0] in CONTROLS
+            }  # fmt: skip
+            measured = {other: cell for other, cell in controls.items() if not math.isnan(cell.mean)}
+            if math.isnan(own.mean) or not measured:
+                continue
+            best = min(measured, key=lambda other: lower(measured[other]))
+            gap = lower(measured[best]) - (own.mean if math.isnan(own.high) else own.high)
+            cells = (own, measured[best], Cell(gap))
+            rows.append(Row((test, detector, title_of(attack), title_of(best)), cells))
+    note = (
+        "AP50 in percent. The margin lies between the upper end of the attack's interval and the lower end of the best "
+        "control's interval or range; above 0 the attack is stronger than all that learns nothing."
+    )
+    heads = ("Town", "Detector", "Attack", "Best control")
+    return Table("margins", "Attacks against controls", heads, ("attack", "control", "margin"), tuple(rows), note)
+
+
+def lower(cell: Cell) -> float:
+    """The lower end of a cell's interval, or its number."""
+    return cell.mean if math.isnan(cell.low) else cell.low
+
+
+def transfer_table(run: PhysicalRun) -> Table:
+    """Textures trained against one detector, shown to all."""
+    rows = []
+    for _, test in run.pairs:
+        for attack in run.attacks:
+            for source in run.detectors:
+                found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
+                if sum(bool(lines) for lines in found) < 2:
+                    continue
+                cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
+                rows.append(Row((test, title_of(attack), source), tuple(cells)))
+    note = "AP50 in percent of the target; n/a where the detector does not find the clean car often enough."
+    heads = ("Town", "Attack", "Trained against")
+    return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
+
+
+def others_table(run: PhysicalRun) -> Table:
+    """The other scores: at a higher confidence, and of all cars."""
+    rows = []
+    for _, test in run.pairs:
+        for detector in run.judges:
+            for attack in run.attacks:
+                lines = run.lines(test, "drive", detector, attack)
+                if lines:
+                    cells = tuple(score(lines, metric) for metric in OTHERS)
+                    rows.append(Row((test, detector, title_of(attack)), cells))
+    heads, columns = ("Town", "Detector", "Attack"), tuple(OTHERS.values())
+    return Table("others", "Other scores", heads, columns, tuple(rows), "Percent.")
+
+
+def grid_table(run: PhysicalRun) -> Table:
+    """All views of the grid together, and the cell in which an attack does least."""
+    rows = []
+    for (test, view, detector, shown), lines in run.records.items():
+        good = [line for line in lines if line["status"] == "ok"]
+        if view != "grid" or not good:
+            continue
+        worst = [line["worst"] for line in good if line["worst"]]
+        cell = max(worst, key=lambda one: one[2]) if worst else None
+        where = f"{cell[0]:g} m, {cell[1]:g}°" if cell else ""
+        head = (test, detector, title_of(shown[:2]), shown[2] if shown[2] != detector else "", where)
+        rows.append(Row(head, (score(good, "AP50"), score(good, "ASR_25"), Cell(100 * cell[2] if cell else math.nan))))
+    note = (
+        "Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
+        "attack does least; of the clean pictures the one in which the detector does."
+    )
+    heads = ("Town", "Detector", "Attack", "Trained against", "Worst cell")
+    return Table("grid", "Views from all around", heads, ("AP50", "ASR", "AP50 in the worst cell"), tuple(rows), note)
+
+
+def effort_table(run: PhysicalRun) -> Table:
+    """How the textures were trained."""
+    rows = {}
+    for line in run.run.lines:
+        if line["status"] == "ok" and "epochs" in line and line["attack"].split()[0] not in CONTROLS:
+            head = (line["train"], line["source"], title_of((line["attack"], line["carrier"])))
+            names = ("epochs", "loss_before", "loss_after")
+            rows[head] = Row(head, tuple(Cell(float(line[name])) for name in names))
+    note = "The loss is ascended; means over the first and the last epoch, each picture with its own print and noise."
+    columns = ("epochs", "loss in the first epoch", "in the last")
+    return Table("effort", "Training", ("Town", "Detector", "Attack"), columns, tuple(rows.values()), note)
+
+
+def maps(run: PhysicalRun) -> list[tuple[str, str]]:
+    """For each town and detector: a title, and heat maps of the clean car beside the attacked one as SVG text."""
+    found = []
+    for _, test in run.pairs:
+        for detector in run.detectors:
+            drawn = []
+            for attack in run.attacks:
+                lines = run.lines(test, "grid", detector, attack)
+                if lines:
+                    drawn.append(_map(lines[0], title_of(attack), clean=attack[0] == "clean"))
+            if drawn:
+                label = f"AP50 by distance and azimuth, {detector} in {test}"
+                found.append((f"{detector}, {test}", heat_maps(drawn, label=label)))
+    return found
+
+
+def weather_maps(run: PhysicalRun) -> list[tuple[str, str]]:
+    """The same by elevation and weather: shares of the views in which the target is found above 0.25."""
+    found = []
+    for _, test in run.pairs:
+        for detector in run.detectors:
+            drawn = []
+            for attack in run.attacks:
+                lines = run.lines(test, "grid", detector, attack)
+                if not lines:
+                    continue
+                sums: dict[tuple[str, str], list[bool]] = {}
+                for _, _, elevation, weather, before, after in lines[0]["views"]:
+                    score_ = before if attack[0] == "clean" else after
+                    sums.setdefault((f"{elevation:g}°", weather), []).append(score_ > 0.25)
+                rows, columns = (list(dict.fromkeys(place[k] for place in sums)) for k in (0, 1))
+                values = {place: sum(own) / len(own) for place, own in sums.items()}
+                tips = {place: f"{title_of(attack)}: {sum(own)} of {len(own)} views" for place, own in sums.items()}
+                rows.sort(key=lambda text: float(text[:-1]))
+                drawn.append(HeatMap(title_of(attack), rows, sorted(columns), values, None, tips))
+            if drawn:
+                label = f"share of views in which {detector} finds the target, by elevation and weather, {test}"
+                found.append((f"{detector}, {test}", heat_maps(drawn, label=label)))
+    return found
+
+
+def _map(line: Line, title: str, *, clean: bool) -> HeatMap:
+    """The map of a record."""
+    values: dict[tuple[str, str], float | None] = {}
+    tips = {}
+    for distance, azimuth, count, before, after in line["cells"]:
+        place = (f"{distance:g} m", f"{azimuth:g}°")
+        values[place] = before if clean else after
+        left = "n/a" if after is None else f"{100 * after:.1f}"
+        was = "n/a" if before is None else f"{100 * before:.1f}"
+        tips[place] = (
+            f"{title}, {place[0]}, {place[1]}: AP50 clean {was}{'' if clean else f', attacked {left}'}, {count} views"
+        )
+    rows, columns = (list(dict.fromkeys(place[k] for place in values)) for k in (0, 1))
+    worst = line["worst"]
+    marked = (f"{worst[0]:g} m", f"{worst[1]:g}°") if worst else None
+    return HeatMap(title, rows, columns, values, marked, tips)
+
+
+def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
+    """For each detector that is attacked: the clean AP50 and the strongest texture, in the first town."""
+    _, test = run.pairs[0]
+    found = []
+    for detector in run.detectors:
+        scores = {attack: score(run.lines(test, "drive", detector, attack), "AP50") for attack in run.attacks}
+        trained = {
+            attack: cell for attack, cell in scores.items()
+            if attack[0] != "clean" and attack[0].split()[0] not in CONTROLS and not math.isnan(cell.mean)
+        }  # fmt: skip
+        worst = min(trained, key=lambda attack: trained[attack].mean, default=None)
+        clean = next((cell for attack, cell in scores.items() if attack[0] == "clean"), Cell(math.nan))
+        found.append(
+            {"name": detector, "town": test, "clean": clean,
+             "worst": title_of(worst) if worst else "none has run", "left": trained[worst] if worst else Cell(math.nan)}
+        )  # fmt: skip
+    return found
+
+
+def summary(found: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return replace(main_table(PhysicalRun(found), 0), note="percent, of the target alone")
+
+
+def section(found: Run) -> tuple[str, Sequence[Table]]:
+    """The page of a physical run and its tables."""
+    run = PhysicalRun(found)
+    main = [main_table(run, number) for number in range(len(run.pairs))]
+    margins, others, effort = margin_table(run), others_table(run), effort_table(run)
+    further = [table for table in (transfer_table(run), grid_table(run)) if table.rows]
+    page = render(
+        "physical.html", found, main=main, margins=margins, further=further, others=others, effort=effort,
+        tiles=tiles(run), maps=maps(run), weathers=weather_maps(run), pictures=pictures(found.folder),
+        failures=[
+            (line["test"], line["view"], line["detector"], title_of((line["attack"], line["carrier"])), line["source"],
+             line.get("reason", ""))
+            for line in found.failures
+        ],
+    )  # fmt: skip
+    return page, [*main, margins, *further, others, effort]

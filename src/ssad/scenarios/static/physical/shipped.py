@@ -1,0 +1,106 @@
+"""Trained textures as files: a picture of what is printed and a card that says where it comes from."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.errors import FormatError, unknown_name
+from ssad.core.images import read_image, save_picture
+from ssad.core.types import U8
+from ssad.core.version import __version__
+
+SHIPPED = Path(__file__).parent / "trained"
+
+
+@dataclass(frozen=True, slots=True)
+class TextureCard:
+    """What a texture is and where it comes from.
+
+    Attributes:
+        attack: That trained it.
+        carrier: Name of what it is printed on.
+        options: Of the carrier.
+        source: The detector that was attacked.
+        weights: Hash of that detector's weights.
+        target: The car, as for `ssad record --target`.
+        data: What it was trained on.
+        command: Command that reproduces it.
+        epochs: Of the training.
+        metrics: Measured on the town of the test, which `data` names.
+        hash: SHA-256 of size and texels; `save_texture` fills it in.
+        version: Version of SSAD; `save_texture` fills it in.
+    """
+
+    attack: str
+    carrier: str
+    options: Mapping[str, Any]
+    source: str
+    weights: str
+    target: str
+    data: str
+    command: str
+    epochs: int
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    hash: str = ""
+    version: str = ""
+
+
+def shipped_textures() -> list[str]:
+    """Names of the textures that SSAD ships."""
+    return sorted(path.stem for path in SHIPPED.glob("*.json"))
+
+
+def load_texture(name: str) -> tuple[Tensor, TextureCard]:
+    """A texture and its card.
+
+    Args:
+        name: Of a shipped texture, or the path of a card (NAME.json, with NAME.png beside it).
+
+    Returns:
+        sRGB [3, H, W] in 0 to 1, and the card.
+
+    Raises:
+        UnknownNameError: No shipped texture has the name.
+        FormatError: A file is missing or broken, or the picture is not the one that the card describes.
+    """
+    path = Path(name).expanduser() if name.endswith(".json") else SHIPPED / f"{name}.json"
+    if not name.endswith(".json") and not path.is_file():
+        raise unknown_name("texture", name, shipped_textures())
+    data = safeio.read_json(path)
+    known = {one.name for one in fields(TextureCard)}
+    if not isinstance(data, dict) or not known >= set(data):
+        raise FormatError(f"{path}: not the card of a texture; its keys are {', '.join(sorted(known))}")
+    try:
+        card = TextureCard(**data)
+    except TypeError as error:
+        raise FormatError(f"{path}: not the card of a texture ({error})") from None
+    picture = read_image(path.with_suffix(".png"))
+    if _hash(picture) != card.hash:
+        raise FormatError(f"{path.with_suffix('.png')}: not the texture that its card describes; get both anew")
+    return torch.from_numpy(picture.copy()).permute(2, 0, 1).float() / 255, card
+
+
+def save_texture(path: Path, picture: U8, card: TextureCard) -> None:
+    """Write PATH.png and PATH.json.
+
+    Args:
+        path: Without a suffix.
+        picture: RGB [H, W, 3].
+        card: Hash and version are filled in.
+    """
+    about = asdict(card) | {"hash": _hash(picture), "version": __version__}
+    save_picture(path.with_suffix(".png"), picture)
+    safeio.write_atomic(path.with_suffix(".json"), safeio.dump_json(about, indent=1) + "\n")
+
+
+def _hash(picture: U8) -> str:
+    return hashlib.sha256(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes()).hexdigest()

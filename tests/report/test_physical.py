@@ -1,0 +1,129 @@
+"""The page of a physical run: the paper's rows, controls, heat maps, refusals; and the paper's tables themselves."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssad.report import write_report
+from ssad.report.heatmap import HeatMap, heat_maps
+from ssad.report.kinds.physical import PhysicalRun, grid_table, main_table, margin_table, transfer_table
+from ssad.report.load import load_run
+from ssad.report.paper import PHYSICAL
+
+
+def line(attack: str, carrier: str, ap: float, **changes: Any) -> dict[str, Any]:
+    """A record."""
+    found: dict[str, Any] = {
+        "attack": attack, "carrier": carrier, "source": "", "test": "Oldmarket", "train": "Twinford", "view": "drive",
+        "detector": "yolov5n", "number": 0, "status": "ok", "n": 40, "drives": 8,
+        "metrics": {"AP50": ap, "AP50_25": ap, "ASR_25": None if attack == "clean" else 1 - ap, "confidence": ap},
+        "intervals": {"AP50": [max(ap - 0.05, 0.0), min(ap + 0.05, 1.0)]},
+    }  # fmt: skip
+    found |= changes
+    told = (found[key] for key in ("attack", "carrier", "source", "view", "detector", "number"))
+    return found | {"key": "-".join(str(part) for part in told)}
+
+
+def grid(ap: float | None, worst: list[float] | None) -> dict[str, Any]:
+    """What a record of the grid has."""
+    views = [[5.0, 0.0, 15.0, "day", 0.9, 0.1], [5.0, 180.0, 15.0, "night", 0.9, 0.6]]
+    return {
+        "view": "grid",
+        "views": views,
+        "cells": [[5.0, 0.0, 1, 1.0, ap], [5.0, 180.0, 1, 0.2, None]],
+        "worst": worst,
+    }
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    lines = [
+        line("clean", "", 0.99), line("random", "patch", 0.98), line("random", "patch", 0.90, number=1),
+        line("adv-patch", "patch", 0.60, source="yolov5n", epochs=12, loss_before=-2.0, loss_after=-0.5),
+        line("grey", "camouflage", 0.97), line("shuffled das", "camouflage", 0.5, source="yolov5n"),
+        line("das", "camouflage", 0.48, source="yolov5n", epochs=12, loss_before=-2.0, loss_after=-0.5),
+        line("das", "camouflage", 0.88, source="yolov5n", detector="fcos3d-light"),
+        line("clean", "", 0.9, **grid(None, [5.0, 180.0, 0.2])),
+        line("das", "camouflage", 0.4, source="yolov5n", **grid(0.35, [5.0, 0.0, 0.35])),
+        line("tpa", "camouflage", 0.0, source="yolov5n", status="failed", reason="the texture is never in view"),
+    ]  # fmt: skip
+    suite = {
+        "name": "t", "kind": "physical", "title": "T", "detectors": ["yolov5n"], "behind": 20.0,
+        "reference": "physical",
+    }  # fmt: skip
+    (tmp_path / "run.json").write_text(json.dumps({"kind": "physical", "suite": suite, "cells": []}))
+    (tmp_path / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    return tmp_path
+
+
+def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
+    rows = main_table(PhysicalRun(load_run(folder)), 0).rows
+    assert [row.head[0] for row in rows] == [
+        "clean", "Benign, Town04", "random patch", "Random patch, Town04", "Adv. Patch", "Adv. Patch, Town04",
+        "grey camouflage", "shuffled DAS", "DAS", "DAS, Town04", "TPA", "TPA, Town04",
+    ]  # fmt: skip
+    text = {row.head[0]: [cell.text for cell in row.cells] for row in rows}
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30"]
+    assert text["DAS"] == ["48.00", "48.00", "52.00"]
+    assert text["TPA"] == ["n/a", "n/a", "n/a"], "what was refused has no number"
+    random = next(row for row in rows if row.head == ("random patch",)).cells[0]
+    assert (random.text, random.interval) == ("94.00", "90.00–98.00"), "mean and range of two draws"
+
+
+def test_a_margin_is_between_the_ends_of_the_intervals(folder: Path) -> None:
+    rows = {row.head[2]: row for row in margin_table(PhysicalRun(load_run(folder))).rows}
+    assert rows["Adv. Patch"].head[3] == "random patch"
+    assert rows["Adv. Patch"].cells[2].mean == pytest.approx(90.0 - 65.0)
+    assert rows["DAS"].head[3] == "shuffled DAS", "the control that hides the target best"
+    assert rows["DAS"].cells[2].mean == pytest.approx(45.0 - 53.0), "inside the intervals, so below 0"
+
+
+def test_transfer_and_the_worst_cell(folder: Path) -> None:
+    run = PhysicalRun(load_run(folder))
+    (moved,) = transfer_table(run).rows
+    assert moved.head == ("Oldmarket", "DAS", "yolov5n")
+    assert [cell.text for cell in moved.cells] == ["48.00", "88.00"]
+    clean, das = grid_table(run).rows
+    assert clean.head[4] == "5 m, 180°"
+    assert das.head[4] == "5 m, 0°"
+    assert das.cells[2].text == "35.00"
+
+
+def test_the_page_shows_all_and_says_what_was_refused(folder: Path) -> None:
+    text = write_report(folder).read_text()
+    assert "the texture is never in view" in text
+    assert text.count('role="img"') == 2, "distance by azimuth, elevation by weather"
+    assert "AP50 clean 20.0, attacked n/a, 1 views" in text
+    assert (folder / "tables" / "margins.csv").is_file()
+
+
+def test_a_heat_map_is_red_where_the_value_is_low_and_marks_its_worst_cell() -> None:
+    values = {("5 m", "0°"): 0.0, ("5 m", "90°"): 1.0, ("9 m", "0°"): None}
+    text = heat_maps([HeatMap("m", ["5 m", "9 m"], ["0°", "90°"], values, ("5 m", "90°"), {})], label="l & l")
+    assert "l &amp; l" in text
+    assert [int(share) for share in re.findall(r"--crash\) (\d+)%", text)] == [70, 0]
+    assert text.count(">n/a<") == 2, "one was not measured, one is absent"
+    assert text.count('stroke="var(--ink)"') == 1
+
+
+@pytest.mark.data
+def test_the_papers_tables_are_as_the_paper_has_them(data_dir: Path) -> None:
+    sources = sorted((data_dir.parent / "paper").glob("*.txt"))
+    if not sources:
+        pytest.skip("the paper's source is not beside the data folder")
+    text = sources[0].read_text()
+    for town, label in (("Town04", "physical1"), ("Town03", "physical2")):
+        block = text[text.index(f"on {town} dataset") : text.index(f"label{{{label}}}")]
+        rows = re.findall(r"(Benign|Random|Adv\. Patch|DAS|TPA)\}?&([\d.\-&]+)\\\\", block)
+        names = list(PHYSICAL[town])
+        assert len(rows) == len(names) == 6
+        for name, (head, numbers) in zip(names, rows, strict=True):
+            assert name.startswith(head)
+            told = [None if value == "-" else float(value) for value in numbers.split("&")]
+            own = PHYSICAL[town][name]
+            assert told == [*own["YoloV5"], *own["YoloV3"]]
