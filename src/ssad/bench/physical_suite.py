@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -155,6 +156,12 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     if len(sources) != 1:
         raise ConfigError(f"suite {suite.name}: shuffled of '{entry.of}': there must be one such attack")
     return {**row_of(suite, sources[0]), "attack": "shuffled", "of": entry.of}
+
+
+def carrier_title(row: Mapping[str, Any]) -> str:
+    """The carrier of a row and its options, in words: such as "patch, height 0.86, width 1.9"; "" for no texture."""
+    options = sorted((row.get("options") or {}).items())
+    return ", ".join([row.get("carrier", ""), *(f"{key} {value}" for key, value in options)])
 
 
 def _ready(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
 from ssad.bench.physical_lights import light_cells, light_edit, light_pieces, light_result, light_sheet
-from ssad.bench.physical_suite import Pair, PhysicalSuite, row_of, target_of
+from ssad.bench.physical_suite import Pair, PhysicalSuite, carrier_title, row_of, target_of
 from ssad.core import safeio
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
@@ -113,11 +113,13 @@ class Physical(Kind):
                 spec["source"] = source if trained else ""
                 fields = {
                     "test": pair.test, "train": pair.train, "view": view, "detector": detector,
-                    "carrier": row.get("carrier", ""),
+                    "carrier": carrier_title(row),
                     "attack": CLEAN if attack is None else attack if not row["of"] else f"shuffled {row['of']}",
                     "source": source if trained else "", "number": seed,
                 }  # fmt: skip
-                title = "/".join([detector, pair.test, fields["attack"], str(fields["carrier"]), source, str(seed)])
+                title = "/".join(
+                    str(one) for one in [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
+                )
                 if view == GRID:
                     title += f"/{GRID}"
                 grid = suite.grid.model_dump_json() if suite.grid and view == GRID else ""

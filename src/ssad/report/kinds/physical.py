@@ -87,11 +87,14 @@ def title_of(attack: tuple[str, str]) -> str:
     first, _, rest = name.partition(" ")
     if carrier.startswith(LIGHT):
         return f"{name}, {carrier.removeprefix(LIGHT)}"
+    _, _, options = carrier.partition(", ")
     if first == "shuffled":
-        return f"shuffled {TITLES.get(rest, rest)}"
-    if name in CONTROLS:
+        title = f"shuffled {TITLES.get(rest, rest)}"
+    elif name in CONTROLS:
         return f"{name} {carrier}"
-    return TITLES.get(name, name)
+    else:
+        title = TITLES.get(name, name)
+    return f"{title}, {options}" if options else title
 
 
 def score(lines: Sequence[Line], metric: str) -> Cell:
