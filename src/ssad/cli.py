@@ -11,6 +11,7 @@ import typer
 
 from ssad.core.errors import ConfigError, SSADError, unknown_name
 from ssad.listing import ALIASES, LISTS
+from ssad.training.commands import train_app
 
 app = typer.Typer(
     help="SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?",
@@ -344,44 +345,7 @@ def record(
     print(text)
 
 
-train_app = typer.Typer(no_args_is_help=True, help="Train a detector.")
 app.add_typer(train_app, name="train")
-
-
-@train_app.command("detector")
-def train_detector(
-    recipe: Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a recipe (see: ssad list recipes).")],
-    data: Annotated[
-        Path,
-        typer.Option(help="3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote."),
-    ],
-    more: Annotated[list[Path] | None, typer.Option(help="2D only: another such folder; can be repeated.")] = None,
-    val_data: Annotated[
-        Path | None, typer.Option(help="3D only: dataset to validate on.  [default: that of --data]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
-    split: Annotated[str, typer.Option(help="Split to train on.")] = "train",
-    val: Annotated[str, typer.Option(help="Split to validate on.")] = "val",
-    change: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the recipe, such as epochs=3."),
-    ] = None,
-    weights: Annotated[Path | None, typer.Option(help="Initial weights.")] = None,
-    device: Device = "auto",
-    gpus: Annotated[int, typer.Option(min=1, help="Number of GPUs, one process each.")] = 1,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="Time limit; stops at the end of the epoch that exceeds it.")
-    ] = None,
-) -> None:
-    """Train a detector and validate it on the split val. To resume, repeat the command."""
-    from ssad.training.detector import Plan, parse_changes, run_training
-
-    plan = Plan(
-        recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
-        gpus=gpus, seconds=seconds, val_data=val_data,
-    )  # fmt: skip
-    for line in run_training(plan, say=lambda text: print(text, flush=True)):
-        print(line)
 
 
 @app.command("list")

@@ -24,7 +24,8 @@ def _system_list() -> dict[str, str]:
     from ssad.core.registry import names
     from ssad.drivers import SYSTEMS
 
-    return names("system", SYSTEMS) | {"module:object": "a driving system of your own (README.md)"}
+    rows = names("system", SYSTEMS) | {"ppo:FILE": "PPO with other weights, FILE.safetensors; also sac and td3"}
+    return rows | {"module:object": "a driving system of your own (README.md)"}
 
 
 def _kind_list() -> dict[str, str]:
@@ -93,11 +94,13 @@ def _detector_list() -> dict[str, str]:
 
 def _recipe_list() -> dict[str, str]:
     from ssad.training.recipe import RECIPES
+    from ssad.training.reinforcement import LEARNINGS
 
-    return {
+    detectors = {
         name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
         for name, r in RECIPES.items()
     }
+    return detectors | {name: f"driver: {r.steps:,} steps, lr {r.lr:g}" for name, r in LEARNINGS.items()}
 
 
 LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {

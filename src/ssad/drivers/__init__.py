@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
+from typing import Any, cast
 
 from ssad.core.driving import Believer, Driver
 from ssad.core.errors import ConfigError
@@ -18,7 +18,33 @@ SYSTEMS: dict[str, str] = {
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",
     "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",
     "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
+    "ppo": "ssad.drivers.rl.learned:PPO",
 }
+LEARNED = ("ppo", "sac", "td3")
+"""Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""
+
+
+def find_system(name: str) -> Any:
+    """The class or object behind a system's name, entry point or "module:object".
+
+    Raises UnknownNameError; ConfigError if it does not import; FormatError for weights that cannot be used.
+    """
+    from ssad.core.registry import resolve
+
+    kind, _, weights = name.partition(":")
+    if kind in LEARNED and weights:
+        from ssad.drivers.rl.learned import Learned
+
+        return Learned(kind, weights)
+    return resolve("system", SYSTEMS, name)
+
+
+def weights_version(name: str) -> str:
+    """The hash of a learned system's weights; "" for a system without any, or of somebody else's.
+
+    Raises FormatError for weights that cannot be used.
+    """
+    return str(make_system(name).version) if name.partition(":")[0] in LEARNED else ""  # type: ignore[attr-defined]
 
 
 def make_system(name: str) -> Driver:
@@ -26,9 +52,7 @@ def make_system(name: str) -> Driver:
 
     Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
-    from ssad.core.registry import resolve
-
-    found = resolve("system", SYSTEMS, name)
+    found = find_system(name)
     system = found() if isinstance(found, type) else found
     controller = getattr(system, "controller", Controller.EXTERNAL)
     if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):
@@ -45,6 +69,7 @@ class _Named:
         self.name = name
         self.controller = controller
         self.target_speed: float | None = getattr(system, "target_speed", None)
+        self.version: str = getattr(system, "version", "")
         self.sensors: tuple[str, ...] = tuple(getattr(system, "sensors", ()))
         self.reset = system.reset
         self.act = system.act

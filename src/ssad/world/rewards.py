@@ -46,7 +46,15 @@ def frea(state: WorldState) -> F64:
     return _ego_reward(state, desired_speed=6.0, collision=10.0, living=0.1)
 
 
-REWARDS: dict[str, Reward] = {"safebench": safebench, "frea": frea}
+def driver(state: WorldState) -> F64:
+    """What the shipped drivers learn from, [B]: SafeBench's with -100 for a contact, -5 off the road and -0.1 a step.
+
+    With SafeBench's -1 or FREA's -10 a contact costs what at most one or two steps bring at 8 m/s.
+    """
+    return _ego_reward(state, desired_speed=8.0, collision=100.0, living=0.1) - 5.0 * state.off_road
+
+
+REWARDS: dict[str, Reward] = {"safebench": safebench, "frea": frea, "driver": driver}
 
 
 def goals(state: WorldState) -> F32:

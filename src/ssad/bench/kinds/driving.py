@@ -23,7 +23,6 @@ from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph, town_file
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
-from ssad.core.registry import resolve
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace, Scenario
@@ -199,17 +198,19 @@ def system_of(name: str) -> Driver:
 
 
 def system_version(name: str) -> str:
-    """12 hex digits over the source of a system and all that it imports.
+    """12 hex digits over the source of a system and all that it imports, and those of its weights if it was trained.
 
     Raises:
         UnknownNameError, ConfigError: there is no such system.
+        FormatError: its weights cannot be used.
     """
-    from ssad.drivers import SYSTEMS
+    from ssad.drivers import find_system, weights_version
 
-    found = resolve("system", SYSTEMS, name)
+    found = find_system(name)
     if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
-    return source_version((found if isinstance(found, type) else type(found)).__module__)
+    source = source_version((found if isinstance(found, type) else type(found)).__module__)
+    return f"{source} {weights_version(name)[:12]}".strip()
 
 
 def policies_of(scenario: Scenario) -> list[str]:

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Driver, Policies, Selector, Sensor, WorldState
+from ssad.core.driving import Choice, Driver, Policies, Selector, Sensor, WorldState
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.generators import Base, Generator, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
@@ -113,10 +113,11 @@ class Trials:
         taken = np.zeros((world.batch, world.agents), bool)
 
         def watched(selector: Selector) -> Selector:
-            def choose(state: WorldState) -> Bool:
-                chosen = np.asarray(selector(state), bool)
+            def choose(state: WorldState) -> Bool | Choice:
+                choice = selector(state)
+                chosen = choice.agents if isinstance(choice, Choice) else np.asarray(choice, bool)
                 np.logical_or(taken, chosen, out=taken)
-                return chosen
+                return choice
 
             return choose
 

@@ -1,0 +1,103 @@
+"""`ssad train`: one short function a command. Heavy imports are inside them, so that --help is quick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the recipe, such as lr=1e-4."),
+]
+
+train_app = typer.Typer(no_args_is_help=True, help="Train a detector, a driver or an adversary.")
+
+
+@train_app.command("detector")
+def train_detector(
+    recipe: Annotated[str, typer.Argument(metavar="RECIPE", help="Name of a recipe (see: ssad list recipes).")],
+    data: Annotated[
+        Path,
+        typer.Option(help="3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote."),
+    ],
+    more: Annotated[list[Path] | None, typer.Option(help="2D only: another such folder; can be repeated.")] = None,
+    val_data: Annotated[
+        Path | None, typer.Option(help="3D only: dataset to validate on.  [default: that of --data]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
+    split: Annotated[str, typer.Option(help="Split to train on.")] = "train",
+    val: Annotated[str, typer.Option(help="Split to validate on.")] = "val",
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a value of the recipe, such as epochs=3."),
+    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="Initial weights.")] = None,
+    device: Device = "auto",
+    gpus: Annotated[int, typer.Option(min=1, help="Number of GPUs, one process each.")] = 1,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Time limit; stops at the end of the epoch that exceeds it.")
+    ] = None,
+) -> None:
+    """Train a detector and validate it on the split val. To resume, repeat the command."""
+    from ssad.training.detector import Plan, parse_changes, run_training
+
+    plan = Plan(
+        recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
+        gpus=gpus, seconds=seconds, val_data=val_data,
+    )  # fmt: skip
+    for line in run_training(plan, say=lambda text: print(text, flush=True)):
+        print(line)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+@train_app.command("driver")
+def train_driver(
+    algorithm: Annotated[str, typer.Argument(metavar="ALGORITHM", help="ppo, sac or td3.")],
+    scenarios: Annotated[
+        str, typer.Option(help="Comma-separated sets, classes or files to learn from (see: ssad list scenarios).")
+    ] = "training",
+    test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "precrash,natural",
+    out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
+    change: Changes = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
+    device: Annotated[str, typer.Option(help="Where the networks are trained: cpu or cuda.")] = "cpu",
+) -> None:
+    """Train a driving system by reinforcement learning (needs the extra train). To resume, repeat the command."""
+    from ssad.training.detector import parse_changes
+    from ssad.training.driver import DriverPlan, run_driver_training
+
+    plan = DriverPlan(
+        algorithm, out, _names(scenarios), _names(test), parse_changes(change or []), seconds=seconds, device=device
+    )
+    for line in run_driver_training(plan, say=lambda text: print(text, flush=True)):
+        print(line)
+
+
+@train_app.command("adversary")
+def train_adversary(
+    algorithm: Annotated[str, typer.Argument(metavar="ALGORITHM", help="adv-ppo.")] = "adv-ppo",
+    ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
+    scenarios: Annotated[
+        str, typer.Option(help="Comma-separated sets or files with background traffic to learn in.")
+    ] = "training",
+    test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "natural",
+    literal: Annotated[bool, typer.Option("--literal", help="Reward as equation 6 of the paper prints it.")] = False,
+    out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
+    change: Changes = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
+) -> None:
+    """Train an adversary against a driving system (needs the extra train). To resume, repeat the command."""
+    from ssad.training.adversary import AdversaryPlan, run_adversary_training
+    from ssad.training.detector import parse_changes
+
+    plan = AdversaryPlan(
+        algorithm, out, ego, _names(scenarios), _names(test), literal, parse_changes(change or []), seconds
+    )
+    for line in run_adversary_training(plan, say=lambda text: print(text, flush=True)):
+        print(line)
