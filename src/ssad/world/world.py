@@ -123,10 +123,9 @@ class World:
         # one thread walks the list on CPU; on CUDA enough to fill the device
         workers = 1 if self.device == "cpu" else min(pairs, 1 << 21)
         dt, substeps, autoreset = self._settings
-        flat = (self.batch, self.agents)
         bank, roads, state, seen = self.bank.episodes, self.bank.roads, self.arrays, self.seen
 
-        # threads of a scene where each has little to do: to begin one costs more than that on CPU
+        # threads of a scene: on CPU to begin one costs more than what most of them have to do
         threads = 1 if self.device == "cpu" else self.agents
         few = (self.batch, threads)
 
@@ -141,13 +140,15 @@ class World:
         self._plan = [
             *(restarts(1) if autoreset else []),
             self._see,
-            self.launch(sight, flat, [bank, roads, state, seen, self.work, self.agents, rows, dt]),
+            self.launch(sight, few, [bank, roads, state, seen, self.work, self.agents, rows, threads, dt]),
             self.launch(meet, workers, [bank, roads, state, seen, self.work, self.agents, rows, workers, dt]),
-            self.launch(change_lanes, flat, [bank, roads, state, seen, self.work, self.agents, rows]),
-            self.launch(drive, flat, [bank, roads, state, seen, self.agents, rows, dt]),
+            self.launch(change_lanes, few, [bank, roads, state, seen, self.work, self.agents, rows, threads]),
+            self.launch(drive, few, [bank, roads, state, seen, self.agents, rows, threads, dt]),
         ]
         self._advance = [
-            self.launch(move, flat, [bank, roads, state, self.controls, self.places, dt, substeps]),
+            self.launch(
+                move, few, [bank, roads, state, self.controls, self.places, self.agents, threads, dt, substeps]
+            ),
             self.launch(contact, few, [bank, state, self.work, self.agents, threads]),
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
         ]

@@ -24,6 +24,8 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
 from ssad.world.kernels.shared import signal_state, wrap
 
+wp.set_module_options({"max_unroll": 0})  # see `traffic`
+
 KEEPS = wp.constant(2.0)  # m from the nearest point of its route, up to which one keeps to it
 ALONG = wp.constant(0.8)  # rad from its route's heading, likewise
 CLEARING = wp.constant(3.0)  # m/s

@@ -99,11 +99,12 @@ def room_behind(seen: Seen, b: int, i: int, agents: int, rows: int) -> bool:
     return free == 1
 
 
-@wp.kernel(enable_backward=False)
-def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, rows: int, dt: float):
-    """Controls of every agent that is not external, from the state of all at the start of the step."""
-    b, i = wp.tid()
-    if state.end[b] != End.RUNNING or state.active[b, i] == Presence.ABSENT:
+@wp.func
+def drive_one(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, agents: int, rows: int, dt: float
+):
+    """Controls of an agent that is not external."""
+    if state.active[b, i] == Presence.ABSENT:
         return
     e = state.episode[b]
     m = bank.model[e, i]
@@ -180,3 +181,12 @@ def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: i
             junction = roads.rule[bank.route[e, i][0] + state.progress[b, i]][2]
         if junction > 10.0:
             state.waited[b, i] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, rows: int, threads: int, dt: float):
+    """Controls of every agent that is not external, from the state of all at the start of the step."""
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            drive_one(bank, roads, state, seen, b, i, agents, rows, dt)

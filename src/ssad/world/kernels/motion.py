@@ -73,23 +73,19 @@ def bicycle(
     return out
 
 
-@wp.kernel(enable_backward=False)
-def move(
+@wp.func
+def move_one(
     bank: EpisodeArrays,
     roads: Roads,
     state: State,
     action: wp.array2d(dtype=wp.vec4),
     place: wp.array2d(dtype=wp.vec4),
+    b: int,
+    i: int,
     dt: float,
     substeps: int,
 ):
-    """Advance every agent by dt with its control (external ones with the action) and look where it is now.
-
-    Agents that are placed are put at `place`: x, y, yaw, speed; those with a trajectory where it has them.
-    """
-    b, i = wp.tid()
-    if state.end[b] != End.RUNNING:
-        return
+    """Advance an agent by dt; see `move`."""
     e = state.episode[b]
     who = state.controller[b, i]
     put = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -176,3 +172,25 @@ def move(
     under = lane_under(roads, bank.town[e], pose[0], pose[1])
     state.lane[b, i] = int(under[0])
     state.lateral[b, i] = wp.vec2(under[1], under[2])
+
+
+@wp.kernel(enable_backward=False)
+def move(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    action: wp.array2d(dtype=wp.vec4),
+    place: wp.array2d(dtype=wp.vec4),
+    agents: int,
+    threads: int,
+    dt: float,
+    substeps: int,
+):
+    """Advance every agent by dt with its control (external ones with the action) and look where it is now.
+
+    Agents that are placed are put at `place`: x, y, yaw, speed; those with a trajectory where it has them.
+    """
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            move_one(bank, roads, state, action, place, b, i, dt, substeps)

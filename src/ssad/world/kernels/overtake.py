@@ -13,6 +13,8 @@ from ssad.world.kernels.lanes import lanes_left, metres_left, way_frame
 from ssad.world.kernels.shared import boxes_touch, route_frame
 from ssad.world.kernels.traffic import idm_gap, line_ahead
 
+wp.set_module_options({"max_unroll": 0})  # see `traffic`
+
 PATIENCE = wp.constant(3.0)  # s that somebody must have stood to be passed
 QUEUE = wp.constant(25.0)  # m before a junction within which who stands waits for it
 VIEW = wp.constant(150.0)  # m within which others count
@@ -216,11 +218,20 @@ def way_is_clear(
     return clear
 
 
-@wp.kernel(enable_backward=False)
-def change_lanes(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Work, agents: int, all_rows: int):
-    """Begin a lane change wherever an Autopilot wants one and it is safe; wait where a lane is about to end."""
-    b, i = wp.tid()
-    if state.end[b] != End.RUNNING or state.active[b, i] != Presence.AWAKE:
+@wp.func
+def choose_lane(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    work: Work,
+    b: int,
+    i: int,
+    agents: int,
+    all_rows: int,
+):
+    """Begin a lane change if an Autopilot wants one and it is safe; wait where a lane is about to end."""
+    if state.active[b, i] != Presence.AWAKE:
         return
     e = state.episode[b]
     route = bank.route[e, i]
@@ -330,3 +341,21 @@ def change_lanes(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, wo
                     state.stalled[b, i] = 1  # too near to pull out
     if stands and wants and not done:
         state.react[b, i] = wp.min(state.react[b, i], idm_gap(v, 0.0, wp.max(gap - PULL_OUT, 0.1)))
+
+
+@wp.kernel(enable_backward=False)
+def change_lanes(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    work: Work,
+    agents: int,
+    all_rows: int,
+    threads: int,
+):
+    """Let every Autopilot begin a lane change that it wants, where that is safe."""
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            choose_lane(bank, roads, state, seen, work, b, i, agents, all_rows)

@@ -31,6 +31,8 @@ from ssad.world.kernels.shared import (
     sign_line,
 )
 
+wp.set_module_options({"max_unroll": 0})  # unrolled, these kernels are three times as long and no faster, on any device
+
 IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
@@ -251,15 +253,21 @@ def apart(
     return aside or wp.min(lon, lon1) - off > ahead or wp.max(lon, lon1) + off < 0.0
 
 
-@wp.kernel(enable_backward=False)
-def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Work, agents: int, rows: int, dt: float):
-    """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
-
-    The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
-    their order does not matter, since only the hardest reaction counts.
-    """
-    b, i = wp.tid()
-    if state.end[b] != End.RUNNING or state.active[b, i] != Presence.AWAKE:
+@wp.func
+def look_around(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    work: Work,
+    b: int,
+    i: int,
+    agents: int,
+    rows: int,
+    dt: float,
+):
+    """An Autopilot's target speed, its reaction to signals, and whom it must look at more closely."""
+    if state.active[b, i] != Presence.AWAKE:
         return
     e = state.episode[b]
     route = bank.route[e, i]
@@ -360,6 +368,29 @@ def sight(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, work: Wor
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
                     work.pair[slot] = ((b * agents + i) * rows + j) * 4 + flags
+
+
+@wp.kernel(enable_backward=False)
+def sight(
+    bank: EpisodeArrays,
+    roads: Roads,
+    state: State,
+    seen: Seen,
+    work: Work,
+    agents: int,
+    rows: int,
+    threads: int,
+    dt: float,
+):
+    """For every Autopilot: its target speed, its reaction to signals, and whom it must look at more closely.
+
+    The pairs go to a list that `meet` works through, so that the few that matter do not hold up the many that don't;
+    their order does not matter, since only the hardest reaction counts.
+    """
+    b, first = wp.tid()
+    if state.end[b] == End.RUNNING:
+        for i in range(first, agents, threads):
+            look_around(bank, roads, state, seen, work, b, i, agents, rows, dt)
 
 
 @wp.kernel(enable_backward=False)
