@@ -1,7 +1,8 @@
-"""Makes the shipped scenario sets: `python benchmarks/make_scenario_sets.py`.
+"""Makes the shipped scenario sets: `python -m benchmarks.make_scenario_sets`.
 
 Routes are searched on the towns' lane graphs: every stretch of road that a class needs (a clear lane, a lane with a
 neighbour, a turn with crossing traffic), then those that lie farthest apart, so that arms, bends and junctions vary.
+Of natural traffic, those draws are taken in which vehicles cross the ego's way; nobody has driven there before.
 """
 
 from __future__ import annotations
@@ -16,22 +17,25 @@ from typing import Literal
 
 import numpy as np
 
+from benchmarks.crossing_traffic import crossings
 from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import write_atomic
-from ssad.core.types import F64, LaneType, Pose, Scenario
+from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
 from ssad.roads import load_town
 from ssad.scenarios.dynamic.catalog import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
+from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
 
 PRECRASH_TOWN = "ProvingGround"
-NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 7, "Crossgate": 8}
-"""Town -> number of junction routes, as FREA has on Town02 and Town05."""
-REPETITIONS = 10
+NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 30, "Crossgate": 45}
+"""Town -> number of junction routes."""
+NATURAL, CROSSING = 150, 2  # scenarios of the set `natural`, as many as FREA has, and the least that cross in each
+UNSELECTED = 2  # draws of traffic on each route in the set `natural-unselected`
 TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
 """Learned drivers are trained here, on none of the towns that the other sets are in."""
 Turn = Literal["left", "straight", "right"]
@@ -227,8 +231,9 @@ def precrash(graph: LaneGraph, routes: int = 4, *, prefix: str = "", least: int 
     return result
 
 
-def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> list[Scenario]:
-    """Routes through junctions, turns in rotation, each with `repetitions` draws of traffic."""
+@remembered(16)
+def junction_routes(graph: LaneGraph, routes: int) -> tuple[Stretch, ...]:
+    """Routes through junctions, turns in rotation, on which traffic has room."""
     from ssad.roads import route_along
 
     def works(stretch: Stretch) -> bool:
@@ -241,6 +246,11 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
     chosen = _spread(list(passages(graph, 30.0, 30.0)), lambda p: p.turn, routes, works)
     if len(chosen) < routes:
         raise RouteError(f"town {graph.name}: only {len(chosen)} of {routes} junction routes")
+    return tuple(chosen)
+
+
+def natural(graph: LaneGraph, routes: int, repetitions: int) -> list[Scenario]:
+    """Junction routes, each with `repetitions` draws of traffic."""
     return [
         Scenario(
             name=f"natural/{graph.name}_{i:02d}/{k:02d}",
@@ -250,8 +260,38 @@ def natural(graph: LaneGraph, routes: int, repetitions: int = REPETITIONS) -> li
             seed=k,
             group=graph.name,
         )
-        for i, stretch in enumerate(chosen)
+        for i, stretch in enumerate(junction_routes(graph, routes))
         for k in range(repetitions)
+    ]
+
+
+def draws(graph: LaneGraph, routes: int, number: int) -> list[Scenario]:
+    """Draw `number` of traffic on each of a town's junction routes."""
+    return [
+        replace(s, name=f"{s.name[:-2]}{number:02d}", traffic=TrafficPlan(draw=number))
+        for s in natural(graph, routes, 1)
+    ]
+
+
+def with_crossing_traffic(towns: Mapping[str, int], count: int) -> list[Scenario]:
+    """The first `count` draws of traffic, one on each route after the other, in which vehicles cross the ego's way."""
+    graphs = {town: load_town(town) for town in towns}
+    chosen: list[Scenario] = []
+    for number in itertools.count():
+        found = [s for town, routes in towns.items() for s in draws(graphs[town], routes, number)]
+        crossed = crossings([build_episode(s, graphs[s.town], seed=0) for s in found], graphs)
+        chosen += [s for s, n in zip(found, crossed.tolist(), strict=True) if n >= CROSSING]
+        if len(chosen) >= count:
+            break
+    return chosen[:count]
+
+
+def unselected(towns: Mapping[str, int]) -> list[Scenario]:
+    """Draws of traffic on the same routes as they come: other ones than those above, and in every episode new ones."""
+    return [
+        replace(s, name=s.name.replace("natural/", "natural-unselected/"), seed=1000 + s.seed)
+        for town, routes in towns.items()
+        for s in natural(load_town(town), routes, UNSELECTED)
     ]
 
 
@@ -267,10 +307,10 @@ def training() -> dict[str, str]:
 
 def make() -> dict[str, str]:
     """File name -> text of the shipped sets that systems are tested on."""
-    drives = [s for town, routes in NATURAL_TOWNS.items() for s in natural(load_town(town), routes)]
     return {
         "precrash.yaml": scenario_text(precrash(load_town(PRECRASH_TOWN))),
-        "natural.yaml": scenario_text(drives),
+        "natural.yaml": scenario_text(with_crossing_traffic(NATURAL_TOWNS, NATURAL)),
+        "natural-unselected.yaml": scenario_text(unselected(NATURAL_TOWNS)),
     }
 
 

@@ -397,11 +397,12 @@ def import_routes(
     from ssad.core.safeio import home
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
+    from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
 
     label = name or folder.resolve().name
     if not label.replace("-", "").replace("_", "").isalnum():
         raise ConfigError(f"'{label}' cannot name a set; choose a name of letters, digits, _ and - with --name")
-    if label in ("precrash", "natural"):
+    if label in BUILT_IN_SETS:
         raise ConfigError(f"'{label}' is a built-in set; choose another name with --name")
     scenarios = read(folder)
     path = home() / "scenarios" / f"{label}.yaml"

@@ -48,7 +48,7 @@ def unpack(text: str, rows: int) -> Any:
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Real episodes of two systems, one failed cell, one hostile name, and a torn last line."""
     folder = tmp_path_factory.mktemp("run")
-    names = ["StraightObstacle/00", "StraightObstacle/01", "RedlightRunning/00", "natural/Twinford_00/00"]
+    names = ["StraightObstacle/00", "StraightObstacle/01", "RedlightRunning/00", "natural/Twinford_03/00"]
     scenarios = [load_scenarios(n)[0] for n in names]
     graphs = {s.town: load_town(s.town) for s in scenarios}
     for name, graph in graphs.items():

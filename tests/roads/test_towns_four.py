@@ -156,7 +156,7 @@ def test_the_four_differ() -> None:
 @pytest.mark.parametrize("name", others_slow(NEW, ["Oldmarket"]))
 def test_natural_traffic_gets_through(name: str) -> None:
     graph = town(name)
-    scenarios = natural(graph, 8)[::4]
+    scenarios = natural(graph, 8, 10)[::4]
     world = World([build_episode(s, graph, seed=0) for s in scenarios], {name: graph}, ego=Controller.AUTOPILOT)
     touched = np.zeros(world.batch, bool)
     for _ in range(300):

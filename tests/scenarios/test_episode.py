@@ -85,13 +85,25 @@ def test_what_a_scenario_leaves_open_is_its_types() -> None:
     episode = build_episode(own, town, seed=0)
     assert (episode.limits, episode.override_until) == (Limits(max_steps=7, max_distance=80.0), 4.0)
     assert set(episode.signal_override.values()) == {SignalState.RED}
-    (scenario,) = load_scenarios("natural/Twinford_00/03")
+    (scenario,) = load_scenarios("natural-unselected/Twinford_00/01")
     town = load_town("Twinford")
     assert build_episode(scenario, town, seed=0).scenario.traffic == TrafficPlan()
     few = replace(scenario, traffic=TrafficPlan(minimum=1, maximum=1))
     episode = build_episode(few, town, seed=0)
     assert episode.scenario.traffic == few.traffic
     assert len(episode.agents) == 2
+
+
+def test_a_draw_of_traffic_is_the_same_for_every_seed() -> None:
+    (scenario,) = load_scenarios("natural-unselected/Crossgate_00/00")
+    town = load_town("Crossgate")
+
+    def vehicles(draw: int | None, seed: int) -> list[tuple[str, Pose, float]]:
+        episode = build_episode(replace(scenario, traffic=TrafficPlan(draw=draw)), town, seed=seed)
+        return [(a.model, a.pose, a.target_speed) for a in episode.agents[1:]]
+
+    assert vehicles(4, 0) == vehicles(4, 1) == vehicles(None, 4)
+    assert vehicles(4, 0) != vehicles(5, 0)
 
 
 def test_the_ego_is_driven_from_outside() -> None:

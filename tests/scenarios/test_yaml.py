@@ -294,10 +294,10 @@ def test_the_shipped_sets_have_the_numbers_of_the_paper() -> None:
     precrash = load_scenarios("precrash")
     assert [s.type for s in precrash] == [name for name in PRECRASH for _ in range(4)]
     assert {s.town for s in precrash} == {"ProvingGround"}
-    assert len(load_scenarios("natural-twinford")) == 70
-    assert len(load_scenarios("natural-crossgate")) == 80
     assert len(load_scenarios("natural")) == 150
-    assert len({s.name for s in load_scenarios("natural") + precrash}) == 182
+    assert sum(len(load_scenarios(f"natural-{town}")) for town in ("twinford", "crossgate")) == 150
+    assert len(load_scenarios("natural-unselected")) == 150
+    assert len({s.name for name in ("precrash", "natural", "natural-unselected") for s in load_scenarios(name)}) == 332
     assert load_scenarios("RightTurn/02") == (load_scenarios("RightTurn")[2],)
 
 
@@ -314,7 +314,10 @@ def test_of_several_mistakes_the_misspelt_key_is_shown() -> None:
     for inner, known in (
         ({"signals": {"ega": "red"}}, r"signals\.ega: unknown key; known: ego, others, until"),
         ({"limits": {"max_step": 3}}, r"limits\.max_step: unknown key; known: max_steps, max_time, max_distance"),
-        ({"traffic": {"maxi": 3}}, r"traffic\.maxi: unknown key; known: intensity, minimum, maximum, wake_distance"),
+        (
+            {"traffic": {"maxi": 3}},
+            r"traffic\.maxi: unknown key; known: intensity, minimum, maximum, wake_distance",
+        ),
         (
             {"actors": [{"pose": {"x": 0, "y": 0}, "phases": [{"when": {"knd": 1}}]}]},
             r"when\.knd: unknown key; known: kind",
@@ -366,6 +369,7 @@ BOUNDS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"traffic": {"maximum": 64}}, {"traffic": {"maximum": 65}}, "maximum: 65 is outside minimum (5) to 64"),
     ({"traffic": {"maximum": 5}}, {"traffic": {"maximum": 4}}, "maximum: 4 is outside minimum (5) to 64"),
     ({"traffic": {"wake_distance": 0}}, {"traffic": {"wake_distance": -0.01}}, "wake_distance: must not be negative"),
+    ({"traffic": {"draw": 0}}, {"traffic": {"draw": -1}}, "draw: must not be negative"),
     ({"route": [START, {"x": 1e5, "y": 0}]}, {"route": [START, {"x": 100001, "y": 0}]}, "route[1]: beyond 100000 m"),
     ({"route": [START, {"x": 9, "y": -1e5}]}, {"route": [START, {"x": 9, "y": -100001}]}, "route[1]: beyond"),
     ({"trigger": {"x": 0, "y": 0, "yaw": 1e5}}, {"trigger": {"x": 0, "y": 0, "yaw": 100001}}, "trigger: beyond 100000"),
@@ -425,10 +429,11 @@ def test_nothing_cannot_be_saved_and_one_of_several_may_be_wrong(tmp_path: Path)
 
 def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert set_names() == ("natural", "natural-crossgate", "natural-twinford", "precrash")
+    shipped = ("natural", "natural-crossgate", "natural-twinford", "natural-unselected", "precrash", "training")
+    assert set_names() == shipped
     mine = scenario_from({**PLAIN, "name": "mine/0"})
     save_scenarios(ssad_home / "scenarios" / "mine.yaml", mine)
-    assert set_names() == ("mine", "natural", "natural-crossgate", "natural-twinford", "precrash")
+    assert set_names() == ("mine", *shipped)
     assert load_scenarios("mine") == load_scenarios("mine/0") == (mine,)
     # a set is read again once its file is another one
     save_scenarios(ssad_home / "scenarios" / "mine.yaml", [mine, replace(mine, name="mine/another")])

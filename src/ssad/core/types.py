@@ -206,12 +206,14 @@ class TrafficPlan:
         minimum: Least number of vehicles.
         maximum: Largest number of vehicles.
         wake_distance: Distance of the ego at which a vehicle wakes, m; 0: it is awake from the start.
+        draw: Number of the draw of vehicles, which is then the same in every episode; None: the episode's seed.
     """
 
     intensity: float = 0.3
     minimum: int = 5
     maximum: int = 18
     wake_distance: float = 50.0
+    draw: int | None = None
 
 
 @dataclass(frozen=True)

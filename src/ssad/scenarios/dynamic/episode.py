@@ -91,7 +91,9 @@ def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, eve
         target_speed=scenario.target_speed,
         route=route,
     )
-    others = kind.build(scenario, graph, route, generator("scenario", scenario.seed, seed, "actors"))
+    fixed = scenario.traffic.draw if scenario.traffic else None
+    draw = seed if fixed is None else fixed
+    others = kind.build(scenario, graph, route, generator("scenario", scenario.seed, draw, "actors"))
     agents = (ego, *others)
     # traffic and an author's own actors stand where they stand in the nominal case: of them only the ego must be clear
     drawn = everybody_apart and any(parameter.spread for parameter in kind.parameters)

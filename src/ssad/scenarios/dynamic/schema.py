@@ -188,6 +188,8 @@ def _plans(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:
         yield ("traffic", "maximum"), f"{traffic.maximum} is outside minimum ({traffic.minimum}) to 64"
     if not traffic.wake_distance >= 0.0:
         yield ("traffic", "wake_distance"), "must not be negative"
+    if traffic.draw is not None and traffic.draw < 0:
+        yield ("traffic", "draw"), "must not be negative"
 
 
 def _actors(scenario: Scenario) -> Iterator[tuple[tuple[str | int, ...], str]]:

@@ -14,20 +14,23 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
+UNSELECTED = ("natural-unselected",)
+"""Traffic as it comes, for rates; its scenarios belong to no class's own."""
 TRAINING = ("training",)
 """What learned drivers are trained on, in towns that no other set uses; its scenarios belong to no class's own."""
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
+BUILT_IN_SETS = (*SHIPPED, *UNSELECTED, *TRAINING, *_TOWN_SETS)
 _SUFFIXES = (".yaml", ".yml")
 
 
 def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     """The scenarios that `ref` names, in their order.
 
-    A set (precrash, natural, natural-twinford, natural-crossgate, or one that was imported, such as
-    safebench, frea), a scenario ("StraightObstacle/00"), a scenario class, a YAML file, or a folder of YAML
-    files. UnknownNameError shows the three closest names.
+    A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, training, or one that was
+    imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario class (its scenarios in
+    precrash and natural), a YAML file, or a folder of YAML files. UnknownNameError shows the three closest names.
     """
     if isinstance(ref, Path) or ref.endswith(_SUFFIXES):
         return _from_path(Path(ref))
@@ -56,7 +59,7 @@ def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
 def set_files() -> dict[str, Path]:
     """Set name -> YAML file: the shipped sets, then the imported ones."""
     found = {path.stem: path for path in sorted((home() / "scenarios").glob("*.yaml"))}
-    return found | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *TRAINING)}
+    return found | {name: DATA / f"{name}.yaml" for name in (*SHIPPED, *UNSELECTED, *TRAINING)}
 
 
 def set_names() -> tuple[str, ...]:
