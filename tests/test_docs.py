@@ -46,7 +46,14 @@ def exists(dotted: str) -> bool:
     return False
 
 
-GROUPS = {"ssad.systems", "ssad.detectors", "ssad.scenarios", "ssad.kinds", "ssad.attacks"}  # of entry points
+GROUPS = {
+    "ssad.systems",
+    "ssad.detectors",
+    "ssad.scenarios",
+    "ssad.kinds",
+    "ssad.attacks",
+    "ssad.generators",
+}  # of entry points
 
 
 @page

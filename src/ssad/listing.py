@@ -76,7 +76,7 @@ def _attack_list() -> dict[str, str]:
 def _generator_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.generate import generator_list
 
-    return generator_list() | {"module:object": "a generator of your own (see ssad.core.generators)"}
+    return generator_list() | {"module:object": "a generator of your own (docs/generators.md)"}
 
 
 def _detector_list() -> dict[str, str]:

@@ -23,6 +23,7 @@ KINDS: dict[str, str] = {
     "detection": "ssad.bench.kinds.detection:Detection",
     "digital": "ssad.bench.kinds.digital:Digital",
     "physical": "ssad.bench.kinds.physical:Physical",
+    "adversarial": "ssad.bench.kinds.adversarial:Adversarial",
 }
 """Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
 

@@ -113,7 +113,9 @@ def advance(
         raise ConfigError(f"a step needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
     throttle, brake = control[..., 0].clamp(0.0, 1.0), control[..., 1].clamp(0.0, 1.0)
     driven = _bicycle(state, throttle, brake, control, bodies, dt / substeps, substeps)
-    walked = _walk(state, throttle, control[..., 2].clamp(-1.0, 1.0), bodies, dt)
+    # half of the work for nothing where nobody walks
+    walkers = bool(bodies.walker.any())
+    walked = _walk(state, throttle, control[..., 2].clamp(-1.0, 1.0), bodies, dt) if walkers else driven
     # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
     drives = (bodies.max_speed > 0.0) & ((state.speed != 0.0) | (control[..., 0] > 0.0))
     parts = []
@@ -121,7 +123,8 @@ def advance(
         walker, moves = (
             mask[..., None] if old.ndim > state.speed.ndim else mask for mask in (bodies.walker, drives)
         )  # fmt: skip
-        parts.append(torch.where(walker, of_walker, torch.where(moves, of_vehicle, old)))
+        moved = torch.where(moves, of_vehicle, old)
+        parts.append(torch.where(walker, of_walker, moved) if walkers else moved)
     return MotionState(*parts)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -20,9 +19,7 @@ BRAKING: Final = 4.0  # m/s^2 at which they stop who still moved when the record
 Rows = tuple[tuple[float, float, float, float], ...]
 
 
-def frozen(
-    episode: Episode, trace: EpisodeTrace, *, name: str | None = None, motions: Mapping[int, F64] | None = None
-) -> Scenario:
+def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) -> Scenario:
     """The scenario in which everybody but the ego repeats what was recorded.
 
     Whoever was still moving at the end of the recording brakes to a stop straight ahead, and stays there. It depends
@@ -32,7 +29,6 @@ def frozen(
         episode: The episode.
         trace: What happened in it.
         name: Of the scenario; None: that of the episode's.
-        motions: Agent -> rows [T, 4] of time s, x, y m, yaw rad that it follows instead of what was recorded.
 
     Returns:
         A scenario of type Custom with the same ego, signals and limits.
@@ -44,18 +40,14 @@ def frozen(
     until = float(episode.limits.max_steps * trace.dt)
     actors = []
     for agent in range(1, len(trace.names)):
-        given = None if motions is None else motions.get(agent)
-        rows = _rows(trace, agent) if given is None else np.asarray(given, np.float64)
+        rows = _rows(trace, agent)
         if rows is None:
             continue
-        if given is None and np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MOVED and bool(trace.active[:, agent].all()):
-            still = agent_pose(rows[0])
+        if np.hypot(*np.ptp(rows[:, 1:3], axis=0)) < MOVED and bool(trace.active[:, agent].all()):
             # things stand by themselves; a vehicle without phases is a parked one
-            actors.append(Actor(trace.names[agent], trace.models[agent], still))
+            actors.append(Actor(trace.names[agent], trace.models[agent], agent_pose(rows[0])))
             continue
-        if bool(trace.active[-1, agent]) or given is not None:
-            rows = _stopping(rows, until)
-        told = told_rows(rows)
+        told = told_rows(_stopping(rows, until) if trace.active[-1, agent] else rows)
         actors.append(Actor(trace.names[agent], trace.models[agent], Pose(*told[0][1:]), trajectory=told))
     return replace(
         base, name=name or base.name, type=CUSTOM, trigger=None, placements=(), parameters=values,
@@ -63,16 +55,35 @@ def frozen(
     )  # fmt: skip
 
 
+def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
+    """A frozen scenario in which one actor moves otherwise.
+
+    Args:
+        scenario: As `frozen` makes it.
+        name: Of the actor.
+        rows: Its time s, x, y m and yaw rad [T, 4]; at their end it brakes to a stop.
+    """
+    told = told_rows(_stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
+    pose = Pose(*told[0][1:])
+    return replace(
+        scenario,
+        actors=tuple(
+            replace(actor, pose=pose, phases=(), path=(), trajectory=told) if actor.name == name else actor
+            for actor in scenario.actors
+        ),
+    )
+
+
 def agent_pose(row: F64) -> Pose:
     """The pose of a row of time, x, y and yaw, as scenario files give it."""
     return Pose(round(float(row[1]), 3), round(float(row[2]), 3), round(float(wrap_angle(row[3])), 4))
 
 
-def told_rows(rows: F64) -> Rows:
-    """Rows [T, 4] as a scenario file gives them: in mm, without those on the line between their neighbours."""
-    return tuple(
-        (round(t, 3), round(x, 3), round(y, 3), round(float(wrap_angle(yaw)), 4)) for t, x, y, yaw in thinned(rows)
-    )
+def told_rows(rows: F64, *, thin: bool = True) -> Rows:
+    """Rows [T, 4] as a scenario file gives them: in mm; thin: without those on the line between their neighbours."""
+    kept = np.array(thinned(rows)) if thin else rows
+    told = np.concatenate([kept[:, :3].round(3), np.asarray(wrap_angle(kept[:, 3:])).round(4)], 1)
+    return tuple((t, x, y, yaw) for t, x, y, yaw in told.tolist())
 
 
 def thinned(rows: F64) -> list[list[float]]:

@@ -24,6 +24,9 @@ GENERATORS: dict[str, str] = {
     "random": f"{_SEARCH}.sampling:RandomSearch",
     "grid": f"{_SEARCH}.sampling:GridSearch",
     "halton": f"{_SEARCH}.sampling:HaltonSearch",
+    "cma-es": f"{_SEARCH}.cma_es:CmaEs",
+    "bayesian": f"{_SEARCH}.bayesian:Bayesian",
+    "king": "ssad.scenarios.dynamic.transition.kinematics:King",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
 BATCH = 8  # rollouts of a base side by side

@@ -78,6 +78,15 @@ class BoxSearch(ABC):
         self.seeds = list(seeds)
         self._asked: list[F64] = []
 
+    @staticmethod
+    def check(scenario: Scenario) -> None:
+        """Whether there is anything to search in a scenario.
+
+        Raises:
+            ConfigError: There is not.
+        """
+        Box.of(scenario)
+
     @abstractmethod
     def points(self, index: int, count: int) -> F64:
         """The next points [0 to count, D] of the unit cube to try in a base."""

@@ -1,0 +1,265 @@
+"""Kind `adversarial`: generators x base scenarios x driving systems; a search within a budget of rollouts a cell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.kinds.driving import (
+    DrivingSuite,
+    plain,
+    scenario_json,
+    suite_scenarios,
+    system_version,
+    town,
+    town_version,
+)
+from ssad.bench.source import source_version
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.generators import Base, Outcome
+from ssad.core.lane_graph import save_graph, town_file
+from ssad.core.seeding import seed32
+from ssad.core.traces import motion_hash, save_trace
+from ssad.jobs.machine import quiet_warp
+
+APART = 1.0  # m by which motions before contact differ on average, to count as distinct
+BEFORE = 3.0  # s of motion that are compared
+
+
+class AdversarialSuite(SuiteBase):
+    """One table: generators x scenarios x systems.
+
+    Attributes:
+        systems: driving systems under test.
+        scenarios: base scenarios, as in a driving suite.
+        generators: names, or module:object.
+        budget: rollouts that a generator may spend on a base.
+        batch: how many of them it is asked for at once.
+        repetitions: searches of each, with seeds of their own.
+        keep: found scenarios that are saved, of each search, the most distinct first.
+        chunk: base scenarios that one generator works on side by side.
+    """
+
+    kind: Literal["adversarial"] = "adversarial"
+    systems: Names
+    scenarios: Names
+    generators: Names
+    budget: int = Field(default=64, ge=1, le=100_000)
+    batch: int = Field(default=8, ge=1, le=1024)
+    repetitions: int = Field(default=1, ge=1, le=1000)
+    keep: int = Field(default=3, ge=0, le=100)
+    chunk: int = Field(default=16, ge=1, le=1024)
+
+    def beside(self, path: Path) -> Self:
+        """Scenario files are looked for in the working folder, then beside the suite."""
+        found = self._driving().beside(path).scenarios
+        return self.model_copy(update={"scenarios": found})
+
+    def _driving(self) -> DrivingSuite:
+        return DrivingSuite(name=self.name, systems=self.systems, scenarios=self.scenarios)
+
+
+class Adversarial(Kind):
+    """See the module."""
+
+    name = "adversarial"
+    suite = AdversarialSuite
+    factors = ("generator", "system", "group")
+    columns = (
+        Column("survived", "plain replay survived"),
+        Column("CR", "collision found, adversary on the road and hitting nobody else", "", "higher"),
+        Column("CR_any", "any collision with the adversary found", "", "higher"),
+        Column("rollouts", "rollouts to the first", "", "lower"),
+        Column("share", "share of rollouts that collide", "", "higher"),
+        Column("distinct", "distinct collisions", "", "higher"),
+        Column("off_road", "rollouts with the adversary off the road", "", "lower"),
+        Column("hit_others", "rollouts with the adversary in others", "", "lower"),
+        Column("moving", "collisions in which the ego moves", "", "higher"),
+        Column("impact_speed", "impact speed", "m/s"),
+        Column("acceleration", "largest acceleration of the adversary", "m/s^2"),
+        Column("jerk", "largest jerk of the adversary", "m/s^3"),
+        Column("within_limits", "collisions within the adversary's limits", "", "higher"),
+        Column("replayed", "saved scenarios that collide again", "", "higher"),
+        Column("seconds", "time a scenario", "s", "lower"),
+    )
+
+    def plan(self, suite: AdversarialSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Systems, generators, scenarios and towns are looked up; with `check`, each scenario is built once."""
+        from ssad.scenarios.dynamic import build_episode
+        from ssad.scenarios.dynamic.generate import generator_factory
+
+        for key in ("systems", "generators"):
+            if len(set(getattr(suite, key))) != len(getattr(suite, key)):
+                raise ConfigError(f"suite {suite.name}: {key}: a name appears twice")
+        systems = {name: system_version(name) for name in suite.systems}
+        factories = {name: generator_factory(name) for name in suite.generators}
+        generators = {name: source_version(f.__module__) for name, f in factories.items()}
+        scenarios = suite_scenarios(suite._driving())
+        towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
+        if check:
+            for scenario in scenarios:
+                build_episode(scenario, town(scenario.town), seed=0)
+                for factory in factories.values():
+                    accepts = getattr(factory, "check", None)
+                    if accepts is not None:
+                        accepts(scenario)
+        cells = []
+        for generator in suite.generators:
+            for system in suite.systems:
+                for scenario in scenarios:
+                    data = scenario_json(scenario)
+                    for repetition in range(suite.repetitions):
+                        # all generators and systems meet the same bases with the same seeds
+                        seed = seed32("adversarial", suite.seed, safeio.dump_json(data), repetition)
+                        mark = f"#{repetition}" if repetition else ""
+                        fields = {
+                            "generator": generator, "system": system, "group": scenario.group or scenario.type,
+                            "cluster": scenario.name,
+                        }  # fmt: skip
+                        spec = {
+                            "scenario": data, "generator": generator, "system": system, "repetition": repetition,
+                            "budget": suite.budget, "batch": suite.batch, "keep": suite.keep,
+                        }  # fmt: skip
+                        versions = systems[system], generators[generator], towns[scenario.town]
+                        name = f"{generator}/{system}/{scenario.name}{mark}"
+                        cells.append(self.make_cell(name, system, seed, fields, spec, *versions))
+        inputs = {"towns": towns, "systems": systems, "generators": generators}
+        return Plan(self, suite, device, tuple(cells), inputs)
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
+        for name in plan.inputs["towns"]:
+            path = folder / "towns" / town_file(name)
+            if not path.exists():
+                save_graph(town(name), path)
+        safeio.make_folder(folder / "traces")
+        safeio.make_folder(folder / "found")
+        return {}
+
+    def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
+        """Cells of one generator and one system, whose bases it works on side by side."""
+        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
+        groups: dict[tuple[str, str], list[Cell]] = {}
+        for cell in cells:
+            groups.setdefault((cell.fields["generator"], cell.system), []).append(cell)
+        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+
+    def start(self, job: Job) -> None:
+        """Loads the world's kernels, which are compiled on first use."""
+        import warp
+
+        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+        quiet_warp()
+        warp.force_load(device=job.device)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Runs one generator on the bases that the system survives."""
+        from ssad.drivers import make_system
+        from ssad.scenarios.dynamic import scenario_from
+        from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
+
+        system, spec = cells[0].system, cells[0].spec
+        trials = Trials(lambda: make_system(system), make_system, device=job.device)
+        bases = {}
+        for cell in cells:
+            scenario = scenario_from(cell.spec["scenario"])
+            bases[cell.key] = trials.base(scenario, town(scenario.town), seed=cell.seed)
+        alive = [cell for cell in cells if bases[cell.key].trace.end != "collision"]
+        results: dict[str, dict[str, Any]] = {}
+        for cell in cells:
+            if cell not in alive:
+                results[cell.key] = {"metrics": {"survived": False}, "case": motion_hash(bases[cell.key].trace)}
+        if not alive:
+            return results
+        began = time.perf_counter()
+        chosen = [bases[cell.key] for cell in alive]
+        generator = generator_factory(spec["generator"])(
+            chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"]
+        )
+        outcomes = search(generator, chosen, trials, budget=spec["budget"], batch=spec["batch"])
+        seconds = (time.perf_counter() - began) / len(alive)
+        for cell, base, row in zip(alive, chosen, outcomes, strict=True):
+            about = self._save(cell, base, row, trials, job.folder)
+            metrics = {"survived": True, **summary(row), **about.pop("metrics"), "seconds": seconds}
+            results[cell.key] = {**about, "metrics": plain(metrics), "case": cell.key, "n": len(row)}
+        return results
+
+    def _save(self, cell: Cell, base: Base, row: Sequence[Outcome], trials: Any, folder: Path) -> dict[str, Any]:
+        """Writes the most distinct collisions as scenarios, drives each again, and keeps the trace of the first."""
+        from ssad.scenarios.dynamic import save_scenarios
+        from ssad.scenarios.dynamic.generate import scenario_of
+
+        found = distinct([outcome for outcome in row if outcome.valid])[: cell.spec["keep"]]
+        if not found:
+            return {"metrics": {"replayed": None}}
+        mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
+        made = [
+            scenario_of(o, base, name=f"{base.scenario.name}/{cell.spec['generator']}{mark}-{n}")
+            for n, o in enumerate(found)
+        ]
+        # with another seed: what is saved must not depend on one
+        again = [trials.base(scenario, base.graph, seed=cell.seed + 1).trace.end == "collision" for scenario in made]
+        artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
+        save_scenarios(folder / artefacts["scenarios"], made)
+        assert found[0].trace is not None
+        save_trace(folder / artefacts["trace"], found[0].trace)
+        return {
+            "artefacts": artefacts, "adversaries": list(found[0].adversaries),
+            "metrics": {"replayed": float(np.mean(again))},
+        }  # fmt: skip
+
+
+def summary(row: Sequence[Outcome]) -> dict[str, Any]:
+    """The metrics of one search; means over collisions are None where there is none."""
+    valid = [o for o in row if o.valid]
+    ran = [o for o in row if o.trace is not None]
+    first = next((n for n, o in enumerate(row, 1) if o.valid), None)
+
+    def mean(values: Sequence[float | bool | None]) -> float | None:
+        known = [float(v) for v in values if v is not None]
+        return float(np.mean(known)) if known else None
+
+    return {
+        "CR": bool(valid), "CR_any": any(o.collision for o in row), "rollouts": first,
+        "share": mean([o.valid for o in row]), "distinct": len(distinct(valid)),
+        "off_road": mean([o.off_road for o in ran]), "hit_others": mean([o.hit_others for o in ran]),
+        "moving": mean([o.ego_speed is not None and o.ego_speed > 0.5 for o in valid]),
+        "impact_speed": mean([o.impact_speed for o in valid]),
+        "acceleration": mean([o.acceleration for o in valid]), "jerk": mean([o.jerk for o in valid]),
+        "within_limits": mean([o.within_limits for o in valid]),
+    }  # fmt: skip
+
+
+def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Those of some collisions that are no copies: the motion of who is hit, as the ego sees it, differs.
+
+    It is compared over the 3 s before contact; less than 1 m on average is the same collision.
+    """
+    kept: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
+    for outcome in outcomes:
+        motion = _approach(outcome)
+        if all(float(np.hypot(*(motion - other).T).mean()) >= APART for _, other in kept):
+            kept.append((outcome, motion))
+    return [outcome for outcome, _ in kept]
+
+
+def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
+    """Where the agent that was hit was in the ego's frame [30, 2], m, in the steps before contact."""
+    trace = outcome.trace
+    assert trace is not None
+    assert outcome.time is not None
+    row = round(outcome.time / trace.dt)
+    agent = int(trace.contact_agent[row])
+    rows = np.clip(np.arange(row - round(BEFORE / trace.dt) + 1, row + 1), 0, None)
+    x, y = (getattr(trace, name)[rows] for name in ("x", "y"))
+    cos, sin = np.cos(trace.yaw[rows, 0]), np.sin(trace.yaw[rows, 0])
+    dx, dy = x[:, agent] - x[:, 0], y[:, agent] - y[:, 0]
+    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], 1)

@@ -1,0 +1,56 @@
+"""CMA-ES: a normal distribution over the box that moves to where it is dangerous, by the package cmaes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ssad.core.errors import ConfigError, install_extra
+from ssad.core.generators import Base
+from ssad.core.seeding import seed32
+from ssad.core.types import F64
+from ssad.scenarios.dynamic.search.box import BoxSearch
+
+POPULATION = 8
+SIGMA = 0.3  # of the unit cube: the first generation covers most of it
+
+
+class CmaEs(BoxSearch):
+    """Covariance matrix adaptation from the nominal scenario, in generations of 8.
+
+    Source: Hansen and Ostermeier, Completely derandomized self-adaptation in evolution strategies, 2001.
+    """
+
+    name = "cma-es"
+
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+        try:
+            from cmaes import CMA
+        except ImportError:
+            raise ConfigError(f"generator cma-es needs the package cmaes; {install_extra('search')}") from None
+        super().__init__(bases, seeds=seeds, budget=budget)
+        self._search: list[Any] = [
+            CMA(
+                mean=np.clip(box.nominal(), 0.05, 0.95),
+                sigma=SIGMA,
+                bounds=np.tile([0.0, 1.0], (box.dimension, 1)),
+                seed=seed32("cma-es", seed),
+                population_size=POPULATION,
+            )
+            for box, seed in zip(self.boxes, seeds, strict=True)
+        ]
+        self._known: list[list[tuple[F64, float]]] = [[] for _ in self.boxes]
+
+    def points(self, index: int, count: int) -> F64:
+        """Draws from the present distribution."""
+        return np.array([self._search[index].ask() for _ in range(count)])
+
+    def learn(self, index: int, points: F64, danger: F64) -> None:
+        """A new generation whenever 8 outcomes are known; the search minimises minus the danger."""
+        known = self._known[index]
+        known += zip(points, (-danger).tolist(), strict=True)
+        while len(known) >= POPULATION:
+            self._search[index].tell(known[:POPULATION])
+            del known[:POPULATION]

@@ -1,0 +1,130 @@
+"""The kind adversarial: equal terms for all generators, what a search's record says, and what is saved of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.command import ssad
+from helpers.metric_traces import make_trace
+
+from ssad.bench.kinds.adversarial import Adversarial, distinct, summary
+from ssad.bench.suite import load_suite
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.generators import Outcome, Proposal
+from ssad.core.jsonl import read_lines
+from ssad.core.traces import load_trace
+from ssad.scenarios.dynamic import load_scenarios, read_scenarios
+
+(SCENARIO,) = load_scenarios("UnprotectedLeftTurn/00")
+STEP = 0.1 * np.arange(31)
+
+
+def hit(offset: float = 0.0, *, speed: float = 8.0, **changes: Any) -> Outcome:
+    """The ego meets who comes from the other side, `offset` m beside it."""
+    contact = (np.arange(31) == 30).astype(np.uint8)
+    trace = make_trace(
+        31, [(speed * STEP, 0.0, 0.0, speed), (50 - 8 * STEP, offset, np.pi, 8.0)], contact=contact,
+        contact_agent=np.where(contact, 1, -1).astype(np.int32),
+    )  # fmt: skip
+    outcome = Outcome(Proposal(SCENARIO), trace=trace, adversaries=(1,), collision=True, time=3.0, gap=0.0)
+    return dataclasses.replace(outcome, ego_speed=speed, impact_speed=16.0, **changes)
+
+
+def test_copies_of_a_collision_count_once() -> None:
+    one, copy, other = hit(), hit(0.3), hit(2.0)
+    assert distinct([one, copy, other]) == [one, other]
+    assert distinct([]) == []
+
+
+def test_a_record_says_what_was_found_and_how_often_not() -> None:
+    miss = Outcome(Proposal(SCENARIO), trace=hit().trace, gap=3.0)
+    failed = Outcome(Proposal(SCENARIO), failure="no room")
+    found = summary([miss, hit(off_road=True), hit(within_limits=True, jerk=4.0), hit(3.0, speed=0.0), failed])
+    assert found["CR"]
+    assert found["CR_any"]
+    assert found["rollouts"] == 3
+    assert found["share"] == pytest.approx(2 / 5)
+    assert found["off_road"] == pytest.approx(1 / 4)
+    assert found["distinct"] == 2
+    assert found["moving"] == pytest.approx(0.5)
+    assert found["within_limits"] == 1.0
+    assert found["jerk"] == 4.0
+    nothing = summary([miss, hit(hit_others=True)])
+    assert not nothing["CR"]
+    assert nothing["CR_any"]
+    assert nothing["rollouts"] is None
+    assert nothing["impact_speed"] is None
+
+
+def test_generators_and_systems_meet_the_same_bases_with_the_same_seeds() -> None:
+    suite = load_suite("adversarial-quick", ["systems=[autopilot,blind]", "repetitions=2"])
+    plan = Adversarial().plan(suite)
+    seeds: dict[tuple[str, int], set[int]] = {}
+    for cell in plan.cells:
+        seeds.setdefault((cell.fields["cluster"], cell.spec["repetition"]), set()).add(cell.seed)
+    assert all(len(found) == 1 for found in seeds.values())
+    assert len({min(found) for found in seeds.values()}) == len(seeds) == 16
+    assert len({cell.key for cell in plan.cells}) == len(plan.cells) == len(suite.generators) * 2 * 16
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["generators=[rendom]"], "unknown generator 'rendom'; closest: random"),
+        (["generators=[random,random]"], "generators: a name appears twice"),
+        (["budget=0"], "budget"),
+    ],
+)
+def test_wrong_suites_are_told_in_a_line(settings: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        Adversarial().plan(load_suite("adversarial-quick", settings))
+
+
+def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp_path: Path) -> None:
+    scenario = {"name": "mine", "type": "Custom", "town": SCENARIO.town}
+    scenario["route"] = [{"x": p.x, "y": p.y, "yaw": p.yaw} for p in SCENARIO.route]
+    (tmp_path / "mine.yaml").write_text(safeio.dump_json(scenario))
+    out = ssad("run", "adversarial-quick", "--set", f"scenarios={tmp_path / 'mine.yaml'}", "--out", tmp_path / "out")
+    assert out.returncode == 2
+    assert "scenario mine: its type Custom has no parameters of other agents to search" in out.stderr
+    king = ssad(
+        "run", "adversarial-quick", "--set", f"scenarios={tmp_path / 'mine.yaml'}", "--set", "generators=king",
+        "--out", tmp_path / "king", "--workers", "1",
+    )  # fmt: skip
+    (line,) = read_lines(tmp_path / "king" / "results.jsonl")
+    assert king.returncode != 0
+    assert line["status"] == "failed"
+    assert "there is no vehicle in it that could be an adversary" in line["reason"]
+
+
+def test_what_a_run_finds_replays_as_a_plain_scenario(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    settings = ("--set", "generators=halton", "--set", "systems=autopilot", "--set", "budget=16", "--set", "keep=2")
+    scenarios = ("--set", "scenarios=[UnprotectedLeftTurn/02,UnprotectedLeftTurn/00]")
+    done = ssad("run", "adversarial-quick", *settings, *scenarios, "--out", run, "--workers", "1")
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in read_lines(run / "results.jsonl") if line["metrics"]["survived"]]
+    found = [line for line in lines if line["metrics"]["CR"]]
+    assert found
+    assert all(line["metrics"]["replayed"] == 1.0 for line in found)
+    file = run / found[0]["artefacts"]["scenarios"]
+    saved = read_scenarios(file)
+    assert 1 <= len(saved) <= 2
+    assert saved[0].name.startswith(f"{found[0]['cluster']}/halton")
+    plain = tmp_path / "plain"
+    again = ssad("run", "quick", "--set", f"scenarios={file}", "--set", "systems=autopilot", "--set", "pictures=[]",
+                 "--out", plain, "--workers", "1")  # fmt: skip
+    assert again.returncode == 0, again.stderr
+    replayed = list(read_lines(plain / "results.jsonl"))
+    assert len(replayed) == len(saved)
+    assert all(line["metrics"]["collision"] for line in replayed)
+    first = load_trace(run / found[0]["artefacts"]["trace"])
+    same = load_trace(plain / replayed[0]["artefacts"]["trace"])
+    assert np.array_equal(first.x, same.x)
+    report = (run / "report.html").read_text()
+    assert "halton" in report
