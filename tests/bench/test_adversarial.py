@@ -11,6 +11,7 @@ import pytest
 from helpers.command import ssad
 from helpers.metric_traces import make_trace
 
+from ssad.bench.kind import Job, Resources
 from ssad.bench.kinds.adversarial import Adversarial, distinct, summary
 from ssad.bench.suite import load_suite
 from ssad.core import safeio
@@ -18,7 +19,11 @@ from ssad.core.errors import ConfigError
 from ssad.core.generators import Outcome, Proposal
 from ssad.core.jsonl import read_lines
 from ssad.core.traces import load_trace
+from ssad.drivers import make_system
+from ssad.metrics.realism import FEATURES
+from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios, read_scenarios
+from ssad.scenarios.dynamic.generate import Trials
 
 (SCENARIO,) = load_scenarios("UnprotectedLeftTurn/00")
 STEP = 0.1 * np.arange(31)
@@ -102,6 +107,39 @@ def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp
     assert "there is no vehicle in it that could be an adversary" in line["reason"]
 
 
+def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = {name: np.zeros(20) for name in FEATURES}
+    monkeypatch.setattr("ssad.bench.kinds.adversarial.reference", lambda folder, device: usual)
+    kind = Adversarial()
+    settings = [
+        "generators=halton",
+        "budget=10",
+        "keep=1",
+        "scenarios=UnprotectedLeftTurn/02",
+        "systems=[autopilot,blind]",
+    ]
+    plan = kind.plan(load_suite("adversarial-quick", settings))
+    job = Job(tmp_path, "cpu", kind.prepare(plan, tmp_path, Resources()))
+    survivor, victim = plan.cells
+    (line,) = kind.execute([survivor], job).values()
+    metrics = line["metrics"]
+    assert metrics["survived"]
+    assert metrics["CR"]
+    assert metrics["replayed"] == 1.0
+    assert 0.0 < metrics["seconds_first"] <= metrics["seconds"]
+    assert 0.0 < metrics["realism"] < 1.0
+    (saved,) = read_scenarios(tmp_path / line["artefacts"]["scenarios"])
+    assert saved.name == "UnprotectedLeftTurn/02/halton-0"
+    trace = load_trace(tmp_path / line["artefacts"]["trace"])
+    again = Trials(lambda: make_system("autopilot")).base(saved, load_town(saved.town), seed=1)
+    assert np.array_equal(trace.x, again.trace.x)
+    assert again.trace.end == "collision"
+    # what collides already in plain replay is not searched
+    (line,) = kind.execute([victim], job).values()
+    assert line["metrics"] == {"survived": False}
+
+
+@pytest.mark.slow
 def test_what_a_run_finds_replays_as_a_plain_scenario(tmp_path: Path) -> None:
     run = tmp_path / "run"
     settings = ("--set", "generators=halton", "--set", "systems=autopilot", "--set", "budget=16", "--set", "keep=2")

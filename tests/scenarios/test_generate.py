@@ -38,7 +38,7 @@ def bases() -> list[Base]:
 
 @pytest.fixture(scope="module")
 def natural() -> Base:
-    (scenario,) = load_scenarios("natural/Twinford_00/00")
+    scenario = load_scenarios("natural")[0]
     return trials("autopilot").base(scenario, load_town(scenario.town), seed=3)
 
 

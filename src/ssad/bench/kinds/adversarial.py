@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field
 
+from ssad.bench.adversarial_realism import likeness, reference
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
 from ssad.bench.kinds.driving import (
     DrivingSuite,
@@ -55,7 +57,7 @@ class AdversarialSuite(SuiteBase):
     batch: int = Field(default=8, ge=1, le=1024)
     repetitions: int = Field(default=1, ge=1, le=1000)
     keep: int = Field(default=3, ge=0, le=100)
-    chunk: int = Field(default=16, ge=1, le=1024)
+    chunk: int = Field(default=32, ge=1, le=1024)
 
     def beside(self, path: Path) -> Self:
         """Scenario files are looked for in the working folder, then beside the suite."""
@@ -87,7 +89,13 @@ class Adversarial(Kind):
         Column("jerk", "largest jerk of the adversary", "m/s^3"),
         Column("within_limits", "collisions within the adversary's limits", "", "higher"),
         Column("replayed", "saved scenarios that collide again", "", "higher"),
-        Column("seconds", "time a scenario", "s", "lower"),
+        Column("realism", "realism score of the adversaries", "", "higher"),
+        Column("w_speed", "Wasserstein distance of speed", "m/s", "lower"),
+        Column("w_acceleration", "Wasserstein distance of acceleration", "m/s^2", "lower"),
+        Column("w_yaw_rate", "Wasserstein distance of yaw rate", "rad/s", "lower"),
+        Column("w_nearest", "Wasserstein distance of the nearest object", "m", "lower"),
+        Column("seconds_first", "CPU time a scenario to the first", "s", "lower"),
+        Column("seconds", "CPU time a scenario", "s", "lower"),
     )
 
     def plan(self, suite: AdversarialSuite, *, device: str = "cpu", check: bool = True) -> Plan:
@@ -179,16 +187,23 @@ class Adversarial(Kind):
                 results[cell.key] = {"metrics": {"survived": False}, "case": motion_hash(bases[cell.key].trace)}
         if not alive:
             return results
-        began = time.perf_counter()
+        began = time.process_time()
         chosen = [bases[cell.key] for cell in alive]
         generator = generator_factory(spec["generator"])(
             chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"]
         )
-        outcomes = search(generator, chosen, trials, budget=spec["budget"], batch=spec["batch"])
-        seconds = (time.perf_counter() - began) / len(alive)
+        clock: dict[int, float] = {}  # rollouts of each base -> s for all bases
+        outcomes = search(
+            generator, chosen, trials, budget=spec["budget"], batch=spec["batch"],
+            after=lambda asked: clock.update({asked: time.process_time() - began}),
+        )  # fmt: skip
+        usual = reference(job.folder, job.device)
         for cell, base, row in zip(alive, chosen, outcomes, strict=True):
             about = self._save(cell, base, row, trials, job.folder)
-            metrics = {"survived": True, **summary(row), **about.pop("metrics"), "seconds": seconds}
+            metrics = {"survived": True, **summary(row), **about.pop("metrics"), **likeness(row, base.graph, usual)}
+            metrics["seconds"] = max(clock.values()) / len(alive)
+            spent = [s for asked, s in clock.items() if metrics["CR"] and asked >= metrics["rollouts"]]
+            metrics["seconds_first"] = min(spent, default=math.nan) / len(alive)
             results[cell.key] = {**about, "metrics": plain(metrics), "case": cell.key, "n": len(row)}
         return results
 

@@ -149,6 +149,7 @@ def search(
     budget: int,
     batch: int = BATCH,
     known: Sequence[Sequence[Outcome]] = (),
+    after: Callable[[int], None] = lambda asked: None,
 ) -> list[list[Outcome]]:
     """Run a generator until each base has used its budget, or nothing more is proposed.
 
@@ -159,6 +160,7 @@ def search(
         budget: Rollouts of each base.
         batch: Rollouts of each base that it is asked for at once.
         known: Outcomes of each base from a search that was cut short; these are told and not driven again.
+        after: Called after each round with the rollouts that each base has been asked for so far.
 
     Returns:
         For each base its outcomes, in the order in which they were proposed.
@@ -195,6 +197,7 @@ def search(
         generator.tell(told)
         for b, outcomes in enumerate(told):
             found[b] += outcomes
+        after(asked)
     return found
 
 

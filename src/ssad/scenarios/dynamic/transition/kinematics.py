@@ -36,7 +36,6 @@ RATE: Final = 0.05  # of Adam
 BETAS: Final = 0.8, 0.99  # KING's
 SOFT: Final = 1.0  # m; the least gap is taken softly
 PURSUIT: Final = 0.2  # weight of the mean gap, KING's own objective: the adversary stays with an ego that waits
-ANSWERS: Final = 2  # of the ego's last rollouts that count: against one alone the two dodge each other in turns
 CLEAR: Final = 1.25  # m that KING keeps between agents
 OTHERS: Final = 3.0  # weight of coming nearer than that; KING's
 ROAD: Final = 20.0  # weight of corners off the road; KING's
@@ -56,7 +55,7 @@ class _Chain:
         base: Number of the base.
         agent: The adversary.
         change: [K, 2] effort and steering added to what was recorded.
-        ego: The ego's box and presence [E, T + 1, 6] in the last rollouts.
+        ego: The ego's box and presence [T + 1, 6] in the last rollout.
         weight: Of the road and the others.
         tried: Rollouts so far.
     """
@@ -121,7 +120,7 @@ class King:
                 if outcome.trace is None or outcome.valid or chain.tried >= (2 if away else PATIENCE):
                     self._chains[k][at] = self._new_chain(k)
                     continue
-                chain.ego = np.stack([_sampled(outcome.trace)[0], *chain.ego[:-1]])
+                chain.ego = _sampled(outcome.trace)[0]
                 if outcome.off_road or outcome.hit_others:
                     chain.weight *= 2.0
 
@@ -135,7 +134,7 @@ class King:
         change = JITTER * min(turn, 1) * draws.standard_normal((STEPS // KNOT + 1, 2))
         if np.abs(self.bases[base].trace.speed[:, agent]).max() < 0.5:
             change[:, 0] += 0.1  # who stands without throttle has no gradient
-        return _Chain(base, agent, change, np.stack([self._motion[base][0]] * ANSWERS))
+        return _Chain(base, agent, change, self._motion[base][0])
 
     def _as_recorded(self, base: int) -> dict[int, tuple[MotionState, Tensor]]:
         """Start and controls [T, 4] with which the twin repeats what each of the adversaries did."""
@@ -193,14 +192,14 @@ class King:
         size = torch.stack([bodies.length, bodies.width], -1)[:, None].expand(-1, STEPS + 1, -1)
         box = torch.cat([pose, size], -1)
         there = ego[..., 5] > 0.5
-        gap = torch.where(there, _gap(box[:, None].expand(-1, ANSWERS, -1, -1), ego[..., :5]), 1.0e3)
+        gap = torch.where(there, _gap(box, ego[..., :5]), 1.0e3)
         near = -SOFT * torch.logsumexp(-gap / SOFT, -1)
         present = there.sum(-1).clamp_min(1)
         pursuit = torch.where(there, gap.clamp(0.0, 50.0), 0.0).sum(-1) / present
-        near = (near + PURSUIT * pursuit).mean(1)
+        near = near + PURSUIT * pursuit
         # the episode ends where the two meet
         time = torch.arange(STEPS + 1)
-        counts = torch.where(time <= gap.detach().argmin(-1).amax(1)[:, None] + 2, 1.0, AFTER)
+        counts = torch.where(time <= gap.detach().argmin(1)[:, None] + 2, 1.0, AFTER)
         apart = (pose.detach()[:, None, :, :2] - others[..., :2]).square().sum(-1)
         pick = torch.where(others[..., 5] > 0.5, apart, 1.0e9).argmin(1)
         nearest = torch.take_along_dim(others, pick[:, None, :, None], 1)[:, 0]

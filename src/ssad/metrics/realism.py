@@ -1,0 +1,136 @@
+"""How much motion looks like ordinary traffic: the histogram score of the sim-agents challenge, Wasserstein distances.
+
+The challenge scores simulated agents against what the same agents did in a log. Generated scenarios have no such log,
+so here a motion is scored under histograms of a named reference, pooled over its agents and steps. Bins, weights and
+pseudo-count are the challenge's.
+
+Source: Montali et al., The Waymo Open Sim Agents Challenge, 2023, with the configuration of 2025.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ssad.core.geometry import obb_distance
+from ssad.core.rotations import wrap_angle
+from ssad.core.types import F64, EpisodeTrace
+from ssad.metrics.criticality import boxes, time_to_collision
+
+PSEUDO_COUNT: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Feature:
+    """A feature of motion: its bins (two of them, 0 and 1, for what either happens or not), weight and unit."""
+
+    low: float
+    high: float
+    bins: int
+    weight: float
+    unit: str
+
+
+FEATURES: Final[Mapping[str, Feature]] = {
+    "speed": Feature(0.0, 25.0, 10, 0.05, "m/s"),
+    "acceleration": Feature(-12.0, 12.0, 11, 0.05, "m/s^2"),
+    "yaw_rate": Feature(-0.628, 0.628, 11, 0.05, "rad/s"),
+    "yaw_acceleration": Feature(-3.14, 3.14, 11, 0.05, "rad/s^2"),
+    "nearest": Feature(-5.0, 40.0, 10, 0.10, "m"),
+    "ttc": Feature(0.0, 5.0, 10, 0.10, "s"),
+    "road_edge": Feature(-20.0, 40.0, 10, 0.05, "m"),
+    "collision": Feature(0.0, 1.0, 2, 0.25, ""),
+    "off_road": Feature(0.0, 1.0, 2, 0.25, ""),
+}
+"""Name -> feature. The challenge's red lights (weight 0.05) are left out: only the ego's are recorded. Collisions are
+those with others than the ego, since a collision with the ego is what a generator is asked for."""
+
+
+def motion_features(trace: EpisodeTrace, agent: int, edge: F64) -> dict[str, F64]:
+    """The features of one agent's motion.
+
+    Args:
+        trace: What happened.
+        agent: The agent.
+        edge: [T] signed distance of its centre from the edge of the road, m, more than 0 off it.
+
+    Returns:
+        Feature -> values, one a step in which it is there and the feature is defined; collision and off_road have one.
+    """
+    there = np.flatnonzero(trace.active[:, agent])
+    dt, box = float(trace.dt), boxes(trace)
+    speed = trace.speed[there, agent].astype(np.float64)
+    rate = np.asarray(wrap_angle(np.diff(trace.yaw[there, agent].astype(np.float64)))) / dt
+    others = [a for a in range(len(trace.kind)) if a != agent]
+    apart = np.full((len(there), len(others)), np.inf)
+    until = np.full((len(there), len(others)), np.inf)
+    velocity = trace.speed[..., None] * np.stack([np.cos(trace.yaw), np.sin(trace.yaw)], -1)
+    for column, other in enumerate(others):
+        both = trace.active[there, other]
+        rows = there[both]
+        apart[both, column] = obb_distance(box[rows, agent], box[rows, other])
+        closing = (velocity[rows, agent] - velocity[rows, other]).astype(np.float64)
+        until[both, column] = time_to_collision(box[rows, agent], box[rows, other], closing)
+    nearest = apart.min(axis=1, initial=np.inf)
+    touched = [a for column, a in enumerate(others) if a != 0 and (apart[:, column] <= 0.0).any()]
+    return {
+        "speed": np.abs(speed),
+        "acceleration": np.diff(speed) / dt,
+        "yaw_rate": rate,
+        "yaw_acceleration": np.diff(rate) / dt,
+        "nearest": nearest[np.isfinite(nearest)],
+        "ttc": np.minimum(until.min(axis=1, initial=np.inf), FEATURES["ttc"].high),
+        "road_edge": edge[there],
+        "collision": np.array([float(bool(touched))]),
+        "off_road": np.array([float((edge[there] > 0.0).any())]),
+    }
+
+
+def pooled(motions: Sequence[Mapping[str, F64]]) -> dict[str, F64]:
+    """Feature -> the values of several motions together."""
+    return {name: np.concatenate([m[name] for m in motions] or [np.zeros(0)]) for name in FEATURES}
+
+
+def histogram(values: F64, feature: Feature) -> F64:
+    """Probabilities [bins] of the bins, with the pseudo-count; what lies outside counts in the first or last bin."""
+    counts = np.bincount(_bin(values, feature), minlength=feature.bins) + PSEUDO_COUNT
+    return np.asarray(counts / counts.sum())
+
+
+def realism(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> float:
+    """The weighted mean of the features' likelihoods under the reference, 0 to 1; NaN without values.
+
+    The likelihood of a feature is the geometric mean of the probabilities of the bins that its values lie in.
+
+    Args:
+        motions: Feature -> values, of what is judged.
+        reference: Likewise, of ordinary traffic.
+    """
+    total = weight = 0.0
+    for name, feature in FEATURES.items():
+        if len(motions[name]) and len(reference[name]):
+            chance = histogram(reference[name], feature)[_bin(motions[name], feature)]
+            total += feature.weight * math.exp(float(np.log(chance).mean()))
+            weight += feature.weight
+    return total / weight if weight else math.nan
+
+
+def wasserstein(motions: Mapping[str, F64], reference: Mapping[str, F64]) -> dict[str, float]:
+    """Wasserstein distance of each feature's values from the reference's, in the feature's unit; NaN without values."""
+    from scipy.stats import wasserstein_distance
+
+    return {
+        name: float(wasserstein_distance(motions[name], reference[name]))
+        if len(motions[name]) and len(reference[name])
+        else math.nan
+        for name in FEATURES
+    }
+
+
+def _bin(values: F64, feature: Feature) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    share = (np.asarray(values, np.float64) - feature.low) / (feature.high - feature.low)
+    return np.clip(np.floor(share * feature.bins), 0, feature.bins - 1).astype(np.int64)

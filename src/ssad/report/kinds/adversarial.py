@@ -1,0 +1,151 @@
+"""The page of an adversarial run: generators on equal terms, against random search, and what they found from above."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+
+from ssad.core.errors import SSADError
+from ssad.core.lane_graph import load_graph, town_file
+from ssad.core.traces import load_trace
+from ssad.metrics import CaseValue, estimate
+from ssad.metrics.uncertainty import paired_difference
+from ssad.report.default import result_table
+from ssad.report.found_view import found_view
+from ssad.report.load import Run
+from ssad.report.pages import render
+from ssad.report.tables import METHODS, Cell, Row, Table
+
+RANDOM = "random"
+SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving")
+VIEWS = 24
+Line = Mapping[str, Any]
+
+
+def section(run: Run) -> tuple[str, Sequence[Table]]:
+    """The page of a run and its tables."""
+    tables = [table for table in (main_table(run), budget_table(run), against_table(run), group_table(run)) if table]
+    failed = [
+        ([str(line.get(name, "")) for name in ("generator", "system", "cluster")], line["status"], line["reason"])
+        for line in run.failures
+    ]
+    return render("adversarial.html", run, tables=tables, failures=failed, views=views(run)), tables
+
+
+def summary(run: Run) -> Table:
+    """The table that is shown on the terminal."""
+    wide = main_table(run)
+    keep = [k for k, column in enumerate(run.header["columns"]) if column["name"] in SUMMARY]
+    rows = tuple(replace(row, cells=tuple(row.cells[k] for k in keep)) for row in wide.rows)
+    columns = "survive plain replay", "CR", "rollouts to the first", "distinct", "ego moves"
+    return replace(wide, columns=columns, rows=rows, note="CR: survived bases in which a collision is found")
+
+
+def main_table(run: Run) -> Table:
+    """Generator and system: every column over all bases."""
+    wide = result_table(replace(run, header={**run.header, "factors": ["generator", "system"]}))
+    note = (
+        f"Over the base scenarios that the system survives in plain replay, {run.suite.get('budget')} rollouts each. "
+        f"{METHODS}"
+    )
+    return replace(wide, name="adversarial", title="Generators on equal terms", note=note)
+
+
+def budget_table(run: Run) -> Table:
+    """CR within parts of the budget."""
+    budget = int(run.suite.get("budget", 1))
+    steps = sorted({max(1, round(budget * share)) for share in (0.125, 0.25, 0.5, 1.0)})
+    rows = []
+    for head, lines in _searches(run).items():
+        cells = []
+        for most in steps:
+            cases = [_case(line, _within(line, most)) for line in lines]
+            cells.append(Cell.of(estimate(cases, "share")))
+        rows.append(Row(head, tuple(cells)))
+    columns = tuple(f"CR within {n}" for n in steps)
+    return Table("budget", "CR by rollouts spent", ("Generator", "System"), columns, tuple(rows), METHODS)
+
+
+def against_table(run: Run) -> Table | None:
+    """CR of each generator less that of random search, over the same bases."""
+    searches = _searches(run)
+    rows = []
+    for (generator, system), lines in searches.items():
+        other = searches.get((RANDOM, system))
+        if other is None or generator == RANDOM:
+            continue
+        first, second = (
+            {
+                f"{line['cluster']}#{line['spec']['repetition']}": _case(line, _within(line))
+                for line in part
+                if line["status"] != "ok" or not math.isnan(_within(line))
+            }
+            for part in (lines, other)
+        )
+        rows.append(Row((generator, system), (Cell.of(paired_difference(first, second)),)))
+    if not rows:
+        return None
+    note = f"CR of the generator minus that of random search in the same base scenarios with the same seeds. {METHODS}"
+    heads = ("Generator", "System")
+    return Table("against_random", "Against random search", heads, ("difference of CR",), tuple(rows), note)
+
+
+def group_table(run: Run) -> Table:
+    """CR by group of base scenarios."""
+    groups = list(dict.fromkeys(str(line["group"]) for line in run.lines))
+    rows = []
+    for head, lines in _searches(run).items():
+        cells = [
+            Cell.of(estimate([_case(line, _within(line)) for line in lines if line["group"] == group], "share"))
+            for group in groups
+        ]
+        rows.append(Row(head, tuple(cells)))
+    return Table("groups", "CR by group", ("Generator", "System"), tuple(groups), tuple(rows), METHODS)
+
+
+def views(run: Run) -> list[dict[str, str]]:
+    """Found scenarios from above, one of each generator and group in turn: data URI, caption, command."""
+    found: dict[tuple[str, str, str], Line] = {}
+    for line in run.lines:
+        if "trace" in (line.get("artefacts") or {}):
+            found.setdefault((str(line["generator"]), str(line["system"]), str(line["group"])), line)
+    shown = []
+    for (generator, system, _), line in list(found.items())[:VIEWS]:
+        try:
+            trace = load_trace(run.folder / line["artefacts"]["trace"])
+            graph = load_graph(run.folder / "towns" / town_file(trace.town))
+        except SSADError:
+            continue  # named on the page as missing or damaged
+        picture = found_view(trace, graph, [int(a) for a in line["adversaries"]])
+        data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+        caption = f"{generator} against {system} in {line['cluster']}"
+        command = f"ssad run quick --set scenarios={run.folder / line['artefacts']['scenarios']} --set systems={system}"
+        uri = f"data:image/png;base64,{base64.b64encode(data).decode()}"
+        shown.append({"data": uri, "caption": caption, "command": command})
+    return shown
+
+
+def _searches(run: Run) -> dict[tuple[str, str], list[Line]]:
+    """Lines by generator and system."""
+    found: dict[tuple[str, str], list[Line]] = {}
+    for line in run.lines:
+        found.setdefault((str(line["generator"]), str(line["system"])), []).append(line)
+    return found
+
+
+def _within(line: Line, most: float = math.inf) -> float:
+    """Whether a search has found a collision within so many rollouts; NaN: nothing to search, or it failed."""
+    metrics = line.get("metrics") or {}
+    if line["status"] != "ok" or not metrics.get("survived"):
+        return math.nan
+    return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
+
+
+def _case(line: Line, value: float) -> CaseValue:
+    """A search as a case of its base scenario."""
+    return CaseValue(value, str(line["cluster"]), str(line["key"]), failed=line["status"] != "ok")

@@ -1,0 +1,97 @@
+"""The tables of an adversarial run, and the views of what was found."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.metric_traces import make_trace
+
+from ssad.bench.kinds.adversarial import Adversarial
+from ssad.report.found_view import ADVERSARY, EGO, found_view
+from ssad.report.kinds.adversarial import against_table, budget_table, group_table, main_table, summary
+from ssad.report.load import Run
+from ssad.roads import load_town
+
+
+def line(generator: str, base: int, first: int | None, *, survived: bool = True, **changes: Any) -> dict[str, Any]:
+    metrics: dict[str, Any] = {"survived": survived}
+    if survived:
+        metrics |= {"CR": first is not None, "rollouts": first, "distinct": 1 if first else 0, "moving": None}
+    return {
+        "generator": generator, "system": "autopilot", "group": "A" if base < 6 else "B", "cluster": f"base {base}",
+        "key": f"{generator}{base}", "status": "ok", "reason": "", "metrics": metrics, "spec": {"repetition": 0},
+    } | changes  # fmt: skip
+
+
+def run(lines: list[dict[str, Any]]) -> Run:
+    columns = [{"name": c.name, "title": c.title, "unit": c.unit, "better": c.better} for c in Adversarial.columns]
+    header = {"suite": {"name": "t", "budget": 16}, "columns": columns, "kind": "adversarial"}
+    return Run(Path("nowhere"), header, tuple(lines), {}, len(lines))
+
+
+@pytest.fixture
+def found() -> Run:
+    good = [line("king", k, 3 if k % 2 else 9) for k in range(10)]
+    poor = [line("random", k, 16 if k == 0 else None) for k in range(10)]
+    lost = [line(name, 10, None, survived=False) for name in ("king", "random")]
+    return run(good + poor + lost)
+
+
+def cell(table: Any, row: int, column: str) -> Any:
+    return table.rows[row].cells[table.columns.index(column)]
+
+
+def test_rates_count_survived_bases_alone(found: Run) -> None:
+    table = main_table(found)
+    column = next(c.title for c in Adversarial.columns if c.name == "CR")
+    assert cell(table, 0, column).mean == 1.0
+    assert cell(table, 0, column).n == 10
+    assert cell(table, 1, column).mean == pytest.approx(0.1)
+    assert cell(table, 1, column).low < 0.1 < cell(table, 1, column).high
+    assert cell(table, 0, "plain replay survived").mean == pytest.approx(10 / 11)
+    assert [row.head for row in table.rows] == [("king", "autopilot"), ("random", "autopilot")]
+    assert len(summary(found).columns) == len(summary(found).rows[0].cells) == 5
+
+
+def test_the_budget_is_shown_in_parts(found: Run) -> None:
+    table = budget_table(found)
+    assert table.columns == tuple(f"CR within {n}" for n in (2, 4, 8, 16))
+    assert [c.mean for c in table.rows[0].cells] == [0.0, 0.5, 0.5, 1.0]
+    assert [c.mean for c in table.rows[1].cells] == [0.0, 0.0, 0.0, 0.1]
+
+
+def test_generators_are_compared_with_random_search_base_by_base(found: Run) -> None:
+    table = against_table(found)
+    assert table is not None
+    (row,) = table.rows
+    assert row.head == ("king", "autopilot")
+    assert row.cells[0].mean == pytest.approx(0.9)
+    assert row.cells[0].failed == 0
+    assert row.cells[0].n == 10
+    assert against_table(run([line("king", 0, 1)])) is None
+
+
+def test_groups_have_their_own_rates_and_failures_count(found: Run) -> None:
+    lines = [*found.lines, line("king", 11, None, status="failed", reason="no road", metrics={})]
+    table = group_table(run(lines))
+    assert table.columns == ("A", "B")
+    assert cell(table, 0, "A").mean == 1.0
+    assert cell(table, 0, "B").failed == 1
+    assert not math.isnan(cell(table, 1, "A").mean)
+
+
+def test_a_view_shows_ego_and_adversary_where_they_met() -> None:
+    graph = load_town("Twinford")
+    x, y = graph.xy[graph.points(0)][0].tolist()
+    step = 0.1 * np.arange(31)
+    ego, other = (x - 30 + 10 * step, y, 0.0, 10.0), (x + 35 - 10 * step, y, math.pi, 10.0)
+    picture = found_view(make_trace(31, [ego, other]), graph, [1], size=300)
+    assert picture.shape == (300, 300, 3)
+    blue, red = ((picture == colour).all(-1) for colour in (EGO, ADVERSARY))
+    assert blue.sum() > 100
+    assert red.sum() > 100
+    assert np.nonzero(blue)[1].mean() < np.nonzero(red)[1].mean()  # east is to the right
