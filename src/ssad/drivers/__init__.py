@@ -19,6 +19,7 @@ SYSTEMS: dict[str, str] = {
     "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",
     "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
     "ppo": "ssad.drivers.rl.learned:PPO",
+    "sac": "ssad.drivers.rl.learned:SAC",
 }
 LEARNED = ("ppo", "sac", "td3")
 """Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""

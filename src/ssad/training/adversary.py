@@ -25,8 +25,8 @@ from ssad.world.selection import FreaSelection
 
 ADVERSARIES = {
     "adv-ppo": replace(
-        LEARNINGS["ppo"], steps=800_000, observation="adversary", action="adversary", reward="adversary", draws=6,
-        gamma=0.98, lr=3e-4, noise=0.6, entropy=0.002, validate=100_000,
+        LEARNINGS["ppo"], steps=200_000, observation="adversary", action="adversary", reward="adversary", draws=6,
+        gamma=0.98, lr=3e-4, noise=0.6, entropy=0.002, validate=50_000,
     )
 }  # fmt: skip
 """How adversaries are trained."""
@@ -43,6 +43,7 @@ class AdversaryPlan:
         scenarios: Natural traffic to learn in.
         test: What the weights are measured on in the end.
         literal: Whether the reward is equation 6 as it is printed.
+        off_road: What each step off the road costs an adversary (the paper and FREA: 0).
         changes: Changed values of the recipe.
         seconds: Time limit, s; None: none.
     """
@@ -53,6 +54,7 @@ class AdversaryPlan:
     scenarios: tuple[str, ...] = ("training",)
     test: tuple[str, ...] = ("natural",)
     literal: bool = False
+    off_road: float = 0.5
     changes: tuple[tuple[str, Any], ...] = ()
     seconds: float | None = None
 
@@ -127,7 +129,7 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
         found = measure_adversary(Candidate(policy), **held)  # type: ignore[arg-type]
         return found | {"score": found["valid"]}
 
-    about = digest("adversary training", plan.ego, plan.literal, *(e.key for e in episodes))[:16]
+    about = digest("adversary training", plan.ego, plan.literal, plan.off_road, *(e.key for e in episodes))[:16]
     state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about)
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
@@ -142,7 +144,7 @@ def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs:
 
     return AdversaryEnv(
         episodes, graphs, learning.scenes, ego=ego, seed=learning.seed, literal=plan.literal,
-        scale=learning.reward_scale, action=learning.action,
+        off_road=plan.off_road, scale=learning.reward_scale, action=learning.action,
     )  # fmt: skip
 
 
@@ -176,6 +178,7 @@ def command_of(plan: AdversaryPlan) -> str:
     words += ["--scenarios", ",".join(plan.scenarios)] if plan.scenarios != usual.scenarios else []
     words += ["--test", ",".join(plan.test)] if plan.test != usual.test else []
     words += ["--literal"] if plan.literal else []
+    words += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != usual.off_road else []
     for key, value in plan.changes:
         words += ["--set", f"{key}={'[' + ','.join(map(str, value)) + ']' if isinstance(value, tuple) else value}"]
     return shlex.join(words)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -40,6 +41,7 @@ class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not b
         ego: Drives the egos.
         seed: Of the draws of episodes.
         literal: Equation 6 as it is printed, see `ssad.world.rewards.adversary`.
+        off_road: What a step off the road costs, likewise.
         scale: The reward is multiplied by it.
         action: As in `ssad.world.policy.to_controls`.
     """
@@ -53,6 +55,7 @@ class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not b
         ego: Driver,
         seed: int = 0,
         literal: bool = False,
+        off_road: float = 0.0,
         scale: float = 0.05,
         action: str = "adversary",
     ) -> None:
@@ -63,7 +66,8 @@ class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not b
         self.world = World(episodes, graphs, assign=np.arange(num_envs) % len(episodes))
         self.loop = Loop(self.world, {0: ego}, policies=make_system)
         self.select = FreaSelection(count=1)
-        self._literal, self._scale, self._action = literal, scale, action
+        self._reward = partial(adversary_reward, literal=literal, off_road=off_road)
+        self._scale, self._action = scale, action
         self._random = generator("adversary episodes", seed)
         self._who = np.full(num_envs, -1)  # agent of each scene's adversary, -1: none
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, np.int64)
@@ -94,7 +98,7 @@ class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not b
         self.loop.step(controls)
         state = world.state()
         reward = np.zeros(self.num_envs)
-        gain: F64 = adversary_reward(state, agents, before, literal=self._literal)
+        gain: F64 = self._reward(state, agents, before)
         reward[acting] = self._scale * gain
         self._returns[acting] += gain
         self._lengths[acting] += 1

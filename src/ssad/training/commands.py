@@ -88,6 +88,7 @@ def train_adversary(
     ] = "training",
     test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "natural",
     literal: Annotated[bool, typer.Option("--literal", help="Reward as equation 6 of the paper prints it.")] = False,
+    off_road: Annotated[float, typer.Option(min=0.0, help="What a step off the road costs; in the paper 0.")] = 0.5,
     out: Annotated[Path, typer.Option(help="Output folder; repeat the command to resume.")] = Path("training"),
     change: Changes = None,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
@@ -97,7 +98,7 @@ def train_adversary(
     from ssad.training.detector import parse_changes
 
     plan = AdversaryPlan(
-        algorithm, out, ego, _names(scenarios), _names(test), literal, parse_changes(change or []), seconds
+        algorithm, out, ego, _names(scenarios), _names(test), literal, off_road, parse_changes(change or []), seconds
     )
     for line in run_adversary_training(plan, say=lambda text: print(text, flush=True)):
         print(line)

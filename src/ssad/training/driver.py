@@ -166,7 +166,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
 
     def validate(policy: Policy) -> dict[str, float]:
         found = measure(Candidate(policy), held, graphs)
-        return found | {"score": found["RC"] - found["CR"] - found["OF"]}
+        return found | {"score": found["RC"] - found["CR"] - 2.0 * found["OF"]}
 
     about = digest("driver training", *(safeio.dump_json([e.key, e.seed]) for e in episodes))[:16]
     state = learn(

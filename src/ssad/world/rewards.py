@@ -85,7 +85,7 @@ def hit_others(state: WorldState, agents: I32) -> Bool:
     return found
 
 
-def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = False) -> F64:
+def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = False, off_road: float = 0.0) -> F64:
     """The reward of goal-seeking adversaries (Adv.PPO), [N].
 
     clip(before - now, -1, 1) - 15 for a contact with anybody but the ego + 15 within 2 m of the goal: what the code
@@ -97,15 +97,17 @@ def adversary(state: WorldState, agents: I32, before: F64, *, literal: bool = Fa
         before: [N] `distance_to_goal` before the step.
         literal: Equation 6 as it is printed instead: now - before - 15 r_col - 15 r_fin with r_col = -1 and r_fin = 1.
             Its signs reward driving away and contacts, and punish reaching the goal.
+        off_road: What each step with its centre off the road costs; neither the paper nor FREA has such a term.
 
     Source: the paper's equation 6; FREA (Chen et al. 2024).
     """
     now = distance_to_goal(state, agents)
     hit, there = hit_others(state, agents), now < GOAL_RADIUS
+    cost = off_road * (state.lane[agents[:, 0], agents[:, 1]] < 0)
     if literal:
-        found: F64 = now - before + 15.0 * hit - 15.0 * there
+        found: F64 = now - before + 15.0 * hit - 15.0 * there - cost
         return found
-    gain: F64 = np.clip(before - now, -1.0, 1.0) - 15.0 * hit + 15.0 * there
+    gain: F64 = np.clip(before - now, -1.0, 1.0) - 15.0 * hit + 15.0 * there - cost
     return gain
 
 

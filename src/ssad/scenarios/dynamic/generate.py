@@ -27,6 +27,7 @@ GENERATORS: dict[str, str] = {
     "cma-es": f"{_SEARCH}.cma_es:CmaEs",
     "bayesian": f"{_SEARCH}.bayesian:Bayesian",
     "king": "ssad.scenarios.dynamic.transition.kinematics:King",
+    "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
 BATCH = 8  # rollouts of a base side by side

@@ -1,0 +1,1 @@
+"""Policy-based generators: adversaries that drive by a learned policy."""

@@ -1,0 +1,86 @@
+"""Adv.PPO: vehicles of the background traffic that a learned policy drives into the ego's way, one or several at once.
+
+    from ssad.scenarios.dynamic.policy.adv_ppo import Adversary
+    from ssad.world.selection import FreaSelection
+    traces = rollout(world, {0: make_system("autopilot"), FreaSelection(count=1): Adversary()})
+
+An adversary seeks the goal, a point 6.5 m ahead of the ego on the ego's own route (`ssad.world.rewards.adversary`). It
+steers, accelerates and drives in reverse; it has no brake. `ssad train adversary` trains it.
+
+Source: the paper, equation 6; FREA (Chen et al. 2024), its adversary `ppo`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ssad.core.driving import Driver, Observation, Selector
+from ssad.core.errors import ConfigError
+from ssad.core.generators import Base, Outcome, Proposal
+from ssad.core.types import F32, Controller, Episode
+from ssad.world.policy import Policy, load_policy
+from ssad.world.selection import VEHICLES, FreaSelection
+
+SHIPPED = Path(__file__).parent / "weights"
+
+
+class Adversary:
+    """Drives whom it is given by a policy that looks at the ego's next way; deterministic, without memory.
+
+    Attributes:
+        policy: What it does.
+        version: Hash of its weights.
+    """
+
+    controller = Controller.EXTERNAL
+
+    def __init__(self, weights: str | Path | None = None, *, name: str = "adv-ppo") -> None:
+        """A driver of adversaries.
+
+        Args:
+            weights: NAME.safetensors with its card beside it, as `ssad train adversary` writes them; None: the shipped
+                ones.
+            name: What tables call it; of the shipped ones, which.
+
+        Raises:
+            FormatError: The weights are missing or broken, or are not those of a policy.
+        """
+        self.name = name
+        self.policy: Policy = load_policy(SHIPPED / f"{name}.safetensors" if weights is None else weights)
+        self.version = self.policy.card.hash
+        self.sensors = (self.policy.observation,)
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: Observation) -> F32:
+        """Throttle, brake, steer and reverse [N, 4] from what its sensor shows."""
+        return self.policy.controls(view.readings[self.policy.observation])
+
+
+class AdvPPO:
+    """Adv.PPO: a learned policy drives the vehicle nearest to the ego into its way; one rollout a base."""
+
+    name = "adv-ppo"
+
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+        """See `ssad.core.generators.GeneratorFactory`; seeds and budget beyond 1 make no difference."""
+        for base in bases:
+            if not any(_can_be(agent.controller) for agent in base.episode.agents[1:]):
+                raise ConfigError(f"scenario {base.scenario.name}: adv-ppo needs other agents than the ego")
+        self._bases = tuple(bases)
+        self._drivers: dict[Selector, Driver] = {FreaSelection(count=1, kinds=VEHICLES): Adversary()}
+        self._asked = False
+
+    def ask(self, count: int) -> Sequence[Sequence[Proposal]]:
+        """The base itself with the policy in it, once."""
+        first, self._asked = not self._asked, True
+        return [[Proposal(base.scenario, drivers=self._drivers)] if first and count else [] for base in self._bases]
+
+    def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
+        """Nothing to learn: the policy was trained before."""
+
+
+def _can_be(controller: Controller) -> bool:
+    return controller in (Controller.AUTOPILOT, Controller.FOLLOW, Controller.SCRIPT, Controller.EXTERNAL)

@@ -1,0 +1,93 @@
+"""The environment in which adversaries learn is the loop in which they drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.core.checkpoints import Card
+from ssad.core.types import Controller
+from ssad.drivers import make_system
+from ssad.training.driver import Candidate, draw_episodes, find_scenarios
+from ssad.world.policy import policy_of, tensors_of
+from ssad.world.rollout import Loop
+from ssad.world.selection import FreaSelection
+from ssad.world.world import World
+
+pytest.importorskip("stable_baselines3", reason="needs the extra train")
+from ssad.training.adversary_env import AdversaryEnv
+
+
+def scenes():
+    scenarios, graphs = find_scenarios([f"training/natural/Larkhill_{k:02d}/00" for k in range(6)])
+    return draw_episodes(scenarios, graphs, draws=1, seed=0), graphs
+
+
+def some_policy():
+    torch.manual_seed(3)
+    layers = [torch.nn.Linear(24, 16), torch.nn.Linear(16, 2)]
+    config = {"observation": "adversary", "action": "adversary", "squash": "tanh"}
+    return policy_of(Card("", "", 0, (), config=config), tensors_of(layers), "test")
+
+
+def environment(monkeypatch, **settings) -> AdversaryEnv:
+    episodes, graphs = scenes()
+    env = AdversaryEnv(episodes, graphs, len(episodes), ego=make_system("autopilot"), **settings)
+    monkeypatch.setattr(env, "_draw", lambda count: np.arange(count, dtype=np.int32))
+    return env
+
+
+def test_an_adversary_drives_in_training_as_it_does_in_the_loop(monkeypatch) -> None:
+    policy, env = some_policy(), environment(monkeypatch)
+    observation = env.reset()
+    episodes, graphs = scenes()
+    world = World(episodes, graphs)
+    loop = Loop(world, {0: make_system("autopilot"), FreaSelection(count=1): Candidate(policy)})
+    loop.reset()
+    seen = 0
+    for _ in range(80):
+        env.step_async(policy.actions(observation))
+        observation, _, _, _ = env.step_wait()
+        loop.step()
+        if (world.ended() != 0).any():
+            break
+        np.testing.assert_array_equal(env.world.state().pose, world.state().pose)
+        seen += int((world.state().policy == 1).sum())
+    assert seen > 30
+
+
+def test_rows_of_scenes_without_an_adversary_are_empty(monkeypatch) -> None:
+    env = environment(monkeypatch)
+    observation = env.reset()
+    assert not observation.any()  # nobody is chosen at the very start
+    released = 0
+    for _ in range(120):
+        before = env._who.copy()
+        env.step_async(np.zeros((6, 2), np.float32))
+        observation, reward, done, infos = env.step_wait()
+        assert done[before < 0].all()
+        assert not reward[before < 0].any()
+        assert not observation[env._who < 0].any()
+        assert (observation[env._who >= 0, 2] > 1.0).all()  # its own length
+        external = env.world.state().controller == Controller.EXTERNAL
+        assert external.sum() == (env._who >= 0).sum()
+        for b in np.flatnonzero(done & (before >= 0)):
+            released += 1
+            assert infos[b]["terminal_observation"][2] > 1.0
+            assert infos[b]["episode"]["l"] > 0
+    assert released >= 3
+
+
+def test_leaving_the_road_costs(monkeypatch) -> None:
+    """Full throttle and full lock leave the road in the end."""
+    found = {}
+    for cost in (0.0, 0.5):
+        env = environment(monkeypatch, off_road=cost, scale=1.0)
+        env.reset()
+        total = 0.0
+        for _ in range(80):
+            env.step_async(np.tile(np.array([1.0, 1.0], np.float32), (6, 1)))
+            total += float(env.step_wait()[1].sum())
+        found[cost] = total
+    assert found[0.5] < found[0.0] - 2.0
