@@ -317,6 +317,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "an empty sweep": ({"sweeps": ["pgd"]}, "neither radii nor steps"),
     "no such data": ({"data": "/nowhere"}, "is no folder"),
     "twice in transfer": ({"transfer_detectors": [LINEAR]}, "appears twice"),
+    "transfer of nothing": ({"transfer_detectors": ["yolov5n"]}, "transfer, and it is empty"),
     "a detector of nothing": ({"detectors": ["helpers.linear3d:build_stranger"]}, "none of the ten classes"),
 }  # fmt: skip
 

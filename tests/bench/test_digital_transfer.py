@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +123,14 @@ def test_a_drive_alone_has_no_others(tiny_set: Path, monkeypatch: pytest.MonkeyP
     for options, words in (({"over": "all"}, "choose others or drive"), ({"frames": 0}, "must be 1 or more")):
         with pytest.raises(SSADError, match=words):
             Digital().plan(suite_of(tiny_set, attacks=[{"name": "universal", "options": options}]))
+
+
+def test_data_without_ground_truth_is_one_line(tiny_set: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    root = tmp_path / "empty"
+    shutil.copytree(tiny_set, root)
+    (root / "v1.0-mini" / "sample_annotation.json").write_text("[]")
+    monkeypatch.setenv("LINEAR_DATA", str(tiny_set))
+    plan = Digital().plan(suite_of(root))
+    with pytest.raises(SSADError, match="has ground truth: there is nothing to score") as caught:
+        run(plan, tmp_path / "out", Resources(0, console=Console(file=io.StringIO())))
+    assert "\n" not in str(caught.value)

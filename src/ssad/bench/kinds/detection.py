@@ -147,6 +147,11 @@ class DetectorKind(Kind):
             version = data.version
             scenes = {name: data.scene(name) for name in scenes_of(data, suite.split)}
             tokens = {name: scene.record.token for name, scene in scenes.items()}
+        if not any(len(boxes) for scene in scenes.values() for boxes in scene.boxes.values()):
+            raise ConfigError(
+                f"suite {suite.name}: data: no scene of the split '{suite.split}' has ground truth: there is nothing "
+                "to score; choose another split"
+            )
         settings = {
             "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
             "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,

@@ -21,6 +21,7 @@ from ssad.bench.digital_points import (
 from ssad.bench.kind import Cell, Column, Job, Plan, Resources
 from ssad.bench.kinds.detection import DetectorKind, data_of, detectors_of
 from ssad.core import safeio
+from ssad.core.errors import ConfigError
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.datasets.nuscenes.truth import GroundTruth
@@ -61,6 +62,8 @@ class Digital(DetectorKind):
         """Attacks, defences and detectors are built once, the data set is looked at."""
         points = points_of(suite)
         weights, detectors = detectors_of(suite, [*suite.detectors, *suite.transfer_detectors], flat=True)
+        if suite.transfer_detectors and not suite.transfer:
+            raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
         main = [text.partition("=")[0] for text in suite.detectors]
         tasks = {name: detector_of(name, file, "cpu").task for name, file in detectors.items()}
         data = data_of(suite)

@@ -181,7 +181,8 @@ def audit_table(verdict: Verdict) -> Table:
         Row((text,), (Cell(verdict.compared[name]), Cell(sum(fault.rule == name for fault in verdict.faults))))
         for name, (text, _) in RULES.items()
     ]
-    return Table("audit", "Audit of the attacks", ("Rule",), ("comparisons", "faults"), tuple(rows), verdict.text)
+    note = " ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)])
+    return Table("audit", "Audit of the attacks", ("Rule",), ("comparisons", "faults"), tuple(rows), note)
 
 
 def curves(run: DigitalRun, what: Literal["radius", "steps"], metric: str = "mAP") -> str:
