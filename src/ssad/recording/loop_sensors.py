@@ -8,7 +8,7 @@ Nothing is rendered unless a driver names the sensor in its `sensors`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.lidar import HDL32E, Lidar, sweep
-from ssad.camera.render import View, Weather, render
+from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.sensor import Sensor as Response
 from ssad.core.driving import Simulator, WorldState
@@ -243,6 +243,19 @@ class OnboardCamera:
     def _read(self, sights: Sequence[Sight], count: int) -> U8:
         """All pictures in as few calls as possible."""
         found = np.zeros((count, self.camera.height, self.camera.width, 3), np.uint8)
+        for part, picture in self.shots(sights):
+            found[[sight.row for sight in part]] = picture.image.numpy()  # type: ignore[attr-defined]
+        return np.moveaxis(found, -1, 1)
+
+    def shots(self, sights: Sequence[Sight]) -> Iterator[tuple[list[Sight], Picture]]:
+        """Render in as few calls as possible.
+
+        Args:
+            sights: What is to be seen.
+
+        Yields:
+            Some of the sights, and what `ssad.camera.render.render` gives for them with its arrays left where they are.
+        """
         by_town: dict[int, list[Sight]] = {}
         for sight in sights:
             by_town.setdefault(id(sight.town), []).append(sight)
@@ -251,9 +264,7 @@ class OnboardCamera:
             for k in range(0, len(here), at_once):
                 part = here[k : k + at_once]
                 views = [self.onboard.view(sight, self.camera) for sight in part]
-                picture = render(part[0].town.scene, views, download=False)
-                found[[sight.row for sight in part]] = picture.image.numpy()  # type: ignore[attr-defined]
-        return np.moveaxis(found, -1, 1)
+                yield part, render(part[0].town.scene, views, download=False)
 
 
 @dataclass(frozen=True, slots=True)
