@@ -24,6 +24,7 @@ KINDS: dict[str, str] = {
     "digital": "ssad.bench.kinds.digital:Digital",
     "physical": "ssad.bench.kinds.physical:Physical",
     "adversarial": "ssad.bench.kinds.adversarial:Adversarial",
+    "gap": "ssad.bench.kinds.gap:Gap",
 }
 """Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
 

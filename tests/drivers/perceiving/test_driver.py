@@ -153,8 +153,9 @@ def test_missed_and_phantom_objects_are_missed_and_there() -> None:
     made, town = episodes(count=1, steps=41)
     counts = {}
     for name, change in (("none", {}), ("missed", {"missed": 0.5, "burst": 2.0}), ("phantoms", {"phantoms": 1.0})):
-        seen: list[Sighting] = []
-        run(Perceiving(PerfectEyes(**change), watch=seen.append), made, town)  # type: ignore[arg-type]
+        told: list[Any] = []
+        run(Perceiving(PerfectEyes(**change), watch=told.append), made, town)  # type: ignore[arg-type]
+        seen = [one for one in told if isinstance(one, Sighting)]
         counts[name] = float(np.mean([len(one.found) for one in seen[:20] if one.found is not None]))
     assert counts["missed"] < counts["none"] < counts["phantoms"]
 

@@ -74,7 +74,7 @@ def test_a_flat_box_is_lifted_by_the_road_under_it(turn: float, kind: AgentKind,
     found, _ = seen(belief)
     camera = rig_camera("CAM_FRONT", 640)
     pose = upright_pose(*EGO) @ camera.to_ego
-    flat = lift(replace(found, solid=None), camera, pose, MMDET3D_CLASSES, settings=Lifting())
+    flat = lift(replace(found, solid=None), camera, pose, MMDET3D_CLASSES, settings=Lifting(overhang=0.0))
     np.testing.assert_allclose(flat.place, belief.pose[0, :, :2], atol=0.35)
     if kind == AgentKind.CAR:
         np.testing.assert_allclose(np.abs(np.cos(flat.yaw - belief.pose[0, :, 2])), 1.0, atol=0.02)

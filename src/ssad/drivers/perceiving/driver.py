@@ -9,7 +9,7 @@ detected objects and nothing else. All else is the Autopilot, so that what it dr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.rotations import upright_pose
-from ssad.core.types import F32, F64, Controller, Episode
+from ssad.core.types import F32, F64, I32, U8, Controller, Episode
 from ssad.drivers.perceiving.eyes import Eyes
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import I64, Objects, no_objects
@@ -35,11 +35,28 @@ class Sighting:
         scene: Which scene.
         time: s when the pictures were taken.
         found: What was found in them, in the world; None: no camera had a picture.
+        pictures: What the cameras showed, uint8 [3, H, W] by name, where eyes look at pictures.
     """
 
     scene: int
     time: float
     found: Objects | None
+    pictures: Mapping[str, U8] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is believed at a step, for who watches.
+
+    Attributes:
+        scene: [N] the scenes.
+        time: [N] s.
+        tracks: The confirmed tracks of these scenes at these times.
+    """
+
+    scene: I32
+    time: F64
+    tracks: Tracks
 
 
 class Perceiving:
@@ -52,7 +69,7 @@ class Perceiving:
         rate: Looks a second; the world has 10 steps a second.
         latency: s from a picture to its detections. Tracks are moved on to the present, so what is late is not
             misplaced, but unknown for so long.
-        watch: Told of each look.
+        watch: Told of each look, and at each step of what is believed.
 
     Raises:
         ConfigError: A value is out of its range.
@@ -69,7 +86,7 @@ class Perceiving:
         tracking: Tracking | None = None,
         rate: float = 5.0,
         latency: float = 0.1,
-        watch: Callable[[Sighting], None] | None = None,
+        watch: Callable[[Sighting | Known], None] | None = None,
     ) -> None:
         if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
             raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
@@ -84,6 +101,11 @@ class Perceiving:
     def cameras(self) -> Mapping[str, Camera]:
         """The cameras among its sensors, which the engine makes."""
         return {name: camera for name, camera in self.eyes.cameras.items() if name in self.sensors}
+
+    @property
+    def detector(self) -> Any:
+        """The detector of its eyes, which attacks ask for; None if they have none."""
+        return getattr(self.eyes, "detector", None)
 
     def to(self, device: str) -> None:
         """Compute on another device, if its eyes can."""
@@ -122,11 +144,10 @@ class Perceiving:
             self._looks[view.scene[due]] = looks[due]
             self._waiting += self._sightings(view, due, now)
         self._take_in(dict(zip(view.scene.tolist(), now.tolist(), strict=True)))
-        return believed(self.tracks(view.scene, now), view.scene)
-
-    def tracks(self, scenes: Any, times: F64) -> Tracks:
-        """The confirmed tracks of scenes [N] at times [N]."""
-        return self._tracker.confirmed(scenes, times)
+        tracks = self._tracker.confirmed(view.scene, now)
+        if self.watch is not None:
+            self.watch(Known(view.scene, now, tracks))
+        return believed(tracks, view.scene)
 
     def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
         """What is seen now in some rows."""
@@ -141,10 +162,15 @@ class Perceiving:
                     found = lift(one, camera, ego @ camera.to_ego, self.eyes.classes, settings=self.lifting)
                     parts.append(replace(found, scene=np.full(len(found), scene)))
             all_ = merged(Objects.joined(parts), self.lifting.merge) if parts else None
-            sightings.append(Sighting(scene, float(now[row]), all_))
+            shown = {} if self.watch is None else self._pictures(view, row)
+            sightings.append(Sighting(scene, float(now[row]), all_, shown))
             if self.watch is not None:
                 self.watch(sightings[-1])
         return sightings
+
+    def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
+        """What the cameras showed to a row."""
+        return {name: view.readings[name][row] for name in self.cameras}
 
     def _take_in(self, now: Mapping[int, float]) -> None:
         """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""

@@ -27,6 +27,7 @@ class Lifting:
         reach: m from the camera beyond which nothing is reported.
         along: Standard deviation of an object's place along the line of sight: m, and m per m of distance.
         across: The same across it.
+        overhang: m from a large vehicle's end to the wheels on which its lower edge seems to stand; of 2D boxes alone.
         merge: Share of the longer of two large objects' lengths within which their middles belong to one object.
     """
 
@@ -34,6 +35,7 @@ class Lifting:
     along: tuple[float, float] = (0.4, 0.05)
     across: tuple[float, float] = (0.2, 0.01)
     merge: float = 0.5
+    overhang: float = 0.9
 
 
 def lift(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, settings: Lifting) -> Objects:
@@ -64,7 +66,7 @@ def lift(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *
     if found.solid is None:
         box = found.box.detach().cpu().double().numpy()[rows]
         _finite(box)
-        place, yaw, known = _on_ground(box, kind, camera, pose)
+        place, yaw, known = _on_ground(box, kind, camera, pose, settings.overhang)
         size: F64 = SIZES[kind, :2]
         velocity: F64 = np.full((len(rows), 2), np.nan)
         rows, kind, place, yaw = rows[known], kind[known], place[known], yaw[known]
@@ -130,7 +132,7 @@ def _spread(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
     ), away
 
 
-def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64) -> tuple[F64, F64, Bool]:
+def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64, overhang: float) -> tuple[F64, F64, Bool]:
     """Middles [N, 2], headings [N] and whether they lie on the road [N] of objects in 2D boxes [N, 4].
 
     A box about as wide as the object's end shows it from front or back, so its heading is along the line of sight and
@@ -147,5 +149,6 @@ def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64) -> tuple[F64, F64
     shape = (box[:, 2] - box[:, 0]) / np.maximum(box[:, 3] - box[:, 1], 1e-6)
     aside = shape > np.sqrt(length * width) / height
     course = np.arctan2(line[:, 1], line[:, 0])
-    middle = where[:, :2] + 0.5 * np.where(aside, width, length)[:, None] * line
+    behind = np.where(aside, 0.5 * width, 0.5 * length - np.where(np.isin(kind, LARGE), overhang, 0.0))
+    middle = where[:, :2] + behind[:, None] * line
     return middle, course + np.where(aside, 0.5 * np.pi, 0.0), known

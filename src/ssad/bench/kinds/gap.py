@@ -1,0 +1,379 @@
+"""Kind `gap`: perceiving systems x scenarios x perturbations of their cameras x severities; an episode a cell.
+
+The same drive gives metrics of the component, on the very pictures that the driver got, and metrics of the system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from ssad.bench.gap_perturbations import NONE, check_perturbation, perturbation_names, perturbed
+from ssad.bench.gap_sheets import drive_sheet
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
+from ssad.bench.kinds.driving import (
+    episode_of,
+    plain,
+    scenario_json,
+    suite_scenarios,
+    system_of,
+    system_version,
+    town,
+    town_version,
+    type_version,
+)
+from ssad.core import safeio
+from ssad.core.driving import Driver
+from ssad.core.errors import ConfigError
+from ssad.core.images import save_picture
+from ssad.core.lane_graph import SignKind, save_graph, town_file
+from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.seeding import digest, seed32
+from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
+from ssad.core.types import Episode, EpisodeTrace
+from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.tracker import Tracking
+from ssad.evaluation.drive_perception import (
+    BANDS,
+    Perceived,
+    cause_of_collision,
+    component_metrics,
+    hard_braking,
+    impact_speed,
+    phantom_stop,
+)
+from ssad.jobs.machine import quiet_warp
+from ssad.metrics import episode_metrics
+
+Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
+
+
+class System(BaseModel):
+    """A perceiving system of a suite.
+
+    Attributes:
+        name: what tables call it.
+        detector: `ssad list detectors`; truth: a perfect detector, which is told the truth.
+        weights: a file of weights; none: the shipped ones.
+        cameras: of the nuScenes rig.
+        width: of their pictures, pixels.
+        input_width: width to which a 3D detector resizes them; none: its own.
+        rate: looks a second.
+        latency: s from a picture to its detections.
+        confirm: hits from which an object is believed (H).
+        reserve: looks without a hit that it stays believed for (R).
+        high, low: scores of the tracker's two stages.
+        missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+    name: str = Field(min_length=1)
+    detector: str = "fcos3d-light"
+    weights: str | None = None
+    cameras: list[Literal[CAMERAS]] = Field(default=["CAM_FRONT"], min_length=1)  # type: ignore[valid-type]
+    width: int = Field(default=640, ge=64, le=1600)
+    input_width: int | None = Field(default=None, ge=64, le=3200)
+    rate: float = Field(default=5.0, gt=0, le=100, allow_inf_nan=False)
+    latency: float = Field(default=0.1, ge=0, le=10, allow_inf_nan=False)
+    confirm: int = Field(default=2, ge=1)
+    reserve: int = Field(default=6, ge=0)
+    high: float = Field(default=0.3, ge=0, le=1)
+    low: float = Field(default=0.1, ge=0, le=1)
+    missed: float = Share
+    burst: float = Field(default=3.0, ge=1, allow_inf_nan=False)
+    noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    phantoms: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+    @property
+    def perfect(self) -> bool:
+        """Whether it is told the truth."""
+        return self.detector == "truth"
+
+    def make(self, watch: Callable[[Sighting | Known], None] | None = None) -> Perceiving:
+        """The driver; `watch` is told what it sees."""
+        cameras = front(self.width, self.cameras)
+        eyes: CameraEyes | PerfectEyes
+        if self.perfect:
+            eyes = PerfectEyes(
+                cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
+            )  # fmt: skip
+        else:
+            eyes = CameraEyes(_detector(self.detector, self.weights, self.input_width), cameras, threshold=self.low)
+        tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
+        return Perceiving(eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch)
+
+
+class GapSuite(SuiteBase):
+    """Systems x scenarios x perturbations.
+
+    Attributes:
+        systems: perceiving systems; names must differ.
+        ceilings: systems that are told the truth, without perturbations (`ssad list systems`).
+        scenarios: what `load_scenarios` understands.
+        perturbations: names (docs/gap.md); "none" always runs.
+        severities: 1 to 5.
+        repetitions, spread, chunk: as in suites of kind driving.
+        sheets: pictures of so many drives, collisions first.
+    """
+
+    kind: Literal["gap"] = "gap"
+    systems: list[System] = Field(min_length=1)
+    ceilings: list[str] = Field(default=["autopilot", "line-of-sight"])
+    scenarios: Names
+    perturbations: list[str] = Field(default=[])
+    severities: list[int] = Field(default=[3], min_length=1)
+    repetitions: int = Field(default=1, ge=1, le=100_000)
+    spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
+    timeout_s: float = Field(default=1200.0, gt=0, allow_inf_nan=False)
+    chunk: int = Field(default=4, ge=1, le=4096)
+    sheets: int = Field(default=6, ge=0)
+
+    def beside(self, path: Path) -> Self:
+        """Scenario files are looked for in the working folder, then beside the suite."""
+        near = [str(path.parent / ref) for ref in self.scenarios]
+        files = [ref.endswith((".yaml", ".yml")) and not Path(ref).exists() for ref in self.scenarios]
+        found = [n if f and Path(n).exists() else ref for ref, n, f in zip(self.scenarios, near, files, strict=True)]
+        return self.model_copy(update={"scenarios": found})
+
+
+class Gap(Kind):
+    """See the module."""
+
+    name = "gap"
+    suite = GapSuite
+    columns = (
+        Column("AP", "AP of all objects, on the drive's pictures", "", "higher"),
+        Column("recall", "recall of the objects in view, within 2 m", "", "higher"),
+        Column("target_recall", "recall of the object that matters", "", "higher"),
+        *(
+            Column(f"target_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            for a, b in BANDS
+        ),
+        Column("distance_error", "error of its distance", "m", "lower"),
+        Column("phantoms", "phantoms a look", "", "lower"),
+        Column("believed", "share of the steps in which it is believed where it is", "", "higher"),
+        Column("switches", "changes of its track", "", "lower"),
+        Column("collision", "CR", "", "lower"),
+        Column("impact_speed", "impact speed", "m/s", "lower"),
+        Column("route_completion", "RC", "", "higher"),
+        Column("min_ttc", "least time to collision", "s", "higher"),
+        Column("hard_braking", "times of braking above 4 m/s^2", "", "lower"),
+        Column("phantom_stop_s", "time stood before a phantom", "s", "lower"),
+    )
+    factors = ("system", "perturbation", "severity")
+
+    def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Names are looked up, detectors are built once; with `check`, each scenario is built once."""
+        names = [one.name for one in suite.systems] + suite.ceilings
+        if len(set(names)) != len(names):
+            raise ConfigError(f"suite {suite.name}: systems: a name appears twice")
+        for name in suite.perturbations:
+            check_perturbation(name)
+        if any(severity not in range(1, 6) for severity in suite.severities):
+            raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
+        versions = {one.name: _version(one) for one in suite.systems}
+        versions |= {name: system_version(name) for name in suite.ceilings}
+        scenarios = suite_scenarios(suite)  # type: ignore[arg-type]  # the same attributes
+        towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
+        cells = [
+            self._cell(suite, scenario, condition, repetition, versions, towns)
+            for condition in _conditions(suite)
+            for scenario in scenarios
+            for repetition in range(suite.repetitions)
+        ]
+        if check:
+            for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
+                episode_of(cell)
+        return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
+
+    def _cell(  # noqa: PLR0917  # plain values
+        self, suite: GapSuite, scenario: Any, condition: tuple[Any, str, int], repetition: int,
+        versions: Mapping[str, str], towns: Mapping[str, str],
+    ) -> Cell:  # fmt: skip
+        """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
+        system, perturbation, severity = condition
+        name = system if isinstance(system, str) else system.name
+        data = scenario_json(scenario)
+        seed = seed32("episode", suite.seed, safeio.dump_json(data), repetition)
+        under = f"{perturbation}-{severity}/" if perturbation != NONE else ""
+        title = f"{name}/{under}{scenario.name}{f'#{repetition}' if repetition else ''}"
+        spec = {
+            "scenario": data, "system": name, "repetition": repetition,
+            "settings": None if isinstance(system, str) else system.model_dump(mode="json"),
+            "spread": suite.spread if repetition else 0.0, "perturbation": perturbation, "severity": severity,
+        }  # fmt: skip
+        fields = {
+            "system": name, "perturbation": perturbation, "severity": severity,
+            "family": perturbation_names()[perturbation], "group": scenario.group or scenario.type,
+            "cluster": scenario.name,
+        }  # fmt: skip
+        inputs = (versions[name], towns.get(scenario.town, ""), type_version(scenario.type), suite.seed)
+        return self.make_cell(title, name, seed, fields, spec, *inputs)
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """Copies of the towns lie beside the results."""
+        for name in plan.inputs["towns"]:
+            path = folder / "towns" / town_file(name)
+            if not path.exists():
+                save_graph(town(name), path)
+        safeio.make_folder(folder / "traces")
+        return {"seed": plan.suite.seed, "sheets": plan.suite.sheets > 0}
+
+    def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
+        """Cells of one condition; a batch is of one town, whose street is then built once."""
+        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
+        groups: dict[tuple[Any, ...], list[Cell]] = {}
+        for cell in cells:
+            key = (cell.spec["scenario"]["town"], cell.system, cell.spec["perturbation"], cell.spec["severity"])
+            groups.setdefault(key, []).append(cell)
+        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+
+    def start(self, job: Job) -> None:
+        """Loads the world's kernels, which are compiled on first use."""
+        import warp
+
+        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+        quiet_warp()
+        warp.force_load(device=job.device)
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Drives the episodes as one batch, and measures component and system."""
+        episodes, traces, seen = drive(cells, device=job.device, seed=job.settings["seed"])
+        results: dict[str, dict[str, Any]] = {}
+        for k, (cell, episode, trace) in enumerate(zip(cells, episodes, traces, strict=True)):
+            artefacts = {"trace": f"traces/{cell.key}.npz"}
+            save_trace(job.folder / artefacts["trace"], trace)
+            signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
+            metrics = plain(episode_metrics(trace, stop_signs=signs).as_dict())
+            metrics |= {"impact_speed": impact_speed(trace), "hard_braking": hard_braking(trace)}
+            about: dict[str, Any] = {"end": trace.end, "trace_hash": trace_hash(trace), "town": trace.town}
+            if seen is not None:
+                own = System.model_validate(cell.spec["settings"])
+                metrics |= component_metrics(trace, seen.perceived(k), sure=own.high)
+                metrics["phantom_stop_s"] = phantom_stop(trace, seen.perceived(k))
+                about["cause"] = cause_of_collision(trace, seen.perceived(k))
+                if job.settings["sheets"] and seen.shots[k]:
+                    artefacts["sheet"] = f"sheets/{cell.key}.jpg"
+                    picture = drive_sheet(trace, seen.perceived(k), seen.shots[k], town(trace.town))
+                    safeio.make_folder(job.folder / "sheets")
+                    save_picture(job.folder / artefacts["sheet"], picture)
+            metrics = {name: None if value is None else _rounded(value) for name, value in metrics.items()}
+            results[cell.key] = {
+                "metrics": metrics, "artefacts": artefacts, "case": motion_hash(trace), **about,
+                "episode": {"scenario": episode.scenario.name, "metrics": metrics, **about},
+            }  # fmt: skip
+        return results
+
+    def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
+        """Drives the episode again and compares every bit of its trace."""
+        quiet_warp()
+        recorded = load_trace(folder / record["artefacts"]["trace"])
+        _, (trace,), _ = drive([cell], device=plan.device, seed=plan.suite.seed)
+        return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
+
+
+class Watcher:
+    """Keeps what a driver sees and believes, by scene, and a few pictures of each drive.
+
+    Args:
+        cameras: Of the driver.
+        scenes: How many.
+        every: s from one picture that is kept to the next.
+    """
+
+    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 1.0) -> None:
+        self.cameras, self.every = cameras, every
+        self.looks: list[list[Any]] = [[] for _ in range(scenes)]
+        self.known: list[list[Any]] = [[] for _ in range(scenes)]
+        self.shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
+
+    def __call__(self, told: Sighting | Known) -> None:
+        """See `Perceiving`."""
+        if isinstance(told, Sighting):
+            self.looks[told.scene].append((told.time, told.found))
+            for picture in list(told.pictures.values())[:1]:
+                self.shots[told.scene].append((told.time, np.ascontiguousarray(np.moveaxis(picture, 0, -1))))
+            return
+        for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
+            self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
+
+    def perceived(self, scene: int) -> Perceived:
+        """What was perceived in a scene."""
+        return Perceived(self.looks[scene], self.known[scene], self.cameras)
+
+
+def drive(cells: Sequence[Cell], *, device: str, seed: int) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
+    """Episodes and traces of cells of one condition, run as one batch, and what was perceived in them."""
+    from ssad.recording.loop_sensors import Onboard
+    from ssad.world.rollout import rollout
+    from ssad.world.world import World
+
+    first = cells[0].spec
+    episodes = [episode_of(cell) for cell in cells]
+    # pictures are keyed by the episode: conditions of one drive must share their noise and weather
+    episodes = [_paired(episode, cell) for episode, cell in zip(episodes, cells, strict=True)]
+    simulator = World(episodes, {episode.town: town(episode.town) for episode in episodes}, device=device)
+    if first["settings"] is None:
+        traces = rollout(simulator, system_of(cells[0].system))
+        return episodes, _named(traces, cells), None
+    driver: Driver
+    own = System.model_validate(first["settings"])
+    watcher = Watcher(front(own.width, own.cameras), len(cells))
+    driver = own.make(watcher)
+    driver.to(device)
+    onboard = Onboard(device=device)
+    sensors, changes = perturbed(
+        onboard, driver.cameras, first["perturbation"], first["severity"], detector=driver.detector, seed=seed
+    )
+    traces = rollout(simulator, driver, sensors=sensors, perturbation=changes)
+    return episodes, _named(traces, cells), watcher
+
+
+def _paired(episode: Episode, cell: Cell) -> Episode:
+    return replace(episode, key=digest("gap", cell.spec["scenario"]["name"], cell.seed)[:16])
+
+
+def _named(traces: Sequence[EpisodeTrace], cells: Sequence[Cell]) -> list[EpisodeTrace]:
+    return [replace(trace, key=cell.key) for trace, cell in zip(traces, cells, strict=True)]
+
+
+def _conditions(suite: GapSuite) -> list[tuple[Any, str, int]]:
+    """System, perturbation, severity; ceilings first, then each system clean and perturbed."""
+    found: list[tuple[Any, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
+    for system in suite.systems:
+        found.append((system, NONE, 0))
+        if not system.perfect:
+            names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
+            found += [(system, name, severity) for name in names for severity in dict.fromkeys(suite.severities)]
+    return found
+
+
+@lru_cache(maxsize=4)
+def _detector(name: str, weights: str | None, width: int | None) -> Any:
+    """A detector, made once a process."""
+    from ssad.detectors import make_detector
+
+    options: dict[str, Any] = {} if width is None else {"input_width": width}
+    return make_detector(name, weights=weights, **options)
+
+
+def _version(system: System) -> str:
+    """Hash of the weights of a system's detector."""
+    from ssad.bench.kinds.detection import state_hash
+
+    if system.perfect:
+        return ""
+    return state_hash(_detector(system.detector, system.weights, system.input_width))
+
+
+def _rounded(value: Any) -> Any:
+    return round(value, 6) if isinstance(value, float) else value

@@ -1,0 +1,234 @@
+"""The page of a gap run: component beside system, the damage to the one against that to the other, causes, pictures."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from typing import Any
+
+from ssad.core import safeio
+from ssad.metrics import CaseValue, estimate, paired_difference
+from ssad.metrics.rank import family_correlation
+from ssad.report.load import Run
+from ssad.report.pages import render
+from ssad.report.tables import METHODS, Cell, Row, Table
+
+Line = Mapping[str, Any]
+Condition = tuple[str, str, int]
+MAIN = {
+    "AP": "AP", "target_recall": "recall of the object that matters", "believed": "believed",
+    "phantoms": "phantoms a look", "collision": "CR", "route_completion": "RC", "min_ttc": "least TTC, s",
+    "hard_braking": "hard braking",
+}  # fmt: skip
+DROPS = {"AP": "AP", "target_recall": "recall of the object that matters", "collision": "CR", "route_completion": "RC"}
+BOUNDED = ("AP", "target_recall", "believed", "route_completion")
+CAUSES = ("hidden", "missed", "misplaced", "late", "known")
+SIZE, MARGIN = 360, 46
+COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)"}
+
+
+def conditions(run: Run) -> dict[Condition, list[Line]]:
+    """System, perturbation and severity -> its lines, in the order of the suite."""
+    found: dict[Condition, list[Line]] = {}
+    for line in run.lines:
+        found.setdefault((line["system"], line["perturbation"], int(line["severity"])), []).append(line)
+    return found
+
+
+def summary(run: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return replace(main_table(run), note="")
+
+
+def section(run: Run) -> tuple[str, Sequence[Table]]:
+    """The page and its tables."""
+    tables = [main_table(run), drop_table(run), rank_table(run), cause_table(run)]
+    main, drop, rank, cause = tables
+    failures = [
+        ([line["system"], line["perturbation"], str(line["severity"]), line["cluster"]], line["reason"])
+        for line in run.failures
+    ]
+    page = render(
+        "gap.html", run, main=main, drop=drop, rank=rank, cause=cause, plot=scatter(run), failures=failures,
+        sheets=sheets(run), systems=list(dict.fromkeys(c[0] for c in conditions(run))),
+    )  # fmt: skip
+    return page, tables
+
+
+def main_table(run: Run) -> Table:
+    """Component and system, a row a condition."""
+    rows = []
+    for (system, perturbation, severity), lines in conditions(run).items():
+        head = (system, perturbation, str(severity) if severity else "")
+        rows.append(Row(head, tuple(_cell(lines, name) for name in MAIN)))
+    note = (
+        "AP: all kinds of objects as one, the mean of those within 0.5, 1, 2 and 4 m, a drive at a time, on the "
+        "pictures that the driver got in it. The object that matters is the one that the ego touches, else the one "
+        "that it comes nearest to; its recall counts looks in which it is in view and found within 2 m; believed "
+        "counts steps. CR: "
+        "share of the drives with a collision. RC: share of the route completed. Hard braking: times above 4 m/s² a "
+        f"drive. {METHODS}"
+    )
+    return Table(
+        "gap", "Component and system", ("System", "Perturbation", "Severity"), tuple(MAIN.values()), tuple(rows), note
+    )
+
+
+def drop_table(run: Run) -> Table:
+    """What a perturbation changes against the same drives without it."""
+    rows = [
+        Row(
+            (system, perturbation, str(severity)),
+            tuple(_change(run, (system, perturbation, severity), n) for n in DROPS),
+        )
+        for system, perturbation, severity in conditions(run)
+        if severity
+    ]
+    note = "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation."
+    heads = ("System", "Perturbation", "Severity")
+    return Table("changes", "What a perturbation changes", heads, tuple(DROPS.values()), tuple(rows), note)
+
+
+def rank_table(run: Run) -> Table:
+    """Does damage to the component tell the damage to the system?"""
+    rows = []
+    perturbed = [condition for condition in conditions(run) if condition[2]]
+    for system in dict.fromkeys(condition[0] for condition in perturbed):
+        own = [condition for condition in perturbed if condition[0] == system]
+        families = [condition[1] for condition in own]
+        for part in ("AP", "target_recall"):
+            lost = [-_change(run, c, part).mean for c in own]
+            cells = []
+            for name, sign in (("collision", 1.0), ("route_completion", -1.0)):
+                harm = [sign * _change(run, c, name).mean for c in own]
+                cells.append(Cell.of(family_correlation(lost, harm, families)))
+            rows.append(Row((system, DROPS[part], f"{len(own)} in {len(set(families))}"), tuple(cells)))
+    note = (
+        "Spearman's rank correlation over perturbations of what the component loses and what the system loses; 95 % "
+        "interval by a bootstrap over the families of perturbations (all severities of one are one family), from five "
+        "families on. n/a: one of the two does not vary."
+    )
+    heads = ("System", "Lost by the component", "Perturbations in families")
+    return Table("rank", "Does the component's damage tell the system's?", heads, ("CR", "RC"), tuple(rows), note)
+
+
+def cause_table(run: Run) -> Table:
+    """What the object that was hit was to the driver before."""
+    rows = []
+    for (system, perturbation, severity), lines in conditions(run).items():
+        found = [line["cause"] for line in lines if line.get("cause")]
+        if not found:
+            continue
+        counts = Counter(one["cause"] for one in found)
+        unknown = sorted(float(one["unknown_s"]) for one in found)
+        middle = unknown[len(unknown) // 2]
+        cells = (Cell(len(found)), *(Cell(counts[name]) for name in CAUSES), Cell(middle))
+        rows.append(Row((system, perturbation, str(severity) if severity else ""), cells))
+    note = (
+        "Collisions by what the object that was hit was in most of the steps from 3 s to 0.5 s before: out of view or "
+        "hidden; in view and not found; found more than 2 m from where it was; found, but not believed yet; believed "
+        "where it was (then planning or prediction failed). Unknown: for how long before the contact it was not "
+        "believed where it was, at most 3 s, the median."
+    )
+    heads = ("System", "Perturbation", "Severity")
+    columns = ("collisions", *CAUSES, "unknown, s")
+    return Table("causes", "Before a collision", heads, columns, tuple(rows), note)
+
+
+def scatter(run: Run) -> str:
+    """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
+    points = [(c, _change(run, c, "AP"), _change(run, c, "collision")) for c in conditions(run) if c[2]]
+    points = [(c, a, b) for c, a, b in points if not math.isnan(a.mean) and not math.isnan(b.mean)]
+    if not points:
+        return ""
+    family = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
+
+    def x(value: float) -> float:
+        return MARGIN + SIZE * (min(max(value, -0.5), 1.0) + 0.5) / 1.5
+
+    def y(value: float) -> float:
+        return 10 + SIZE * (1.0 - min(max(value, -1.0), 1.0)) / 2.0
+
+    parts = []
+    for share in (-0.5, 0.0, 0.5, 1.0):
+        strong = ' style="stroke-width:2"' if share == 0.0 else ""
+        parts.append(f'<line x1="{x(share):.1f}" x2="{x(share):.1f}" y1="10" y2="{SIZE + 10}" class="grid"{strong}/>')
+        parts.append(f'<text x="{x(share):.1f}" y="{SIZE + 26}" text-anchor="middle">{share:g}</text>')
+    for share in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        strong = ' style="stroke-width:2"' if share == 0.0 else ""
+        line = (
+            f'<line x1="{MARGIN}" x2="{MARGIN + SIZE}" y1="{y(share):.1f}" y2="{y(share):.1f}" class="grid"{strong}/>'
+        )
+        parts.append(f'{line}<text x="{MARGIN - 6}" y="{y(share) + 4:.1f}" text-anchor="end">{share:g}</text>')
+    for (system, name, severity), fall, rise in points:
+        colour, at, up = COLOURS.get(family.get(name, ""), "var(--s3)"), x(-fall.mean), y(rise.mean)
+        for one, two in (((x(-fall.high), up), (x(-fall.low), up)), ((at, y(rise.low)), (at, y(rise.high)))):
+            if not any(math.isnan(v) for v in (*one, *two)):
+                style = 'stroke-dasharray="2 3"' if "range" in (fall.method, rise.method) else ""
+                parts.append(
+                    f'<line x1="{one[0]:.1f}" y1="{one[1]:.1f}" x2="{two[0]:.1f}" y2="{two[1]:.1f}" stroke="{colour}" '
+                    f'opacity=".5" {style}/>'
+                )
+        tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
+        parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="5" fill="{colour}"><title>{escape(tip)}</title></circle>')
+        parts.append(f'<text x="{at + 7:.1f}" y="{up - 6:.1f}">{escape(f"{name} {severity}")}</text>')
+    parts.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
+    parts.append(
+        f'<text x="12" y="{SIZE / 2}" transform="rotate(-90 12 {SIZE / 2})" text-anchor="middle">CR gained</text>'
+    )
+    label = "AP lost against collision rate gained, a point a perturbation"
+    return (
+        f'<svg viewBox="0 0 {SIZE + MARGIN + 140} {SIZE + 52}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+    )
+
+
+def sheets(run: Run) -> list[dict[str, str]]:
+    """Sheets of drives as the suite asks: collisions first, no condition twice before each has been shown."""
+    most = int(run.suite.get("sheets", 0))
+    shown: Counter[Condition] = Counter()
+    chosen: list[tuple[int, int, Line, str]] = []
+    for line in sorted(run.lines, key=lambda line: not (line.get("metrics") or {}).get("collision")):
+        path = (line.get("artefacts") or {}).get("sheet")
+        if path and (run.folder / path).is_file():
+            condition = (line["system"], line["perturbation"], int(line["severity"]))
+            shown[condition] += 1
+            chosen.append((shown[condition], len(chosen), line, path))
+    found = []
+    for _, _, line, path in sorted(chosen, key=lambda one: one[:2])[:most]:
+        data = base64.b64encode(safeio.read_bytes(run.folder / path)).decode()
+        cause = (line.get("cause") or {}).get("cause", "")
+        under = f"{line['perturbation']} {line['severity']}" if line["severity"] else "clean"
+        end = str(line.get("end", "")).replace("_", " ")
+        caption = f"{line['system']}, {line['cluster']}, {under}: {end}{f' ({cause})' if cause else ''}"
+        found.append({"caption": caption, "data": f"data:image/jpeg;base64,{data}", "key": str(line["key"])})
+    return found
+
+
+def _values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
+    """A metric by drive: scenario and repetition."""
+    found = {}
+    for line in lines:
+        value = (line.get("metrics") or {}).get(name) if line["status"] == "ok" else None
+        cluster = str(line.get("cluster") or line["key"])
+        case = f"{line.get('case') or line['key']}"
+        number = math.nan if value is None else float(value)
+        key = f"{cluster}#{line['spec'].get('repetition', 0)}"
+        found[key] = CaseValue(number, cluster, case, failed=line["status"] != "ok")
+    return found
+
+
+def _cell(lines: Sequence[Line], name: str) -> Cell:
+    values = _values(lines, name).values()
+    if name == "collision":
+        return Cell.of(estimate(values, "share"))
+    return Cell.of(estimate(values, "bounded" if name in BOUNDED else "mean"))
+
+
+def _change(run: Run, condition: Condition, name: str) -> Cell:
+    every = conditions(run)
+    clean = every.get((condition[0], "none", 0), [])
+    return Cell.of(paired_difference(_values(every[condition], name), _values(clean, name)))

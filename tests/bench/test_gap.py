@@ -1,0 +1,161 @@
+"""Suites of kind `gap`: what runs, that drives are paired and replay to the bit, what fails alone, the page."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.sharing import Shared
+from pydantic import ValidationError
+from rich.console import Console
+
+from ssad.bench.gap_perturbations import perturbation_names
+from ssad.bench.kind import Plan, Resources
+from ssad.bench.kinds.gap import Gap, GapSuite
+from ssad.bench.run import run
+from ssad.bench.suite import load_suite, suite_files
+from ssad.core.errors import SSADError
+from ssad.core.traces import load_trace
+from ssad.report import check_artefacts, write_report
+from ssad.report.kinds.gap import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
+from ssad.report.load import load_run
+from ssad.report.terminal import summary
+
+SHORT = """
+name: short
+type: StraightObstacle
+town: ProvingGround
+route: [{x: 217.0, y: -5.25}, {x: 317.0, y: -5.25}]
+limits: {max_steps: 12}
+"""
+TRUTH = {"name": "perfect", "detector": "truth"}
+BRIGHT = {"name": "bright", "detector": "helpers.gap_detectors:Bright", "width": 64, "rate": 5.0}
+
+
+def suite_of(folder: Path, *systems: dict[str, Any], **changes: Any) -> GapSuite:
+    (folder / "short.yaml").write_text(SHORT)
+    base: dict[str, Any] = {
+        "kind": "gap",
+        "name": "t",
+        "systems": list(systems),
+        "scenarios": [str(folder / "short.yaml")],
+    }
+    return GapSuite.model_validate(base | changes)
+
+
+def go(plan: Plan, folder: Path, workers: int = 0) -> list[dict[str, Any]]:
+    return run(plan, folder, Resources(workers, console=Console(file=io.StringIO())))
+
+
+@pytest.fixture(scope="session")
+def folder(shared: Shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    def make(out: Path) -> None:
+        place = tmp_path_factory.mktemp("gap")
+        suite = suite_of(place, TRUTH, BRIGHT, perturbations=["dropped", "blackout", "fog"], severities=[5])
+        plan = Gap().plan(suite)
+        go(plan, out)
+        Gap().finish(plan, out)
+        write_report(out)
+
+    return shared("gap-run", make)
+
+
+def test_every_condition_meets_the_same_drive(folder: Path) -> None:
+    found = load_run(folder)
+    told = [(line["system"], line["perturbation"], line["severity"]) for line in found.lines]
+    assert told == [
+        ("autopilot", "none", 0), ("line-of-sight", "none", 0), ("perfect", "none", 0), ("bright", "none", 0),
+        ("bright", "dropped", 5), ("bright", "blackout", 5), ("bright", "fog", 5),
+    ]  # fmt: skip
+    assert {line["status"] for line in found.lines} == {"ok"}
+    assert len({line["seed"] for line in found.lines}) == 1
+    traces = [load_trace(folder / line["artefacts"]["trace"]) for line in found.lines]
+    for trace in traces[1:]:
+        np.testing.assert_array_equal(trace.x[0], traces[0].x[0])
+    assert check_artefacts(folder) == []
+
+
+def test_component_metrics_are_those_of_systems_that_look(folder: Path) -> None:
+    metrics = {(one["system"], one["perturbation"]): one["metrics"] for one in load_run(folder).lines}
+    assert "AP" not in metrics["autopilot", "none"]
+    assert metrics["perfect", "none"]["recall"] in (None, 1.0)
+    bright = metrics["bright", "none"]
+    assert bright["phantoms"] == pytest.approx(1.0)  # a car that is not there, at every look
+    assert metrics["bright", "blackout"]["phantoms"] < 1.0
+    assert metrics["bright", "dropped"]["phantoms"] < 1.0
+    # it is held up by its phantom
+    assert bright["driven"] < metrics["autopilot", "none"]["driven"]
+
+
+def test_a_cell_replays_to_the_bit(folder: Path) -> None:
+    found = load_run(folder)
+    plan = Gap().plan(GapSuite.model_validate(found.suite))
+    for number in (2, 5):
+        record = next(line for line in found.lines if line["key"] == plan.cells[number].key)
+        again = plan.kind.replay(plan, plan.cells[number], record, folder)
+        assert again.difference is None
+
+
+def test_the_page_has_tables_a_figure_and_drives(folder: Path) -> None:
+    found = load_run(folder)
+    text = (folder / "report.html").read_text()
+    assert [len(t(found).rows) for t in (main_table, drop_table, rank_table, cause_table)] == [7, 3, 2, 0]
+    assert len(conditions(found)) == 7
+    shown = sheets(found)
+    assert 0 < len(shown) <= 6
+    assert shown[0]["data"] in text
+    assert "What a perturbation changes" in text
+    assert (folder / "tables" / "changes.csv").is_file()
+    assert summary(folder).rows
+    assert scatter(found) == "" or "<svg" in scatter(found)
+
+
+def test_a_detector_that_returns_nan_fails_its_drives_alone(tmp_path: Path) -> None:
+    spoilt = BRIGHT | {"name": "spoilt", "detector": "helpers.gap_detectors:Spoilt"}
+    records = go(Gap().plan(suite_of(tmp_path, TRUTH, spoilt, ceilings=[])), tmp_path / "out")
+    assert [one["status"] for one in records] == ["ok", "failed"]
+    assert "not finite" in records[1]["reason"]
+    write_report(tmp_path / "out")
+    assert "not finite" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "status"), [("Dying", "crashed"), ("Hanging", "timeout")])
+def test_a_detector_that_dies_or_hangs_fails_its_drives_alone(tmp_path: Path, name: str, status: str) -> None:
+    broken = BRIGHT | {"name": "broken", "detector": f"helpers.gap_detectors:{name}"}
+    suite = suite_of(tmp_path, broken, BRIGHT, ceilings=[], timeout_s=90.0)
+    records = go(Gap().plan(suite), tmp_path / "out", workers=1)
+    assert [one["status"] for one in records] == [status, "ok"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"perturbations": ["fogg"]}, "fog"),
+        ({"severities": [6]}, "severities are 1 to 5"),
+        ({"systems": [TRUTH, TRUTH]}, "twice"),
+        ({"systems": [BRIGHT | {"detector": "yolov5x"}]}, "yolov5"),
+        ({"ceilings": ["autopilo"]}, "autopilot"),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(SSADError, match=words):
+        Gap().plan(suite_of(tmp_path, TRUTH, **changes))
+
+
+def test_settings_out_of_range_are_refused(tmp_path: Path) -> None:
+    for wrong in ({"confirm": 0}, {"missed": 1.0}, {"cameras": ["CAM"]}, {"rate": 0.0}):
+        with pytest.raises(ValidationError):
+            suite_of(tmp_path, TRUTH | wrong)
+
+
+def test_the_suites_that_are_shipped_can_be_planned() -> None:
+    names = [name for name in suite_files() if name.startswith("gap")]
+    assert "gap-quick" in names
+    for name in names:
+        suite = load_suite(name)
+        assert isinstance(suite, GapSuite)
+        assert set(suite.perturbations) <= set(perturbation_names())

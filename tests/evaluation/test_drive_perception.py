@@ -1,0 +1,170 @@
+"""What was perceived in a drive, in cases that can be worked out by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.metric_traces import make_trace, straight
+
+from ssad.camera.rig import rig_camera
+from ssad.core.types import AgentKind, Contact, EpisodeTrace
+from ssad.drivers.perceiving.objects import Objects, no_objects
+from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks
+from ssad.evaluation.drive_perception import (
+    Perceived,
+    cause_of_collision,
+    component_metrics,
+    hard_braking,
+    impact_speed,
+    in_view,
+    object_that_matters,
+    phantom_stop,
+)
+
+CAMERAS = {"front": rig_camera("CAM_FRONT", 640)}
+STEPS = 41
+
+
+def objects(*places: tuple[float, float], score: float = 0.9) -> Objects:
+    n = len(places)
+    return Objects(
+        np.zeros(n, np.int64), np.array(places, float).reshape(n, 2), np.tile(0.09 * np.eye(2), (n, 1, 1)), np.zeros(n),
+        np.tile([4.5, 1.9], (n, 1)), np.full((n, 2), np.nan), np.full(n, int(AgentKind.CAR)), np.full(n, score),
+    )  # fmt: skip
+
+
+def tracks(*places: tuple[float, float]) -> Tracks:
+    tracker = Tracker(Tracking(confirm=1))
+    tracker.update(np.array([0]), np.zeros(1), objects(*places))
+    return tracker.tracks
+
+
+def perceived(trace: EpisodeTrace, found: Any, known: Any) -> Perceived:
+    """`found` and `known` give places for a step; None: no picture."""
+    looks = [(k * trace.dt, None if found(k) is None else objects(*found(k))) for k in range(0, STEPS, 2)]
+    return Perceived(looks, [(k * trace.dt, tracks(*known(k))) for k in range(STEPS)], CAMERAS)
+
+
+def towards(gap: float = 25.0, speed: float = 5.0, **changes: Any) -> EpisodeTrace:
+    """The ego drives at a standing car; at 4 s, and 5 m before its middle, they touch."""
+    struck = np.full(STEPS, -1)
+    struck[-1] = 1
+    contact = np.zeros(STEPS)
+    contact[-1] = Contact.VEHICLE
+    bodies = (straight(0.0, 0.0, 0.0, speed, STEPS), straight(gap, 0.0, 0.0, 0.0, STEPS))
+    return make_trace(STEPS, bodies, **({"contact_agent": struck, "contact": contact} | changes))
+
+
+def test_in_view_is_what_a_camera_shows_and_nothing_hides() -> None:
+    bodies = (
+        (0.0, 0.0, 0.0, 0.0),
+        (15.0, 0.0, 0.0, 0.0),
+        (30.0, 0.0, 0.0, 0.0),
+        (-9.0, 0.0, 0.0, 0.0),
+        (5.0, 9.0, 0, 0),
+    )
+    assert in_view(make_trace(2, bodies), 0, CAMERAS).tolist() == [False, True, False, False, False]
+    left = CAMERAS | {"left": rig_camera("CAM_FRONT_LEFT", 640)}
+    assert in_view(make_trace(2, bodies), 0, left).tolist() == [False, True, False, False, True]
+
+
+def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> None:
+    trace = towards()
+    good = component_metrics(trace, perceived(trace, lambda k: [(25.0, 0.0)], lambda k: [(25.0, 0.0)]), sure=0.3)
+    assert good["AP"] == pytest.approx(1.0)
+    assert [good[n] for n in ("recall", "target_recall", "distance_error", "phantoms", "believed", "switches")] == [
+        1.0, 1.0, 0.0, 0.0, 1.0, 0.0,
+    ]  # fmt: skip
+    assert good["target_recall_30_60"] is None
+    assert good["target_recall_15_30"] == 1.0
+    none = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), sure=0.3)
+    assert [none[n] for n in ("AP", "recall", "target_recall", "believed")] == [0.0, 0.0, 0.0, 0.0]
+    assert none["distance_error"] is None
+    assert none["switches"] is None
+
+
+def test_misplaced_objects_have_a_distance_error_and_invented_ones_are_phantoms() -> None:
+    trace = towards()
+    found = component_metrics(trace, perceived(trace, lambda k: [(28.0, 0.0), (40.0, 9.0)], lambda k: []), sure=0.3)
+    assert found["target_recall"] == 0.0
+    assert found["distance_error"] == pytest.approx(3.0)
+    assert found["phantoms"] == 1.0
+    unsure = component_metrics(trace, perceived(trace, lambda k: [(40.0, 9.0)], lambda k: []), sure=0.95)
+    assert unsure["phantoms"] == 0.0
+
+
+def test_a_drive_without_others_has_nothing_to_measure() -> None:
+    trace = make_trace(STEPS)
+    alone = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), sure=0.3)
+    assert all(alone[name] is None for name in ("AP", "recall", "target_recall", "believed"))
+    assert alone["phantoms"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("found", "known", "cause"),
+    [
+        (lambda k: [], lambda k: [], "missed"),
+        (lambda k: None, lambda k: [], "missed"),
+        (lambda k: [(29.0, 0.0)], lambda k: [], "misplaced"),
+        (lambda k: [(25.0, 0.0)], lambda k: [], "late"),
+        (lambda k: [], lambda k: [(25.5, 0.0)], "known"),
+    ],
+)
+def test_the_cause_is_what_was_commonest_before_the_contact(found: Any, known: Any, cause: str) -> None:
+    trace = towards()
+    told = cause_of_collision(trace, perceived(trace, found, known))
+    assert told is not None
+    assert told["cause"] == cause
+    assert told["agent"] == "agent1"
+    assert told["unknown_s"] == pytest.approx(0.0 if cause == "known" else 3.0)
+
+
+def test_who_comes_from_behind_was_hidden() -> None:
+    struck = np.full(STEPS, -1)
+    struck[-1] = 1
+    trace = make_trace(STEPS, ((0.0, 0.0, 0.0, 0.0), straight(-25.0, 0.0, 0.0, 5.0, STEPS)), contact_agent=struck)
+    told = cause_of_collision(trace, perceived(trace, lambda k: [], lambda k: []))
+    assert told is not None
+    assert told["cause"] == "hidden"
+
+
+def test_how_long_it_was_unknown_counts_from_the_last_step_in_which_it_was_known() -> None:
+    trace = towards()
+    told = cause_of_collision(trace, perceived(trace, lambda k: [], lambda k: [(25.0, 0.0)] if k < 32 else []))
+    assert told is not None
+    assert told["unknown_s"] == pytest.approx(0.8)
+    assert cause_of_collision(make_trace(STEPS), perceived(make_trace(STEPS), lambda k: [], lambda k: [])) is None
+
+
+def test_impact_speed_hard_braking_and_the_object_that_matters() -> None:
+    trace = towards(speed=6.0)
+    assert impact_speed(trace) == pytest.approx(6.0)
+    assert impact_speed(make_trace(STEPS)) is None
+    accel = np.zeros(STEPS)
+    accel[[3, 4, 9]] = -5.0
+    accel[20] = -3.0
+    assert hard_braking(make_trace(STEPS, accel=accel)) == 2
+    assert object_that_matters(trace) == 1
+    bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0), (0.0, 9.0, 0.0, 0.0))
+    assert object_that_matters(make_trace(STEPS, bodies)) == 2
+    assert object_that_matters(make_trace(STEPS)) is None
+
+
+def test_who_stands_before_nothing_stands_before_a_phantom() -> None:
+    bodies = ((0.0, 0.0, 0.0, 0.0), (30.0, 0.0, 0.0, 0.0))
+    trace = make_trace(STEPS, bodies)
+    assert phantom_stop(trace, perceived(trace, lambda k: [], lambda k: [(10.0, 0.5)])) == pytest.approx(0.1 * STEPS)
+    assert phantom_stop(trace, perceived(trace, lambda k: [], lambda k: [(10.0, 5.0)])) == 0.0
+    there = make_trace(STEPS, (bodies[0], (11.0, 0.0, 0.0, 0.0)))
+    assert phantom_stop(there, perceived(there, lambda k: [], lambda k: [(10.0, 0.5)])) == 0.0
+    moving = make_trace(STEPS, ((*straight(0.0, 0.0, 0.0, 0.1, STEPS)[:3], 5.0), bodies[1]))
+    assert phantom_stop(moving, perceived(moving, lambda k: [], lambda k: [(10.0, 0.5)])) == 0.0
+
+
+def test_lost_pictures_count_as_looks_in_which_nothing_was_found() -> None:
+    trace = towards()
+    half = perceived(trace, lambda k: [(25.0, 0.0)] if k % 4 else None, lambda k: [])
+    assert component_metrics(trace, half, sure=0.3)["target_recall"] == pytest.approx(10 / 21)
+    assert no_objects().score.shape == (0,)
