@@ -1,0 +1,103 @@
+"""Speed of the world's step beside that of another version, in turn on the same machine and the same traffic.
+
+    git worktree add ../before 2dc730f
+    uv run python -m benchmarks.world_ratio ../before --json benchmarks/results/world-ratio.json
+
+Each version runs in a process of its own. Both go through the same steps again and again; the figure is the median of
+the ratios of processor times. It counts also where the machine has other things to do, which times alone do not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+SCENARIOS = ROOT / "src" / "ssad" / "scenarios" / "dynamic" / "data" / "natural-unselected.yaml"
+WARM = 60  # steps before the first that counts, for traffic to be awake
+
+
+def serve(batch: int, steps: int) -> None:
+    """In a process of its own: for each line that comes, drive the same steps and answer with s of processor time."""
+    from ssad.core.types import Controller
+    from ssad.roads import load_town
+    from ssad.scenarios.dynamic import build_episode, load_scenarios
+    from ssad.world.world import World
+
+    scenarios = load_scenarios(SCENARIOS)
+    graphs = {s.town: load_town(s.town) for s in scenarios}
+    bank = [build_episode(s, graphs[s.town], seed=k) for k, s in enumerate(scenarios)]
+    assign = [k % len(bank) for k in range(batch)]
+    world = World(bank, graphs, assign=assign, ego=Controller.AUTOPILOT, autoreset=True)
+    for _ in range(WARM):
+        world.step()
+    start = world.snapshot()
+    for _ in sys.stdin:
+        world.restore(start)
+        began = time.process_time()
+        for _ in range(steps):
+            world.step()
+        print(f"took {time.process_time() - began}", flush=True)
+
+
+def ask(process: subprocess.Popen[str]) -> float:
+    """One round of a process."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    print("go", file=process.stdin, flush=True)
+    for line in process.stdout:  # Warp prints, too
+        if line.startswith("took "):
+            return float(line[5:])
+    raise SystemExit("a version has failed")
+
+
+def measure(before: Path, *, batch: int, steps: int, rounds: int) -> dict[str, Any]:
+    """Speed of this version over that of another, as the median of the rounds and the middle half of them."""
+    words = [sys.executable, __file__, str(before), "--serve", "--batch", str(batch), "--steps", str(steps)]
+    pair = [
+        subprocess.Popen(
+            words, env=os.environ | {"PYTHONPATH": str(tree / "src")}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            text=True,
+        )
+        for tree in (before, ROOT)
+    ]  # fmt: skip
+    ratios = []
+    for number in range(-1, rounds):
+        order = (0, 1) if number % 2 else (1, 0)
+        took = {k: ask(pair[k]) for k in order}
+        if number >= 0:  # the first also loads code
+            ratios.append(took[0] / took[1])
+    for process in pair:
+        process.communicate()
+    low, middle, high = statistics.quantiles(ratios, n=4)
+    return {"batch": batch, "steps": steps, "rounds": rounds, "ratio": middle, "low": low, "high": high}
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path, help="folder of a checkout of the other version")
+    parser.add_argument("--batch", type=int, default=1024)
+    parser.add_argument("--steps", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.serve:
+        serve(given.batch, given.steps)
+        return
+    found = measure(given.before.resolve(), batch=given.batch, steps=given.steps, rounds=given.rounds)
+    print(f"{found['ratio']:.3f} times the speed of {given.before} ({found['low']:.3f} to {found['high']:.3f})")
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
