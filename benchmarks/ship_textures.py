@@ -43,7 +43,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         )
         card = TextureCard(
             line["attack"], line["carrier"], line["spec"]["options"], line["source"], weights[line["source"]],
-            suite["target"], data, run.command, int(line["epochs"]),
+            suite["target"], data, f"ssad run {suite['name']}", int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
         )  # fmt: skip
         name = f"{line['attack']}-{line['source']}-{pair['train'].lower()}"

@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[1]
         ("page", "benchmarks"),
         ("shift_page", "results"),
         ("digital_page", "digital"),
+        ("physical_page", "physical_results"),
         ("detector_accuracy", "accuracy"),
     ],
 )

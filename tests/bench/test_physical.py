@@ -18,6 +18,7 @@ from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.images import read_image
+from ssad.report import write_report
 from ssad.scenarios.static.physical import TextureSpec
 
 PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
@@ -193,7 +194,7 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert kept.mean() > 0.3, "what is on the body; the gutter is grey"
     assert shuffled["artefacts"]["texture"] != trained["artefacts"]["texture"]
     plan.kind.finish(plan, tmp_path)
-    assert read_image(tmp_path / "pictures" / "textures.jpg").shape[1] == 3 * 644
+    assert read_image(tmp_path / "pictures" / "drive-oldmarket.jpg").shape[1] == 3 * 644
     results = (tmp_path / "results.jsonl").read_bytes()
     assert run(plan, tmp_path, Resources(workers=1)) == records
     assert (tmp_path / "results.jsonl").read_bytes() == results
@@ -204,6 +205,29 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     texture.with_suffix(".checkpoint.npz").unlink()
     Physical().execute([cell], job)  # which needs no piece of work done before it
     assert np.array_equal(texture_of(job, spec), colour), "trained anew, the same to the bit"
+
+
+@pytest.mark.slow
+def test_the_grid_is_recorded_and_a_panel_that_nobody_sees_is_refused_there_alone(tmp_path: Path) -> None:
+    """A patch on the front is not seen from behind, and is from the front; a 3D detector judges."""
+    grid = {"distances": [8.0], "azimuths": [0.0, 180.0], "elevations": [10.0], "weathers": ["overcast"]}
+    attacks = [{"name": "random", "carrier": "patch", "options": {"panel": "front"}}]
+    plan = Physical().plan(suite(grid=grid, attacks=attacks, judges=["fcos3d-light"]))
+    by_name = dict(zip([cell.name for cell in plan.cells], run(plan, tmp_path, Resources(workers=2)), strict=True))
+    behind = by_name["yolov5n/Oldmarket/random/patch, panel front/yolov5n/0"]
+    assert behind["status"] == "failed"
+    assert "never in view in the 2 pictures of Oldmarket" in behind["reason"]
+    around = by_name["yolov5n/Oldmarket/random/patch, panel front/yolov5n/0/grid"]
+    assert around["status"] == "ok"
+    assert sorted(view[1] for view in around["views"]) == [0.0, 180.0]
+    assert {view[3] for view in around["views"]} == {"overcast"}
+    assert [cell[2] for cell in around["cells"]] == [1, 1]
+    judged = by_name["fcos3d-light/Oldmarket/clean//fcos3d-light/0"]
+    assert judged["status"] == "ok"
+    assert judged["metrics"]["AP50"] is not None
+    plan.kind.finish(plan, tmp_path)
+    assert (tmp_path / "pictures" / "grid-oldmarket.jpg").is_file()
+    assert "Views from all around" in write_report(tmp_path).read_text()
 
 
 def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

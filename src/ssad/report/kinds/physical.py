@@ -47,7 +47,7 @@ class PhysicalRun:
         found: dict[tuple[str, str, str, Shown], list[Line]] = {}
         for line in self.run.lines:
             shown = (line["attack"], line["carrier"], line["source"])
-            found.setdefault((line["test"], line["view"], line["detector"], shown), []).append(line)
+            found.setdefault((line["test"], line.get("view", "drive"), line["detector"], shown), []).append(line)
         return found
 
     @property
