@@ -65,8 +65,8 @@ def page() -> str:
     """The page."""
     lines = [
         "# The shipped detectors under physical attacks", "",
-        "`benchmarks/physical_page.py` makes this page from the tables that the commands below wrote, which are kept in",
-        "`benchmarks/results`. What the attacks, carriers and scores are: [physical.md](physical.md).", "",
+        "`benchmarks/physical_page.py` makes this page from the tables that the commands below wrote, which are kept",
+        "in `benchmarks/results`. What the attacks, carriers and scores are: [physical.md](physical.md).", "",
     ]  # fmt: skip
     for name in SUITES:
         lines += part(name)

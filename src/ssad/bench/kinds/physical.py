@@ -228,7 +228,8 @@ class Physical(Kind):
             for view, places in (("drive", (None,)), (GRID, SIDES)):
                 path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
                 clips = TargetClips(folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}", 1)
-                shown = chosen if view == "drive" else dict([*chosen.items()][-1:])
+                trained = [(title, spec) for title, spec in chosen.items() if spec.source and not spec.of]
+                shown = chosen if view == "drive" else dict(trained[-1:])
                 if path.is_file() or not (clips.folder / "annotations").is_dir() or not chosen:
                     continue
                 save_picture(path, _sheet(job, detector, clips, shown, places))
