@@ -64,6 +64,7 @@ def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     assert min(hit.values()) >= len(routes) / 16
     for record in blind:
         if record["metrics"]["collision"]:
-            assert record["witness"]["verdict"] in ("avoidable", "anticipation", "autopilot", "unavoidable")
+            assert record["witness"]["verdict"] in ("avoidable", "limit", "unavoidable")
+            assert record["metrics"]["avoided_by_cc"] == record["witness"]["avoids"]["cc"]
     avoidable = [r for r in blind if r.get("witness", {}).get("verdict") == "avoidable"]
-    assert len(avoidable) >= 0.75 * len(routes)
+    assert len(avoidable) >= 0.4 * len(routes)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ssad.core.types import EpisodeTrace as EpisodeTrace
     from ssad.core.types import Scenario as Scenario
     from ssad.drivers import make_system as make_system
+    from ssad.drivers.careful.grade import grade_collision as grade_collision
     from ssad.metrics import aggregate as aggregate
     from ssad.metrics import episode_metrics as episode_metrics
     from ssad.roads import load_town as load_town
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from ssad.world.check import check_simulator as check_simulator
     from ssad.world.env import VectorEnv as VectorEnv
     from ssad.world.rollout import rollout as rollout
-    from ssad.world.witness import find_witness as find_witness
     from ssad.world.world import World as World
 
 _WHERE = {
@@ -51,7 +51,7 @@ _WHERE = {
     "check_simulator": "world.check",
     "VectorEnv": "world.env",
     "rollout": "world.rollout",
-    "find_witness": "world.witness",
+    "grade_collision": "drivers.careful.grade",
     "World": "world.world",
 }
 __all__ = ["__version__", *_WHERE]  # noqa: PLE0604

@@ -29,7 +29,6 @@ from ssad.bench.kinds.driving import (
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.lane_graph import town_file
 from ssad.core.types import Actor, Pose, Scenario
-from ssad.drivers import make_system
 
 GOOD: dict[str, Any] = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"]}
 
@@ -265,32 +264,6 @@ def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) ->
         suite_scenarios(suite(scenarios=["one", "three"]))
 
 
-def test_a_witness_is_looked_for_once_for_an_episode_and_speed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    speeds = []
-
-    def find(episode: Any, graph: Any, *, device: str, policies: Any, sensors: Any) -> Any:
-        assert policies is make_system
-        assert sensors == {}
-        speeds.append((episode.agents[0].target_speed, episode.agents[1:], graph.name, device))
-        return SimpleNamespace(as_dict=lambda: {"found": True, "margin": math.inf, "speed": np.float64(2.5)})
-
-    monkeypatch.setattr("ssad.world.witness.find_witness", find)
-    monkeypatch.setattr(driving, "replace", lambda old, **new: SimpleNamespace(**(vars(old) | new)))
-    monkeypatch.setattr(driving, "scenario_json", lambda scenario: {"name": "s"})
-    ego, other = SimpleNamespace(target_speed=8.0), SimpleNamespace(target_speed=1.0)
-    episode: Any = SimpleNamespace(agents=(ego, other), scenario=SimpleNamespace(actors=()), seed=3, town="Nowhere")
-    expected = {"found": True, "margin": None, "speed": 2.5}
-    for speed in (None, 9.5, 9.5, None):
-        assert driving.witness(tmp_path, episode, speed, "cpu") == expected
-    assert speeds == [(8.0, (other,), "Nowhere", "cpu"), (9.5, (other,), "Nowhere", "cpu")]
-    files = list((tmp_path / "witness").iterdir())
-    assert len(files) == 2
-    assert all(len(path.stem) == 16 and path.read_text().endswith("}\n") for path in files)
-    later: Any = SimpleNamespace(**(vars(episode) | {"seed": 4}))
-    driving.witness(tmp_path, later, None, "cpu")
-    assert len(speeds) == 3
-
-
 def test_plain_data() -> None:
     given = {
         "a": (1, [np.float32(0.5), math.nan]),
@@ -321,30 +294,30 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     monkeypatch.setattr(driving, "save_trace", lambda path, trace: path.write_text(trace.end))
     monkeypatch.setattr(driving, "trace_hash", lambda trace: f"hash {trace.end}")
     monkeypatch.setattr(driving, "motion_hash", lambda trace: f"motion {trace.end}")
-    monkeypatch.setattr(driving, "system_of", lambda name: SimpleNamespace(target_speed=7.5))
     measured = SimpleNamespace(as_dict=lambda: {"speed": math.inf})
     monkeypatch.setattr(driving, "episode_metrics", lambda trace, stop_signs: measured)
 
-    def witness(*given: Any) -> dict[str, bool]:
+    def grade_of(*given: Any) -> Any:
         asked.append(given)
-        return {"avoidable": True}
+        return SimpleNamespace(as_dict=lambda: {"danger": math.nan}, metrics=lambda: {"avoided_by_cc": 1.0})
 
-    monkeypatch.setattr(driving, "witness", witness)
+    monkeypatch.setattr(driving, "grade_of", grade_of)
     (tmp_path / "traces").mkdir()
     found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": True}))
     one, two = (found[cell.key] for cell in cells)
     path = f"traces/{cells[0].key}.npz"
     assert one == {
-        "metrics": {"speed": None}, "artefacts": {"trace": path}, "case": "motion collision", "wall_s": 4.0 + 1.0,
+        "metrics": {"speed": None, "avoided_by_cc": 1.0}, "artefacts": {"trace": path}, "case": "motion collision",
+        "wall_s": 4.0 + 1.0,
         "episode": {
             "scenario": "a", "repetition": 0, "town": "Nowhere", "end": "collision", "trace_hash": "hash collision",
-            "trace": path, "metrics": {"speed": None},
+            "trace": path, "metrics": {"speed": None, "avoided_by_cc": 1.0},
         },
-        "witness": {"avoidable": True},
+        "witness": {"danger": None},
     }  # fmt: skip
     assert two["wall_s"] == 4.0 + 2.0
     assert "witness" not in two, "nothing was hit"
-    assert asked == [(tmp_path, episodes[0], 7.5, "cpu")]
+    assert [(given[0], given[1].end, given[2]) for given in asked] == [(episodes[0], "collision", "cpu")]
     assert (tmp_path / path).read_text() == "collision"
     found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": False}))
     assert "witness" not in found[cells[0].key]

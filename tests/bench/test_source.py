@@ -104,7 +104,8 @@ def test_the_source_of_a_cell_is_found() -> None:
     """What a drive depends on is in its key, and a report or a detector is not."""
     found = set(source_files("ssad.bench.kinds.driving"))
     for name in ("core.safeio", "core.registry", "core.traces", "core.geometry", "metrics.driving",
-                 "metrics.criticality", "world.kernels.traffic", "world.witness", "drivers.builtin", "roads.router",
+                 "metrics.criticality", "world.kernels.traffic", "drivers.careful.grade", "drivers.builtin",
+                 "roads.router",
                  "scenarios.dynamic.knowledge.lane_changing", "scenarios.dynamic.knowledge._placing"):  # fmt: skip
         assert f"ssad.{name}" in found, name
     assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)

@@ -13,13 +13,13 @@ from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.traces import first_difference
 from ssad.core.types import Actor, Controller, Episode, Limits, Pose, Scenario
 from ssad.drivers import make_system
+from ssad.drivers.careful.grade import grade_collision
 from ssad.roads.library import load_town
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.schema import check
 from ssad.scenarios.dynamic.yamlio import read_scenarios, save_scenarios
 from ssad.world.env import VectorEnv
 from ssad.world.rollout import rollout
-from ssad.world.witness import find_witness
 from ssad.world.world import World
 
 TOWN = load_town("ProvingGround")
@@ -130,14 +130,19 @@ def test_environments_by_name_know_the_drivers(tmp_path: Path) -> None:
     assert env.unwrapped.world.state().speed[0, 2] > 0.5
 
 
-def test_the_search_for_a_way_out_drives_them_too() -> None:
+def test_a_collision_with_them_is_graded_with_them_at_the_wheel() -> None:
     class Stay(Straight):
         def act(self, view):
             return 0.0 * super().act(view)
 
     ahead = replace(built(path=()), limits=Limits(max_steps=80))
-    assert find_witness(ahead, TOWN, policies=lambda name: Straight()).verdict == "harmless"
-    assert find_witness(ahead, TOWN, policies=lambda name: Stay()).verdict == "avoidable"
+    (trace,) = rollout(World([ahead], GRAPHS), make_system("blind"), policies=lambda name: Stay())
+    assert trace.end == "collision"
+    found = grade_collision(ahead, TOWN, trace, policies=lambda name: Stay())
+    assert found.exact
+    assert found.avoids["cc"]
+    # who drives on where it stood is not what was met: the replay says so
+    assert not grade_collision(ahead, TOWN, trace, policies=lambda name: Straight()).exact
 
 
 def test_a_scenario_with_a_policy_round_trips(tmp_path: Path) -> None:

@@ -13,6 +13,10 @@ from ssad.core.types import Controller
 SYSTEMS: dict[str, str] = {
     "autopilot": "ssad.drivers.builtin:Autopilot",
     "blind": "ssad.drivers.builtin:Blind",
+    "careful-cc": "ssad.drivers.careful.driver:CarefulCC",
+    "careful-fsm": "ssad.drivers.careful.driver:CarefulFSM",
+    "careful-reg157": "ssad.drivers.careful.driver:CarefulReg157",
+    "careful-rss": "ssad.drivers.careful.driver:CarefulRSS",
     "line-of-sight": "ssad.drivers.belief:LineOfSight",
     "perceiving-perfect": "ssad.drivers.perceiving.systems:Perfect",
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",

@@ -76,6 +76,13 @@ class EpisodeMetrics:
         min_ttc: Least time to collision, s (10: none).
         pet: Post-encroachment time, s (10: none).
         min_distance: Least distance to another agent, m (NaN: there is none).
+        impact_speed: Speed of the ego against what it hit first, m/s (NaN: it hit nothing).
+        avoided_by_cc: 1 if the careful and competent human driver of UN R157 avoids the collision that was, else 0
+            (NaN: there was none, or it was not graded); likewise the others.
+        avoided_by_reg157: Of UN R157, 5.2.5.2.
+        avoided_by_rss: Of RSS.
+        avoided_by_fsm: Of the FSM.
+        avoided_by_limit: By some manoeuvre of the search for the kinematic limit, or by a careful driver.
     """
 
     collision: bool
@@ -101,6 +108,12 @@ class EpisodeMetrics:
     min_ttc: float
     pet: float
     min_distance: float
+    impact_speed: float = math.nan
+    avoided_by_cc: float = math.nan
+    avoided_by_reg157: float = math.nan
+    avoided_by_rss: float = math.nan
+    avoided_by_fsm: float = math.nan
+    avoided_by_limit: float = math.nan
 
     def as_dict(self) -> dict[str, Any]:
         """Field name -> value."""
@@ -159,6 +172,7 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
         pet=0.0 if touched else post_encroachment_time(trace),
         min_distance=0.0 if touched else min_distance(trace),
         stop_signs=signs,
+        impact_speed=impact_speed(trace),
         **infractions,
     )
 
@@ -166,6 +180,38 @@ def episode_metrics(trace: EpisodeTrace, *, stop_signs: bool = False) -> Episode
 def collided(trace: EpisodeTrace) -> bool:
     """Whether the ego hit anything. SafeBench reads its last record, whose collision flag stays set once raised."""
     return bool((trace.contact != 0).any()) or trace.end == "collision"
+
+
+def first_contact(trace: EpisodeTrace) -> tuple[int, int]:
+    """The first contact of a drive.
+
+    Args:
+        trace: The drive.
+
+    Returns:
+        Its step, and the agent that was hit; -1: something that is no agent.
+
+    Raises:
+        ValueError: There is none.
+    """
+    steps = np.flatnonzero(trace.contact)
+    if len(steps) == 0:
+        raise ValueError(f"trace {trace.key}: no contact")
+    return int(steps[0]), max(int(trace.contact_agent[steps[0]]), -1)
+
+
+def impact_speed(trace: EpisodeTrace) -> float:
+    """Speed of the ego against what it hit first, m/s: the length of the difference of their velocities; NaN: nothing.
+
+    It is the severity that NeuroNCAP weighs collisions by.
+    """
+    if not (trace.contact != 0).any():
+        return math.nan
+    step, agent = first_contact(trace)
+    who = [0] if agent < 1 else [0, agent]
+    speed, yaw = trace.speed[step, who].astype(np.float64), trace.yaw[step, who].astype(np.float64)
+    sides = np.array([1.0, -1.0])[: len(who)]
+    return float(np.hypot((sides * speed * np.cos(yaw)).sum(), (sides * speed * np.sin(yaw)).sum()))
 
 
 def collision_events(trace: EpisodeTrace) -> Bool:

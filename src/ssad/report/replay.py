@@ -13,13 +13,13 @@ from ssad.report.embed import SCALE, SHARE, SPEED, episode_data, town_data
 from ssad.report.episodes import DrivingRun, EpisodeRecord
 from ssad.report.paper import SCENARIOS
 
-VERDICTS = {
-    "harmless": "a blind driver at the system's speed stays clear",
-    "avoidable": "avoidable by reacting once the danger has begun",
-    "anticipation": "avoidable only by acting earlier",
-    "autopilot": "avoided only by the privileged Autopilot",
-    "unavoidable": "nobody tried stayed clear",
+MODELS = {
+    "cc": "UN R157's careful human driver",
+    "reg157": "UN R157, 5.2.5.2",
+    "rss": "RSS",
+    "fsm": "FSM",
 }
+"""Careful drivers by their short names in a grade."""
 
 
 def outcome_class(record: EpisodeRecord) -> str:
@@ -78,12 +78,19 @@ def replay_data(run: DrivingRun) -> dict[str, Any]:
 
 
 def _witness_words(witness: Mapping[str, Any] | None) -> str:
-    """What the witness says, in a sentence."""
-    if not witness:
+    """What the grade of a collision says, in a sentence."""
+    if not witness or "avoids" not in witness:
         return ""
-    words = VERDICTS.get(str(witness["verdict"]), str(witness["verdict"]))
-    m = witness.get("manoeuvre")
-    if m:
-        side = "" if not m["offset"] else f", {abs(m['offset']):.1f} m to the {'left' if m['offset'] > 0 else 'right'}"
-        words += f": from {m['start']:.1f} s on {m['speed']:.1f} m/s for {m['hold']:.0f} s{side}"
-    return f"{words} ({witness['clear']} of {witness['tried']} drivers tried stay clear)"
+    good = [name for key, name in MODELS.items() if witness["avoids"].get(key)]
+    words = f"avoided by {', '.join(good)}" if good else "avoided by no careful driver"
+    limit, m = witness["limit"], witness["limit"]["manoeuvre"]
+    if not m:
+        return f"{words}; none of {limit['tried']} manoeuvres stays clear"
+    does = (
+        "keep the speed"
+        if not m["accel"]
+        else f"{'brake' if m['accel'] < 0 else 'speed up'} {abs(m['accel']):.1f} m/s²"
+    )
+    side = "" if not m["aside"] else f", {abs(m['aside']):.1f} m to the {'left' if m['aside'] > 0 else 'right'}"
+    until = f"the last of {limit['clear']} manoeuvres that stay clear begins {limit['latest']:.1f} s before the contact"
+    return f"{words}; {until}, the gentlest: from {m['start']:.1f} s on {does}{side}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -80,7 +81,7 @@ class LaneQuery:
         """The grid over lanes of the given types."""
         key = tuple(sorted({int(t) for t in types}))
         if key not in self._grids:
-            self._grids[key] = build_grid(self.graph, key)
+            self._grids[key] = grid_of(self.graph, key)
         return self._grids[key]
 
     def nearest(self, xy: npt.ArrayLike, types: Sequence[LaneType] = DRIVABLE) -> Nearest:
@@ -157,6 +158,18 @@ def segments(graph: LaneGraph, types: Sequence[int]) -> tuple[F32, F32, I32, F32
     seg = np.concatenate([graph.xy[i], graph.xy[i + 1]], axis=1)
     half = 0.5 * np.stack([graph.width[i], graph.width[i + 1]], axis=1)
     return seg, half.astype(np.float32), lane[i], graph.s[i]
+
+
+_GRIDS: dict[tuple[int, tuple[int, ...]], tuple[weakref.ref[LaneGraph], Grid]] = {}
+
+
+def grid_of(graph: LaneGraph, types: Sequence[int]) -> Grid:
+    """`build_grid`, made once for a town that is kept in memory: worlds of one town are often built by the hundred."""
+    key = (id(graph), tuple(int(t) for t in types))
+    kept = _GRIDS.get(key)
+    if kept is None or kept[0]() is not graph:
+        _GRIDS[key] = kept = (weakref.ref(graph, lambda _: _GRIDS.pop(key, None)), build_grid(graph, types))
+    return kept[1]
 
 
 def build_grid(graph: LaneGraph, types: Sequence[int]) -> Grid:

@@ -14,7 +14,7 @@ from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
-from ssad.roads.query import CELL, DRIVABLE, build_grid
+from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, TurnRank
@@ -143,7 +143,7 @@ class Lanes:
 
     def __init__(self, graph: LaneGraph) -> None:
         self.graph = graph
-        self._grid = build_grid(graph, DRIVABLE)
+        self._grid = grid_of(graph, DRIVABLE)
         seg = self._grid.seg
         self._yaw = np.arctan2(seg[:, 3] - seg[:, 1], seg[:, 2] - seg[:, 0])
         count = graph.lanes

@@ -13,7 +13,7 @@ from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.roads.query import CELL, DRIVABLE, build_grid
+from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
@@ -402,7 +402,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     parts: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in array_types(Roads)}
     segments = lanes = cells = entries = signals = 0
     for graph in graphs:
-        grid = build_grid(graph, DRIVABLE)  # only lanes that a car may be on count as road under its centre
+        grid = grid_of(graph, DRIVABLE)  # only lanes that a car may be on count as road under its centre
         parts["segment"].append(grid.seg)
         parts["segment_half"].append(grid.seg_half)
         parts["segment_lane"].append(grid.seg_lane + lanes)

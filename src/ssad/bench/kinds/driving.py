@@ -8,10 +8,10 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field
 
@@ -29,6 +29,9 @@ from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import METRICS, episode_metrics
 
+if TYPE_CHECKING:
+    from ssad.drivers.careful.grade import Grade
+
 HIGHWAY = "highway-env"  # as a set of scenarios
 HIGHWAY_TYPE = "ssad.interchange.highway_env:SCENARIO"
 
@@ -44,7 +47,7 @@ class DrivingSuite(SuiteBase):
         spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
             not at all, then scenarios without traffic of their own give copies, which count once.
         chunk: cells that run as one batch of the world (results do not depend on it).
-        witness: search each collision for a way out.
+        witness: grade each collision: which careful drivers avoid it, and could anybody (docs/careful.md).
         pictures: what the report shows besides (shifts: contact sheets of the distribution shifts; camera: what the
             camera sees).
     """
@@ -154,6 +157,10 @@ class Driving(Kind):
             save_trace(job.folder / artefact, trace)
             signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
             metrics = plain(episode_metrics(trace, stop_signs=signs).as_dict())
+            found: Grade | None = None
+            if job.settings["witness"] and trace.end == "collision" and not in_highway(cell):
+                found = grade_of(episode, trace, job.device)
+                metrics |= found.metrics()
             about = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
             about |= {"end": trace.end, "trace_hash": trace_hash(trace), "trace": artefact, "metrics": metrics}
             result = {
@@ -162,9 +169,8 @@ class Driving(Kind):
                 "episode": about,
                 "case": motion_hash(trace),
             }
-            if job.settings["witness"] and trace.end == "collision" and not in_highway(cell):
-                speed = getattr(system_of(cell.system), "target_speed", None)
-                result["witness"] = witness(job.folder, episode, speed, job.device)
+            if found is not None:
+                result["witness"] = plain(found.as_dict())
             results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
         return results
 
@@ -327,27 +333,14 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras}
 
 
-def witness(folder: Path, episode: Episode, speed: float | None, device: str) -> dict[str, Any]:
-    """Could anybody have avoided the collision, coming at the speed (m/s) of the system that had it?
-
-    Searched once for an episode and speed, whichever systems collide in it.
-    """
+def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
+    """Who could have avoided the collision of a drive."""
     from ssad.drivers import make_system
-    from ssad.world.witness import find_witness
+    from ssad.drivers.careful.grade import grade_collision
 
-    if speed is not None:
-        ego = replace(episode.agents[0], target_speed=speed)
-        episode = replace(episode, agents=(ego, *episode.agents[1:]))
-    name = digest("witness", safeio.dump_json(scenario_json(episode.scenario)), episode.seed, speed)[:16]
-    path = folder / "witness" / f"{name}.json"
-    if path.exists():
-        found: dict[str, Any] = safeio.read_json(path)
-        return found
     made = [make_system(name) for name in policies_of(episode.scenario)]
-    find = partial(find_witness, device=device, policies=make_system, sensors=onboard_sensors(made, device))
-    found = plain(find(episode, town(episode.town)).as_dict())
-    safeio.write_atomic(path, safeio.dump_json(found) + "\n")
-    return found
+    sensors = onboard_sensors(made, device)
+    return grade_collision(episode, town(episode.town), trace, device=device, policies=make_system, sensors=sensors)
 
 
 def plain(value: Any) -> Any:

@@ -31,7 +31,8 @@ class CarefulModel:
         delay: s from the moment that the danger is perceived to the first braking.
         jerk: m/s^3 by which braking may grow; infinite: at once.
         coast: m/s^2 that it slows by during the delay.
-        hold: m/s^2 with which it goes on braking until it closes on nobody, once it brakes; 0: it does as it demands.
+        hold: m/s^2 with which it goes on braking for whom it brakes, until it no longer closes on him or he is out of
+            its way; 0: it does as it demands.
     """
 
     name: str
@@ -249,7 +250,8 @@ def react(model: CarefulModel, e: Encounter, before: Reaction, dt: float) -> tup
     wants = model.demand(e)
     began = (before.since + dt > model.delay) & (before.since >= 0.0)
     if model.hold > 0.0:
-        wants = np.where(began & e.ahead() & stays(e), np.maximum(wants, model.hold), wants)
+        there = (e.lateral <= 0.0) | (e.approach > 0.0)
+        wants = np.where(began & e.ahead() & there, np.maximum(wants, model.hold), wants)
     since = np.where(wants > 0.0, np.maximum(before.since, 0.0), -1.0)
     # braking may begin within the step
     share = np.clip((since + dt - model.delay) / dt, 0.0, 1.0)

@@ -14,7 +14,7 @@ from ssad.report.episodes import FAMILY_TITLES, DrivingRun, load_episodes
 from ssad.report.figures import interval_plot
 from ssad.report.load import Run
 from ssad.report.pages import render
-from ssad.report.replay import VERDICTS, outcome_class, replay_data
+from ssad.report.replay import MODELS, outcome_class, replay_data
 from ssad.report.tables import Cell, Table
 
 PICTURES = {
@@ -100,12 +100,19 @@ def _matrix(run: DrivingRun) -> list[dict[str, Any]]:
 
 
 def _witness(run: DrivingRun) -> dict[str, Any] | None:
-    """For each group: how the collisions divide by what could have avoided them."""
-    rows: dict[str, Counter[str]] = {}
+    """For each system and group: of how many collisions, how many each careful driver avoids, and anybody."""
+    rows: dict[tuple[str, str], Counter[str]] = {}
     for r in run.records:
-        if r.witness:
-            rows.setdefault(r.heading, Counter())[str(r.witness["verdict"])] += 1
+        if r.witness and "avoids" in r.witness:
+            row = rows.setdefault((r.system, r.heading), Counter())
+            row["n"] += 1
+            row.update({name: int(fine) for name, fine in r.witness["avoids"].items()})
+            row["limit"] += r.witness["verdict"] != "unavoidable"
     if not rows:
         return None
-    known = [v for v in VERDICTS if any(row[v] for row in rows.values())]
-    return {"rows": rows, "verdicts": known, "words": VERDICTS}
+    for system in run.systems:
+        own = [row for (name, _), row in rows.items() if name == system]
+        if len(own) > 1:
+            rows[system, "all"] = sum(own, Counter())
+    order = sorted(rows, key=lambda key: run.systems.index(key[0]))
+    return {"rows": {key: rows[key] for key in order}, "columns": {**MODELS, "limit": "any manoeuvre tried"}}
