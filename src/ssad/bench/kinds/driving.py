@@ -23,7 +23,7 @@ from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph, town_file
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
-from ssad.core.seeding import digest, seed32
+from ssad.core.seeding import seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.jobs.machine import quiet_warp
