@@ -97,14 +97,21 @@ def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp
     out = ssad("run", "adversarial-quick", "--set", f"scenarios={tmp_path / 'mine.yaml'}", "--out", tmp_path / "out")
     assert out.returncode == 2
     assert "scenario mine: its type Custom has no parameters of other agents to search" in out.stderr
-    king = ssad(
-        "run", "adversarial-quick", "--set", f"scenarios={tmp_path / 'mine.yaml'}", "--set", "generators=king",
-        "--out", tmp_path / "king", "--workers", "1",
-    )  # fmt: skip
-    (line,) = read_lines(tmp_path / "king" / "results.jsonl")
-    assert king.returncode != 0
-    assert line["status"] == "failed"
-    assert "there is no vehicle in it that could be an adversary" in line["reason"]
+
+
+def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_searched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ssad.bench.kinds.adversarial.reference", lambda folder, device: {})
+    kind = Adversarial()
+    settings = ["generators=king", "budget=1", "scenarios=[StraightObstacle/00]"]
+    with pytest.raises(ConfigError, match=r"generator king: scenario StraightObstacle/00: there is no vehicle in it"):
+        kind.plan(load_suite("adversarial-quick", settings))
+    plan = kind.plan(load_suite("adversarial-quick", [*settings[:2], "scenarios=[StraightObstacle/00,RightTurn/00]"]))
+    refused = plan.cells[0]
+    (line,) = kind.execute([refused], Job(tmp_path, "cpu", {})).values()
+    assert line["metrics"] == {"applies": False, "survived": True}
+    assert "there is no vehicle in it" in line["refused"]
 
 
 def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -136,7 +143,7 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert again.trace.end == "collision"
     # what collides already in plain replay is not searched
     (line,) = kind.execute([victim], job).values()
-    assert line["metrics"] == {"survived": False}
+    assert line["metrics"] == {"applies": True, "survived": False}
 
 
 @pytest.mark.slow

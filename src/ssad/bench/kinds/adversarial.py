@@ -29,6 +29,7 @@ from ssad.core.generators import Base, Outcome
 from ssad.core.lane_graph import save_graph, town_file
 from ssad.core.seeding import seed32
 from ssad.core.traces import motion_hash, save_trace
+from ssad.core.types import Episode
 from ssad.jobs.machine import quiet_warp
 
 APART = 1.0  # m by which motions before contact differ on average, to count as distinct
@@ -75,6 +76,7 @@ class Adversarial(Kind):
     suite = AdversarialSuite
     factors = ("generator", "system", "group")
     columns = (
+        Column("applies", "generator applies"),
         Column("survived", "plain replay survived"),
         Column("CR", "collision found, adversary on the road and hitting nobody else", "", "higher"),
         Column("CR_any", "any collision with the adversary found", "", "higher"),
@@ -112,12 +114,11 @@ class Adversarial(Kind):
         scenarios = suite_scenarios(suite._driving())
         towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
         if check:
-            for scenario in scenarios:
-                build_episode(scenario, town(scenario.town), seed=0)
-                for factory in factories.values():
-                    accepts = getattr(factory, "check", None)
-                    if accepts is not None:
-                        accepts(scenario)
+            episodes = [build_episode(scenario, town(scenario.town), seed=0) for scenario in scenarios]
+            for name, factory in factories.items():
+                refused = [refusal(factory, episode) for episode in episodes]
+                if all(refused):
+                    raise ConfigError(f"generator {name}: {refused[0]}")
         cells = []
         for generator in suite.generators:
             for system in suite.systems:
@@ -180,18 +181,22 @@ class Adversarial(Kind):
         for cell in cells:
             scenario = scenario_from(cell.spec["scenario"])
             bases[cell.key] = trials.base(scenario, town(scenario.town), seed=cell.seed)
-        alive = [cell for cell in cells if bases[cell.key].trace.end != "collision"]
+        factory = generator_factory(spec["generator"])
+        alive: list[Cell] = []
         results: dict[str, dict[str, Any]] = {}
         for cell in cells:
-            if cell not in alive:
-                results[cell.key] = {"metrics": {"survived": False}, "case": motion_hash(bases[cell.key].trace)}
+            refused = refusal(factory, bases[cell.key].episode)
+            survived = bases[cell.key].trace.end != "collision"
+            if survived and not refused:
+                alive.append(cell)
+                continue
+            metrics: dict[str, Any] = {"applies": not refused, "survived": survived}
+            results[cell.key] = {"metrics": metrics, "case": motion_hash(bases[cell.key].trace), "refused": refused}
         if not alive:
             return results
         began = time.process_time()
         chosen = [bases[cell.key] for cell in alive]
-        generator = generator_factory(spec["generator"])(
-            chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"]
-        )
+        generator = factory(chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"])
         clock: dict[int, float] = {}  # rollouts of each base -> s for all bases
         outcomes = search(
             generator, chosen, trials, budget=spec["budget"], batch=spec["batch"],
@@ -200,7 +205,13 @@ class Adversarial(Kind):
         usual = reference(job.folder, job.device)
         for cell, base, row in zip(alive, chosen, outcomes, strict=True):
             about = self._save(cell, base, row, trials, job.folder)
-            metrics = {"survived": True, **summary(row), **about.pop("metrics"), **likeness(row, base.graph, usual)}
+            metrics = {
+                "applies": True,
+                "survived": True,
+                **summary(row),
+                **about.pop("metrics"),
+                **likeness(row, base.graph, usual),
+            }
             metrics["seconds"] = max(clock.values()) / len(alive)
             spent = [s for asked, s in clock.items() if metrics["CR"] and asked >= metrics["rollouts"]]
             metrics["seconds_first"] = min(spent, default=math.nan) / len(alive)
@@ -230,6 +241,17 @@ class Adversarial(Kind):
             "artefacts": artefacts, "adversaries": list(found[0].adversaries),
             "metrics": {"replayed": float(np.mean(again))},
         }  # fmt: skip
+
+
+def refusal(factory: Any, episode: Episode) -> str:
+    """Why a generator has nothing to change in an episode; "": it has."""
+    check = getattr(factory, "check", None)
+    try:
+        if check is not None:
+            check(episode)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def summary(row: Sequence[Outcome]) -> dict[str, Any]:

@@ -141,7 +141,7 @@ def _searches(run: Run) -> dict[tuple[str, str], list[Line]]:
 def _within(line: Line, most: float = math.inf) -> float:
     """Whether a search has found a collision within so many rollouts; NaN: nothing to search, or it failed."""
     metrics = line.get("metrics") or {}
-    if line["status"] != "ok" or not metrics.get("survived"):
+    if line["status"] != "ok" or metrics.get("CR") is None:
         return math.nan
     return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
 

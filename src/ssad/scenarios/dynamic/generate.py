@@ -28,6 +28,7 @@ GENERATORS: dict[str, str] = {
     "bayesian": f"{_SEARCH}.bayesian:Bayesian",
     "king": "ssad.scenarios.dynamic.transition.kinematics:King",
     "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
+    "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
 BATCH = 8  # rollouts of a base side by side

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
-from ssad.core.types import F64, Scenario
+from ssad.core.types import F64, Episode, Scenario
 from ssad.scenarios.dynamic.catalog import scenario_type
 from ssad.scenarios.dynamic.sampling import TARGET_SPEED
 
@@ -79,13 +79,13 @@ class BoxSearch(ABC):
         self._asked: list[F64] = []
 
     @staticmethod
-    def check(scenario: Scenario) -> None:
-        """Whether there is anything to search in a scenario.
+    def check(episode: Episode) -> None:
+        """Whether there is anything to search in an episode.
 
         Raises:
             ConfigError: There is not.
         """
-        Box.of(scenario)
+        Box.of(episode.scenario)
 
     @abstractmethod
     def points(self, index: int, count: int) -> F64:

@@ -22,9 +22,10 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import generator
-from ssad.core.types import F64, AgentKind, EpisodeTrace
+from ssad.core.types import F64, AgentKind, Episode, EpisodeTrace, Scenario
 from ssad.scenarios.dynamic.frozen import frozen, with_motion
 from ssad.scenarios.dynamic.transition.road import raster_of
+from ssad.world.models import model
 from ssad.world.twin import Bodies, MotionState, advance, bodies_of, box_gap, unroll
 
 STEP: Final = 0.25  # s, as KING's
@@ -79,7 +80,7 @@ class King:
         self._seeds = list(seeds)
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._agents = [adversaries(base) for base in bases]
-        self._motion = [_sampled(base.trace) for base in bases]
+        self._motion = [sampled(base.trace) for base in bases]
         self._recorded = [self._as_recorded(k) for k in range(len(self.bases))]
         self._road = raster_of(
             [base.graph for base in bases],
@@ -91,6 +92,16 @@ class King:
         self._started = [0] * len(self.bases)
         self._away: list[set[int]] = [set() for _ in self.bases]
         self._chains: list[list[_Chain]] = [[] for _ in self.bases]
+
+    @staticmethod
+    def check(episode: Episode) -> None:
+        """Whether an episode has a vehicle that could become the adversary.
+
+        Raises:
+            ConfigError: It has none.
+        """
+        if not any(model(agent.model).kind <= AgentKind.BICYCLE for agent in episode.agents[1:]):
+            raise _nobody(episode.scenario)
 
     def ask(self, count: int) -> list[list[Proposal]]:
         """Each chain, further optimised."""
@@ -120,7 +131,7 @@ class King:
                 if outcome.trace is None or outcome.valid or chain.tried >= (2 if away else PATIENCE):
                     self._chains[k][at] = self._new_chain(k)
                     continue
-                chain.ego = _sampled(outcome.trace)[0]
+                chain.ego = sampled(outcome.trace)[0]
                 if outcome.off_road or outcome.hit_others:
                     chain.weight *= 2.0
 
@@ -225,11 +236,15 @@ def adversaries(base: Base) -> list[int]:
             apart = np.hypot(*np.moveaxis(path[:, None] - trace.route[None], -1, 0))
             found.append((float(apart.min()), agent))
     if not found:
-        raise ConfigError(
-            f"scenario {base.scenario.name}: there is no vehicle in it that could be an adversary; add one, or take "
-            "another scenario"
-        )
+        raise _nobody(base.scenario)
     return [agent for _, agent in sorted(found)[:NEAREST]]
+
+
+def _nobody(scenario: Scenario) -> ConfigError:
+    return ConfigError(
+        f"scenario {scenario.name}: there is no vehicle in it that could be an adversary; "
+        "add one, or take another scenario"
+    )
 
 
 def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
@@ -283,7 +298,7 @@ def _corners(box: Tensor) -> Tensor:
     return torch.stack([box[..., 0:1] + cos * along - sin * across, box[..., 1:2] + sin * along + cos * across], -1)
 
 
-def _sampled(trace: EpisodeTrace) -> F64:
+def sampled(trace: EpisodeTrace) -> F64:
     """Boxes and presence [A, T + 1, 6] of a trace at the steps of the optimisation; after its end nobody is there."""
     at = STEP * np.arange(STEPS + 1) / trace.dt
     last = len(trace.active) - 1

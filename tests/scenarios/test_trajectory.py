@@ -1,0 +1,91 @@
+"""CAT: a prior learned from recorded motions, the product of its terms, and what it proposes."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from ssad.core.generators import Base
+from ssad.drivers import make_system
+from ssad.roads import load_town
+from ssad.roads.query import LaneQuery
+from ssad.scenarios.dynamic import load_scenarios
+from ssad.scenarios.dynamic.generate import Trials
+from ssad.scenarios.dynamic.transition import trajectory
+from ssad.scenarios.dynamic.transition.trajectory import Cat, traffic
+
+
+@pytest.fixture(scope="module")
+def base() -> Base:
+    scenario = load_scenarios("natural")[0]
+    return Trials(lambda: make_system("blind")).base(scenario, load_town(scenario.town), seed=2)
+
+
+@pytest.fixture(scope="module")
+def cat(base: Base) -> Cat:
+    patch = pytest.MonkeyPatch()
+    patch.setattr(trajectory, "EPISODES", 4)
+    traffic.cache_clear()
+    made = Cat([base], seeds=[1], budget=8)
+    patch.undo()
+    return made
+
+
+def test_recorded_motions_start_at_the_origin_and_can_be_driven(cat: Cat) -> None:
+    motions, speeds = traffic()
+    assert len(motions) == len(speeds) > 50
+    assert np.abs(motions[:, 0]).max() < 1e-9
+    assert motions[:, 4, 0].min() > -0.5  # nobody drives backwards
+    assert np.hypot(*np.diff(motions[..., :2], axis=1).T).max() / 0.25 < 20.0
+
+
+def test_candidates_stay_on_the_road_and_their_priors_add_up(cat: Cat, base: Base) -> None:
+    (found,) = cat._left
+    assert len(found) > 50
+    query = LaneQuery(base.graph)
+    assert all(not query.off_road(c.pose[::2, :2]).any() for c in found[::10])
+    total: dict[tuple[int, int], float] = {}
+    for c in found:
+        total[c.agent, c.start] = total.get((c.agent, c.start), 0.0) + c.prior
+    assert all(value == pytest.approx(1.0) for value in total.values())
+
+
+def test_the_score_sums_over_the_egos_rollouts_and_falls_with_the_time(cat: Cat) -> None:
+    candidate = cat._left[0][0]
+    motion = cat._motion[0]
+
+    def ego(meets: int | None) -> np.ndarray:
+        """An ego far away that is where the candidate is from one step on."""
+        rows = motion[0].copy()
+        rows[:, :2] += 1.0e4
+        rows[:, 5] = 1.0
+        if meets is not None:
+            steps = np.arange(meets, trajectory.LENGTH + 1)
+            rows[candidate.start + steps, :3] = candidate.pose[steps]
+        return rows
+
+    def score(*egos: np.ndarray) -> float:
+        cat._egos[0] = deque(egos, maxlen=5)
+        return cat._score(0, candidate)[0]
+
+    kept = cat._egos[0]
+    assert score(ego(None)) == 0.0
+    assert score(ego(0)) == pytest.approx(candidate.prior)
+    assert score(ego(10)) == pytest.approx(candidate.prior * 0.99**5)  # the sixth look, at steps of 0.5 s
+    assert score(ego(0), ego(None), ego(10)) == pytest.approx(candidate.prior * (1.0 + 0.99**5))
+    cat._egos[0] = kept
+
+
+def test_the_best_are_proposed_first_and_none_twice(cat: Cat) -> None:
+    scores = [cat._score(0, c) for c in cat._left[0]]
+    count = len(cat._left[0])
+    (first,) = cat.ask(4)
+    (second,) = cat.ask(4)
+    assert len(first) == len(second) == 4
+    assert len(cat._left[0]) == count - 8
+    left = [cat._score(0, c) for c in cat._left[0]]
+    assert sorted(scores)[:-8] == sorted(left)
+    assert len({p.scenario.actors for p in [*first, *second]}) == 8
+    assert all(p.scenario.type == "Custom" for p in first)
