@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -116,9 +117,17 @@ def replay(
     cell: Annotated[str, typer.Argument(metavar="CELL", help="Key of a cell, the start of one, or SYSTEM/SCENARIO.")],
     out: Annotated[Path | None, typer.Option(help="Output folder.  [default: DIR/replays]")] = None,
     video: Annotated[Video, typer.Option(help="Video format.")] = Video.mp4,
+    wear: Annotated[
+        Path | None, typer.Option(metavar="TEXTURE", help="Also film the drive with a car that wears this texture.")
+    ] = None,
+    wearer: Annotated[
+        int | None, typer.Option(min=1, help="Number of the agent that wears it.  [default: the car nearest ahead]")
+    ] = None,
+    detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
 ) -> None:
     """Run one cell again, compare it with its record bit by bit, and write a video and the trace.
 
+    TEXTURE is a folder of `ssad export texture`. The film shows what the ego's camera sees, clean and attacked.
     Exit code 1: the new run differs from the record.
     """
     from ssad.bench.replay import replay as run_again
@@ -126,6 +135,7 @@ def replay(
     from ssad.core.traces import save_trace
     from ssad.report import write_video
 
+    film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
     found = run_again(folder, cell)
     target = make_folder(out or folder / "replays") / found.cell.key
     save_trace(target.with_suffix(".npz"), found.trace)
@@ -133,7 +143,33 @@ def replay(
     verdict = f"differs: {found.difference}" if found.difference else "identical"
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
     print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
+    if film_of is not None:
+        print(f"film: {film_of(found.trace, found.graph, target.with_suffix(f'.worn.{video.value}'))}")
     raise typer.Exit(1 if found.difference else 0)
+
+
+def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any, Any, Path], Path] | None:
+    """What films a drive with a car that wears a texture; None without one. SSADError: no such texture or detector."""
+    if wear is None:
+        if wearer is not None:
+            raise ConfigError("--wearer says who wears a texture: give --wear TEXTURE as well")
+        return None
+    from ssad.detectors import make_detector
+    from ssad.recording.attacked_film import attacked_frames, first_car
+    from ssad.recording.texture_export import load_print
+    from ssad.report.video import save_frames
+
+    worn, judge = load_print(wear), None if detector == "none" else make_detector(detector)
+    worn.live(1)
+
+    def film(trace: Any, graph: Any, path: Path) -> Path:
+        agent = first_car(trace) if wearer is None else wearer
+        if agent is None:
+            raise ConfigError(f"{trace.key}: no car is ahead of the ego at any time; name the agent with --wearer")
+        shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2)
+        return save_frames(shown, path, dt=2 * trace.dt)
+
+    return film
 
 
 @exports.command("texture")

@@ -137,7 +137,7 @@ def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
     ]  # fmt: skip
     plan = Physical().plan(suite(attacks=[], lights=rows))
     records = run(plan, tmp_path, Resources(workers=2))
-    assert [(record.get("reason"), record["status"]) for record in records] == [(None, "ok")] * len(records)
+    assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * len(records)
     by_name = {(record["attack"], record["carrier"]): record for record in records}
     laser = by_name["laser", "light, night"]
     assert laser["queries"] == 8

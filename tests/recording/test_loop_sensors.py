@@ -8,19 +8,26 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
+from ssad.assets.mesh import Mesh
+from ssad.camera.lamps import Lamp
 from ssad.camera.lidar import Lidar
 from ssad.camera.render import Weather, render
+from ssad.camera.scene_edit import Card, SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
 from ssad.recording import loop_sensors
 from ssad.recording.episode_scene import LENSES, Moment, moments_of
+from ssad.recording.live_attack import LiveAttack
 from ssad.recording.loop_sensors import Onboard
 from ssad.recording.scene_objects import PHASES
+from ssad.recording.target import TargetCar
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.scenarios.static.physical import Camouflage
 from ssad.world.check import check_driver
 from ssad.world.rollout import Loop, rollout
 from ssad.world.world import World
@@ -287,3 +294,44 @@ def test_a_driver_with_a_camera_can_be_checked() -> None:
 
     make = lambda order: world(*order)  # noqa: E731
     check_driver(lambda: Shy("front"), make, episodes=2, steps=3, sensors=both(onboard))
+
+
+def patched(mesh: Mesh) -> SceneEdit:
+    """A loud patch on the roof and both sides, and a lamp that follows."""
+    draws = torch.Generator().manual_seed(1)
+    surface = Camouflage(texels=16).on(mesh)
+    pose = np.array([[0.0, 0, 1, -8], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
+    lamp = Lamp(pose, 2000.0, (0.2, 0.2))
+    return SceneEdit(
+        (surface.layer,), (lamp,), cards=(Card(np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 2]])),),
+        textures={0: torch.rand((3, *surface.size), generator=draws)}, masks={0: surface.mask},
+    )  # fmt: skip
+
+
+def test_an_attack_in_the_loop_is_what_is_rendered_from_the_trace() -> None:
+    """To the bit, with several episodes at once; LiDAR too."""
+    rear = Camera.typical(96, 64, channel="REAR")
+    back = np.diag([-1.0, -1.0, 1.0, 1.0])
+    cameras = {"front": FRONT, "rear": replace(rear, to_ego=back @ rear.to_ego)}
+    attack = LiveAttack(patched, TargetCar("sedan", "red"), agent=1)
+
+    def sensors(onboard: Onboard) -> dict:
+        return {name: onboard.camera(camera) for name, camera in cameras.items()} | {"lidar": onboard.lidar(BEAMS)}
+
+    watcher, plain = Watcher("front", "rear", "lidar"), Watcher("front", "rear", "lidar")
+    traces = rollout(world(2, 2), watcher, sensors=sensors(Onboard(attack=attack)))
+    rollout(world(2, 2), plain, sensors=sensors(Onboard()))
+    again = sensors(Onboard(attack=attack))
+    differs: dict[str, int] = {}
+    for (name, scene, agent, step), shown in watcher.shown.items():
+        (recalled,) = again[name].of_trace(traces[scene], town(), agent=agent, steps=[step])
+        assert np.array_equal(shown, recalled), (name, scene, step)
+        differs[name] = differs.get(name, 0) + int((shown != plain.shown[name, scene, agent, step]).any())
+    assert max(differs["front"], differs["rear"]) > 0, "it is seen"
+
+
+def test_an_attack_that_does_not_fit_ends_in_one_line() -> None:
+    for agent, message in ((1, "agent 1 is a walker"), (7, "agent 7 cannot be attacked")):
+        onboard = Onboard(attack=LiveAttack(patched, TargetCar(), agent=agent))
+        with pytest.raises(ConfigError, match=message):
+            rollout(world(0), Watcher("front"), sensors={"front": onboard.camera(FRONT)})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +12,18 @@ from PIL import Image
 
 from ssad.assets.mesh_files import load_mesh
 from ssad.core import safeio
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.images import read_image
 from ssad.recording.target import TargetCar, TargetSign
-from ssad.recording.texture_export import export_texture
+from ssad.recording.texture_export import Print, export_texture, load_print
 from ssad.scenarios.static.physical import Camouflage, Patch, control
 
 
 def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: Path) -> None:
-    target = TargetCar()
-    surface = Patch(width=1.2, height=0.4, texels=24).on(target.mesh())
+    surface = Patch(width=1.2, height=0.4, texels=24).on(TargetCar().mesh())
     colour = control("random", surface.size, seed=3)
-    written = export_texture(tmp_path, colour, surface, target, dots=500, name="mine")
+    made = Print(colour, "patch", {"width": 1.2, "height": 0.4, "texels": 24}, "sedan:silver:0")
+    written = export_texture(tmp_path, made, dots=500, name="mine")
     assert all(path.is_file() for path in written)
     with Image.open(tmp_path / "print.png") as image:
         assert image.size == (600, 200)
@@ -42,12 +43,24 @@ def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: 
     assert about["metres"] == [1.2, 0.4]
     assert about["panels"]["rear"]["metres"][0] > 1.2
     assert 0.0 < about["non_printability"] < 0.5
+    again = load_print(tmp_path)
+    assert torch.equal(again.colour, colour)
+    assert again.on(TargetCar().mesh()).layer == surface.layer
+    edit = again.edit(replace(TargetCar(), size=(5.2, 2.0, 2.0)).mesh())
+    assert edit.textures[0].shape == (3, 8, 24), "also on a body of another size"
+    (tmp_path / "texture.npz").write_bytes((tmp_path / "texture.npz").read_bytes() + b"x")
+    with pytest.raises(FormatError, match="not the texture that"):
+        load_print(tmp_path)
+    (tmp_path / "texture.npz").unlink()
+    with pytest.raises(SSADError, match=r"texture\.npz"):
+        load_print(tmp_path)
 
 
 def test_the_obj_is_the_target_with_its_atlas(tmp_path: Path) -> None:
     target = TargetCar("hatchback", "red")
     mesh, surface = target.mesh(), Camouflage(texels=16).on(target.mesh())
-    export_texture(tmp_path, control("noise", surface.size), surface, target, dots=20)
+    made = Print(control("noise", surface.size), "camouflage", {"texels": 16}, "hatchback:red:0")
+    export_texture(tmp_path, made, dots=20)
     read = load_mesh(tmp_path / "target.obj")
     assert len(read.faces) == len(mesh.faces)
     assert read.bounds()[1] - read.bounds()[0] == pytest.approx(target.full_size, abs=1e-3)
@@ -66,8 +79,12 @@ def test_the_obj_is_the_target_with_its_atlas(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_printed_ends_in_one_line(tmp_path: Path) -> None:
-    sign = TargetSign()
-    surface = Patch(panel="face", width=0.4, height=0.4, texels=8).on(sign.mesh())
+    options = {"panel": "face", "width": 0.4, "height": 0.4, "texels": 8}
+    sign = Print(torch.full((3, 8, 8), 0.5), "patch", options, "stop_sign")
     with pytest.raises(ConfigError, match="dots; from 1 to 16384"):
-        export_texture(tmp_path, control("grey", surface.size), surface, sign, dots=100_000)
-    assert export_texture(tmp_path, torch.full((3, 8, 8), 0.5), surface, sign, dots=100)
+        export_texture(tmp_path, sign, dots=100_000)
+    assert export_texture(tmp_path, sign, dots=100)
+    with pytest.raises(ConfigError, match="only cars drive"):
+        sign.live(1)
+    with pytest.raises(ConfigError, match="8 x 8 texels, a patch on this body 4 x 4"):
+        replace(sign, options=options | {"texels": 4}).on(TargetSign().mesh())

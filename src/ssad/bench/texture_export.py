@@ -8,7 +8,7 @@ from ssad.bench.kind import find_cell
 from ssad.bench.run import read_plan
 from ssad.core.errors import ConfigError, StoreError
 from ssad.recording.target import parse_target
-from ssad.recording.texture_export import export_texture
+from ssad.recording.texture_export import Print, export_texture
 from ssad.scenarios.static.physical import CONTROLS, TextureSpec, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
 
@@ -36,7 +36,6 @@ def export_cell_texture(folder: Path, name: str, out: Path, *, dots: int = 1000)
             f"{folder}: cell {cell.key} ({cell.name}) shows no texture; choose one of an attack or control"
         )
     spec, suite = TextureSpec.of_row(cell.spec), plan.suite
-    target = parse_target(suite.target)
     kept = TextureFolder(folder / "textures", suite.seed, "cpu")
     if (spec.attack not in CONTROLS or spec.source) and not kept.kept(spec).is_file():
         raise StoreError(f"{folder}: the texture of cell {cell.key} ({cell.name}) is not trained yet; run the suite")
@@ -44,6 +43,6 @@ def export_cell_texture(folder: Path, name: str, out: Path, *, dots: int = 1000)
     def never() -> list[object]:
         raise StoreError(f"{folder}: the texture of cell {cell.key} is gone; run the suite again")
 
-    surface = make_carrier(spec.carrier, spec.options).on(target.mesh())
+    surface = make_carrier(spec.carrier, spec.options).on(parse_target(suite.target).mesh())
     colour = kept.texture(spec, surface, views=never, detector=never)  # type: ignore[arg-type]
-    return export_texture(out, colour, surface, target, dots=dots, name=cell.name)
+    return export_texture(out, Print(colour, spec.carrier, spec.options, suite.target), dots=dots, name=cell.name)

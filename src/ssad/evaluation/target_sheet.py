@@ -60,3 +60,23 @@ def _square(box: Sequence[float], width: int, height: int) -> tuple[int, int, in
     left = min(max(round(0.5 * (box[0] + box[2]) - side / 2), 0), width - side)
     top = min(max(round(0.5 * (box[1] + box[3]) - side / 2), 0), height - side)
     return left, top, side
+
+
+@torch.no_grad()
+def marked(detector: Detector, image: Tensor) -> U8:
+    """A picture with the boxes that a detector finds, RGB [H, W, 3].
+
+    Args:
+        detector: Whose boxes are drawn.
+        image: [1, 3, H, W] in 0 to 1, where the detector is.
+    """
+    (found,) = detector.predict(image, threshold=LEAST)
+    picture = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
+    for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
+        low, high = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))
+        cv2.rectangle(picture, low, high, FOUND, 2, cv2.LINE_AA)
+        text = f"{detector.classes[label]} {score:.2f}"
+        place = (low[0], max(low[1] - 4, 12))
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, FOUND, 1, cv2.LINE_AA)
+    return picture

@@ -6,7 +6,7 @@ same to the bit. Nothing here depends on which other episodes share a scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -152,22 +152,35 @@ class EpisodeScene:
         found = list(street_signs(graph, at, Clear(street), key=(graph.name,), many=False, detail=1))
         self._sign_poses = [upright_pose(*sign.pose) for sign in found]
         self._fixed = [merge([sign.plate, sign.post]) for sign in found] + [_lens(state) for state in LENSES]
-        self._bodies: dict[BodyKey, int] = {}
+        self._bodies: dict[object, int] = {}
+        self._own: dict[object, Mesh] = {}
         self._scene: Scene | None = None
 
     def cast(self, bodies: Iterable[BodyKey]) -> None:
         """Have these bodies; what is there already stays."""
         missing = sorted(set(bodies) - set(self._bodies))
-        if missing:
+        self._add({key: body_of(*key) for key in missing})
+
+    def have(self, meshes: Mapping[object, Mesh]) -> None:
+        """Have other meshes, by names of their own; what is there already stays."""
+        self._add({key: mesh for key, mesh in meshes.items() if key not in self._bodies})
+
+    def _add(self, meshes: Mapping[object, Mesh]) -> None:
+        if meshes:
             first = len(self._fixed) + len(self._bodies)
-            self._bodies |= {key: first + n for n, key in enumerate(missing)}
+            self._bodies |= {key: first + n for n, key in enumerate(meshes)}
+            self._own |= meshes
             self._scene = None
+
+    def index(self, key: object) -> int:
+        """Number of a mesh in the scene."""
+        return self._bodies[key]
 
     @property
     def scene(self) -> Scene:
         """Street and bodies on the device."""
         if self._scene is None:
-            meshes = [*self._fixed, *(body_of(*key) for key in self._bodies)]
+            meshes = [*self._fixed, *self._own.values()]
             self._scene = Scene(self.street, meshes, device=self.device)
         return self._scene
 

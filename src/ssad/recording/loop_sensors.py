@@ -9,15 +9,18 @@ Nothing is rendered unless a driver names the sensor in its `sensors`.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
+import warp as wp
 
 from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.lidar import HDL32E, Lidar, sweep
 from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.rig import RIG, rig_camera
+from ssad.camera.scene import Thing
+from ssad.camera.scene_edit import SceneEdit, render_with
 from ssad.camera.sensor import Sensor as Response
 from ssad.core.driving import Simulator, WorldState
 from ssad.core.errors import ConfigError
@@ -27,6 +30,7 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import digest
 from ssad.core.types import F32, F64, I32, U8, AgentKind, End, EpisodeTrace
 from ssad.recording.episode_scene import EpisodeScene, Looks, Moment, moments_of, walked_to
+from ssad.recording.live_attack import LiveAttack
 from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.world.models import MODELS
 
@@ -93,12 +97,18 @@ class Onboard:
         weather: Of all episodes, or a function from an episode's key to its weather.
         response: What stands between lens and picture; as the recorder's.
         device: Where it is rendered: cpu or cuda:0.
+        attack: A physical attack on one of the agents, in what cameras and LiDARs see.
     """
 
     def __init__(
-        self, *, weather: Weather | Callable[[str], Weather] = DAY, response: Response = SENSOR, device: str = "cpu"
+        self,
+        *,
+        weather: Weather | Callable[[str], Weather] = DAY,
+        response: Response = SENSOR,
+        device: str = "cpu",
+        attack: LiveAttack | None = None,
     ) -> None:
-        self.weather, self.response, self.device = weather, response, device
+        self.weather, self.response, self.device, self.attack = weather, response, device, attack
         self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
         self._simulator: Simulator | None = None
         self._tracks: dict[int, _Track] = {}
@@ -160,7 +170,34 @@ class Onboard:
         """Have bodies for all episodes that a simulator can run."""
         for episode in simulator.episodes:
             town = self.town(simulator.graphs[episode.town])
-            town.cast(town.looks(episode).bodies())
+            self._prepare(town, town.looks(episode))
+
+    def _prepare(self, town: EpisodeScene, looks: Looks) -> None:
+        """Have the bodies of an episode."""
+        town.cast(looks.bodies())
+        if self.attack is not None:
+            town.have(self.attack.meshes(self.attack.attacked(looks.models, looks.key)))
+
+    def things(self, sight: Sight) -> tuple[Thing, ...]:
+        """The bodies that an agent could see."""
+        found = sight.town.things(sight.looks, sight.moment, without=sight.agent)
+        if self.attack is None:
+            return found
+        (own, *_) = self.attack.meshes(sight.looks.models[self.attack.agent])
+        return self.attack.dressed(found, sight.town.index(own))
+
+    def render(self, sights: Sequence[Sight], camera: Camera) -> Picture:
+        """What sights in one town show, all of one edit (see `edit`), with its arrays left where they are."""
+        views, edit, scene = [self.view(sight, camera) for sight in sights], self.edit(sights[0]), sights[0].town.scene
+        if edit is None:
+            return render(scene, views, download=False)
+        picture = render_with(scene, views, edit.textures, edit.masks)
+        image, tag, depth = (wp.array(one, device=self.device) for one in (picture.image, picture.tag, picture.depth))
+        return replace(picture, image=image, tag=tag, depth=depth)
+
+    def edit(self, sight: Sight) -> SceneEdit | None:
+        """What the attack changes in an episode, the same for all episodes whose attacked agent is of one model."""
+        return None if self.attack is None else self.attack.body(sight.looks.models[self.attack.agent])[1]
 
     def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
         """What agents [N, 2] (scene, agent) could see now; without those whose episode has ended."""
@@ -201,7 +238,7 @@ class Onboard:
             )
         town = self.town(graph)
         looks = town.looks_of_trace(trace)
-        town.cast(looks.bodies())
+        self._prepare(town, looks)
         return [Sight(row, town, looks, moments[step], agent) for row, step in enumerate(chosen)]
 
     def view(self, sight: Sight, camera: Camera) -> View:
@@ -209,13 +246,18 @@ class Onboard:
         looks, moment, agent = sight.looks, sight.moment, sight.agent
         weather = self.weather if isinstance(self.weather, Weather) else self.weather(looks.key)
         eye = sight.pose @ camera.to_ego
-        things = sight.town.things(looks, moment, without=agent)
+        things = self.things(sight)
         lights = sight.town.lights(looks, moment, eye[:2, 3])
         body = MODELS[looks.models[agent]]
         nose = sight.pose @ upright_pose(0.5 * body.length - NOSE, 0.0, 0.0)
         lamps = own_lamps(nose, weather) if body.kind in WITH_LAMPS else ()
         noise = int(digest("onboard noise", looks.key, moment.step, agent, camera.channel)[:7], 16)
-        return View(camera, eye, (*things, *lights), weather, self.response, noise, lamps)
+        view = View(camera, eye, (*things, *lights), weather, self.response, noise, lamps)
+        edit = self.edit(sight)
+        if edit is None or self.attack is None:
+            return view
+        _, *cards = self.attack.meshes(looks.models[self.attack.agent])
+        return edit.on(view, self.attack.agent + 1, cards=[sight.town.index(key) for key in cards])
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,15 +298,14 @@ class OnboardCamera:
         Yields:
             Some of the sights, and what `ssad.camera.render.render` gives for them with its arrays left where they are.
         """
-        by_town: dict[int, list[Sight]] = {}
+        alike: dict[tuple[int, int], list[Sight]] = {}
         for sight in sights:
-            by_town.setdefault(id(sight.town), []).append(sight)
+            alike.setdefault((id(sight.town), id(self.onboard.edit(sight))), []).append(sight)
         at_once = AT_ONCE if self.onboard.device == "cpu" else AT_ONCE_GPU
-        for here in by_town.values():
+        for here in alike.values():
             for k in range(0, len(here), at_once):
                 part = here[k : k + at_once]
-                views = [self.onboard.view(sight, self.camera) for sight in part]
-                yield part, render(part[0].town.scene, views, download=False)
+                yield part, self.onboard.render(part, self.camera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +336,7 @@ class OnboardLidar:
         found[..., 4] = -1.0
         for sight in sights:
             looks, moment, agent = sight.looks, sight.moment, sight.agent
-            things = sight.town.things(looks, moment, without=agent)
+            things = self.onboard.things(sight)
             key = ("onboard lidar", looks.key, moment.step, agent)
             points, _ = sweep(sight.town.scene, self.lidar, sight.pose, things, key=key)
             found[sight.row, : len(points)] = points

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,13 @@ from torch import Tensor
 
 from ssad.assets.mesh import Mesh
 from ssad.assets.obj_writer import write_obj
+from ssad.camera.scene_edit import SceneEdit
 from ssad.core import safeio
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, FormatError
 from ssad.core.types import U8
-from ssad.recording.target import TargetCar, TargetSign
-from ssad.scenarios.static.physical import Surface
+from ssad.recording.live_attack import LiveAttack
+from ssad.recording.target import TargetCar, TargetSign, parse_target
+from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
 from ssad.scenarios.static.physical.carrier import metres_of
 from ssad.scenarios.static.physical.inks import printable_colours
 from ssad.scenarios.static.physical.printing import non_printability
@@ -27,16 +31,67 @@ LARGEST = 16384  # dots of a side
 ATLAS = 2048  # texels of a side of the atlas that shows a patch
 
 
-def export_texture(
-    out: Path, colour: Tensor, surface: Surface, target: TargetCar | TargetSign, *, dots: int = 1000, name: str = ""
-) -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class Print:
+    """A texture with what it takes to put it on its target again.
+
+    Attributes:
+        colour: sRGB [3, H, W] in 0 to 1.
+        carrier: Name of its carrier (`ssad.scenarios.static.physical.CARRIERS`).
+        options: Of the carrier.
+        target: Whom it is made for, as for `ssad record --target`.
+    """
+
+    colour: Tensor
+    carrier: str
+    options: Mapping[str, Any]
+    target: str
+
+    def on(self, mesh: Mesh) -> Surface:
+        """Where it goes on a body. ConfigError: it does not fit."""
+        surface = make_carrier(self.carrier, self.options).on(mesh)
+        if surface.size != tuple(self.colour.shape[1:]):
+            raise ConfigError(
+                f"the texture has {self.colour.shape[2]} x {self.colour.shape[1]} texels, a {self.carrier} on this "
+                f"body {surface.size[1]} x {surface.size[0]}"
+            )
+        return surface
+
+    def edit(self, mesh: Mesh) -> SceneEdit:
+        """The body wears it."""
+        surface = self.on(mesh)
+        return SceneEdit((surface.layer,), textures={0: albedo_of(self.colour)}, masks={0: surface.mask})
+
+    def live(self, agent: int) -> LiveAttack:
+        """An agent of the closed loop wears it. ConfigError: it is made for a sign."""
+        car = parse_target(self.target)
+        if not isinstance(car, TargetCar):
+            raise ConfigError(f"this texture is made for {self.target}; only cars drive")
+        return LiveAttack(self.edit, car, agent)
+
+
+def load_print(folder: Path) -> Print:
+    """What `export_texture` wrote.
+
+    Raises:
+        FormatError: A file is missing or broken, or the numbers are not those that were exported.
+    """
+    about, numbers = safeio.read_json(folder / "texture.json"), safeio.read_bytes(folder / "texture.npz")
+    try:
+        if hashlib.sha256(numbers).hexdigest() != about["sha256"]:
+            raise FormatError(f"{folder / 'texture.npz'}: not the texture that texture.json describes; export it again")
+        colour = torch.from_numpy(safeio.load_npz(folder / "texture.npz")["colour"].copy())
+        return Print(colour, about["carrier"], about["options"], about["target"])
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{folder / 'texture.json'}: no exported texture ({error}); export it again") from None
+
+
+def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") -> list[Path]:
     """Write a texture for a printer, and for programs that show meshes.
 
     Args:
-        out: Folder: print.png, atlas.png, target.obj, target.mtl and texture.json.
-        colour: sRGB [3, H, W] in 0 to 1.
-        surface: What it is printed on.
-        target: What wears it.
+        out: Folder: print.png, atlas.png, target.obj, target.mtl, texture.npz and texture.json.
+        made: The texture, its carrier and its target.
         dots: Of print.png for each metre.
         name: What texture.json calls it.
 
@@ -44,15 +99,17 @@ def export_texture(
         What was written.
 
     Raises:
-        ConfigError: The print has too many dots, or none.
+        ConfigError: The print has too many dots, or none; the texture does not fit on the target.
     """
+    target, colour = parse_target(made.target), made.colour
+    mesh = target.mesh()
+    surface = made.on(mesh)
     width, height = (round(metres * dots) for metres in surface.metres)
     if dots < 1 or not (1 <= width <= LARGEST and 1 <= height <= LARGEST):
         raise ConfigError(
             f"{surface.metres[0]:.2f} x {surface.metres[1]:.2f} m with {dots} dots per metre are {width} x {height} "
             f"dots; from 1 to {LARGEST} a side can be written"
         )
-    mesh = target.mesh()
     texels = np.ascontiguousarray(colour.permute(1, 2, 0).numpy().astype(np.float32))
     safeio.make_folder(out)
     _save(out / "print.png", _resized(texels, (height, width)), dots)
@@ -61,15 +118,20 @@ def export_texture(
         mesh, materials=tuple(replace(m, colour=_paint(target)) if m.paint else m for m in mesh.materials)
     )
     write_obj(out / "target.obj", painted, texture="atlas.png")
+    numbers = safeio.npz_bytes({"colour": colour.numpy()})
+    safeio.write_atomic(out / "texture.npz", numbers)
     score = float(non_printability(colour, printable_colours(), torch.from_numpy(surface.mask.copy())))
     about = {
-        "name": name, "target": type(target).__name__, "style": target.style, "dots_per_metre": dots,
+        "name": name, "target": made.target, "carrier": made.carrier, "options": dict(made.options),
+        "dots_per_metre": dots, "sha256": hashlib.sha256(numbers).hexdigest(),
         "metres": [round(one, 4) for one in surface.metres], "texels": [colour.shape[2], colour.shape[1]],
         "rectangle": [round(v, 6) for v in surface.layer.rectangle], "panels": _panels(mesh),
         "non_printability": round(score, 4),
     }  # fmt: skip
     safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
-    return [out / file for file in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.json")]
+    return [
+        out / file for file in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.npz", "texture.json")
+    ]
 
 
 def _resized(texels: Any, size: tuple[int, int]) -> U8:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -143,33 +144,48 @@ def write_video(trace: EpisodeTrace, graph: LaneGraph, path: Path | str) -> Path
     ConfigError for another suffix or when no encoder answers; StoreError for a folder that cannot be written.
     """
     path = Path(path)
+    if path.suffix == ".gif":
+        return save_frames(frames(trace, graph, size=(640, 360)), path, dt=trace.dt)
+    return save_frames(frames(trace, graph), path, dt=trace.dt)
+
+
+def save_frames(shown: Iterable[Frame], path: Path, *, dt: float) -> Path:
+    """Write frames as .mp4 or .gif (every second frame), whole or not at all.
+
+    Args:
+        shown: RGB, uint8 [H, W, 3], one size.
+        path: Where to.
+        dt: From one frame to the next, s.
+
+    Raises:
+        ConfigError: Another suffix, no frames, or no encoder answers.
+        StoreError: The folder cannot be written.
+    """
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"{path}: a video is .mp4 or .gif")
     with atomic_path(path) as temporary:
-        if path.suffix == ".mp4":
-            _mp4(trace, graph, temporary)
-        else:
-            _gif(trace, graph, temporary)
+        (_mp4 if path.suffix == ".mp4" else _gif)(iter(shown), temporary, dt)
     return path
 
 
-def _mp4(trace: EpisodeTrace, graph: LaneGraph, path: Path) -> None:
-    size = (960, 540)
+def _mp4(shown: Iterator[Frame], path: Path, dt: float) -> None:
+    first = next(shown, None)
+    if first is None:
+        raise ConfigError(f"{path}: a video without frames")
+    size = first.shape[1], first.shape[0]
     code: Any = cv2.VideoWriter.fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(path), code, round(1.0 / trace.dt), size)
+    writer = cv2.VideoWriter(str(path), code, round(1.0 / dt), size)
     if not writer.isOpened():
         raise ConfigError(f"{path}: OpenCV has no mp4 encoder here; write a .gif")
     try:
-        for frame in frames(trace, graph, size=size):
+        for frame in chain([first], shown):
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
     finally:
         writer.release()
 
 
-def _gif(trace: EpisodeTrace, graph: LaneGraph, path: Path) -> None:
-    pictures = [
-        Image.fromarray(f).quantize(64) for k, f in enumerate(frames(trace, graph, size=(640, 360))) if k % 2 == 0
-    ]
-    pictures[0].save(
-        path, save_all=True, append_images=pictures[1:], duration=round(2000 * trace.dt), loop=0, optimize=False
-    )
+def _gif(shown: Iterator[Frame], path: Path, dt: float) -> None:
+    pictures = [Image.fromarray(f).quantize(64) for k, f in enumerate(shown) if k % 2 == 0]
+    if not pictures:
+        raise ConfigError(f"{path}: a video without frames")
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(2000 * dt), loop=0, optimize=False)

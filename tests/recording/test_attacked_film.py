@@ -1,0 +1,70 @@
+"""Films of attacked drives: who is attacked, and clean beside attacked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssad.assets.mesh import Mesh
+from ssad.camera.scene_edit import SceneEdit
+from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
+from ssad.recording.attacked_film import attacked_frames, first_car
+from ssad.recording.live_attack import LiveAttack
+from ssad.recording.target import TargetCar
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.scenarios.static.physical import Camouflage
+from ssad.world.rollout import rollout
+from ssad.world.world import World
+
+
+class Standing:
+    """Stays where it is."""
+
+    name, controller = "standing", Controller.EXTERNAL
+
+    def reset(self, episodes) -> None:
+        pass
+
+    def act(self, view):
+        return np.tile(np.array([0.0, 1.0, 0.0], np.float32), (len(view.scene), 1))
+
+
+@pytest.fixture(scope="module")
+def trace() -> EpisodeTrace:
+    """Two steps; another car stands 12 m before the ego."""
+    scenario = next(s for s in load_scenarios("precrash") if s.name == "RedlightRunning/00")
+    town = load_town("ProvingGround")
+    episode = replace(build_episode(scenario, town, seed=0), limits=Limits(max_steps=2))
+    (made,) = rollout(World([episode], {town.name: town}), Standing())
+    x, y, yaw = made.x.copy(), made.y.copy(), made.yaw.copy()
+    cos, sin = np.cos(yaw[:, 0]), np.sin(yaw[:, 0])
+    x[:, 1], y[:, 1], yaw[:, 1] = x[:, 0] + 12 * cos, y[:, 0] + 12 * sin, yaw[:, 0]
+    return replace(made, x=x, y=y, yaw=yaw)
+
+
+def white(mesh: Mesh) -> SceneEdit:
+    surface = Camouflage(texels=8).on(mesh)
+    return SceneEdit((surface.layer,), textures={0: torch.full((3, 8, 8), 0.9)}, masks={0: surface.mask})
+
+
+def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
+    assert first_car(trace) == 1
+    behind = replace(trace, x=2 * trace.x[:, :1] - trace.x, y=2 * trace.y[:, :1] - trace.y)
+    assert first_car(behind) is None
+    walker = trace.kind.copy()
+    walker[1] = AgentKind.WALKER
+    assert first_car(replace(trace, kind=walker)) is None
+
+
+def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
+    attack = LiveAttack(white, TargetCar(paint="black"), agent=1)
+    frames = list(attacked_frames(trace, load_town("ProvingGround"), attack, width=160, every=2))
+    assert len(frames) == 2
+    for frame in frames:
+        left, right = np.split(frame[:90].astype(int), 2, axis=1)
+        changed = np.abs(left - right).max(-1) > 30
+        assert 20 < changed.sum() < 0.2 * changed.size, "the car, and not the rest"
