@@ -72,6 +72,16 @@ def test_one_of_two_that_stand_nose_to_nose_backs_out() -> None:
     assert not found["contacts"]
 
 
+@pytest.mark.parametrize(("name", "key"), [("Crossgate", 47), ("Twinford", 128), ("Twinford", 176)])
+def test_who_has_no_room_behind_is_made_room_for(name: str, key: int) -> None:
+    """Scenes in which the one of two that should back out stands before a queue: 17, 25 and 32 vehicles were stuck."""
+    graph = load_town(name)
+    scene = traffic(graph, town_routes(graph, ROUTES, LENGTH), 40, key=key, green=False)
+    found = measure(graph, [scene], seconds=300.0)
+    assert len(found["stuck"]) <= 2
+    assert not found["contacts"]
+
+
 def test_a_vehicle_beyond_the_end_of_a_route_is_seen() -> None:
     parked = ego(x=300.0, controller=Controller.NONE)
     coming = ego(x=40.0, speed=8.0, controller=Controller.AUTOPILOT, name="coming", route=line_route(40.0, 120.0))

@@ -27,7 +27,7 @@ from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 
-VERSION = "4"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "5"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
 

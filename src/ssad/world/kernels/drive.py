@@ -77,17 +77,12 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
 
 
 @wp.func
-def room_behind(seen: Seen, b: int, i: int, agents: int, rows: int) -> bool:
-    """Whether nobody is within a metre and a half behind a vehicle."""
+def room_behind(seen: Seen, b: int, i: int, from_row: int, to_row: int) -> bool:
+    """Whether nobody in these rows of `seen` is within a metre and a half behind a vehicle."""
     pose = seen.pose[b, i]
     own = seen.half[b, i]
     back = wp.vec3(pose[0] - 1.5 * wp.cos(pose[2]), pose[1] - 1.5 * wp.sin(pose[2]), pose[2])
     free = int(1)
-    from_row = int(0)
-    to_row = agents
-    if i == 0 and seen.believes[b] == 1:
-        from_row = agents
-        to_row = rows
     for j in range(from_row, to_row):
         if j != i and seen.kind[b, j] != AgentKind.NONE:
             q = seen.pose[b, j]
@@ -167,7 +162,12 @@ def drive_one(
             brake = 1.0
         state.control[b, i] = wp.vec4(throttle, brake, steer, 0.0)
         if who == Controller.AUTOPILOT and state.stalled[b, i] == 1 and v < 0.3:
-            if room_behind(seen, b, i, agents, rows):
+            from_row = int(0)
+            to_row = agents
+            if i == 0 and seen.believes[b] == 1:
+                from_row = agents
+                to_row = rows
+            if room_behind(seen, b, i, from_row, to_row):
                 throttle = 0.0
                 if v > -1.0:
                     throttle = 0.4

@@ -24,6 +24,7 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
+from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, changes, way_frame
 from ssad.world.kernels.shared import (
     IDM_ACCEL,
@@ -38,7 +39,8 @@ IDM_HEADWAY = wp.constant(1.2)
 IDM_GAP = wp.constant(2.0)
 SIGHT = wp.constant(60.0)
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
-NOSE_TO_NOSE = wp.constant(3.5)  # m
+NOSE_TO_NOSE = wp.constant(4.5)  # m
+MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
 STANDS = wp.constant(0.2)  # m/s
 LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
@@ -450,8 +452,19 @@ def meet(
                 wp.atomic_min(work.leader, b, i, int(100.0 * wp.clamp(lead[0], 0.0, SIGHT)) * LEADERS + j)
                 if heading[0] * c + heading[1] * s > 0.7:
                     leads = 1
-                if stands and lead[0] < NOSE_TO_NOSE and state.waited[b, i] > BACK_OUT and seen.waited[b, j] > BACK_OUT:
+                near = NOSE_TO_NOSE
+                if state.control[b, i][3] > 0.5:
+                    near = MAKES_ROOM  # backs out already
+                if stands and lead[0] < near and wp.min(state.waited[b, i], seen.waited[b, j]) > BACK_OUT:
+                    # who has to wait makes room, or, if it has no room behind, the other one
+                    from_row = int(0)
+                    to_row = agents
+                    if i == 0 and seen.believes[b] == 1:
+                        from_row = agents
+                        to_row = rows
                     if not has_priority(bank, roads, state, seen, b, i, j, e, dt):
+                        state.stalled[b, i] = 1
+                    elif not room_behind(seen, b, j, from_row, to_row):
                         state.stalled[b, i] = 1
                 # a junction is entered only where there is room behind it
                 room = roads.ahead[first][2] - part - own[0] + 2.0 * own[0] + 2.0
