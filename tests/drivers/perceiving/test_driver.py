@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 
 from ssad import World, build_episode, load_scenarios, load_town, make_system, rollout
+from ssad.bench.kinds.driving import system_version
 from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
@@ -204,3 +206,13 @@ def test_settings_out_of_range_are_one_line() -> None:
     eyes = CameraEyes(OneCar(), {"front": CAMERA})
     with pytest.raises(ConfigError, match="expected"):
         eyes.look(steady_view(0.0, front=np.ones((1, 3, 5, 5), np.uint8)), np.array([0]))
+
+
+def test_results_depend_on_the_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    before = system_version("perceiving-yolov5n")
+    (tmp_path / "yolov5n.json").write_text('{"hash": "0123456789abcdef"}')
+    monkeypatch.setattr("ssad.detectors.SHIPPED", tmp_path)
+    after = system_version("perceiving-yolov5n")
+    assert after == f"{before.split()[0]} 0123456789ab"
+    assert after != before
+    assert " " not in system_version("perceiving-perfect")

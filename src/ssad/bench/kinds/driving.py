@@ -216,6 +216,11 @@ def system_version(name: str) -> str:
     if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
     source = source_version((found if isinstance(found, type) else type(found)).__module__)
+    detector = getattr(found, "weights", "")
+    if detector:  # of a perceiving system, with the weights that are shipped
+        from ssad.detectors import SHIPPED
+
+        return f"{source} {safeio.read_json(SHIPPED / f'{detector}.json')['hash'][:12]}"
     return f"{source} {weights_version(name)[:12]}".strip()
 
 

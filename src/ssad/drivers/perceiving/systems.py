@@ -11,22 +11,28 @@ from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
 class Fcos3d(Perceiving):
     """One front camera, FCOS3D light."""
 
+    weights = "fcos3d-light"  # results depend on them
+
     def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes("fcos3d-light", front(width)), **settings)
+        super().__init__(CameraEyes(self.weights, front(width)), **settings)
 
 
 class PgdDet(Perceiving):
     """One front camera, PGD-Det light."""
 
+    weights = "pgd-det-light"  # results depend on them
+
     def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes("pgd-det-light", front(width)), **settings)
+        super().__init__(CameraEyes(self.weights, front(width)), **settings)
 
 
 class Yolov5n(Perceiving):
     """One front camera, YOLOv5n, whose boxes are lifted by the ground plane."""
 
+    weights = "yolov5n"  # results depend on them
+
     def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes("yolov5n", front(width)), **settings)
+        super().__init__(CameraEyes(self.weights, front(width)), **settings)
 
 
 class Perfect(Perceiving):
