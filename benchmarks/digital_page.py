@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from ssad.bench.kinds.detection import state_hash
+from ssad.bench.suite import load_suite
 from ssad.evaluation.scene_boxes import detector_of
 
 ROOT = Path(__file__).parents[1]
@@ -21,6 +23,17 @@ def outdated() -> list[str]:
     """Detectors whose shipped weights are others than those that were attacked."""
     weights = json.loads((RESULTS / "run.json").read_text())["weights"]
     return [name for name, known in weights.items() if state_hash(detector_of(name, "", "cpu")) != known]
+
+
+def grown(stored: dict[str, Any]) -> list[str]:
+    """What the suite has by now that the stored run does not have: attacks of the table, detectors of the transfer."""
+    suite = load_suite("digital").model_dump(mode="json")
+    known = [{k: v for k, v in one.items() if v} for one in stored["attacks"]]
+    fresh = [{k: v for k, v in one.items() if v} for one in suite["attacks"]]
+    names = dict.fromkeys(f"`{one['name']}`" for one in fresh if one not in known)
+    missing = [f"the attack {' and '.join(names)}"] if len(names) == 1 else [f"the attacks {' and '.join(names)}"]
+    others = [f"`{one}`" for one in suite["transfer_detectors"] if one not in stored.get("transfer_detectors", [])]
+    return (missing if names else []) + ([f"transfer to and from {' and '.join(others)}"] if others else [])
 
 
 def page() -> str:
@@ -45,6 +58,8 @@ def page() -> str:
         "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
         "",
     ]
+    if new := grown(about["suite"]):
+        lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
     for name in TABLES:
         lines += [(RESULTS / f"{name}.md").read_text().strip(), ""]
     return "\n".join(lines)
