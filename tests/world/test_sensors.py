@@ -112,6 +112,19 @@ def test_a_collision_costs_what_safebench_and_frea_say() -> None:
     assert hit - free == pytest.approx(-1.0)
     hit, free = rewards.frea(world.state())
     assert hit - free == pytest.approx(-10.0)
+    hit, free = rewards.driver(world.state())
+    assert hit - free == pytest.approx(-100.0)
+
+
+@pytest.mark.parametrize(("y", "costs"), [(0.4, 0.0), (2.5, 3.0), (-2.5, 3.0 + 5.0), (4.5, 6.0)])
+def test_shipped_drivers_learn_to_stay_on_their_route_and_on_the_road(y: float, costs: float) -> None:
+    """South of the lane is a sidewalk, north of it the other lane."""
+    world = World([episode(ego(speed=5.0, pose=Pose(30.0, y), route=line_route(10.0, 210.0)))], GRAPHS)
+    world.step(np.zeros((1, 3), np.float32))
+    same = rewards.safebench(world.state())[0] - 0.1
+    assert rewards.lane(world.state())[0] == pytest.approx(same - costs, abs=1e-3)
+    off = 5.0 if y < -2.0 else 0.0
+    assert rewards.driver(world.state())[0] == pytest.approx(same - off, abs=1e-3)
 
 
 def test_the_adversarys_reward_and_equation_6_as_printed() -> None:

@@ -24,6 +24,7 @@ SYSTEMS: dict[str, str] = {
     "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
     "ppo": "ssad.drivers.rl.learned:PPO",
     "sac": "ssad.drivers.rl.learned:SAC",
+    "td3": "ssad.drivers.rl.learned:TD3",
 }
 LEARNED = ("ppo", "sac", "td3")
 """Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""

@@ -80,11 +80,10 @@ class Learning:
     seed: FromNone = 0
 
 
-_OFF_POLICY = Learning("sac", 256_000, batch=256, lr=7e-4, validate=64_000)
 LEARNINGS: dict[str, Learning] = {
     "ppo": Learning("ppo", 1_000_000),
-    "sac": _OFF_POLICY,
-    "td3": replace(_OFF_POLICY, algorithm="td3", noise=0.15),
+    "sac": Learning("sac", 256_000, batch=256, lr=7e-4, validate=64_000),
+    "td3": Learning("td3", 320_000, batch=128, lr=3e-4, gamma=0.97, validate=64_000, noise=0.15),
 }
 """How drivers are trained."""
 
