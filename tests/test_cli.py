@@ -13,7 +13,9 @@ import pytest
 from helpers.command import ssad, ssad_process
 from helpers.plugin import install
 
-COMMANDS = ("run", "report", "replay", "shift", "score", "record", "list", "import", "doctor")
+from ssad.core.version import __version__
+
+COMMANDS = ("run", "report", "compare", "replay", "shift", "score", "record", "list", "import", "doctor")
 
 
 def fails(done: CompletedProcess[str], *parts: str) -> None:
@@ -31,6 +33,11 @@ def test_help_names_every_command() -> None:
     done = ssad_process("--help")
     assert done.returncode == 0
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+
+
+def test_module_and_version() -> None:
+    done = subprocess.run([sys.executable, "-m", "ssad", "--version"], check=True, capture_output=True, text=True)
+    assert done.stdout == f"ssad {__version__}\n"
 
 
 def test_nothing_heavy_is_imported_for_help() -> None:
@@ -51,6 +58,7 @@ def test_nothing_heavy_is_imported_for_help() -> None:
         (("run", "quick", "--set", "scenarios=[safebench]"), ("ssad import routes",)),
         (("run", "quick", "--device", "tpu"), ("auto, cpu or cuda",)),
         (("report", "nowhere"), ("nowhere: not a results folder", "ssad run")),
+        (("compare", "nowhere", "elsewhere"), ("nowhere: no run here",)),
         (("replay", "nowhere", "x"), ("nowhere: not a results folder",)),
         (("list", "towms"), ("unknown list 'towms'", "towns")),
         (("import", "map", "nowhere.xodr"), ("nowhere.xodr",)),

@@ -128,7 +128,7 @@ def test_the_readme_stays_short() -> None:
 def packages() -> set[str]:
     folder = ROOT / "src" / "ssad"
     found = {path.parent.name for path in folder.glob("*/__init__.py")}
-    return found | {path.stem for path in folder.glob("*.py")} - {"__init__"}
+    return found | {path.stem for path in folder.glob("*.py")} - {"__init__", "__main__"}
 
 
 def test_the_architecture_names_every_package_once_and_no_other() -> None:

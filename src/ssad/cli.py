@@ -11,13 +11,12 @@ from typing import Annotated, Any
 import typer
 
 from ssad.core.errors import ConfigError, SSADError, unknown_name
+from ssad.core.version import __version__
 from ssad.listing import ALIASES, LISTS
 from ssad.training.commands import train_app
 
 app = typer.Typer(
-    help="SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -34,6 +33,22 @@ Workers = Annotated[int | None, typer.Option(min=1, help="Number of worker proce
 Ray = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Run on the Ray cluster at ADDRESS; 'local' starts one here.")
 ]
+
+
+def show_version(asked: bool) -> None:
+    """Print the version and stop, if it is asked for."""
+    if asked:
+        print(f"ssad {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def about(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=show_version)
+    ] = False,
+) -> None:
+    """SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?"""
 
 
 class Video(StrEnum):
@@ -109,6 +124,31 @@ def report(folder: Dir) -> None:
     if problems:
         print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
         raise typer.Exit(1)
+
+
+@app.command()
+def compare(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR DIR...", help="Results folders of `ssad run`; all are compared with the first."),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output folder.  [default: that of the last DIR]")] = None,
+) -> None:
+    """Compare runs with the first one, cell by cell: differences with intervals and a test, and what changed."""
+    from rich.console import Console
+
+    from ssad.report.compare import write_comparison
+    from ssad.report.terminal import comparison_table
+
+    page, found = write_comparison(folders, out or folders[-1])
+    console = Console()
+    for each in found:
+        console.print(comparison_table(each.table))
+        told = f"{each.both} cells in both, {each.equal} of them equal to the last digit"
+        console.print(told + f"; {len(each.verdicts)} with another outcome" if each.verdicts else told)
+        if each.left_out:
+            console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}")
+    print(f"comparison: {page}")
 
 
 @app.command()
@@ -512,11 +552,10 @@ def main() -> None:
     except typer.Abort:
         sys.exit(130)
     except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
+            print(error.format_message())
+            sys.exit(2)
         command = error.ctx.command_path if error.ctx is not None else "ssad"
         print(f"error: {error.format_message()} (see: {command} --help)", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)
-
-
-if __name__ == "__main__":
-    main()

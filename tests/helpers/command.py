@@ -34,6 +34,6 @@ def ssad(*words: str | Path) -> CompletedProcess[str]:
 def ssad_process(*words: str, cwd: Path | None = None, **environment: str) -> CompletedProcess[str]:
     """Run as a user does: in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "ssad.cli", *words],
+        [sys.executable, "-m", "ssad", *words],
         capture_output=True, text=True, check=False, cwd=cwd, env=os.environ | environment, timeout=300,
     )  # fmt: skip

@@ -387,7 +387,7 @@ def test_recording_again_changes_nothing(drives: Path) -> None:
 def test_same_bytes_of_an_orbit_for_two_workers_and_after_kill_9(orbits: Path, tmp_path: Path) -> None:
     record_clips(todo(tmp_path / "d", "orbit"), workers=2)
     assert contents(tmp_path / "d") == contents(orbits)
-    command = [sys.executable, "-m", "ssad.cli", "record", str(tmp_path / "e"), "--clips", "orbit", "--images", "2,1"]
+    command = [sys.executable, "-m", "ssad", "record", str(tmp_path / "e"), "--clips", "orbit", "--images", "2,1"]
     command += ["--towns", "Twinford,Oldmarket", "--held-out", "Oldmarket", "--target", "van:white:3", "--workers", "2"]
     for pause in (5.0, 7.0):
         with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:

@@ -125,7 +125,7 @@ def test_same_bytes_for_any_number_of_workers_and_after_a_stop(recorded: Path, t
 @pytest.mark.slow
 def test_same_bytes_after_kill_9_at_any_moment(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "c"
-    command = [sys.executable, "-m", "ssad.cli", "record", str(out), "--towns", "Twinford,Oldmarket", "--held-out"]
+    command = [sys.executable, "-m", "ssad", "record", str(out), "--towns", "Twinford,Oldmarket", "--held-out"]
     command += ["Oldmarket", "--scenes", "1", "--seconds", "1", "--width", "160", "--sweeps", "1", "--workers", "2"]
     for pause in (4.0, 6.0, 7.0, 8.0):
         with subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL) as process:

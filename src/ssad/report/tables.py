@@ -30,6 +30,7 @@ class Cell:
     failed: int = 0
     clusters: int = 0
     method: str = ""
+    digits: int = 2
 
     @classmethod
     def of(cls, e: Estimate) -> Cell:
@@ -39,14 +40,16 @@ class Cell:
     @property
     def text(self) -> str:
         """The number, or n/a."""
-        return "n/a" if math.isnan(self.mean) else f"{self.mean:.2f}"
+        return "n/a" if math.isnan(self.mean) else f"{self.mean:.{self.digits}f}"
 
     @property
     def interval(self) -> str:
-        """`[low, high]` of an interval, `low–high` of a range, or nothing."""
+        """`[low, high]` of an interval, `low–high` (`low to high` below 0) of a range, or nothing."""
         if math.isnan(self.low) or math.isnan(self.high):
             return ""
-        return f"{self.low:.2f}–{self.high:.2f}" if self.method == "range" else f"[{self.low:.2f}, {self.high:.2f}]"
+        if self.method == "range":
+            return f"{self.low:.2f}{' to ' if self.low < 0.0 else '–'}{self.high:.2f}"
+        return f"[{self.low:.2f}, {self.high:.2f}]"
 
     @property
     def count(self) -> str:

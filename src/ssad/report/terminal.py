@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from ssad.report.load import load_run
 from ssad.report.pages import kind_module
+from ssad.report.tables import Table
 
 MODULE = re.compile(r"^[\w.]+:(?=\w+$)")  # of "module:Class"
 
@@ -47,4 +48,22 @@ def summary(folder: Path | str) -> rich.table.Table:
     failed = len(run.failures)
     notes = [table.note, f"{failed} of {len(run.lines)} cells failed and count" if failed else ""]
     result.caption, result.caption_justify = escape("\n".join(filter(None, notes))), "left"
+    return result
+
+
+def comparison_table(table: Table) -> rich.table.Table:
+    """A table of differences: the interval in a column of its own, leading columns that say nothing left out."""
+    result = rich.table.Table(
+        title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
+    telling = [k for k in range(len(table.heads)) if len({row.head[k] for row in table.rows}) > 1]
+    for k in telling:
+        result.add_column(table.heads[k].lower())
+    for name in (*table.columns, ""):
+        result.add_column(name, justify="right", no_wrap=True)
+    for row in table.rows:
+        *values, difference, p = row.cells
+        texts = [*(cell.text for cell in values), difference.text, p.text, difference.interval]
+        result.add_row(*(escape(text) for text in (*(row.head[k] for k in telling), *texts)))
     return result

@@ -1,0 +1,5 @@
+"""`python -m ssad` is `ssad`."""
+
+from ssad.cli import main
+
+main()

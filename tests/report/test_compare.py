@@ -1,0 +1,124 @@
+"""Two runs beside each other: differences by hand, pairs by name, what changed, and runs that cannot be compared."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.run_folder import GROUPS, driving_line, write_run
+from typer.testing import CliRunner
+
+from ssad.cli import app
+from ssad.core.errors import ConfigError
+from ssad.report.compare import compare_runs, write_comparison
+from ssad.report.load import load_run
+
+
+def driving_run(folder: Path, *, hits: int, system: str = "a", routes: int = 5, **header: Any) -> Path:
+    """One system in the eight scenarios, `routes` routes each; the first `hits` episodes end in a collision."""
+    lines = []
+    for g, group in enumerate(GROUPS):
+        for route in range(routes):
+            number = g * routes + route
+            cluster = f"{group}/0{route}"
+            lines.append(driving_line(f"{folder.name}{number}", group, cluster, system=system, collision=number < hits))
+    cells = [{"key": line["key"], "name": f"{system}/{line['cluster']}"} for line in lines]
+    return write_run(folder, {"kind": "driving", "cells": cells, "suite": {"seed": 0}, **header}, lines)
+
+
+def scores(folder: Path, value: float, *, seed: int = 0, detector: str = "d") -> Path:
+    """A run of another kind: one detector under two shifts, with replicates of ten scenes."""
+    lines = [
+        {
+            "key": f"{folder.name}{shift}", "detector": detector, "status": "ok", "reason": "", "n": 60, "scenes": 10,
+            "metrics": {"mAP": value - k / 10}, "artefacts": {}, "spec": {},
+            "replicates": {"mAP": [value - k / 10 + d / 100 for d in range(-9, 10)]},
+        }
+        for k, shift in enumerate(("fog", "rain"))
+    ]  # fmt: skip
+    cells = [
+        {"key": line["key"], "name": f"{detector}/{shift}"} for line, shift in zip(lines, ("fog", "rain"), strict=True)
+    ]
+    header = {"kind": "detection", "cells": cells, "suite": {"seed": seed}, "columns": [{"name": "mAP"}]}
+    return write_run(folder, header, lines)
+
+
+def test_differences_are_paired_by_name(tmp_path: Path):
+    first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=18, code="new")
+    (found,) = compare_runs([first, second])
+    rows = {row.head: row.cells for row in found.table.rows}
+    before, now, difference, p = rows["a", "all", "CR"]
+    assert (before.mean, now.mean, difference.mean, difference.n) == (8 / 40, 18 / 40, pytest.approx(0.25), 40)
+    assert 0.0 < difference.low < 0.25 < difference.high < 1.0
+    assert p.mean == pytest.approx(2 * 0.5**10)
+    assert (found.both, found.equal, found.only, found.left_out) == (40, 30, (0, 0), ())
+    assert found.changes == ("code: nothing → new",)
+    assert found.verdicts[0] == f"a/{GROUPS[1]}/03: no collision before, collision now"
+    assert len(found.verdicts) == 10
+    assert found.groups is not None
+    group = {row.head: row.cells for row in found.groups.rows}["a", GROUPS[1], "CR"]
+    assert [cell.mean for cell in group[:3]] == [0.6, 1.0, pytest.approx(0.4)]
+
+
+def test_a_failed_cell_is_no_pair_and_is_named(tmp_path: Path):
+    first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=8)
+    lines = [json.loads(line) for line in (second / "results.jsonl").read_text().splitlines()]
+    lines[0] |= {"status": "timeout", "reason": "slow", "metrics": {}}
+    (second / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines[:-1]))
+    (found,) = compare_runs([first, second])
+    difference = next(row.cells[2] for row in found.table.rows if row.head[2] == "CR")
+    assert (difference.n, difference.failed, difference.mean) == (38, 2, 0.0)
+    assert found.verdicts == (f"a/{GROUPS[0]}/00: collision before, timeout now",)
+    assert (found.both, found.only) == (39, (1, 0))
+
+
+def test_two_runs_of_one_system_each_are_compared_whatever_they_are_called(tmp_path: Path):
+    first = driving_run(tmp_path / "one", hits=40, system="blind")
+    second = driving_run(tmp_path / "two", hits=0, system="mine")
+    (found,) = compare_runs([first, second])
+    assert found.table.rows[0].head == ("blind → mine", "all", "CR")
+    assert found.table.rows[0].cells[2].mean == -1.0
+
+
+def test_scores_are_paired_by_their_replicates(tmp_path: Path):
+    first, second = scores(tmp_path / "one", 0.4), scores(tmp_path / "two", 0.5)
+    (found,) = compare_runs([first, second])
+    (fog, rain) = found.table.rows
+    assert (fog.head, rain.head) == (("d", "fog", "mAP"), ("d", "rain", "mAP"))
+    # each resample differs by the same 0.1, so there is no doubt about it, though each score alone is uncertain
+    assert (fog.cells[2].low, fog.cells[2].high) == (pytest.approx(0.1, abs=1e-3), pytest.approx(0.1, abs=1e-3))
+    assert fog.cells[3].mean == pytest.approx(2 / 20)
+    assert found.groups is None
+    (other,) = compare_runs([first, scores(tmp_path / "three", 0.5, seed=1)])
+    assert other.table.rows[0].cells[2].interval == ""
+    assert other.table.rows[0].cells[3].text == "n/a"
+
+
+def test_a_page_and_tables_are_written(tmp_path: Path):
+    folders = [driving_run(tmp_path / name, hits=hits) for name, hits in (("one", 8), ("two", 18), ("three", 0))]
+    page, found = write_comparison(folders, tmp_path / "out")
+    text = page.read_text()
+    assert "two beside one" in text
+    assert "three beside one" in text
+    assert [each.table.name for each in found] == ["difference", "difference_2"]
+    assert (tmp_path / "out" / "tables" / "difference_2_groups.csv").is_file()
+    again = CliRunner().invoke(app, ["compare", *map(str, folders), "--out", str(tmp_path / "out")])
+    assert again.exit_code == 0, again.output
+    assert "10 with another outcome" in again.output
+    assert page.read_text() == text
+
+
+def test_runs_that_cannot_be_compared(tmp_path: Path):
+    first = driving_run(tmp_path / "one", hits=8)
+    with pytest.raises(ConfigError, match="two results folders"):
+        compare_runs([first])
+    with pytest.raises(ConfigError, match="with itself"):
+        compare_runs([first, first])
+    with pytest.raises(ConfigError, match="different kinds"):
+        compare_runs([first, scores(tmp_path / "scores", 0.4)])
+    lines = [json.loads(line) for line in (first / "results.jsonl").read_text().splitlines()]
+    header = dict(load_run(first).header) | {"cells": [{"key": line["key"], "name": line["key"]} for line in lines]}
+    with pytest.raises(ConfigError, match="shares no cell"):
+        compare_runs([first, write_run(tmp_path / "renamed", header, lines)])
