@@ -200,7 +200,7 @@ class Data:
         pass
 
     def scene(self, name: str) -> Any:
-        return SimpleNamespace(record=SimpleNamespace(token=SCENES[name]))
+        return SimpleNamespace(record=SimpleNamespace(token=SCENES[name]), boxes={"sample": [None]})
 
 
 @pytest.fixture

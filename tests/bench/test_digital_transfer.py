@@ -112,7 +112,8 @@ def test_a_universal_change_is_found_on_other_pictures_and_asks_nothing(folder: 
     for over in OVER:
         one = found[THREE, "universal", f"frames=4 over={over}"]
         assert one["metrics"]["mAP"] < clean - 0.05, "the best change is the same for all pictures"
-        assert (one["access"], one["steps"], one["change_px"]) == ("none", 3, 5.0)
+        assert (one["access"], one["steps"]) == ("none", 3)
+        assert 0.0 < one["change_px"] <= 5.0
         assert one["gradients"] == pytest.approx(4 * (3 + 1) / 12, abs=1e-5), "of the frames that it was fitted to"
         assert one["gradient_error"] < 1e-4
         assert one["loss_after"] > one["loss_before"]

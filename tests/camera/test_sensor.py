@@ -18,7 +18,7 @@ from torch import Tensor
 from ssad.assets.bodies import make_body
 from ssad.assets.mesh import Material, build
 from ssad.camera import torch_jpeg
-from ssad.camera.render import View, Weather, _develop, render, response
+from ssad.camera.render import View, Weather, develop_radiance, render, response
 from ssad.camera.scene import Layer, Scene, Thing
 from ssad.camera.sensor import DAY_EXPOSURE, PINHOLE, Sensor, noise_levels
 from ssad.camera.texture import Taps, retexture, taps_of
@@ -60,7 +60,7 @@ def developed(radiance: Any, sensors: list[Sensor], exposure: float = DAY_EXPOSU
     """What the renderer makes of radiance [B, H, W, 3]; the seeds of noise count up from the first."""
     views = [View(Camera.typical(96, 64), FORWARD, sensor=s, seed=first_seed + k) for k, s in enumerate(sensors)]
     held = wp.array(np.asarray(radiance, np.float32), dtype=wp.vec3, device="cpu")
-    return _develop(held, views, [exposure] * len(sensors)).numpy()
+    return develop_radiance(held, views, [exposure] * len(sensors)).numpy()
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,9 @@ from ssad.metrics.driving import (
     off_road_distance,
 )
 
+PAIR = ((0.0, 0.0, 0.0, 0.0), (50.0, 0.0, 0.0, 0.0))
+"""The ego and another, as bodies."""
+
 
 def test_quiet_episode():
     m = episode_metrics(make_trace(11, driven=np.arange(11)))
@@ -39,7 +42,9 @@ def test_quiet_episode():
 
 def test_collision_in_the_last_row():
     contact = [0, 0, Contact.VEHICLE | Contact.STATIC]
-    m = episode_metrics(make_trace(3, contact=contact, contact_agent=[-1, -1, 1], end="collision", route_complete=40))
+    m = episode_metrics(
+        make_trace(3, PAIR, contact=contact, contact_agent=[-1, -1, 1], end="collision", route_complete=40)
+    )
     assert m.collision
     assert m.collision_events == 1
     assert (m.collisions_vehicle, m.collisions_static, m.collisions_walker, m.collisions_cyclist) == (1, 1, 0, 0)
@@ -47,7 +52,7 @@ def test_collision_in_the_last_row():
 
 
 def test_collision_flag_stays_set_after_a_contact():
-    assert episode_metrics(make_trace(3, contact=[0, 4, 0], contact_agent=[-1, 1, -1])).collision
+    assert episode_metrics(make_trace(3, PAIR, contact=[0, 4, 0], contact_agent=[-1, 1, -1])).collision
 
 
 def test_contact_between_rows_leaves_no_margin():
@@ -251,7 +256,7 @@ def test_an_event_is_compared_with_all_before_it():
     trace = make_trace(4, [(np.array([0, 10, 20, 30]), 0, 0, 0)], contact=contact, contact_agent=[1, 2, 1, 2])
     assert collision_events(trace).tolist() == [True, True, False, False]
     kinds = [Contact.WALKER, Contact.CYCLIST, 0, 0]
-    m = episode_metrics(make_trace(4, contact=kinds, contact_agent=[1, 2, -1, -1]))
+    m = episode_metrics(make_trace(4, [*PAIR, PAIR[1]], contact=kinds, contact_agent=[1, 2, -1, -1]))
     assert (m.collisions_walker, m.collisions_cyclist) == (1, 0)  # the second at the same place is no event
 
 

@@ -36,7 +36,7 @@ def test_they_stop_behind_who_stands_and_go_their_way_else(name: str) -> None:
 
 def test_they_keep_a_route_with_bends_and_stop_for_red() -> None:
     town = load_town("Crossgate")
-    scenario = load_scenarios("natural/Crossgate_02/00")[0]
+    scenario = load_scenarios("natural/Crossgate_00/00")[0]
     one = build_episode(scenario, town, seed=0)
     lamps = range(len(town.signal_phase))
     alone = replace(one, agents=one.agents[:1], override_until=1e6)

@@ -22,6 +22,7 @@ from ssad.scenarios.static.digital.check import quality_left, within
 from ssad.scenarios.static.digital.objectives import Margin, Vanish
 from ssad.scenarios.static.digital.victim import Victim
 from ssad.scenarios.static.physical import ATTACKS as PHYSICAL
+from ssad.scenarios.static.physical.noninvasive import LIGHTS
 
 from .toy_detector import ToyDetector, TrueLogits, best_linf, toy_scene
 
@@ -245,7 +246,7 @@ def test_names_and_options() -> None:
 
 def test_all_names_are_listed_with_what_they_need() -> None:
     rows = LISTS["attacks"]()
-    assert rows.keys() == {*ATTACKS, *PHYSICAL, "module:object"}
+    assert rows.keys() == {*ATTACKS, *PHYSICAL, *LIGHTS, "module:object"}
     assert rows["adv-patch"] == "physical: trains a patch (docs/physical.md)"
     assert rows["pgd"] == "white-box, loss full"
     assert rows["transfer"].startswith("made in Python: needs surrogate, inner")
