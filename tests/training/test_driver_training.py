@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,14 +112,19 @@ def test_a_diverging_training_keeps_the_last_good_checkpoint(tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["sac", "td3"])
-def test_off_policy_trainings_go_on_with_what_they_remember(tmp_path: Path, algorithm: str) -> None:
+def test_off_policy_trainings_go_on_with_what_they_remember(
+    tmp_path: Path, algorithm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     changes = {"first": 64, "buffer": 1000, "updates": 1}
-    list(run_driver_training(plan(tmp_path, algorithm, seconds=0.0, **changes), say=lambda line: None))
+    with monkeypatch.context() as patch:  # a clock that goes on by a second at each look: the limit comes in mid-way
+        patch.setattr("ssad.training.reinforcement.time", SimpleNamespace(monotonic=itertools.count().__next__))
+        list(run_driver_training(plan(tmp_path, algorithm, seconds=60.0, **changes), say=lambda line: None))
     before = torch.load(tmp_path / "last.pt", weights_only=True)
     list(run_driver_training(plan(tmp_path, algorithm, **changes), say=lambda line: None))
     after = torch.load(tmp_path / "last.pt", weights_only=True)
     rows = len(before["memory"]["rewards"])
-    assert rows > 0
+    assert rows > 10
+    assert before["steps"] < 512
     assert torch.equal(after["memory"]["rewards"][:rows], before["memory"]["rewards"])
     assert 512 <= after["steps"] < 768
     assert load_policy(tmp_path / f"{algorithm}.safetensors").squash == "tanh"
