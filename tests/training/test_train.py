@@ -130,7 +130,7 @@ def test_what_is_missing_is_said_before_anything_is_read(
         (replace(flat, split="evening"), "annotations/evening.json"),
         (replace(flat, data=(clips, twin)), "the same name"),
         (replace(flat, val_data=drives), "--val-data is for 3D detectors"),
-        (replace(deep, data=(drives, drives)), "--more is for 2D detectors"),
+        (replace(deep, data=(drives, tmp_path / "other")), "other"),
         (replace(deep, val="mini_val"), "none of its 2 scenes"),
         (replace(deep, split="mini_train"), "mini_train"),
         (replace(deep, data=(tmp_path / "nowhere",)), "nowhere"),
@@ -151,6 +151,11 @@ def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypat
     assert card.config["epochs_done"] == 1
     assert "--seconds 0.0" in card.command
     assert {"mAP", "NDS"} <= card.metrics.keys()
+
+
+def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
+    (one, _), (two, _) = (training._items(Plan("fcos3d-light", n * (drives,), Path("out")), three=True) for n in (1, 2))
+    assert len(two) == 2 * len(one) > 0
 
 
 def test_the_command_can_be_given_to_a_shell() -> None:

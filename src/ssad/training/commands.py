@@ -23,7 +23,7 @@ def train_detector(
         Path,
         typer.Option(help="3D: dataset in the nuScenes schema. 2D: folder that `ssad record --clips` wrote."),
     ],
-    more: Annotated[list[Path] | None, typer.Option(help="2D only: another such folder; can be repeated.")] = None,
+    more: Annotated[list[Path] | None, typer.Option(help="Another such folder; can be repeated.")] = None,
     val_data: Annotated[
         Path | None, typer.Option(help="3D only: dataset to validate on.  [default: that of --data]")
     ] = None,

@@ -254,12 +254,10 @@ def _card_epochs(weights: Path) -> int:
 def _items(plan: Plan, *, three: bool) -> tuple[list[Item], dict[str, Any]]:
     """Pictures of all folders, and options of the detector. ConfigError: none, or options that do nothing."""
     options: dict[str, Any] = {}
-    if three and len(plan.data) > 1:
-        raise ConfigError("--more is for 2D detectors; a 3D one learns from one data set in the nuScenes schema")
     if not three and plan.val_data is not None:
         raise ConfigError("--val-data is for 3D detectors; clips have a split of their own to validate on")
     if three:
-        items = list(nuscenes_items(plan.data[0], None, plan.split))
+        items = [item for folder in plan.data for item in nuscenes_items(folder, None, plan.split)]
     else:
         items = []
         for folder in plan.data:
