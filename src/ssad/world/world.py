@@ -22,10 +22,12 @@ from ssad.world.kernels.belief import see
 from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
+from ssad.world.kernels.noise import calm, chance
 from ssad.world.kernels.overtake import change_lanes
 from ssad.world.kernels.record import contact, record, restart, restart_record
 from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
+from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 
 VERSION = "5"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
@@ -45,7 +47,8 @@ class World:
     `episodes` are the bank; scene b runs episode `assign[b]` (default: one scene an episode). `graphs` maps each
     town named by them to its lane graph. `ego` replaces every ego's controller; `models` are the bodies. With
     `autoreset` a scene whose episode has ended starts it again at the next step. A scene's bits depend on its episode
-    and controls alone: not on the batch, its order, or what the other scenes do.
+    and controls alone: not on the batch, its order, or what the other scenes do. `noise` brings chance into traffic,
+    from a key that each scene has (`rekey`); without it there is none.
 
     Raises ConfigError for an episode that cannot be built.
     """
@@ -62,6 +65,7 @@ class World:
         ego: Controller | None = None,
         models: Mapping[str, Model] = MODELS,
         autoreset: bool = False,
+        noise: Noise | None = None,
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
@@ -97,6 +101,9 @@ class World:
         self.work.count = wp.zeros(1, dtype=wp.int32, device=device)
         self.work.leader = wp.zeros((self.batch, self.agents), dtype=wp.int32, device=device)
         self._settings = (dt, substeps, autoreset)
+        self.chance = noise
+        if noise is not None:
+            self.noise = noise_state(noise, self.episodes, order.astype(np.int32), self.agents, device)
         self._assign(order.astype(np.int32))
         self._make_room(0)
         self.reset()
@@ -130,7 +137,12 @@ class World:
         few = (self.batch, threads)
 
         def restarts(ended_too: int) -> list[Any]:
+            forget = []
+            if self.chance is not None:
+                inputs = [state, self.noise, self._mask, ended_too, self.agents, self.chance.stretches]
+                forget = [self.launch(calm, self.batch, inputs)]
             return [
+                *forget,
                 self.launch(restart, few, [bank, roads, state, self._mask, ended_too, self.agents, threads]),
                 self.launch(restart_record, self.batch, [bank, roads, state, seen, self.ego, self._mask, ended_too]),
             ]
@@ -145,6 +157,9 @@ class World:
             self.launch(change_lanes, few, [bank, roads, state, seen, self.work, self.agents, rows, threads]),
             self.launch(drive, few, [bank, roads, state, seen, self.agents, rows, threads, dt]),
         ]
+        if self.chance is not None:
+            inputs = [bank, roads, state, self.chance.rule(dt), self.noise, self.agents, threads]
+            self._plan.append(self.launch(chance, few, inputs))
         self._advance = [
             self.launch(
                 move, few, [bank, roads, state, self.controls, self.places, self.agents, threads, dt, substeps]
@@ -153,6 +168,10 @@ class World:
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
         ]
         self._graph: Any = None
+
+    @property
+    def _noisy(self) -> tuple[str, ...]:
+        return () if self.chance is None else NAMES
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """A recorded launch: its arguments are packed once."""
@@ -200,6 +219,8 @@ class World:
         if name in ("controls", "places"):
             return getattr(self, name)
         part, _, own = name.rpartition(".")
+        if part == "noise":
+            return getattr(self.noise, own)
         return getattr({"": self.arrays, "ego": self.ego, "seen": self.seen}[part], own)
 
     def put(self, name: str, value: npt.NDArray[Any]) -> None:
@@ -223,6 +244,16 @@ class World:
         self._mask.assign(mask)
         for command in self._restart:
             command.launch()
+        if self.chance is not None and episodes is not None:
+            self.rekey(episode_keys(self.episodes)[np.asarray(episodes)], which)
+
+    def rekey(self, keys: Keys, scenes: Scenes | None = None) -> None:
+        """Give scenes (default: all) other keys: what chance does from now on. ConfigError: the world has no noise."""
+        if self.chance is None:
+            raise ConfigError("there is no chance in this world: it was made without noise")
+        own = self.array("noise.key").copy()
+        own[np.arange(self.batch) if scenes is None else np.asarray(scenes)] = keys
+        self.put("noise.key", own)
 
     def set_controls(self, controls: npt.ArrayLike) -> None:
         """Controls of external agents: [B, 3|4] for the egos or [B, A, 3|4] for all; throttle, brake, steer, reverse.
@@ -435,12 +466,15 @@ class World:
         """Copy of all that changes."""
         arrays = {name: self.array(name).copy() for name in _STATE}
         arrays |= {f"ego.{name}": self.array(f"ego.{name}").copy() for name in _EGO}
+        arrays |= {f"noise.{name}": self.array(f"noise.{name}").copy() for name in self._noisy}
         if self.array("seen.believes").any():
             arrays |= {f"seen.{name}": self.array(f"seen.{name}").copy() for name in _SEEN}
         return Snapshot(arrays)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this world; raises ConfigError if it is of another shape."""
+        if any(name.startswith("noise.") for name in snapshot.arrays) != bool(self._noisy):
+            raise ConfigError("snapshot does not fit this world: only one of them has noise")
         believed = max(np.shape(snapshot.arrays.get("seen.kind", self.array("pose")))[1] - self.agents, 0)
         if believed > self.believed:
             self._make_room(believed)
@@ -463,6 +497,7 @@ class World:
         """One hash a scene over all that changes (but its place in the batch and bank)."""
         arrays = [self.array(name) for name in _STATE if name != "episode"]
         arrays += [self.array(f"ego.{name}") for name in _EGO]
+        arrays += [self.array(f"noise.{name}") for name in self._noisy]
         believes = self.array("seen.believes")
         rows = [self.array(f"seen.{name}") for name in _SEEN if name not in ("believes", "light")]
         kind, light = self.array("seen.kind"), self.array("seen.light")
