@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from world.worlds import DEVICES
 
 from ssad.core.types import Controller
 from ssad.roads import load_town
@@ -28,25 +29,27 @@ def _bank():
     return [build_episode(s, graphs[s.town], seed=7) for s in scenarios], graphs
 
 
-def _hashes(assign: list[int]) -> dict[int, str]:
+def _hashes(assign: list[int], device: str = "cpu") -> dict[int, str]:
     """Episode -> hash after STEPS steps with episodes that start again when they end."""
     episodes, graphs = _bank()
-    world = World(episodes, graphs, assign=assign, ego=Controller.AUTOPILOT, autoreset=True)
+    world = World(episodes, graphs, assign=assign, ego=Controller.AUTOPILOT, autoreset=True, device=device)
     for _ in range(STEPS):
         world.step()
     return dict(zip(assign, world.hashes(), strict=True))
 
 
-def test_hashes_after_1000_steps_do_not_depend_on_batch_order_or_processes() -> None:
-    batch = _hashes(list(range(COUNT)))
+@pytest.mark.parametrize("device", DEVICES)
+def test_hashes_after_1000_steps_do_not_depend_on_batch_order_or_processes(device: str) -> None:
+    batch = _hashes(list(range(COUNT)), device)
     assert len(set(batch.values())) == COUNT
-    assert _hashes(list(range(COUNT))[::-1]) == batch
-    wide = World(_bank()[0], _bank()[1], assign=np.arange(64) % COUNT, ego=Controller.AUTOPILOT, autoreset=True)
+    assert _hashes(list(range(COUNT))[::-1], device) == batch
+    many = np.arange(64) % COUNT
+    wide = World(*_bank(), assign=many, ego=Controller.AUTOPILOT, autoreset=True, device=device)
     for _ in range(STEPS):
         wide.step()
     assert wide.hashes() == [batch[k % COUNT] for k in range(64)]
     for k in (0, COUNT - 1):
-        assert _hashes([k]) == {k: batch[k]}
+        assert _hashes([k], device) == {k: batch[k]}
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from ssad.world.check import WorldCheckError, check_driver
 from ssad.world.rollout import Loop, rollout
 from ssad.world.world import World
 from tests.world.test_world import bank
-from tests.world.worlds import GRAPHS, ego, episode, line_route
+from tests.world.worlds import DEVICES, GRAPHS, ego, episode, line_route
 
 
 class Pusher:
@@ -56,10 +56,10 @@ def crowd() -> list:
     return [replace(e, agents=(*e.agents, cyclist)) if k % 2 else e for k, e in enumerate(bank())]
 
 
-def drive(assign, *, steps: int = 60, drivers=None) -> list[list[str]]:
+def drive(assign, device: str, *, steps: int = 60, drivers=None) -> list[list[str]]:
     """Hashes of each step."""
     episodes = crowd()
-    world = World(episodes, GRAPHS, assign=assign, ego=Controller.AUTOPILOT)
+    world = World(episodes, GRAPHS, assign=assign, ego=Controller.AUTOPILOT, device=device)
     loop = Loop(world, drivers if drivers is not None else {Between(1.0, 3.0): Pusher()})
     loop.reset()
     out = []
@@ -69,34 +69,37 @@ def drive(assign, *, steps: int = 60, drivers=None) -> list[list[str]]:
     return out
 
 
-def test_takeovers_do_not_depend_on_batch_or_order() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_takeovers_do_not_depend_on_batch_or_order(device: str) -> None:
     order = [0, 1, 2, 3]
-    told = drive(order)
-    assert [row[::-1] for row in drive(order[::-1])] == told
-    wide = drive([k % 4 for k in range(64)])
+    told = drive(order, device)
+    assert [row[::-1] for row in drive(order[::-1], device)] == told
+    wide = drive([k % 4 for k in range(64)], device)
     assert all(row == [short[k % 4] for k in range(64)] for row, short in zip(wide, told, strict=True))
     for k in order:
-        assert [row[0] for row in drive([k])] == [row[k] for row in told]
-    untouched = drive(order, drivers={})
+        assert [row[0] for row in drive([k], device)] == [row[k] for row in told]
+    untouched = drive(order, device, drivers={})
     assert untouched[:10] != told[:11]
     assert [a[0] == b[0] for a, b in zip(untouched, told, strict=True)] == [True] * 60  # nobody to take over there
     assert untouched[-1][2] != told[-1][2]
 
 
-def test_a_takeover_in_one_scene_leaves_the_others_to_the_bit() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_takeover_in_one_scene_leaves_the_others_to_the_bit(device: str) -> None:
     class OnlyThird(Between):
         def __call__(self, state):
             return super().__call__(state) & (np.arange(len(state.time)) == 2)[:, None]
 
-    told = drive([0, 1, 2, 3], drivers={})
-    with_one = drive([0, 1, 2, 3], drivers={OnlyThird(1.0, 3.0): Pusher()})
+    told = drive([0, 1, 2, 3], device, drivers={})
+    with_one = drive([0, 1, 2, 3], device, drivers={OnlyThird(1.0, 3.0): Pusher()})
     for k in range(4):
         same = [a[k] == b[k] for a, b in zip(told, with_one, strict=True)]
         assert all(same) == (k != 2)
 
 
-def test_a_snapshot_in_the_middle_of_a_takeover_continues_to_the_bit() -> None:
-    world = World(crowd(), GRAPHS, ego=Controller.AUTOPILOT)
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_snapshot_in_the_middle_of_a_takeover_continues_to_the_bit(device: str) -> None:
+    world = World(crowd(), GRAPHS, ego=Controller.AUTOPILOT, device=device)
     loop = Loop(world, {Between(1.0, 3.0): Pusher()})
     loop.reset()
     for _ in range(20):
@@ -114,7 +117,7 @@ def test_a_snapshot_in_the_middle_of_a_takeover_continues_to_the_bit() -> None:
     first = rest()
     world.restore(kept)
     assert rest() == first
-    other = World(crowd(), GRAPHS, ego=Controller.AUTOPILOT)
+    other = World(crowd(), GRAPHS, ego=Controller.AUTOPILOT, device=device)
     other.restore(kept)
     loop = Loop(other, {Between(1.0, 3.0): Pusher()})
     for hashes in first:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
+import warp as wp
 
 from ssad.core.lane_graph import LaneGraph, Marking
 from ssad.core.types import (
@@ -17,6 +19,9 @@ from ssad.core.types import (
     Route,
     Scenario,
 )
+
+GPU = pytest.param("cuda:0", marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device"))
+DEVICES = ["cpu", GPU]
 
 
 def straight_graph(length: float = 400.0, width: float = 3.5) -> LaneGraph:
