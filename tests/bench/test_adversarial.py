@@ -12,7 +12,7 @@ from helpers.command import ssad
 from helpers.metric_traces import make_trace
 
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.adversarial import Adversarial, distinct, summary
+from ssad.bench.kinds.adversarial import Adversarial
 from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
@@ -20,6 +20,7 @@ from ssad.core.generators import Outcome, Proposal
 from ssad.core.jsonl import read_lines
 from ssad.core.traces import load_trace
 from ssad.drivers import make_system
+from ssad.evaluation.search_scores import distinct, summary
 from ssad.metrics.realism import FEATURES
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios, read_scenarios

@@ -12,13 +12,13 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.gap_perturbations import perturbation_names
 from ssad.bench.kind import Plan, Resources
 from ssad.bench.kinds.gap import Gap, GapSuite
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite, suite_files
 from ssad.core.errors import SSADError
 from ssad.core.traces import load_trace
+from ssad.recording.loop_perturbations import perturbation_names
 from ssad.report import check_artefacts, write_report
 from ssad.report.kinds.gap import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
 from ssad.report.load import load_run

@@ -13,6 +13,7 @@ from ssad.core.frames import Camera
 from ssad.core.rotations import upright_pose
 from ssad.core.types import F64, AgentKind, Bool, EpisodeTrace
 from ssad.drivers.belief import in_sight
+from ssad.drivers.perceiving.driver import Known, Sighting
 from ssad.drivers.perceiving.objects import I64, Objects
 from ssad.drivers.perceiving.tracker import Tracks
 from ssad.metrics.detection import match
@@ -48,6 +49,36 @@ class Perceived:
     looks: Sequence[tuple[float, Objects | None]]
     known: Sequence[tuple[float, Tracks]]
     cameras: Mapping[str, Camera]
+
+
+class Watcher:
+    """Keeps what a driver sees and believes, by scene, and a few pictures of each drive.
+
+    Args:
+        cameras: Of the driver.
+        scenes: How many.
+        every: s from one picture that is kept to the next.
+    """
+
+    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 1.0) -> None:
+        self.cameras, self.every = cameras, every
+        self.looks: list[list[Any]] = [[] for _ in range(scenes)]
+        self.known: list[list[Any]] = [[] for _ in range(scenes)]
+        self.shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
+
+    def __call__(self, told: Sighting | Known) -> None:
+        """See `Perceiving`."""
+        if isinstance(told, Sighting):
+            self.looks[told.scene].append((told.time, told.found))
+            for picture in list(told.pictures.values())[:1]:
+                self.shots[told.scene].append((told.time, np.ascontiguousarray(np.moveaxis(picture, 0, -1))))
+            return
+        for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
+            self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
+
+    def perceived(self, scene: int) -> Perceived:
+        """What was perceived in a scene."""
+        return Perceived(self.looks[scene], self.known[scene], self.cameras)
 
 
 def in_view(trace: EpisodeTrace, step: int, cameras: Mapping[str, Camera]) -> Bool:

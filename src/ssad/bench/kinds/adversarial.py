@@ -11,7 +11,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from ssad.bench.adversarial_realism import likeness, reference
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
 from ssad.bench.kinds.driving import (
     DrivingSuite,
@@ -30,10 +29,8 @@ from ssad.core.lane_graph import save_graph, town_file
 from ssad.core.seeding import seed32
 from ssad.core.traces import motion_hash, save_trace
 from ssad.core.types import Episode
+from ssad.evaluation.search_scores import distinct, likeness, reference, summary
 from ssad.jobs.machine import quiet_warp
-
-APART = 1.0  # m by which motions before contact differ on average, to count as distinct
-BEFORE = 3.0  # s of motion that are compared
 
 
 class AdversarialSuite(SuiteBase):
@@ -252,51 +249,3 @@ def refusal(factory: Any, episode: Episode) -> str:
     except ConfigError as error:
         return str(error)
     return ""
-
-
-def summary(row: Sequence[Outcome]) -> dict[str, Any]:
-    """The metrics of one search; means over collisions are None where there is none."""
-    valid = [o for o in row if o.valid]
-    ran = [o for o in row if o.trace is not None]
-    first = next((n for n, o in enumerate(row, 1) if o.valid), None)
-
-    def mean(values: Sequence[float | bool | None]) -> float | None:
-        known = [float(v) for v in values if v is not None]
-        return float(np.mean(known)) if known else None
-
-    return {
-        "CR": bool(valid), "CR_any": any(o.collision for o in row), "rollouts": first,
-        "share": mean([o.valid for o in row]), "distinct": len(distinct(valid)),
-        "off_road": mean([o.off_road for o in ran]), "hit_others": mean([o.hit_others for o in ran]),
-        "moving": mean([o.ego_speed is not None and o.ego_speed > 0.5 for o in valid]),
-        "impact_speed": mean([o.impact_speed for o in valid]),
-        "acceleration": mean([o.acceleration for o in valid]), "jerk": mean([o.jerk for o in valid]),
-        "within_limits": mean([o.within_limits for o in valid]),
-    }  # fmt: skip
-
-
-def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Those of some collisions that are no copies: the motion of who is hit, as the ego sees it, differs.
-
-    It is compared over the 3 s before contact; less than 1 m on average is the same collision.
-    """
-    kept: list[tuple[Outcome, np.ndarray[Any, Any]]] = []
-    for outcome in outcomes:
-        motion = _approach(outcome)
-        if all(float(np.hypot(*(motion - other).T).mean()) >= APART for _, other in kept):
-            kept.append((outcome, motion))
-    return [outcome for outcome, _ in kept]
-
-
-def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
-    """Where the agent that was hit was in the ego's frame [30, 2], m, in the steps before contact."""
-    trace = outcome.trace
-    assert trace is not None
-    assert outcome.time is not None
-    row = round(outcome.time / trace.dt)
-    agent = int(trace.contact_agent[row])
-    rows = np.clip(np.arange(row - round(BEFORE / trace.dt) + 1, row + 1), 0, None)
-    x, y = (getattr(trace, name)[rows] for name in ("x", "y"))
-    cos, sin = np.cos(trace.yaw[rows, 0]), np.sin(trace.yaw[rows, 0])
-    dx, dy = x[:, agent] - x[:, 0], y[:, agent] - y[:, 0]
-    return np.stack([cos * dx + sin * dy, cos * dy - sin * dx], 1)

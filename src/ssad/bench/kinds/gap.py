@@ -11,11 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from ssad.bench.gap_perturbations import NONE, check_perturbation, perturbation_names, perturbed
-from ssad.bench.gap_sheets import drive_sheet
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.kinds.driving import (
     episode_of,
@@ -42,15 +39,17 @@ from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
 from ssad.drivers.perceiving.tracker import Tracking
 from ssad.evaluation.drive_perception import (
     BANDS,
-    Perceived,
+    Watcher,
     cause_of_collision,
     component_metrics,
     hard_braking,
     impact_speed,
     phantom_stop,
 )
+from ssad.evaluation.drive_sheet import drive_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import episode_metrics
+from ssad.recording.loop_perturbations import NONE, check_perturbation, perturbation_names, perturbed
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 
@@ -279,36 +278,6 @@ class Gap(Kind):
         recorded = load_trace(folder / record["artefacts"]["trace"])
         _, (trace,), _ = drive([cell], device=plan.device, seed=plan.suite.seed)
         return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
-
-
-class Watcher:
-    """Keeps what a driver sees and believes, by scene, and a few pictures of each drive.
-
-    Args:
-        cameras: Of the driver.
-        scenes: How many.
-        every: s from one picture that is kept to the next.
-    """
-
-    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 1.0) -> None:
-        self.cameras, self.every = cameras, every
-        self.looks: list[list[Any]] = [[] for _ in range(scenes)]
-        self.known: list[list[Any]] = [[] for _ in range(scenes)]
-        self.shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
-
-    def __call__(self, told: Sighting | Known) -> None:
-        """See `Perceiving`."""
-        if isinstance(told, Sighting):
-            self.looks[told.scene].append((told.time, told.found))
-            for picture in list(told.pictures.values())[:1]:
-                self.shots[told.scene].append((told.time, np.ascontiguousarray(np.moveaxis(picture, 0, -1))))
-            return
-        for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
-            self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
-
-    def perceived(self, scene: int) -> Perceived:
-        """What was perceived in a scene."""
-        return Perceived(self.looks[scene], self.known[scene], self.cameras)
 
 
 def drive(cells: Sequence[Cell], *, device: str, seed: int) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
