@@ -34,8 +34,9 @@ def suite(**changes: Any) -> DetectionSuite:
 def no_detectors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Detectors are names; looking at data is another matter."""
 
-    def detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str]]:
-        return {name: f"hash of {name}" for name in suite.detectors}, {name: f"{name}.pth" for name in suite.detectors}
+    def detectors(suite: DetectionSuite) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
+        hashes = {name: f"hash of {name}" for name in suite.detectors}
+        return hashes, {name: f"{name}.pth" for name in suite.detectors}, dict.fromkeys(suite.detectors, "3d")
 
     monkeypatch.setattr(detection, "detectors_of", detectors)
 

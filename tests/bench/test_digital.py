@@ -18,7 +18,7 @@ from rich.console import Console
 
 from ssad.bench.digital_points import DigitalSuite
 from ssad.bench.kind import Job, Plan, Resources
-from ssad.bench.kinds import digital
+from ssad.bench.kinds import detection, digital
 from ssad.bench.kinds.digital import Digital
 from ssad.bench.run import run
 from ssad.bench.suite import command_of, load_suite
@@ -100,6 +100,16 @@ def test_cells_are_the_clean_data_noise_of_each_size_the_table_and_the_curves(ro
         assert not keys & {cell.key for cell in Digital().plan(suite_of(root, detectors=[LINEAR], **changed)).cells}
     fewer_at_once = Digital().plan(suite_of(root, detectors=[LINEAR], batch=2))
     assert keys == {cell.key for cell in fewer_at_once.cells}, "results do not depend on the batch"
+
+
+def test_a_plan_builds_each_detector_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[str] = []
+    real = detection.detector_of
+    for module in (detection, digital):
+        monkeypatch.setattr(module, "detector_of", lambda *given: built.append(given[0]) or real(*given), raising=False)
+    plan = Digital().plan(suite_of(root))
+    assert built == [LINEAR, BLIND]
+    assert {cell.fields["task"] for cell in plan.cells} == {"3d"}
 
 
 def test_attacks_of_the_kind_by_default(root: Path) -> None:

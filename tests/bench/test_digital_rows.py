@@ -19,11 +19,14 @@ from ssad.bench.kind import Job, Resources
 from ssad.bench.kinds.digital import Digital
 from ssad.bench.run import run
 from ssad.core.errors import SSADError
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_CLASSES
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.evaluation import attack_scores, attacked_scenes
 from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample, worst_of
 from ssad.evaluation.attacked_scenes import AttackedScene
+from ssad.evaluation.camera_truth import camera_truth
+from ssad.evaluation.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
 from ssad.evaluation.detection import SampleBoxes, match_boxes
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
 from ssad.report import write_report
@@ -58,6 +61,7 @@ def suite_of(root: Path, **changes: Any) -> DigitalSuite:
             {**PGD, "defence": "resize", "aware": True, "draws": 2, "scenes": 1},
             {"name": "fgsm", "loss": "vanish", "classes": ["car"]},
             {"name": "fgsm", "loss": "vanish", "classes": ["truck"], "scenes": 1},
+            {"name": "fgsm", "loss": "vanish", "object": "nearest", "scenes": 1, "precision": "bfloat16"},
         ],
         "sweeps": [{"name": "pgd", "radii": [0, 1, 5], "scenes": 1, "options": {"steps": 2}}], "transfer": [PGD],
     }  # fmt: skip
@@ -117,11 +121,11 @@ def test_no_picture_is_attacked_twice(folder: Path) -> None:
     told = json.loads((folder / "attacked.json").read_text())
     counts = told["counts"]
     plain = [count for about, count in counts.items() if about.startswith(("pgd on linear ", "fgsm on linear "))]
-    assert len(plain) == 8, "two detectors: PGD, FGSM, and FGSM on cars and on trucks"
+    assert len(plain) == 10, "two detectors: PGD, FGSM, and FGSM on cars, on trucks and on the nearest object"
     assert max(plain) == 24 + 12, "for table, ensemble, transfer, unknown defences and the curve at once; and at 1 px"
     behind = [count for about, count in counts.items() if "+" in about]
     assert behind == [24, 24], "known ones, 12 pictures of one scene, two detectors"
-    passes = 2 * (24 * (2 + 1 + 1) + 12 * (1 + 2 + 2 * 2 + 2))
+    passes = 2 * (24 * (2 + 1 + 1) + 12 * (1 + 1 + 2 + 2 * 2 + 2))
     assert f"{passes:,} forward and backward passes for 2 detectors" in told["said"]
 
 
@@ -176,17 +180,66 @@ def test_a_target_is_reached_where_the_car_is_gone(folder: Path, root: Path) -> 
     row = target_table(load_digital_run(load_run(folder))).rows[0]
     assert row.cells[0].mean == pytest.approx(100 * found["metrics"]["success"])
     clean, attacked, truth = boxes_of(folder, root)
-    same = target_success(clean, clean, truth, classes=["car"], becomes={})
-    assert same == {"targets": found["metrics"]["targets"], "success": 0.0}
-    assert target_success(clean, clean, truth, classes=[], becomes={"car": "car"})["success"] == 1.0
-    fewer = target_success(attacked, clean, truth, classes=["car"], becomes={})
+    same = target_success(clean, clean, truth, ["car"], becomes={})
+    assert same == {"targets": found["metrics"]["targets"], "success": 0.0, "kept": 1.0}
+    assert target_success(clean, clean, truth, becomes={"car": "car"})["success"] == 1.0
+    fewer = target_success(attacked, clean, truth, ["car"], becomes={})
     assert fewer["targets"] < same["targets"], "only what was found before can be lost"
-    assert "success" not in target_success(clean, clean, truth, classes=["trailer"], becomes={})
+    assert "success" not in target_success(clean, clean, truth, ["trailer"], becomes={})
     bands = by_distance(clean, truth)
     told = one(folder, attack=None)["metrics"]
     assert bands == {key: value for key, value in told.items() if key.endswith(("0-20", "20-40", "40+"))}
     assert "mAP_0-20" in bands
     assert all(0 < value <= 1 for value in bands.values())
+
+
+def test_of_all_objects_only_the_chosen_one_is_attacked(folder: Path, root: Path) -> None:
+    found = one(folder, attack="fgsm", target="nearest", subset=1)
+    assert (found["options"], found["loss"]) == ("precision=bfloat16", "vanish")
+    with NuScenes(root) as data:
+        scene = data.scene(data.scenes()[0].name)
+    places = chosen_places(scene, NEAREST)
+    assert 0 < found["metrics"]["targets"] <= len(places) == len(scene.samples)
+    assert found["metrics"]["success"] > 0
+    assert found["metrics"]["kept"] > found["metrics"]["mAP"] > 0, "the others stay"
+    shows = [frame for frame in scene.frames if frame.modality == "camera" and frame.key_frame
+             and len(chosen_first(scene, frame, NEAREST))]  # fmt: skip
+    assert found["images"] - found["idle"] == len(shows) < found["images"], "pictures without it are left as they are"
+    row = target_table(load_digital_run(load_run(folder))).rows
+    assert "nearest" in {r.head[3] for r in row}
+    assert all(len(r.cells) == 4 for r in row)
+
+
+def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(root: Path) -> None:
+    with NuScenes(root) as data:
+        scene = data.scene(data.scenes()[0].name)
+    sample = scene.samples[0].token
+    found = scene.annotations(sample)
+    cameras = [f for f in scene.frames if f.sample_token == sample and f.modality == "camera" and f.key_frame]
+
+    def seen(row: int) -> bool:
+        return any(len(camera_truth(frame, found.take(np.array([row]))).label) for frame in cameras)
+
+    gap = np.linalg.norm(found.centre[:, :2] - cameras[0].ego_to_world[:2, 3], axis=1)
+    for classes in ((), ("car",)):
+        names = classes or MMDET3D_CLASSES
+        wanted = [k for k in range(len(found)) if CATEGORY_TO_CLASS.get(found.category[k]) in names and seen(k)]
+        row = chosen_object(scene, sample, NEAREST, classes)
+        assert row == min(wanted, key=lambda k: gap[k])
+        assert chosen_object(scene, sample, found.instance[row], classes) == row
+        frame = next(f for f in cameras if len(camera_truth(f, found.take(np.array([row]))).label))
+        assert chosen_first(scene, frame, NEAREST, classes).token[0] == found.token[row]
+    assert chosen_object(scene, sample, "nobody") is None
+    assert chosen_object(scene, sample, NEAREST, ("trailer",)) is None, "the tiny set has none"
+
+
+def test_an_object_that_is_nowhere_is_a_recorded_failure(root: Path, tmp_path: Path) -> None:
+    attacks = [{"name": "fgsm", "loss": "vanish", "object": "nobody", "scenes": 1}]
+    suite = suite_of(root, detectors=[ONE], attacks=attacks, sweeps=[], transfer=[])
+    records = run(Digital().plan(suite), tmp_path, Resources(0, console=Console(file=io.StringIO())))
+    (failed,) = [r for r in records if r["attack"] == "fgsm"]
+    assert failed["status"] == "failed"
+    assert "no moment of these scenes has it" in failed["reason"]
 
 
 def boxes_of(folder: Path, root: Path) -> tuple[list[SampleBoxes], list[SampleBoxes], GroundTruth]:
@@ -246,7 +299,7 @@ def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:
     assert 1 < row.cells[0].mean < 5
     groups = {a.group for a in attempts_of(load_digital_run(load_run(folder)))}
     assert groups == {
-        "", "1 of each town", "car", "truck, 1 of each town", "bit depth, 1 of each town",
+        "", "1 of each town", "car", "truck, 1 of each town", "nearest, 1 of each town", "bit depth, 1 of each town",
         "random resizing, 1 of each town",
     }  # fmt: skip
 
@@ -294,6 +347,8 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "aware of nothing": ({"attacks": [{**PGD, "aware": True}]}, "aware of which defence"),
     "no such class": ({"attacks": [{**PGD, "classes": ["cat"]}]}, "unknown class 'cat'"),
     "becomes": ({"attacks": [{**PGD, "becomes": {"car": "bus"}}]}, "becomes needs loss: mislabel"),
+    "an object of all": ({"attacks": [{"name": "fgsm", "object": "nearest"}]}, "loss full is of all objects"),
+    "a class of all": ({"attacks": [{**PGD, "loss": "depth", "classes": ["car"]}]}, "loss depth is of all objects"),
     "no members": ({"attacks": ["ensemble"]}, "an ensemble has members"),
     "members": ({"attacks": [{**PGD, "members": ["fgsm"]}]}, "an ensemble has members"),
     "budgets": (

@@ -15,6 +15,9 @@ from ssad.evaluation.attacked_scenes import AttackSpec, takes
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
 from ssad.scenarios.static.digital.defences import make_defence
+from ssad.scenarios.static.digital.objectives import UNDIVIDED
+from ssad.scenarios.static.digital.universal import UniversalFit
+from ssad.scenarios.static.digital.victim import Precision
 
 Radius = Annotated[float, Field(ge=0.0, le=255.0 * 4000, allow_inf_nan=False)]
 Steps = Annotated[int, Field(ge=1)]
@@ -31,6 +34,7 @@ class Method(BaseModel):
         loss: what it ascends (default: what the attack is about).
         norm: of the budget.
         options: further settings, such as restarts.
+        precision: of the gradients, where it is not the suite's.
     """
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -39,6 +43,7 @@ class Method(BaseModel):
     loss: str | None = None
     norm: Literal["linf", "l2"] = "linf"
     options: dict[str, Any] = {}
+    precision: Precision | None = None
 
 
 class Row(Method):
@@ -74,6 +79,8 @@ class Entry(Row):
         draws: see `aware`.
         classes: the classes whose objects are attacked; empty: all.
         becomes: class -> class that its objects should be taken for.
+        object: the one object of each moment that is attacked: "nearest" (of `classes`, or of the classes that become
+            others, if they are given), or the token of an instance; None: all.
         members: of the attack `ensemble`: the attacks of which the worst is kept at each moment.
     """
 
@@ -82,6 +89,7 @@ class Entry(Row):
     draws: Steps | None = None
     classes: list[str] = []
     becomes: dict[str, str] = {}
+    object: Annotated[str, Field(min_length=1)] | None = None
     members: list[Row] = []
 
     @field_validator("defence", "members", mode="before")
@@ -117,6 +125,7 @@ class DigitalSuite(DetectorSuite):
         radius: 8-bit code values that a picture may be moved by, where an attack does not say it.
         steps: gradient steps, likewise.
         batch: camera images that are attacked at once on a GPU; where memory does not suffice they are fewer.
+        precision: of the gradients: bfloat16 is faster on a GPU. Losses that decide, and scores, are exact.
     """
 
     kind: Literal["digital"]
@@ -130,6 +139,7 @@ class DigitalSuite(DetectorSuite):
     radius: Radius = Field(default=5.0, gt=0.0)
     steps: Steps = 10
     batch: int = Field(default=12, ge=1)
+    precision: Precision = "float32"
 
     @field_validator("attacks", "sweeps", "transfer", mode="before")
     @classmethod
@@ -216,7 +226,16 @@ def rows_of(suite: DigitalSuite) -> list[Point]:
                     raise unknown_name("class", name, MMDET3D_CLASSES)
             if becomes and (one.loss or default_loss(one.name)) != "mislabel":
                 raise ConfigError(f"suite {suite.name}: attack {one.name}: becomes needs loss: mislabel")
-            specs = [replace(_spec(suite, one, one.radius, one.steps), classes=classes, becomes=becomes, draws=draws)]
+            spec = replace(
+                _spec(suite, one, one.radius, one.steps), classes=classes, becomes=becomes, draws=draws,
+                object=one.object or "",
+            )  # fmt: skip
+            if not spec.aim.everything and spec.loss in UNDIVIDED:
+                raise ConfigError(
+                    f"suite {suite.name}: attack {one.name}: loss {spec.loss} is of all objects; to attack some "
+                    "choose loss: vanish, margin, hide or mislabel"
+                )
+            specs = [spec]
         found.append(
             Point(tuple(specs), guard, bool(one.aware), "", one.scenes or 0, row=guard is None and not one.scenes)
         )
@@ -287,8 +306,9 @@ def _spec(suite: DigitalSuite, method: Method, radius: float | None, steps: int 
         raise ConfigError(
             f"suite {suite.name}: attack {method.name}: options are numbers and words, not {options}"
         ) from None
-    spec.make()
-    return spec
+    made = spec.make()
+    graded = made.access == "white-box" or isinstance(made, UniversalFit)
+    return replace(spec, precision=method.precision or suite.precision) if graded else spec
 
 
 def _swept(suite: DigitalSuite) -> list[Point]:

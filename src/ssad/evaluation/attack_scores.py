@@ -19,6 +19,7 @@ from ssad.metrics.detection_boxes import BoxTable
 
 BANDS: Mapping[str, tuple[float, float]] = {"0-20": (0.0, 20.0), "20-40": (20.0, 40.0), "40+": (40.0, np.inf)}
 NEAR = 2.0  # metres within which a box is taken for that of an object, as for the true-positive errors of nuScenes
+SAME = 1e-3  # metres within which two places are one
 SEEN = 0.1  # least score of a box that counts as a detection of an object
 
 
@@ -78,9 +79,10 @@ def target_success(
     clean: Sequence[SampleBoxes],
     attacked: Sequence[SampleBoxes],
     truth: GroundTruth,
+    classes: Sequence[str] = (),
     *,
-    classes: Sequence[str],
     becomes: Mapping[str, str],
+    at: Mapping[str, F64] | None = None,
 ) -> dict[str, float]:
     """How often a targeted attack reaches its target, over the objects that are found in the clean pictures.
 
@@ -92,21 +94,28 @@ def target_success(
         clean: Boxes in the clean pictures.
         attacked: Boxes under the attack.
         truth: Of the same samples.
-        classes: Names of the classes that are attacked, where `becomes` is empty.
+        classes: Names of the classes that are attacked; empty: all, or those that `becomes` names.
         becomes: Class -> class that its objects should be taken for.
+        at: Where the one object of each sample is that is attacked, m, by token; None: all objects are.
 
     Returns:
-        success, absent if no such object is found; targets, the number of objects.
+        success, absent if no such object is found; targets, the number of objects; kept, the share of the others that
+        are found as what they are in both, absent if there are none.
     """
     real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
-    chosen = [CLASSES.index(name) for name in becomes or classes]
-    real = real.take(np.flatnonzero(np.isin(real.label, chosen)))
+    chosen = np.isin(real.label, [CLASSES.index(name) for name in becomes or classes or CLASSES])
+    if at is not None:
+        places = np.array([at.get(token, np.full(3, np.nan)) for token in truth.samples])
+        chosen &= np.abs(real.centre - places[real.sample]).max(1) < SAME
     before, after = (_taken_for(real, box_table(found, truth)) for found in (clean, attacked))
     known = before == real.label
+    others = known & ~chosen
+    kept = {"kept": round(float((after == before)[others].mean()), 6)} if others.any() else {}
+    known &= chosen
     wanted = {CLASSES.index(one): CLASSES.index(other) for one, other in becomes.items()}
     reached = after == [wanted.get(int(label), -2) for label in real.label] if becomes else after != real.label
     count = int(known.sum())
-    return {"targets": count, **({"success": round(float(reached[known].mean()), 6)} if count else {})}
+    return {"targets": count, **({"success": round(float(reached[known].mean()), 6)} if count else {}), **kept}
 
 
 def _taken_for(real: BoxTable, boxes: BoxTable) -> F64:

@@ -44,6 +44,7 @@ def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpe
                 if watched.reason:
                     continue
             title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"
+            title += f", {spec.target}" if spec and spec.target else ""
             seen = tile((watched, examination.device), scene, frame, picture, title="what it finds")
             change = magnified(picture, clean)
             rows.append(np.concatenate([_shrunk(picture, title), _shrunk(change, "change, magnified"), seen], 1))

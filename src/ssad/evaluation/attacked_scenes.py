@@ -25,6 +25,7 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.evaluation.attack_tally import Tally
 from ssad.evaluation.camera_truth import camera_truth
+from ssad.evaluation.chosen_object import chosen_first
 from ssad.evaluation.detection import AT_ONCE, to_images
 from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name, system_of
 from ssad.scenarios.static.digital import (
@@ -43,7 +44,7 @@ from ssad.scenarios.static.digital.expectation import Expected
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.transfer import translate
 from ssad.scenarios.static.digital.universal import UniversalFit
-from ssad.scenarios.static.digital.victim import NothingToAttackError, Victim, steady
+from ssad.scenarios.static.digital.victim import NothingToAttackError, Precision, Victim, steady
 
 CAMERAS = 6  # of a sample, as nuScenes has them
 _INSPECTED: dict[tuple[Any, ...], tuple[float | None, float | None]] = {}  # of this process
@@ -62,6 +63,8 @@ class AttackSpec:
         classes: names of the classes that are attacked; empty: all.
         becomes: (class, class that its objects should be taken for); empty: any other.
         draws: of a random defence that the attack knows, over which it ascends the mean loss; 0: it knows none.
+        object: which object of each moment is attacked (see `ssad.evaluation.chosen_object`); "": all.
+        precision: of the gradients.
     """
 
     attack: str
@@ -72,6 +75,8 @@ class AttackSpec:
     classes: tuple[str, ...] = ()
     becomes: tuple[tuple[str, str], ...] = ()
     draws: int = 0
+    object: str = ""
+    precision: Precision = "float32"
 
     @property
     def name(self) -> str:
@@ -85,6 +90,8 @@ class AttackSpec:
             *self.classes,
             *(f"{one}-to-{other}" for one, other in self.becomes),
             *([f"draws{self.draws}"] if self.draws else []),
+            *([f"object-{self.object}"] if self.object else []),
+            *([self.precision] if self.precision != "float32" else []),
         ]
         return file_name("-".join(parts))
 
@@ -97,7 +104,18 @@ class AttackSpec:
     @property
     def aim(self) -> Aim:
         """Which objects are attacked, and what they should become."""
-        return Aim(classes=self.classes or None, becomes=dict(self.becomes))
+        return Aim(self.classes or None, (0,) if self.object else None, dict(self.becomes))
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Names of the classes whose objects are attacked; empty: all."""
+        return tuple(one for one, _ in self.becomes) or self.classes
+
+    @property
+    def target(self) -> str:
+        """Which objects are attacked and what they should become, in words: "nearest car", "car to bus"; "": all."""
+        changes = [f"{one} to {other}" for one, other in self.becomes]
+        return " ".join(filter(None, [self.object, ", ".join(changes or self.classes)]))
 
     @property
     def passes(self) -> int:
@@ -240,9 +258,18 @@ class SceneAttacker:
         return read_image(self.examination.root / frame.filename)
 
     def _truth(self, frame: SensorFrame, scene: SceneData | None = None) -> Truth:
-        """What is in a frame, with the labels of the attacked detector; objects that it does not know are left out."""
-        truth = camera_truth(frame, (scene or self.scene).annotations(frame.sample_token))
-        return translate(truth, MMDET3D_CLASSES, self.watched.classes)[0]
+        """What is in a frame, with the labels of the attacked detector; objects that it does not know are left out.
+
+        Where one object is attacked it comes first; a frame without it is empty.
+        """
+        scene, spec = scene or self.scene, self.view.spec
+        found = scene.annotations(frame.sample_token)
+        if spec.object:
+            found = chosen_first(scene, frame, spec.object, spec.wanted)
+        truth, kept = translate(camera_truth(frame, found), MMDET3D_CLASSES, self.watched.classes)
+        if spec.object and kept[:1] != (0,):  # the detector does not know the class of the chosen one
+            truth = camera_truth(frame, found.take(np.arange(0)))
+        return truth
 
     def _all(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
         """Pictures of one size, in batches; smaller ones from where memory does not suffice."""
@@ -275,7 +302,7 @@ class SceneAttacker:
         own = images[active]
         found = run_attack(
             self.attack, self.watched.detector, own, [truth[k] for k in active], budget, objective=spec.loss,
-            aim=spec.aim, intrinsic=lens[active], check=False,
+            aim=spec.aim, intrinsic=lens[active], check=False, precision=spec.precision,
             keys=[(self.examination.seed, frames[k].token) for k in active],
         )  # fmt: skip
         self.tally.add(found, own, budget)
@@ -315,7 +342,7 @@ class SceneAttacker:
         own, spec = self.examination, self.view.spec
         asked = (
             str(own.root), own.version, own.detectors, own.device, self.view.source, self.scene.record.name, spec.loss,
-            spec.classes, spec.becomes, self.attack.access,
+            spec.classes, spec.becomes, spec.object, self.attack.access,
         )  # fmt: skip
         if not self.view.source or asked not in _INSPECTED:
             _INSPECTED[asked] = self._inspected(frames)
@@ -336,7 +363,9 @@ class SceneAttacker:
                     images, lens = self._tensors(some, [self._read(frame) for frame in some])
                     objective = make_objective(spec.loss)
                     try:
-                        victim = Victim(detector, images, truth, objective, intrinsic=lens, aim=spec.aim)
+                        victim = Victim(
+                            detector, images, truth, objective, intrinsic=lens, aim=spec.aim, precision=spec.precision
+                        )  # fmt: skip
                     except NothingToAttackError:
                         continue
                     if self.tally.gradient_error is None:
@@ -360,7 +389,7 @@ class SceneAttacker:
 
     def _inspected(self, frames: Sequence[SensorFrame]) -> tuple[float | None, float | None]:
         """Error of the gradient and coupling; None where there is nothing to look at."""
-        names = [*self.view.spec.classes, *dict(self.view.spec.becomes)] or MMDET3D_CLASSES
+        names = self.view.spec.wanted or MMDET3D_CLASSES
         known = self.watched.classes
         wanted = torch.tensor([known.index(name) for name in names if name in known])
         counted = sorted(frames, key=lambda frame: -int(torch.isin(self._truth(frame).label, wanted).sum()))

@@ -74,16 +74,19 @@ def target_table(run: DigitalRun) -> Table:
     for (detector, setting), record in run.records.items():
         if setting.target and record["status"] == "ok":
             metrics = record["metrics"]
-            count, share = metrics.get("targets"), metrics.get("success")
-            cells = [Cell(math.nan if share is None else 100 * share), Cell(math.nan if count is None else count)]
+            count = metrics.get("targets")
+            shares = (metrics.get(name) for name in ("success", "kept"))
+            cells = [Cell(math.nan if share is None else 100 * share) for share in shares]
+            cells.insert(1, Cell(math.nan if count is None else count))
             head = (detector, title_of(setting), size_of(setting._replace(target="")), setting.target)
             rows.append(Row((*head, scenes_of(setting)), (*cells, metric_cell(record, "mAP"))))
     note = (
         "Success in percent of the objects that are found in the clean pictures, by the best box within 2 m with a "
-        "score of at least 0.1: it is of the wanted class under the attack, or gone where no class is wanted."
+        "score of at least 0.1: it is of the wanted class under the attack, or gone where no class is wanted. Others "
+        "kept: percent of the found objects that were not attacked which are found under the attack too."
     )
     heads = ("Detector", "Attack", "Budget", "Target", "Scenes")
-    return Table("targets", "Targeted attacks", heads, ("success", "objects", "mAP"), tuple(rows), note)
+    return Table("targets", "Targeted attacks", heads, ("success", "objects", "others kept", "mAP"), tuple(rows), note)
 
 
 def halving_table(run: DigitalRun) -> Table:

@@ -19,13 +19,15 @@ from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_at
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
 from ssad.scenarios.static.digital.check import quality_left, within
-from ssad.scenarios.static.digital.objectives import Margin, Vanish
-from ssad.scenarios.static.digital.victim import Victim
+from ssad.scenarios.static.digital.gradient_check import check_gradient
+from ssad.scenarios.static.digital.objectives import Margin, Vanish, make_objective
+from ssad.scenarios.static.digital.victim import Precision, Victim
 from ssad.scenarios.static.physical import ATTACKS as PHYSICAL
 from ssad.scenarios.static.physical.noninvasive import LIGHTS
 
 from .toy_detector import ToyDetector, TrueLogits, best_linf, toy_scene
 
+PRECISIONS: tuple[Precision, ...] = ("float32", "bfloat16")
 WHITE = ["fgsm", "pgd", "momentum", "apgd", "cw"]
 
 
@@ -272,3 +274,18 @@ def test_random_starts_come_from_the_keys() -> None:
     first, second = victim.draw("uniform", "start", 0)
     assert torch.equal(first, second)
     assert not torch.equal(first, victim.draw("uniform", "start", 1)[0])
+
+
+def test_gradients_in_bfloat16_are_nearly_those_of_float32_and_losses_are_the_same() -> None:
+    images, truth = toy_scene(2)
+    detector = ToyDetector()
+    exact, mixed = (Victim(detector, images, truth, make_objective("full"), precision=p) for p in PRECISIONS)
+    (loss, slope), (rough, other) = exact.gradient(images), mixed.gradient(images)
+    assert not torch.equal(slope, other)
+    assert torch.cosine_similarity(slope.flatten(1), other.flatten(1)).min() > 0.99
+    torch.testing.assert_close(rough, loss, rtol=0.02, atol=0.02)
+    assert torch.equal(exact.loss(images), mixed.loss(images))
+    assert check_gradient(mixed) == check_gradient(exact), "the gradient is checked in float64 in any case"
+    pgd, small = make_attack("pgd"), Budget(px(3))
+    left = [run_attack(pgd, detector, images, truth, small, objective="vanish", precision=p).after for p in PRECISIONS]
+    torch.testing.assert_close(left[1], left[0], rtol=0.02, atol=0.02)

@@ -219,7 +219,7 @@ class Detection(DetectorKind):
                 raise ConfigError(f"suite {suite.name}: a {what} appears twice")
         for known in suite.shifts:
             ShiftSpec(known, calibration=suite.calibration)
-        weights, detectors = detectors_of(suite)
+        weights, detectors, _ = detectors_of(suite)
         data = data_of(suite)
         conditions: list[tuple[str | None, int | str]] = [
             (None, 0),
@@ -280,8 +280,8 @@ class Detection(DetectorKind):
 
 def detectors_of(
     suite: DetectorSuite, names: Sequence[str] | None = None, *, flat: bool = False
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Versions of the detectors' weights and own source by name, and their files of weights ("": the shipped ones).
+) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
+    """By name of the detectors: versions of weights and own source; files of weights ("": shipped); tasks (2d, 3d).
 
     Args:
         suite: Which names them.
@@ -293,6 +293,7 @@ def detectors_of(
     """
     weights: dict[str, str] = {}
     files: dict[str, str] = {}
+    tasks: dict[str, str] = {}
     for text in suite.detectors if names is None else names:
         name, _, file = text.partition("=")
         if name in files:
@@ -308,14 +309,15 @@ def detectors_of(
                 f"(docs/detectors.md: ssad train detector {kind}, or official ones)"
             )
         detector = detector_of(name, path, "cpu")
-        if getattr(detector, "task", None) != "3d":
+        tasks[name] = str(getattr(detector, "task", ""))
+        if tasks[name] != "3d":
             if not flat:
                 raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
             if not set(detector.classes) & set(MMDET3D_CLASSES):
                 raise ConfigError(f"suite {suite.name}: {name} knows none of the ten classes of nuScenes")
         own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
         weights[name], files[name] = state_hash(detector) + own, path
-    return weights, files
+    return weights, files, tasks
 
 
 def state_hash(detector: Any) -> str:

@@ -22,20 +22,21 @@ from ssad.bench.kind import Cell, Column, Job, Plan, Resources
 from ssad.bench.kinds.detection import DetectorKind, data_of, detectors_of
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
-from ssad.core.types import U8
+from ssad.core.types import F64, U8
+from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.evaluation.attack_scores import Match, by_distance, target_success, worst_of
 from ssad.evaluation.attack_sheet import attack_sheet
 from ssad.evaluation.attack_tally import sum_notes
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec
+from ssad.evaluation.chosen_object import chosen_places
 from ssad.evaluation.picture_scores import match_pictures
 from ssad.evaluation.scene_boxes import (
     Condition,
     Examination,
     ShiftedScene,
     boxes_path,
-    detector_of,
     find_boxes,
     picture_truth_of,
     read_scenes,
@@ -61,11 +62,10 @@ class Digital(DetectorKind):
     def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Attacks, defences and detectors are built once, the data set is looked at."""
         points = points_of(suite)
-        weights, detectors = detectors_of(suite, [*suite.detectors, *suite.transfer_detectors], flat=True)
+        weights, detectors, tasks = detectors_of(suite, [*suite.detectors, *suite.transfer_detectors], flat=True)
         if suite.transfer_detectors and not suite.transfer:
             raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
         main = [text.partition("=")[0] for text in suite.detectors]
-        tasks = {name: detector_of(name, file, "cpu").task for name, file in detectors.items()}
         data = data_of(suite)
         cells = []
         for detector in detectors:
@@ -178,11 +178,21 @@ class Digital(DetectorKind):
         metrics = after["metrics"] | eye.by_distance(boxes, truth)
         clean_score = before["metrics"]["mAP"]
         metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
-        if (specs[0].classes or specs[0].becomes) and not eye.flat:
-            metrics |= target_success(
-                clean, boxes, truth, classes=specs[0].classes, becomes=dict(specs[0].becomes)
-            )  # fmt: skip
+        if not specs[0].aim.everything and not eye.flat:
+            places = self._places(examination, specs[0], whole)
+            metrics |= target_success(clean, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
         return {**after, **_noted(noted), **told, "metrics": metrics, "clean_mAP": clean_score}
+
+    def _places(self, examination: Examination, spec: AttackSpec, scenes: Sequence[Condition]) -> dict[str, F64] | None:
+        """Where the one object is that is attacked, by sample; None: more than one is. ConfigError: it is nowhere."""
+        if not spec.object:
+            return None
+        with NuScenes(examination.root, examination.version) as data:
+            parts = [chosen_places(data.scene(one.scene), spec.object, spec.wanted) for one in scenes]
+        found = {token: place for part in parts for token, place in part.items()}
+        if not found:
+            raise ConfigError(f"object {spec.object}: no moment of these scenes has it; nothing was attacked")
+        return found
 
     def sheet(self, examination: Examination, suite: DigitalSuite) -> tuple[Callable[[], U8], str]:
         """One moment under the attacks of the table."""
@@ -234,10 +244,9 @@ def _fields(point: Point) -> dict[str, Any]:
         return {"attack": None, "loss": None, "norm": None, "radius": 0.0, "steps": 0, "options": "", "target": "",
                 **about}  # fmt: skip
     spec = point.specs[0]
-    target = [*spec.classes, *(f"{one} to {other}" for one, other in spec.becomes)]
     found = {
         "attack": spec.attack, "loss": spec.loss if spec.attack != "noise" else None, "norm": spec.norm,
-        "radius": spec.radius, "steps": spec.steps, "options": _options(spec), "target": ", ".join(target), **about,
+        "radius": spec.radius, "steps": spec.steps, "options": _options(spec), "target": spec.target, **about,
     }  # fmt: skip
     if len(point.specs) > 1:
         members = ", ".join(" ".join(filter(None, [one.attack, one.loss, _options(one)])) for one in point.specs)
@@ -248,6 +257,7 @@ def _fields(point: Point) -> dict[str, Any]:
 def _options(spec: AttackSpec) -> str:
     others = [(key, value) for key, value in spec.options if key != "steps"]
     others += [("draws", spec.draws)] if spec.draws else []
+    others += [("precision", spec.precision)] if spec.precision != "float32" else []
     return " ".join(f"{key}={value}" for key, value in others)
 
 
@@ -270,7 +280,8 @@ def _told(spec: AttackSpec) -> dict[str, Any]:
     return {
         "attack": spec.attack, "loss": spec.loss, "norm": spec.norm, "radius": spec.radius,
         "options": [list(pair) for pair in spec.options], "classes": list(spec.classes),
-        "becomes": [list(pair) for pair in spec.becomes], "draws": spec.draws,
+        "becomes": [list(pair) for pair in spec.becomes], "draws": spec.draws, "object": spec.object,
+        "precision": spec.precision,
     }  # fmt: skip
 
 
@@ -280,5 +291,5 @@ def _told_spec(data: Mapping[str, Any]) -> AttackSpec:
     becomes = tuple((one, other) for one, other in data["becomes"])
     return AttackSpec(
         data["attack"], data["loss"], data["norm"], data["radius"], options, tuple(data["classes"]), becomes,
-        data["draws"],
+        data["draws"], data["object"], data["precision"],
     )  # fmt: skip

@@ -40,6 +40,7 @@ def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], l
     """The paper's row beside one of ours: its name and budget, and the metrics of each detector; None: it has none."""
     attack, loss, norm, radius, _, options = setting[:6]
     told = PAPER.get((attack, loss))
+    options = " ".join(word for word in options.split() if not word.startswith("precision="))
     if told is None or not run.suite.get("reference") or options or (attack and (norm, radius) != ("linf", EPSILON)):
         return None
     names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]

@@ -15,7 +15,7 @@ from ssad.core.protocols import Detector
 from ssad.scenarios.static.digital.budget import LEVELS, Budget, quantise
 from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.objectives import EVERYTHING, Aim, Objective, make_objective
-from ssad.scenarios.static.digital.victim import Cost, Through, Victim, steady
+from ssad.scenarios.static.digital.victim import Cost, Precision, Through, Victim, steady
 
 Access = Literal["white-box", "black-box", "none"]
 
@@ -83,6 +83,7 @@ def run_attack(
     aim: Aim = EVERYTHING,
     keys: Sequence[tuple[object, ...]] | None = None,
     through: Through | None = None,
+    precision: Precision = "float32",
     check: bool = True,
 ) -> Attacked:
     """Attack a batch of images.
@@ -98,6 +99,7 @@ def run_attack(
         aim: Which objects are attacked.
         keys: What the random draws of each image come from.
         through: A defence that the attack knows.
+        precision: Of the gradients; see `Victim`.
         check: Compare the gradient with finite differences first (white-box attacks only).
 
     Returns:
@@ -109,7 +111,8 @@ def run_attack(
     ascended = make_objective(objective) if isinstance(objective, str) else objective
     with steady(detector):
         victim = Victim(
-            detector, images, truth, ascended, intrinsic=intrinsic, aim=aim, keys=keys, through=through
+            detector, images, truth, ascended, intrinsic=intrinsic, aim=aim, keys=keys, through=through,
+            precision=precision,
         )  # fmt: skip
         error = check_gradient(victim) if check and attack.access == "white-box" else None
         before = victim.loss(victim.clean)

@@ -67,7 +67,7 @@ def _error(victim: Victim) -> float:
 def _without_stairs(victim: Victim) -> Victim:
     """Without a defence that is not smooth: finite differences say nothing about the slope across its stairs."""
     found = copy.copy(victim)
-    found.cost = copy.copy(victim.cost)
+    found.cost, found.precision = copy.copy(victim.cost), "float32"
     if not getattr(victim.through, "smooth", True):
         found.through = None
     if not getattr(getattr(victim.detector, "defence", None), "smooth", True):

@@ -270,6 +270,10 @@ OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
 }
 
 
+UNDIVIDED = frozenset({"full", *TERMS, "fabricate"})
+"""Objectives that are of all objects, and take no aim at some."""
+
+
 def make_objective(name: str) -> Objective:
     """An objective by name.
 

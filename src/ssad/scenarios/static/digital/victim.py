@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from ssad.scenarios.static.digital.budget import LEVELS, codes_of
 from ssad.scenarios.static.digital.objectives import EVERYTHING, Aim, Objective, Situation
 
 Through = Callable[[Tensor], Tensor]
+Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(slots=True)
@@ -71,6 +72,8 @@ class Victim:
         aim: Which objects are attacked.
         keys: For each image what its random draws come from; default: its number in the batch.
         through: What every picture passes on its way to the detector (a defence that the attack knows).
+        precision: What the detector computes gradients in, as far as autocast takes it; losses that are asked for
+            without a gradient, and the target assignment, are exact in any case.
 
     Attributes:
         clean: [B, 3, H, W] the images, equal to their code values over 255.
@@ -94,6 +97,7 @@ class Victim:
         aim: Aim = EVERYTHING,
         keys: Sequence[tuple[object, ...]] | None = None,
         through: Through | None = None,
+        precision: Precision = "float32",
     ) -> None:
         if images.ndim != 4 or images.shape[1] != 3 or not images.is_floating_point() or 0 in images.shape:
             raise ConfigError(f"an attack takes images [B, 3, H, W] of floats, not {list(images.shape)} {images.dtype}")
@@ -103,7 +107,7 @@ class Victim:
         self.clean = (self.codes.to(images.dtype) / LEVELS).contiguous(memory_format=torch.channels_last)
         self.detector, self.objective, self.intrinsic, self.through = detector, objective, intrinsic, through
         self.keys = [(k,) for k in range(len(images))] if keys is None else list(keys)
-        self.cost = Cost()
+        self.cost, self.precision = Cost(), precision
         with torch.no_grad():
             dense = self._dense(self.clean)
             assignment = detector.assign(dense, truth)
@@ -137,7 +141,9 @@ class Victim:
         self.cost.gradients += 1
         images = images.detach().requires_grad_()
         with torch.enable_grad():
-            loss = self.objective(self._dense(images), self.situation)
+            with torch.autocast(images.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+                dense = self._dense(images)
+            loss = self.objective(dense, self.situation)
             found: tuple[Tensor | None, ...] = (None,)
             if loss.requires_grad:
                 found = torch.autograd.grad(loss.sum(), images, allow_unused=True)
