@@ -48,16 +48,12 @@ def step(
     detector: Any, views: list[View], colour: torch.Tensor, window: int | None, device: str
 ) -> tuple[float, float]:
     """Ms of rendering and of the detector in one step."""
-    draws, start = torch.Generator().manual_seed(0), clock(device)
-    shown, truths = [], []
-    for view in views:
-        picture = view.picture.show({0: albedo_of(Expectation().draw(colour, draws))}, draws)
-        truth = view.truth
-        if window is not None:
-            picture, truth = around_target(picture, truth, window, draws)
-        shown.append(picture)
-        truths.append(truth)
-    images = torch.cat(shown)
+    draws, start = [torch.Generator().manual_seed(k) for k in range(len(views))], clock(device)
+    textures, truths = {0: albedo_of(Expectation().draw(colour, draws))}, [view.truth for view in views]
+    images = type(views[0].picture).together([view.picture for view in views], textures, draws)
+    if window is not None:
+        parts = [around_target(images[k : k + 1], truth, window, draws[k]) for k, truth in enumerate(truths)]
+        images, truths = torch.cat([part for part, _ in parts]), [truth for _, truth in parts]
     forward = clock(device)
     leaf = images.detach().requires_grad_()
     dense = detector.dense(leaf)

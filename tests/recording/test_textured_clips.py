@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,10 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
 from ssad.recording.clip_recorder import Clips, clip_views, record_clips
 from ssad.recording.nuscenes_recorder import SENSOR
-from ssad.recording.textured_clips import KEPT, textured_clips
+from ssad.recording.textured_clips import KEPT, Wearing, textured_clips
 
 LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
-SIZES = {0: 32, 1: (16, 24)}
+SIZES: dict[int, int | tuple[int, int]] = {0: 32, 1: (16, 24)}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -88,6 +89,32 @@ def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(module, "_drawing", lambda: "another version")
     with pytest.raises(AssertionError, match="rendered again"):
         next(textured_clips(folder, LAYERS))
+
+
+def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
+    """With windows of unlike sizes, one at the border of the picture, each with a texture and noise of its own."""
+    clip = next(textured_clips(folder, LAYERS))
+    fragments, width = clip.fragments, clip.radiance.shape[1]
+    least = int(fragments["place"].min()) // width
+    few = replace(clip, fragments=fragments[fragments["place"] < (least + 20) * width])
+    down = clip.image.shape[0] - clip.corner[0] - clip.radiance.shape[0]
+    low = replace(clip, corner=(clip.corner[0] + down, clip.corner[1]), image=np.roll(clip.image, down, 0))
+    ready = [one.prepare(SIZES) for one in (clip, few, low)]
+    assert len({tuple(one.part.shape) for one in ready}) == 3
+    textures = [{k: (v * share).requires_grad_() for k, v in colours().items()} for share in (1.0, 0.5, 0.8)]
+
+    def draws(k: int) -> torch.Generator:
+        return torch.Generator().manual_seed(k)
+
+    alone = torch.cat([one.show(textures[k], draws(k)) for k, one in enumerate(ready)])
+    both = {k: torch.stack([own[k] for own in textures]) for k in SIZES}
+    together = Wearing.together(ready, both, [draws(k) for k in range(3)])
+    torch.testing.assert_close(together, alone, rtol=0, atol=1e-5)
+    weight = torch.rand(alone.shape, generator=torch.Generator().manual_seed(9))
+    leaves = [v for own in textures for v in own.values()]
+    slopes = [torch.autograd.grad((shown * weight).sum(), leaves) for shown in (alone, together)]
+    for one, other in zip(*slopes, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
 
 
 def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:

@@ -8,7 +8,8 @@ between the panels of an atlas) take no part, at any level: what is printed ther
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -166,18 +167,43 @@ def _covered(mask: Bool | None, levels: list[tuple[int, int]]) -> F64 | None:
 
 
 def pyramid(texture: Tensor, mask: Tensor | None = None) -> Tensor:
-    """All levels of a texture [3, H, W] as rows [N, 3], the finest first: means over the texels of the mask [H, W]."""
-    if texture.ndim != 3 or texture.shape[0] != 3:
+    """All levels of a texture as rows, the finest first: means over the texels of the mask.
+
+    Args:
+        texture: [3, H, W], or [B, 3, H, W].
+        mask: Texels [H, W] that count; None for all.
+
+    Returns:
+        [N, 3], or those of B textures one after the other [B * N, 3].
+    """
+    if texture.ndim not in (3, 4) or texture.shape[-3] != 3:
         raise ConfigError(f"a texture must be [3, H, W], not {list(texture.shape)}")
-    sizes = levels_of((texture.shape[1], texture.shape[2]))
-    weight = torch.ones_like(texture[:1]) if mask is None else mask.to(texture.dtype)[None]
-    level, rows = texture, [texture.flatten(1).T]
+    sizes = levels_of((texture.shape[-2], texture.shape[-1]))
+    weight = torch.ones_like(texture[..., :1, :, :]) if mask is None else mask.to(texture.dtype)[None]
+    level, rows = texture, [texture.flatten(-2).mT]
     for _ in sizes[1:]:
         summed = functional.avg_pool2d(level * weight, 2, ceil_mode=True, divisor_override=4)
         weight = functional.avg_pool2d(weight, 2, ceil_mode=True, divisor_override=4)
         level = summed / weight.clamp_min(1e-30)
-        rows.append(level.flatten(1).T)
-    return torch.cat(rows)
+        rows.append(level.flatten(-2).mT)
+    return torch.cat(rows, -2).reshape(-1, 3)
+
+
+def joined(taps: Sequence[Taps], pixels: Sequence[Tensor]) -> Taps:
+    """The taps of several pictures as those of one batch, each with a texture of its own.
+
+    Args:
+        taps: Of one texture in each picture, all of one size and mask.
+        pixels: The pixels [F] of each in the batch.
+    """
+    if len(taps) == 1:
+        return replace(taps[0], pixel=pixels[0])
+    rows = sum(height * width for height, width in levels_of(taps[0].size))
+    return Taps(
+        taps[0].size, taps[0].mask, torch.cat(list(pixels)), torch.cat([one.light for one in taps]),
+        torch.cat([one.index + number * rows for number, one in enumerate(taps)]),
+        torch.cat([one.weight for one in taps]),
+    )  # fmt: skip
 
 
 def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
@@ -185,19 +211,21 @@ def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:
 
     Args:
         taps: What pixels see of it.
-        texture: Linear albedo [3, H, W], 0 to 1 (see `printable`).
+        texture: Linear albedo [3, H, W], 0 to 1 (see `printable`); of each of several pictures (see `joined`)
+            [B, 3, H, W].
         radiance: Of the picture whose taps these are [B, H, W, 3], without the texture.
 
     Raises:
         ConfigError: A texture of another size, or with albedo beyond 0 to 1.
     """
-    if tuple(texture.shape[1:]) != taps.size:
-        raise ConfigError(f"these taps are of a texture of {list(taps.size)} texels, not {list(texture.shape[1:])}")
-    low, high = texture.detach().aminmax()
+    if tuple(texture.shape[-2:]) != taps.size:
+        raise ConfigError(f"these taps are of a texture of {list(taps.size)} texels, not {list(texture.shape[-2:])}")
+    low, high = torch.stack(texture.detach().aminmax()).tolist()
     if not (low >= 0.0 and high <= 1.0):
-        raise ConfigError(f"an albedo of {float(low):.3g} to {float(high):.3g}: it lies in 0 to 1")
+        raise ConfigError(f"an albedo of {low:.3g} to {high:.3g}: it lies in 0 to 1")
     rows = pyramid(texture, taps.mask)
-    colour = (rows[taps.index] * taps.weight[..., None]).sum(1) * taps.light
+    looked_up = rows.index_select(0, taps.index.flatten()).reshape(*taps.index.shape, 3)
+    colour = (looked_up * taps.weight[..., None]).sum(1) * taps.light
     flat = radiance.reshape(-1, 3)
     return flat.index_add(0, taps.pixel, colour.to(flat.dtype)).reshape(radiance.shape)
 

@@ -419,11 +419,13 @@ class Window:
         Returns:
             [B, 3, H, W]; differentiable in both.
         """
-        whole = picture.clone()
+        renewed = []
         for n, ((y, x), (rows, columns)) in enumerate(zip(self.changed, self.coded, strict=True)):
             top, left = y[0] - rows[0], x[0] - columns[0]
-            whole[n, :, slice(*y), slice(*x)] = developed[n, :, top : top + y[1] - y[0], left : left + x[1] - x[0]]
-        return whole
+            one = picture[n].clone()  # each by itself: a copy into the batch would cost its gradient as often
+            one[:, slice(*y), slice(*x)] = developed[n, :, top : top + y[1] - y[0], left : left + x[1] - x[0]]
+            renewed.append(one)
+        return torch.stack(renewed)
 
 
 def develop_at(

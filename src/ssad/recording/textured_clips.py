@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,8 @@ import ssad
 from ssad.camera.render import Picture, render
 from ssad.camera.scene import Layer
 from ssad.camera.sensor import Sensor
-from ssad.camera.texture import Taps, retexture, taps_of
-from ssad.camera.torch_sensor import Window
+from ssad.camera.texture import Taps, joined, retexture, taps_of
+from ssad.camera.torch_sensor import Rectangle, Window
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -85,16 +85,18 @@ class TexturedClip:
         if not worn <= set(sizes):
             raise ConfigError(f"{self.file}: no size for texture {min(worn - set(sizes))}, which its target wears")
         masks = masks or {}
-        shape = (1, *self.radiance.shape[:2])
-        taps = {k: taps_of(self, size, texture=k, mask=masks.get(k)) for k, size in sizes.items()}
+        (top, left), (height, width) = self.corner, self.image.shape[:2]
+        part = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
+        taps = {
+            k: _moved(taps_of(self, size, texture=k, mask=masks.get(k)), part, ((0, height), (0, width)))
+            for k, size in sizes.items()
+        }
         touched = torch.cat([one.pixel for one in taps.values()])
-        window = Window.around(touched, shape, sensor, quality=quality)
-        part = window.crop(torch.tensor(self.radiance)[None]).to(device)
-        before = torch.tensor(self.image).to(device).permute(2, 0, 1)[None].float() / 255
-        return Wearing(
-            self.corner, shape, window, part, self.exposure,
-            {k: window.taps(one).to(device) for k, one in taps.items()}, before,
-        )  # fmt: skip
+        window = Window.around(touched, (1, height, width), sensor, quality=quality)
+        radiance = _cut(torch.tensor(self.radiance), part, window.read[0])
+        before = torch.tensor(self.image).to(device).permute(2, 0, 1)
+        own = {k: window.taps(one).to(device) for k, one in taps.items()}
+        return Wearing(window, radiance.to(device), self.exposure, own, before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,17 +104,13 @@ class Wearing:
     """A picture that waits for textures.
 
     Attributes:
-        corner: Row and column at which the part that changes begins.
-        shape: Of this part: 1, height, width.
         window: What is developed anew.
-        part: Radiance of the window, without the textures.
+        part: Radiance of what the window reads, without the textures [h, w, 3].
         exposure: What radiance is multiplied by.
-        taps: What pixels see of each texture, by its number.
-        before: The whole picture as it was recorded [1, 3, H, W] in 0 to 1.
+        taps: What pixels of the part see of each texture, by its number.
+        before: The whole picture as it was recorded, uint8 [3, H, W].
     """
 
-    corner: tuple[int, int]
-    shape: tuple[int, int, int]
     window: Window
     part: Tensor
     exposure: float
@@ -120,34 +118,92 @@ class Wearing:
     before: Tensor
 
     def show(self, textures: Mapping[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
-        """The picture with textures on its target.
+        """The picture with textures on its target, [1, 3, H, W].
 
         Args:
             textures: Number -> linear albedo [3, h, w] in 0 to 1.
-            noise: Draws the sensor's noise where the picture changes; None for none there.
+            noise: See `together`.
+
+        Raises:
+            ConfigError: See `together`.
+        """
+        given = {number: texture[None] for number, texture in textures.items()}
+        return Wearing.together([self], given, None if noise is None else [noise])
+
+    @classmethod
+    def together(
+        cls,
+        pictures: Sequence[Wearing],
+        textures: Mapping[int, Tensor],
+        noise: Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
+        """Pictures with textures on their targets, in few operations however many there are.
+
+        Args:
+            pictures: Of one size, sensor and JPEG quality.
+            textures: Number -> linear albedo in 0 to 1, one for each picture [B, 3, h, w].
+            noise: Of each picture, draws the sensor's noise where it changes; None for none there.
 
         Returns:
-            [1, 3, H, W] in [0, 1], differentiable in the textures.
+            [B, 3, H, W] in [0, 1], differentiable in the textures.
 
         Raises:
             ConfigError: A texture of another size or beyond 0 to 1; one is missing.
         """
-        missing = sorted(set(self.taps) - set(textures))
+        first = pictures[0].window
+        missing = sorted(set(pictures[0].taps) - set(textures))
         if missing:
             raise ConfigError(f"no texture {missing[0]}")
-        radiance = self.part
-        for number, taps in self.taps.items():
-            radiance = retexture(taps, textures[number], radiance)
+        window = first
+        if len(pictures) > 1:
+            window = Window.of(
+                [one.window.changed[0] for one in pictures], (len(pictures), *first.shape[1:]), first.sensor,
+                quality=first.quality, subsampling=first.subsampling,
+            )  # fmt: skip
+        parts = list(zip(pictures, window.read, strict=True))
+        radiance = torch.stack([_cut(one.part, one.window.read[0], read) for one, read in parts])
+        for number in pictures[0].taps:
+            taps = [one.taps[number] for one in pictures]
+            pixels = [
+                _moved(one.taps[number], one.window.read[0], read, k).pixel for k, (one, read) in enumerate(parts)
+            ]
+            radiance = retexture(joined(taps, pixels), textures[number], radiance)
         sample = None
         if noise is not None:
-            size = radiance.shape[: 3 if self.window.sensor.mosaic else 4]
-            sample = torch.randn(size, generator=noise, device=noise.device).to(radiance)
-        developed = self.window.develop(radiance, self.exposure, sample)
-        (top, left), (_, height, width) = self.corner, self.shape
-        whole = self.before.clone()
-        place = (..., slice(top, top + height), slice(left, left + width))
-        whole[place] = self.window.paste(developed, self.before[place])
-        return whole
+            drawn = []
+            for (one, read), draws in zip(parts, noise, strict=True):
+                size = one.part.shape[:2] if first.sensor.mosaic else one.part.shape
+                drawn.append(_cut(torch.randn(size, generator=draws), one.window.read[0], read))
+            sample = torch.stack(drawn).to(radiance)
+        exposure = torch.tensor([one.exposure for one in pictures]).to(radiance)
+        before = torch.stack([one.before for one in pictures]).float().div_(255)
+        return window.paste(window.develop(radiance, exposure, sample), before)
+
+
+def _cut(values: Tensor, own: Rectangle, wanted: Rectangle) -> Tensor:
+    """What values [h, w, ...] of a rectangle are in another one; 0 outside of their own."""
+    if own == wanted:
+        return values
+    shape = [high - low for low, high in wanted]
+    inside = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, wanted, strict=True)]
+    found = values.new_zeros((*shape, *values.shape[2:]))
+    if all(low < high for low, high in inside):
+        there, here = (
+            tuple(slice(low - one[0], high - one[0]) for (low, high), one in zip(inside, rectangle, strict=True))
+            for rectangle in (wanted, own)
+        )
+        found[there] = values[here]
+    return found
+
+
+def _moved(taps: Taps, own: Rectangle, wanted: Rectangle, number: int = 0) -> Taps:
+    """Taps into a rectangle as taps into another one that holds their pixels, the picture `number` of a batch."""
+    if own == wanted and not number:
+        return taps
+    (rows, columns), width = wanted, own[1][1] - own[1][0]
+    y, x = taps.pixel // width + (own[0][0] - rows[0]), taps.pixel % width + (own[1][0] - columns[0])
+    high, wide = rows[1] - rows[0], columns[1] - columns[0]
+    return replace(taps, pixel=(number * high + y) * wide + x)
 
 
 def textured_clips(

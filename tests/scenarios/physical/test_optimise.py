@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -40,6 +41,15 @@ class Painted:
         cell = (0, slice(None), slice(top, top + CELL), slice(left, left + CELL))
         whole[cell] = (whole[cell] + GAIN * (textures[0] - 0.46)).clamp(0.0, 1.0)
         return whole
+
+    @classmethod
+    def together(
+        cls,
+        pictures: Sequence[Painted],
+        textures: Mapping[int, Tensor],
+        noise: Sequence[torch.Generator] | None = None,
+    ) -> Tensor:
+        return torch.cat([one.show({0: texture}) for one, texture in zip(pictures, textures[0], strict=True)])
 
 
 def views(count: int = 4, *, seed: int = 0) -> list[View]:
@@ -145,8 +155,9 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
     class Away:
         image: Tensor
 
-        def show(self, textures: dict[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
-            return self.image[None] + 0.0 * textures[0].sum()
+        @classmethod
+        def together(cls, pictures: Sequence[Away], textures: Mapping[int, Tensor], noise: object = None) -> Tensor:
+            return torch.stack([one.image for one in pictures]) + 0.0 * textures[0].sum()
 
     images, truth = toy_scene(2, classes=("car",))
     seen = [View(Away(image), one) for image, one in zip(images, truth, strict=True)]
@@ -227,8 +238,8 @@ def test_parts_of_an_attention_map_by_hand() -> None:
     local = torch.zeros(7, 7)
     local[1, 1], local[1, 2], local[2, 2] = 1.0, 0.8, 0.6
     local[5, 5] = 0.6
-    assert float(_parts(local)) == pytest.approx(0.5 * (2.4 / 47 + 0.6 / 49))
+    assert float(_parts(local[None])) == pytest.approx(0.5 * (2.4 / 47 + 0.6 / 49))
     snake = torch.zeros(7, 7)
     snake[0, :], snake[1, 6], snake[2, :], snake[3, 0], snake[4, :] = 1.0, 1.0, 1.0, 1.0, 1.0
-    assert float(_parts(snake)) == pytest.approx(23 / 27), "one part, however it winds"
-    assert float(_parts(torch.zeros(7, 7))) == 0.0, "nothing above the mean"
+    assert float(_parts(torch.stack([local, snake]))[1]) == pytest.approx(23 / 27), "one part, however it winds"
+    assert float(_parts(torch.zeros(1, 7, 7))) == 0.0, "nothing above the mean"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -29,8 +29,11 @@ TARGET = Aim(objects=(0,))
 class Shows(Protocol):
     """A picture that waits for textures (see `ssad.recording.textured_clips.Wearing`)."""
 
-    def show(self, textures: dict[int, Tensor], noise: torch.Generator | None = None) -> Tensor:
-        """[1, 3, H, W] in 0 to 1, differentiable in the textures [3, h, w] of linear albedo."""
+    @classmethod
+    def together(
+        cls, pictures: Sequence[Any], textures: Mapping[int, Tensor], noise: Sequence[torch.Generator] | None = None
+    ) -> Tensor:
+        """Pictures [B, 3, H, W] in 0 to 1, differentiable in the textures [B, 3, h, w] of linear albedo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,16 +211,17 @@ def _ascended(  # noqa: PLR0917
     key: tuple[object, ...],
 ) -> Tensor:
     """The loss [B] of some pictures, with texture, print and noise of their own."""
-    images, truth = [], []
-    for number in chosen:
-        draws = torch.Generator().manual_seed(int(digest("texture draw", *key, number)[:15], 16))
-        printed = attack.expectation.draw(colour, draws)
-        picture, seen = views[number].picture.show({0: shown(printed)}, draws), views[number].truth
-        if attack.window is not None:
-            picture, seen = around_target(picture, seen, attack.window, draws)
-        images.append(picture)
-        truth.append(seen)
-    dense = detector.dense(torch.cat(images))
+    draws = [torch.Generator().manual_seed(int(digest("texture draw", *key, k)[:15], 16)) for k in chosen]
+    pictures, truth = [views[k].picture for k in chosen], [views[k].truth for k in chosen]
+    printed = shown(attack.expectation.draw(colour, draws))
+    images = type(pictures[0]).together(pictures, {0: printed}, draws)
+    if attack.window is not None:
+        parts = [
+            around_target(image[None], seen, attack.window, own)
+            for image, seen, own in zip(images, truth, draws, strict=True)
+        ]
+        images, truth = torch.cat([part for part, _ in parts]), [seen for _, seen in parts]
+    dense = detector.dense(images)
     with torch.no_grad():
         assignment = detector.assign(dense, truth)
     return objective(dense, Situation(detector, assignment, TARGET))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -37,36 +38,35 @@ class Expectation:
         if min(self.brightness, self.noise, self.shift, self.turn) < 0.0 or self.shift >= 0.5:
             raise ConfigError("brightness, noise, shift and turn are 0 or more, shift is below 0.5")
 
-    def draw(self, colour: Tensor, generator: torch.Generator) -> Tensor:
-        """The texture as it is on one car.
+    def draw(self, colour: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
+        """The texture as it is on several cars.
 
         Args:
             colour: sRGB [3, H, W] in 0 to 1.
-            generator: On the CPU, so that the draws are the same on every device.
+            generators: One for each car, on the CPU, so that the draws are the same on every device.
 
         Returns:
-            [3, H, W] in 0 to 1, differentiable in `colour`.
+            [B, 3, H, W] in 0 to 1, differentiable in `colour`.
         """
 
         def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return (low + (high - low) * torch.rand(shape, generator=generator)).to(colour)
+            drawn = torch.stack([torch.rand(shape, generator=one) for one in generators])
+            return (low + (high - low) * drawn).to(colour)
 
-        found = colour
+        found = colour.expand(len(generators), *colour.shape)
         if self.shift > 0.0 or self.turn > 0.0:
-            angle = uniform(-self.turn, self.turn, 1)[0]
+            angle = uniform(-self.turn, self.turn, 1)[:, 0]
             move = uniform(-2.0 * self.shift, 2.0 * self.shift, 2)
             height, width = colour.shape[1:]
             aspect = width / height
             cos, sin = torch.cos(angle), torch.sin(angle)
             rows = torch.stack([
-                torch.stack([cos, -sin / aspect, move[0]]), torch.stack([sin * aspect, cos, move[1]])
-            ])  # fmt: skip
-            grid = functional.affine_grid(rows[None], [1, *colour.shape], align_corners=False)
-            found = functional.grid_sample(
-                found[None], grid, mode="bilinear", padding_mode="border", align_corners=False
-            )[0]
-        factor = uniform(*self.contrast, 1)
-        found = 0.5 + factor * (found - 0.5) + uniform(-self.brightness, self.brightness, 1)
+                torch.stack([cos, -sin / aspect, move[:, 0]], -1), torch.stack([sin * aspect, cos, move[:, 1]], -1)
+            ], 1)  # fmt: skip
+            grid = functional.affine_grid(rows, list(found.shape), align_corners=False)
+            found = functional.grid_sample(found, grid, mode="bilinear", padding_mode="border", align_corners=False)
+        factor = uniform(*self.contrast, 1, 1, 1)
+        found = 0.5 + factor * (found - 0.5) + uniform(-self.brightness, self.brightness, 1, 1, 1)
         if self.noise > 0.0:
             found = found + uniform(-self.noise, self.noise, *colour.shape)
         return found.clamp(0.0, 1.0)

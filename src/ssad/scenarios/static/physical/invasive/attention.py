@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -17,7 +19,6 @@ from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.objectives import Situation, log_scores
 
 GRID = 7  # cells a side of the attention map in which DAS counts connected parts
-ROUNDS = GRID * GRID  # enough for a label to cross the grid
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +46,9 @@ class Distraction:
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """See `Objective`."""
         maps = attention(dense, situation, dense.features)
-        values = []
-        for k, box in enumerate(_targets(situation)):
-            parts = [_parts(_crop(level[k], box, dense.size, self.window)) for level in maps]
-            values.append(-torch.stack(parts).mean())
-        return torch.stack(values)
+        boxes = torch.stack(_targets(situation)).to(maps[0])
+        crops = torch.stack([_crop(level, boxes, dense.size, self.window) for level in maps])
+        return -_parts(crops.flatten(0, 1)).reshape(len(maps), -1).mean(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,30 +139,25 @@ def _inside(level: Tensor, boxes: list[Tensor], size: tuple[int, int]) -> Tensor
 
 
 def _crop(level: Tensor, box: Tensor, size: tuple[int, int], window: float) -> Tensor:
-    """A window [7, 7] of a map [h, w] around a box, bilinear; 0 outside the picture."""
-    box = box.to(level)
-    middle, half = 0.5 * (box[:2] + box[2:]), 0.5 * window * (box[2:] - box[:2]).clamp_min(1.0)
+    """A window [B, 7, 7] of maps [B, h, w] around boxes [B, 4], bilinear; 0 outside the picture."""
+    middle, half = 0.5 * (box[:, :2] + box[:, 2:]), 0.5 * window * (box[:, 2:] - box[:, :2]).clamp_min(1.0)
     steps = (torch.arange(GRID, device=level.device, dtype=level.dtype) + 0.5) * (2.0 / GRID) - 1.0
-    x, y = middle[0] + half[0] * steps, middle[1] + half[1] * steps
-    grid = torch.stack(torch.meshgrid(2.0 * x / size[1] - 1.0, 2.0 * y / size[0] - 1.0, indexing="xy"), -1)
-    return functional.grid_sample(level[None, None], grid[None], align_corners=False)[0, 0]
+    places = (middle[:, None] + half[:, None] * steps[:, None]) * (2.0 / level.new_tensor([size[1], size[0]])) - 1.0
+    x, y = places[:, None, :, 0].expand(-1, GRID, -1), places[:, :, None, 1].expand(-1, -1, GRID)
+    return functional.grid_sample(level[:, None], torch.stack([x, y], -1), align_corners=False)[:, 0]
 
 
 def _parts(local: Tensor) -> Tensor:
-    """Mean over the 4-connected parts of a map [7, 7] above its mean: the part's attention over the cells left free."""
-    above = local.detach() > local.detach().mean()
-    if not bool(above.any()):
-        return local.mean()
-    label = torch.where(above, torch.arange(1, GRID * GRID + 1, device=local.device).reshape(GRID, GRID), 0)
-    for _ in range(ROUNDS):
-        wide = functional.pad(label, (1, 1, 1, 1))
-        near = torch.stack([label, wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]])
-        grown = torch.where(above, near.amax(0), 0)
-        if torch.equal(grown, label):
-            break
-        label = grown
-    strength = [
-        local[label == number].sum() / (GRID * GRID + 1 - (label == number).sum())
-        for number in sorted(set(label[label > 0].tolist()))
-    ]
-    return torch.stack(strength).mean()
+    """Mean over the 4-connected parts of maps [M, 7, 7] above their mean: a part's attention over the cells left free.
+
+    A map without a part counts with its mean.
+    """
+    flat = local.flatten(1)
+    above = local.detach() > local.detach().mean((1, 2), keepdim=True)
+    labels = [cv2.connectedComponents(one, connectivity=4)[1] for one in above.cpu().numpy().astype(np.uint8)]
+    label = torch.from_numpy(np.stack(labels).reshape(len(labels), -1).astype(np.int64)).to(local.device)
+    attention, cells = (
+        torch.zeros_like(flat).scatter_add(1, label, values)[:, 1:] for values in (flat, torch.ones_like(flat))
+    )
+    count = (cells > 0).sum(1)
+    return torch.where(count > 0, (attention / (GRID * GRID + 1 - cells)).sum(1) / count.clamp_min(1), flat.mean(1))
