@@ -304,7 +304,7 @@ def _worn(job: Job, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str
     colour = albedo_of(texture_of(job, spec)).to(job.device)  # may be trained now, so gradients are on
     for drive, view in clips.wearing(_surface(job.settings["target"], spec.surface)):
         with torch.no_grad():
-            yield drive, view.picture.show({0: colour}), view.truth
+            yield drive, view.picture.together([view.picture], {0: colour[None]}), view.truth
 
 
 @lru_cache(maxsize=8)
