@@ -29,12 +29,14 @@ from ssad.evaluation import attacked_scenes
 from ssad.evaluation.attack_sheet import magnified
 from ssad.evaluation.attack_tally import sum_notes
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
-from ssad.evaluation.scene_boxes import Examination, Watched, detector_of
+from ssad.evaluation.scene_boxes import Examination, Watched, boxes_path, detector_of, find_boxes, read_boxes
 from ssad.report import write_report
-from ssad.report.kinds.digital import attempts_of, load_digital_run, lost_table, main_table
+from ssad.report.kinds.digital import attempts_of, effort_table, load_digital_run, lost_table, main_table, short_of
+from ssad.report.kinds.digital import summary as kind_summary
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
 from ssad.report.terminal import summary
+from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.training.data import nuscenes_items
 
 LINEAR, BLIND = "helpers.linear3d:build", "helpers.linear3d:build_blind"
@@ -278,8 +280,76 @@ def test_where_memory_does_not_suffice_batches_are_halved(root: Path, monkeypatc
     short.batch = 4
     found = short.look(frames)
     assert sizes == [4, 2, 1, 1, 1, 1]
-    assert short.tally.batch == 1, "said in the record"
+    assert (short.tally.batch, short.tally.halved) == (1, 2), "said in the record"
     assert all((a == b).all() for a, b in zip(found, expected, strict=True))
+
+
+def test_a_universal_change_is_fitted_to_fewer_images_at_once_where_memory_does_not_suffice(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes: list[int] = []
+    real = attacked_scenes.Victim
+
+    def narrow(detector: Any, images: torch.Tensor, *given: Any, **named: Any) -> Any:
+        sizes.append(len(images))
+        if len(images) > 1:
+            raise torch.OutOfMemoryError("no memory")
+        return real(detector, images, *given, **named)
+
+    monkeypatch.setattr(attacked_scenes, "Victim", narrow)
+    base, _ = attacker(root, batch=4)
+    spec = AttackSpec("universal", "full", "linf", 5.0, (("frames", 4), ("over", "drive"), ("steps", 1)))
+    own = SceneAttacker(AttackedScene(spec, base.view.scene), base.examination, base.scene, base.watched)
+    own.batch = 4
+    own._fit()
+    assert sizes == [4, 2, 1, 1, 1, 1]
+    assert own.tally.halved == 2
+    assert own.attack.name == "universal"
+    assert not isinstance(own.attack, UniversalFit)
+
+
+def test_short_memory_is_said_in_the_report_and_on_the_terminal(folder: Path) -> None:
+    found = load_run(folder)
+    assert not short_of(load_digital_run(found))
+    assert "Memory" not in str(kind_summary(found).note)
+    lines = tuple({**r, "halved": 2} if r["attack"] == "fgsm" else r for r in found.lines)
+    short = type(found)(found.folder, found.header, lines, {}, found.planned)
+    assert "batches were halved 4 times" in effort_table(load_digital_run(short)).note
+    assert "batches were halved 4 times" in kind_summary(short).note
+
+
+def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base, _ = attacker(root, batch=1)
+    view = AttackedScene(PGD, base.view.scene, source=LINEAR)
+    asked: list[str] = []
+    real = attacked_scenes.run_attack
+    stop_at = 3
+
+    def counted(*given: Any, **named: Any) -> Any:
+        (key,) = named["keys"]
+        if len(asked) == stop_at:
+            raise KeyboardInterrupt
+        asked.append(key[1])
+        return real(*given, **named)
+
+    monkeypatch.setattr(attacked_scenes, "run_attack", counted)
+    out = [Examination(tmp_path / name, root, "v1.0-mini", ((LINEAR, ""),), 0, "cpu", 1) for name in ("cut", "whole")]
+    with pytest.raises(KeyboardInterrupt):
+        find_boxes(out[0], view, [LINEAR])
+    kept = sorted((tmp_path / "cut" / "unfinished").rglob("*.npz"))
+    assert len(kept) == 3
+    kept[0].write_bytes(b"cut off in the middle")
+    stop_at = 1000
+    find_boxes(out[0], view, [LINEAR])
+    many = len([f for f in base.scene.frames if f.modality == "camera" and f.key_frame])
+    assert len(asked) == many + 1, "of three one was broken"
+    find_boxes(out[1], view, [LINEAR])
+    boxes, notes = zip(*(read_boxes(boxes_path(one.folder, LINEAR, view)) for one in out), strict=True)
+    assert notes[0] == notes[1]
+    assert [one.boxes.score.tolist() for one in boxes[0]] == [one.boxes.score.tolist() for one in boxes[1]]
+    assert not list((tmp_path / "cut" / "unfinished").rglob("*.npz")), "a finished scene needs them no more"
 
 
 def test_an_image_without_objects_is_left_as_it_is_by_a_loss_that_needs_some(root: Path) -> None:
@@ -297,7 +367,7 @@ def test_an_image_without_objects_is_left_as_it_is_by_a_loss_that_needs_some(roo
 def test_notes_of_scenes_are_put_together() -> None:
     one = {
         "access": "white-box", "images": 3, "idle": 1, "gradients": 30, "queries": 6, "before": 3.0, "after": 9.0,
-        "used": 1.0, "change": 4.0, "batch": 2, "gradient_error": 0.1, "coupling": None,
+        "used": 1.0, "change": 4.0, "batch": 2, "gradient_error": 0.1, "coupling": None, "halved": 2,
     }  # fmt: skip
     empty = one | dict.fromkeys(("images", "idle", "gradients", "queries", "before", "after", "used", "batch"), 0)
     other = one | {"images": 1, "idle": 0, "gradients": 10, "queries": 2, "used": 0.5, "change": 5.0, "batch": 1,
@@ -305,6 +375,7 @@ def test_notes_of_scenes_are_put_together() -> None:
     assert sum_notes([one, empty, other]) == {
         "access": "white-box", "images": 4, "idle": 1, "gradients": 10.0, "queries": 2.0, "loss_before": 1.5,
         "loss_after": 4.5, "used": 0.5, "change_px": 5.0, "batch": 2, "gradient_error": 0.3, "coupling": None,
+        "halved": 4,
     }  # fmt: skip
 
 

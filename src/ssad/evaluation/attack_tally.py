@@ -26,6 +26,7 @@ class Tally:
         change: the largest change of an image, in the norm, 8-bit code values.
         batch: the least number of images that had to be attacked at once for lack of memory, 0: none yet.
         gradient_error: of the gradient against finite differences; None: not looked at.
+        halved: how often a batch was halved for lack of memory.
         coupling: relative change of an image's loss when another one is in its batch; None: not looked at.
         access: of the attack.
     """
@@ -40,6 +41,7 @@ class Tally:
     used: float = 0.0
     change: float = 0.0
     batch: int = 0
+    halved: int = 0
     gradient_error: float | None = None
     coupling: float | None = None
 
@@ -61,6 +63,13 @@ class Tally:
         self.used += float((mean / radius)[~found.idle].sum())
         self.batch = min(self.batch or count, count)
 
+    def absorb(self, notes: Mapping[str, Any]) -> None:
+        """Counts the images that another tally noted; the checks of gradient and batch stay its own."""
+        for name in ("images", "idle", "gradients", "queries", "before", "after", "used", "halved"):
+            setattr(self, name, getattr(self, name) + notes[name])
+        self.change = max(self.change, notes["change"])
+        self.batch = min(self.batch or notes["batch"], notes["batch"])
+
     def notes(self) -> dict[str, Any]:
         """Plain data."""
         return {name: getattr(self, name) for name in self.__slots__}
@@ -74,8 +83,8 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
     Returns:
         access; images and idle; gradients, queries and mean losses before and after, an image; used, the mean share of
-        the budget; change_px, the largest change; batch; gradient_error and coupling, the largest, None where they were
-        not looked at.
+        the budget; change_px, the largest change; batch; halved; gradient_error and coupling, the largest, None where
+        they were not looked at.
     """
     some = [one for one in notes if one["images"]]
     images = sum(one["images"] for one in some)
@@ -94,5 +103,6 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "gradients": mean("gradients", images), "queries": mean("queries", images),
         "loss_before": mean("before", images), "loss_after": mean("after", images), "used": mean("used", active),
         "change_px": largest("change"), "batch": max((one["batch"] for one in some), default=0),
+        "halved": sum(one["halved"] for one in some),
         "gradient_error": largest("gradient_error"), "coupling": largest("coupling"),
     }  # fmt: skip

@@ -27,6 +27,7 @@ from ssad.evaluation.attack_tally import Tally
 from ssad.evaluation.camera_truth import camera_truth
 from ssad.evaluation.chosen_object import chosen_first
 from ssad.evaluation.detection import AT_ONCE, to_images
+from ssad.evaluation.saved_pictures import FOLDER, SavedPictures
 from ssad.evaluation.scene_boxes import Examination, Shown, Watched, file_name, system_of
 from ssad.scenarios.static.digital import (
     ATTACKS,
@@ -185,7 +186,8 @@ class AttackedScene:
         source = next((one for one in detectors if one.name == self.source), None)
         if source is None:
             source = Watched(system_of(examination, self.source), self.source)
-        attacker = SceneAttacker(self, examination, data.scene(self.scene), source)
+        saved = SavedPictures(examination.folder / FOLDER / self.name) if examination.device == "cpu" else None
+        attacker = SceneAttacker(self, examination, data.scene(self.scene), source, saved)
 
         def look(frames: Sequence[SensorFrame]) -> list[U8]:
             pictures = attacker.look(frames)
@@ -195,7 +197,8 @@ class AttackedScene:
             return pictures
 
         # enough pictures at once to fill a batch, of one sample's cameras or of several
-        return Shown(look, attacker.tally.notes, ahead=False, at_once=max(AT_ONCE, math.ceil(self.batch / CAMERAS)))
+        at_once = max(AT_ONCE, math.ceil(self.batch / CAMERAS))
+        return Shown(look, attacker.tally.notes, ahead=False, at_once=at_once, done=saved.forget if saved else _nothing)
 
 
 @dataclass(slots=True)
@@ -210,6 +213,7 @@ class SceneAttacker:
         examination: Data, device, seed.
         scene: The data.
         watched: The attacked system; what it raises is kept there.
+        saved: Where pictures are kept until the scene is finished; None: nowhere.
         attack: The attack with its settings.
         tally: What was done.
         batch: Images at once; it shrinks when memory does not suffice.
@@ -219,6 +223,7 @@ class SceneAttacker:
     examination: Examination
     scene: SceneData
     watched: Watched
+    saved: SavedPictures | None = None
     attack: Attack = field(init=False)
     tally: Tally = field(init=False)
     batch: int = field(init=False)
@@ -283,12 +288,21 @@ class SceneAttacker:
                 count = len(frames[part])
                 if count == 1:
                     raise
-            torch.cuda.empty_cache()
-            self.batch = count // 2
+            self._halve(count)
         return found
+
+    def _halve(self, count: int) -> None:
+        """Fewer images at once from now on, which the record says."""
+        torch.cuda.empty_cache()
+        self.batch = count // 2
+        self.tally.halved += 1
 
     def _some(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> list[U8]:
         """One batch."""
+        saved = self.saved if len(frames) == 1 and self.attack.access != "none" else None
+        if saved and (kept := saved.read(frames[0].token)):
+            self.tally.absorb(kept[1])
+            return [kept[0]]
         spec = self.view.spec
         budget = Budget(px(spec.radius), spec.norm)
         images, lens = self._tensors(frames, pictures)
@@ -305,10 +319,14 @@ class SceneAttacker:
             aim=spec.aim, intrinsic=lens[active], check=False, precision=spec.precision,
             keys=[(self.examination.seed, frames[k].token) for k in active],
         )  # fmt: skip
-        self.tally.add(found, own, budget)
+        taken = Tally(self.attack.access)
+        taken.add(found, own, budget)
+        self.tally.absorb(taken.notes())
         codes = (found.images * LEVELS).round().to(torch.uint8).permute(0, 2, 3, 1).cpu().numpy()
         for k, picture in zip(active, codes, strict=True):
             out[k] = np.ascontiguousarray(picture)
+        if saved:
+            saved.write(frames[0].token, out[0], taken.notes())
         return out
 
     def _tensors(self, frames: Sequence[SensorFrame], pictures: Sequence[U8]) -> tuple[Tensor, Tensor]:
@@ -350,9 +368,16 @@ class SceneAttacker:
 
     def _fit(self) -> None:
         """Find the change of a universal attack, on frames of this drive or of others."""
-        fit, spec = self.attack, self.view.spec
-        if not isinstance(fit, UniversalFit):
-            return
+        while isinstance(self.attack, UniversalFit):
+            try:
+                self._fit_to(self.attack)
+            except torch.OutOfMemoryError:
+                if self.batch == 1:
+                    raise
+                self._halve(self.batch)
+
+    def _fit_to(self, fit: UniversalFit) -> None:
+        spec = self.view.spec
         detector, budget = self.watched.detector, Budget(px(spec.radius), spec.norm)
         victims = []
         with steady(detector):
@@ -416,6 +441,10 @@ class SceneAttacker:
                 other = float(both.loss(both.clean)[0])
                 coupling = abs(other - own) / max(abs(own), 1e-6)
         return error, coupling
+
+
+def _nothing() -> None:
+    """What is done where no pictures were saved."""
 
 
 def _key_frames(scene: SceneData) -> list[SensorFrame]:

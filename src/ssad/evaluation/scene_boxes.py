@@ -87,12 +87,14 @@ class Shown:
         notes: plain data for the file of boxes, complete when all was looked at.
         ahead: the next pictures may be made while a detector looks at these.
         at_once: samples that a GPU is shown at once.
+        done: is called when the boxes are written.
     """
 
     look: Look | None = None
     notes: Callable[[], Mapping[str, Any]] = field(default=dict)
     ahead: bool = True
     at_once: int = AT_ONCE
+    done: Callable[[], None] = lambda: None
 
 
 class Condition(Protocol):
@@ -275,6 +277,7 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
         )  # fmt: skip
     for name, samples, one in zip(names, found, watched, strict=True):
         _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes(), flat=one.task == "2d")
+    shown.done()
 
 
 def _write(path: Path, samples: Sequence[Any], reason: str, notes: Mapping[str, Any], *, flat: bool) -> None:

@@ -113,10 +113,20 @@ def effort_table(run: DigitalRun) -> Table:
     note = (
         "Means over the images. Idle images have no object for a loss that needs one and are left as they are. The "
         "error of the gradient is against finite differences, on the image with most objects of each scene."
+        f"{short_of(run)}"
     )
     return Table(
         "effort", "What it took", ("Detector", "Attack", "Budget", "Scenes", "Access"), columns, tuple(rows), note
     )
+
+
+def short_of(run: DigitalRun) -> str:
+    """Where memory did not suffice, that it did not; else ""."""
+    halved = sum(int(record.get("halved") or 0) for record in run.records.values())
+    if not halved:
+        return ""
+    times = "once" if halved == 1 else f"{halved} times"
+    return f" Memory was short: batches were halved {times}; set a smaller batch to save this time."
 
 
 def every_table(run: DigitalRun) -> Table:
@@ -268,6 +278,7 @@ def summary(found: Run) -> Table:
     run = load_digital_run(found)
     verdict = audit(attempts_of(run))
     lines = ["percent", verdict.text, *(f"{fault.detector}: {fault.text}" for fault in verdict.faults[:5])]
+    lines += filter(None, [short_of(run).strip()])
     return replace(main_table(run), note="\n".join(lines))
 
 

@@ -1,0 +1,61 @@
+"""Attacked pictures of a scene that is not finished, kept on disk so that a run that is stopped loses one at most."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssad.core import safeio
+from ssad.core.errors import SSADError
+from ssad.core.types import U8
+
+FOLDER = "unfinished"
+
+
+@dataclass(frozen=True, slots=True)
+class SavedPictures:
+    """The pictures of one scene under one attack, a file each.
+
+    Attributes:
+        folder: where they lie.
+    """
+
+    folder: Path
+
+    def read(self, token: str) -> tuple[U8, dict[str, Any]] | None:
+        """A picture [H, W, 3] and what its attack took; None if it is not there, or broken.
+
+        Args:
+            token: Of the camera frame.
+        """
+        path = self._path(token)
+        if not path.is_file():
+            return None
+        try:
+            kept = safeio.load_npz(path)
+            return np.asarray(kept["picture"], np.uint8), dict(safeio.parse_json(str(kept["notes"])))
+        except (SSADError, KeyError, ValueError):
+            return None
+
+    def write(self, token: str, picture: U8, notes: Mapping[str, Any]) -> None:
+        """Keep a picture.
+
+        Args:
+            token: Of the camera frame.
+            picture: [H, W, 3].
+            notes: What its attack took, plain data.
+        """
+        columns = {"picture": picture, "notes": np.array(safeio.dump_json(dict(notes)))}
+        safeio.write_atomic(self._path(token), safeio.npz_bytes(columns))
+
+    def forget(self) -> None:
+        """Remove all: the scene is finished."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _path(self, token: str) -> Path:
+        return self.folder / f"{token}.npz"
