@@ -12,6 +12,7 @@ import typer
 
 from ssad.core.errors import ConfigError, SSADError, unknown_name
 from ssad.core.version import __version__
+from ssad.interchange.commands import ExportGroup, register
 from ssad.listing import ALIASES, LISTS
 from ssad.training.commands import train_app
 
@@ -21,11 +22,14 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 imports = typer.Typer(
-    help="Import OpenDRIVE maps, SafeBench, FREA or leaderboard routes, and logged drives.", no_args_is_help=True
+    help="Import maps, routes and scenarios of other programs, and logged drives.", no_args_is_help=True
 )
 app.add_typer(imports, name="import")
-exports = typer.Typer(help="Export what a run has made for other programs.", no_args_is_help=True)
+exports = typer.Typer(
+    help="Export scenarios, or what a run has made, for other programs.", no_args_is_help=True, cls=ExportGroup
+)
 app.add_typer(exports, name="export")
+register(exports, imports)
 
 Dir = Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of `ssad run`.")]
 Device = Annotated[str, typer.Option(help="Where to compute: auto, cpu or cuda.")]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from roads.towns import IMPORTED, built_in, imported
 
-from benchmarks.make_towns import generate_town
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import LaneGraph, SignKind, equal
 from ssad.core.types import LaneType
 from ssad.roads import bake, import_map, load_graph, load_town, town_names
 from ssad.roads import bake as bake_function
+from ssad.roads.designs import generate_town
 from ssad.roads.query import nearest_all, segments
 
 carla = pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")
@@ -301,7 +301,7 @@ def test_import_makes_a_town(tmp_path: Path, ssad_home: Path) -> None:
     assert graph.name == "Elsewhere"
     assert equal(graph, load_graph(stored))
     assert np.array_equal(graph.xy, load_town(str(path)).xy)
-    assert [p.name for p in stored.parent.iterdir()] == ["Elsewhere.npz"]
+    assert sorted(p.name for p in stored.parent.iterdir()) == ["Elsewhere.npz", "Elsewhere.xodr"]
     for name in ("../x", "a/b", ".hidden"):
         with pytest.raises(MapError, match="cannot be the name"):
             import_map(path, name, ssad_home)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
-from benchmarks.make_towns import generate_town
 from ssad.core.types import SignalState
 from ssad.roads import LaneGraph, bake
+from ssad.roads.designs import generate_town
 from ssad.world.episode_arrays import signal_programs
 
 GO = (int(SignalState.GREEN), int(SignalState.YELLOW))

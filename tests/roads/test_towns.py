@@ -12,12 +12,13 @@ import pytest
 from helpers.quick import others_slow
 from roads.towns import BUILT_IN, built_in
 
-from benchmarks.make_towns import TOWNS, generate_town
 from ssad.core.errors import MapError, UnknownNameError
 from ssad.core.lane_graph import SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
 from ssad.roads import LaneGraph, bake, load_town, town_names
+from ssad.roads.designs import DESIGNS as TOWNS
+from ssad.roads.designs import generate_town
 from ssad.roads.router import _across
 
 INTERCHANGES = {2000, 12000}  # of Longreach

@@ -14,13 +14,14 @@ import pytest
 from helpers.quick import others_slow
 
 from benchmarks.make_scenario_sets import natural
-from benchmarks.make_towns import TOWNS, generate_town
 from ssad.core.lane_graph import load_graph, save_graph
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import npz_bytes
 from ssad.core.seeding import generator
 from ssad.core.types import ENDS, Controller, LaneType
 from ssad.roads import LaneGraph, bake, random_route
+from ssad.roads.designs import DESIGNS as TOWNS
+from ssad.roads.designs import generate_town
 from ssad.roads.library import BUILT_IN
 from ssad.scenarios.dynamic import build_episode
 from ssad.world.world import World

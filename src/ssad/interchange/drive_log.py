@@ -20,9 +20,10 @@ from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.core.types import F64, Actor, Limits, Pose, Scenario, SignalPlan
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
+from ssad.interchange.ego_start import start_parameters
 from ssad.roads import load_town, route_along, town_names
 from ssad.roads.paths import graph_of_paths
-from ssad.scenarios.dynamic import build_episode, parameter_box
+from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.frozen import Rows, told_rows
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
@@ -243,18 +244,10 @@ def _scenario(  # noqa: PLR0917
             "give the map of that place"
         )
     first = points[0]
-    yaw = float(route.yaw[0])
-    dx, dy = first.x - float(route.xy[0, 0]), first.y - float(route.xy[0, 1])
     early = way[np.searchsorted(way[:, 0], min(0.5, float(way[-1, 0])))]
     speed = math.hypot(early[1] - first.x, early[2] - first.y) / max(float(early[0]), STEP)
-    wanted = {
-        "ego_speed": speed,
-        "ego_lateral": -dx * math.sin(yaw) + dy * math.cos(yaw),
-        "ego_heading": float(wrap_angle(first.yaw - yaw)),
-    }
-    box = parameter_box("Custom")
-    clipped = {key: round(float(np.clip(value, box[key].low, box[key].high)), 3) for key, value in wanted.items()}
-    parameters = {key: value for key, value in clipped.items() if value != 0.0}
+    parameters = start_parameters(route, first, speed, digits=3)
+    parameters.pop("ego_longitudinal", None)  # the route begins where the ego does
     seconds = 1e-6 * (scene.samples[-1].timestamp - scene.samples[0].timestamp)
     steps = math.ceil(2 * seconds / STEP) + 100
     location = f" in {scene.log.location}" if scene.log is not None and scene.log.location else ""

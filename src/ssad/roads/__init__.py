@@ -2,7 +2,7 @@
 
 from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.roads.bake import bake, import_map
-from ssad.roads.library import load_town, town_names
+from ssad.roads.library import load_town, town_names, town_signals, town_xodr
 from ssad.roads.query import LaneQuery, Nearest
 from ssad.roads.router import random_route, route_along
 
@@ -19,4 +19,6 @@ __all__ = [
     "route_along",
     "save_graph",
     "town_names",
+    "town_signals",
+    "town_xodr",
 ]

@@ -18,9 +18,10 @@ import numpy.typing as npt
 
 from ssad.core.errors import MapError, install_extra
 from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
+from ssad.core.safeio import read_bytes, write_atomic
 from ssad.core.types import F64, I32, LaneType
 from ssad.roads.signals import Approaches, place_signals, place_signs
-from ssad.roads.xodr import Connection, Lane, Link, Network, Road, read_network
+from ssad.roads.xodr import MAX_BYTES, Connection, Lane, Link, Network, Road, read_network
 
 TIMEOUT = 120.0  # s; Town05 takes about 3
 STEP = 2.0  # m, most between two points of a lane
@@ -76,7 +77,7 @@ def bake(xodr: Path, name: str | None = None) -> LaneGraph:
 
 
 def import_map(path: Path, name: str | None, home: Path) -> Path:
-    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, whole or not at all.
+    """Bake an OpenDRIVE file into HOME/towns/NAME.npz, whole or not at all; a copy of the file lies beside it.
 
     Args:
         path: The file; a town that is baked already (.npz) is copied.
@@ -94,7 +95,14 @@ def import_map(path: Path, name: str | None, home: Path) -> Path:
         raise MapError(f"'{label}' cannot be the name of a town; use letters, digits, _ and -")
     target = Path(home) / "towns" / f"{label}.npz"
     baked = Path(path).suffix == ".npz"
-    save_graph(replace(load_graph(path), name=label) if baked else bake(path, label), target)
+    graph = replace(load_graph(path), name=label) if baked else bake(path, label)
+    source = Path(path).with_suffix(".xodr")
+    copy = read_bytes(source, limit=MAX_BYTES) if source.is_file() else None
+    save_graph(graph, target)
+    if copy is not None:
+        write_atomic(target.with_suffix(".xodr"), copy)
+    else:
+        target.with_suffix(".xodr").unlink(missing_ok=True)  # of another map that was called so
     return target
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import tempfile
 from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
 from ssad.core.errors import MapError, unknown_name
 from ssad.core.lane_graph import LaneGraph, load_graph
-from ssad.core.safeio import home
+from ssad.core.safeio import home, read_text
 from ssad.roads.bake import bake
+from ssad.roads.signals import signal_names
+from ssad.roads.xodr import MAX_BYTES, read_network
 
 BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
 
@@ -38,6 +41,32 @@ def load_town(name: str) -> LaneGraph:
     if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
         raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr)")
     raise unknown_name("town", name, town_names())
+
+
+def town_xodr(name: str) -> str:
+    """The OpenDRIVE text of a town, as `load_town` finds it.
+
+    Raises:
+        MapError: The town has none: its lanes were not made from OpenDRIVE.
+    """
+    from ssad.roads.designs import generate_town
+
+    if name in BUILT_IN:
+        return generate_town(name)
+    plain = Path(name).name == name and Path(name).suffix != ".xodr"
+    path = home() / "towns" / f"{name}.xodr" if plain else Path(name).with_suffix(".xodr")
+    if not path.is_file():
+        raise MapError(f"town '{name}' has no OpenDRIVE: there is no {path}; import its map: ssad import map FILE.xodr")
+    return read_text(path, limit=MAX_BYTES)
+
+
+@lru_cache(maxsize=8)
+def town_signals(name: str) -> dict[int, str]:
+    """The id that each signal of a town has in its OpenDRIVE; MapError as `town_xodr`."""
+    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
+        path = Path(folder) / "map.xodr"
+        path.write_text(town_xodr(name), encoding="utf-8")
+        return signal_names(load_town(name), read_network(path))
 
 
 @lru_cache(maxsize=8)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.geometry import in_polygon
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, LaneType
 from ssad.roads.xodr import Network
 
@@ -231,3 +232,26 @@ def _stop(data: Approaches, lane: int) -> float:
         if hit.any():
             stop = min(stop, float(at[hit][0]) - SETBACK)
     return max(stop, 0.0)
+
+
+def signal_names(graph: LaneGraph, network: Network) -> dict[int, str]:
+    """The id that each signal of a lane graph has in the OpenDRIVE map it was made from; virtual ones have none.
+
+    The rule is that of `place_signals`: the map ties a light to lanes of an approach, or to the lanes after them.
+    """
+    names: dict[int, str] = {}
+    known = set(network.lights)
+    for signal in np.flatnonzero(~graph.signal_virtual).tolist():
+        lanes = graph.stop_lane[graph.stop_signal == signal].tolist()
+        after = {int(n) for lane in lanes for n in graph.successors(lane) if graph.junction[n] >= 0}
+        votes: Counter[str] = Counter()
+        for lane in [*lanes, *sorted(after)]:
+            number = int(graph.lane_id[lane])
+            for place in network.roads[int(graph.road[lane])].lights:
+                spans_all = place.low == 0 == place.high
+                if place.signal in known and not (spans_all and lane in lanes):
+                    votes[place.signal] += spans_all or place.low <= number <= place.high
+        best = min(votes, key=lambda name: (-votes[name], name), default="")
+        if votes[best]:
+            names[signal] = best
+    return names

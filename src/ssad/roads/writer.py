@@ -73,7 +73,8 @@ def write_town(town: Town) -> str:
         _ring(roads, root, ring, entries)
         for junction in entries:
             _signs(roads, junction, junction.arms, lengths, stop=False)
-    root[1:1] = roads
+    order = {"header": 0, "controller": 2, "junction": 3}  # as the format asks for it, between them the roads
+    root[:] = sorted([*root, *roads], key=lambda element: order.get(element.tag, 1))
     indent(root, " ")
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
 

@@ -1,1 +1,1 @@
-"""Baked towns that ship with SSAD (*.npz); `benchmarks/make_towns.py` writes their OpenDRIVE."""
+"""Baked towns that ship with SSAD (*.npz); `ssad.roads.designs` gives their OpenDRIVE."""

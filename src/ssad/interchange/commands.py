@@ -1,0 +1,88 @@
+"""`ssad export SCENARIO... OUT` and the imports of other formats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from ssad.core.errors import ConfigError
+
+
+class Format(StrEnum):
+    """What scenarios can be exported to."""
+
+    openscenario = "openscenario"
+
+
+class ExportGroup(TyperGroup):
+    """Commands of `ssad export`; arguments that begin with none of them are scenarios."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the name of the command for scenarios where it was left out."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["scenarios", *args]
+        return super().parse_args(ctx, args)
+
+
+def register(exports: typer.Typer, imports: typer.Typer) -> None:
+    """Add the commands of this module to `ssad export` and `ssad import`."""
+    exports.command("scenarios")(export_scenarios)
+    imports.command("openscenario")(import_openscenario)
+
+
+def export_scenarios(
+    scenarios: Annotated[
+        list[str], typer.Argument(metavar="SCENARIO...", help="Sets, classes, names or YAML files of scenarios.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    to: Annotated[Format, typer.Option("--format", help="Format.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes: of their random traffic.")] = 0,
+) -> None:
+    """Write scenarios for other programs, with the maps of their towns, and say what is not carried over.
+
+    The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
+    """
+    from ssad.interchange.export import export_openscenario
+    from ssad.scenarios.dynamic import load_scenarios
+
+    chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
+    written, lost = {Format.openscenario: export_openscenario}[to](chosen, out, seed=seed)
+    print(f"{len(chosen)} scenarios written to {out}: {len(written)} files")
+    told("not carried over", lost)
+
+
+def import_openscenario(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="OpenSCENARIO XML file.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: the file's own]")
+    ] = None,
+) -> None:
+    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    from ssad.interchange.openscenario_reader import read_openscenario
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    found = read_openscenario(file, map_name=on)
+    save_scenarios(out, found.scenario)
+    scenario = found.scenario
+    print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
+    told("not carried over", found.lost)
+
+
+def check_yaml(out: Path) -> None:
+    """ConfigError where a scenario file would not end in .yaml."""
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a scenario file ends in .yaml")
+
+
+def told(what: str, lines: Sequence[str]) -> None:
+    """Print lines under a heading, each once, with how often it came."""
+    counted = {line: lines.count(line) for line in lines}
+    for line, count in counted.items():
+        print(f"{what}: {line}{f' ({count} scenarios)' if count > 1 else ''}")

@@ -1,0 +1,63 @@
+"""Folders of scenarios for other programs: a file each, and the maps of their towns beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ssad.core.errors import ConfigError, SSADError
+from ssad.core.safeio import make_folder, write_atomic
+from ssad.core.types import Episode, Scenario
+from ssad.interchange.openscenario_writer import openscenario_text
+from ssad.roads import load_town, town_signals, town_xodr
+from ssad.scenarios.dynamic import build_episode
+
+Written = tuple[list[Path], list[str]]
+"""The files, and what they do not carry over, a line for each scenario that it is true of."""
+
+
+def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0) -> Written:
+    """Write scenarios as OpenSCENARIO XML 1.2 with OpenDRIVE.
+
+    Args:
+        scenarios: The scenarios.
+        out: Folder.
+        seed: Of the episodes.
+
+    Raises:
+        SSADError: A scenario cannot be built, its town has no OpenDRIVE, or a file cannot be written.
+    """
+    files: list[Path] = []
+    lost: list[str] = []
+    folder = make_folder(out)
+    names = file_names(scenarios)
+    for town in sorted({scenario.town for scenario in scenarios}):
+        files.append(folder / f"{Path(town).stem}.xodr")
+        write_atomic(files[-1], town_xodr(town))
+    for scenario, name in zip(scenarios, names, strict=True):
+        town = scenario.town
+        text, missing = openscenario_text(
+            episode(scenario, seed), load_town(town), network=f"{Path(town).stem}.xodr", signals=town_signals(town)
+        )
+        files.append(folder / f"{name}.xosc")
+        write_atomic(files[-1], text)
+        lost += missing
+    return files, lost
+
+
+def episode(scenario: Scenario, seed: int) -> Episode:
+    """The nominal episode of a scenario; errors name it."""
+    try:
+        return build_episode(scenario, load_town(scenario.town), seed=seed)
+    except SSADError as error:
+        text = str(error)
+        raise type(error)(text if scenario.name in text else f"scenario {scenario.name}: {text}") from None
+
+
+def file_names(scenarios: Sequence[Scenario]) -> list[str]:
+    """Names of files without folders. ConfigError where two scenarios would share one."""
+    names = [scenario.name.replace("/", "-").replace(":", "-") for scenario in scenarios]
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f"two scenarios would be written to '{name}'; rename one, or name each only once")
+    return names

@@ -1,0 +1,240 @@
+"""OpenSCENARIO: what is written is valid, and comes back as the same drive; what others write; what is refused."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.command import ssad
+
+from ssad.core.types import Actor, Episode, EpisodeTrace, Phase, Pose, Scenario
+from ssad.drivers import make_system
+from ssad.interchange.export import export_openscenario
+from ssad.interchange.openscenario_reader import read_openscenario
+from ssad.metrics import episode_metrics
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios
+from ssad.scenarios.dynamic.frozen import frozen
+from ssad.world.rollout import rollout
+from ssad.world.world import World
+
+FEW = ("StraightObstacle/00", "LaneChanging/01", "VehiclePassing/02", "UnprotectedLeftTurn/01")
+CLOSE = 0.01  # m
+
+
+def drive(episodes: Sequence[Episode], system: str = "autopilot") -> list[EpisodeTrace]:
+    return rollout(World(episodes, {e.town: load_town(e.town) for e in episodes}), make_system(system))
+
+
+def returned(scenarios: Sequence[Scenario], folder: Path) -> list[Scenario]:
+    files, _ = export_openscenario(scenarios, folder)
+    return [read_openscenario(path).scenario for path in files if path.suffix == ".xosc"]
+
+
+def same_drives(before: Sequence[Episode], after: Sequence[Episode], system: str) -> None:
+    for one, other in zip(drive(before, system), drive(after, system), strict=True):
+        assert one.names == other.names
+        assert one.models == other.models
+        assert one.end == other.end
+        assert np.array_equal(one.active, other.active)
+        off = np.hypot(one.x - other.x, one.y - other.y)[one.active]
+        assert off.max() < CLOSE
+        measured, again = (episode_metrics(trace).as_dict() for trace in (one, other))
+        for name, value in measured.items():
+            near = pytest.approx(value, rel=1e-3, abs=1e-3, nan_ok=True) if isinstance(value, float) else value
+            assert again[name] == near, (one.key, name)
+
+
+def built(scenarios: Sequence[Scenario]) -> list[Episode]:
+    return [build_episode(scenario, load_town(scenario.town), seed=0) for scenario in scenarios]
+
+
+@pytest.mark.parametrize(("names", "system"), [
+    (FEW, "blind"),
+    pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
+    pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: str, tmp_path: Path) -> None:
+    scenarios = [scenario for name in names for scenario in load_scenarios(name)]
+    again = returned(scenarios, tmp_path)
+    assert [s.name for s in again] == [s.name for s in scenarios]
+    same_drives(built(scenarios), built(again), system)
+
+
+@pytest.mark.parametrize("every", [75, pytest.param(7, marks=pytest.mark.slow)])
+def test_trajectories_come_back(every: int, tmp_path: Path) -> None:
+    """Natural traffic as it was recorded: also who appears later, and who leaves before the end."""
+    natural = built(load_scenarios("natural")[::every])
+    scenarios = [frozen(e, t, name=f"seen/{k}") for k, (e, t) in enumerate(zip(natural, drive(natural), strict=True))]
+    late = Actor("late", "compact", Pose(0.0, 0.0), trajectory=((2.0, 0.0, 0.0, 0.0), (4.0, 10.0, 0.0, 0.0)))
+    early = replace(
+        late, name="early", trajectory=((-1.0, 0.0, 30.0, 0.0), (3.0, 8.0, 30.0, 0.0)), pose=Pose(0.0, 30.0)
+    )
+    scenarios[0] = replace(scenarios[0], actors=(*scenarios[0].actors, late, early))
+    assert any(actor.trajectory for actor in scenarios[-1].actors)
+    same_drives(built(scenarios), built(returned(scenarios, tmp_path)), "autopilot")
+
+
+def test_what_is_not_carried_over_is_said(tmp_path: Path) -> None:
+    _, lost = export_openscenario(load_scenarios("natural")[:3], tmp_path)
+    assert any("waits until the ego is within" in line for line in lost)
+
+
+def test_commands(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = ssad("export", "RedlightRunning/00", "LaneChanging/00", out, "--format", "openscenario")
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.name for p in out.iterdir()) == [
+        "LaneChanging-00.xosc", "ProvingGround.xodr", "RedlightRunning-00.xosc",
+    ]  # fmt: skip
+    assert "not carried over: the programme of 25 other signals" in done.stdout
+    done = ssad("import", "openscenario", out / "RedlightRunning-00.xosc", tmp_path / "a.yaml")
+    assert done.returncode == 0, done.stderr
+    (found,) = read_scenarios(tmp_path / "a.yaml")
+    assert (found.name, found.signals.ego, found.signals.others) == ("RedlightRunning/00", "green", "red")
+    assert ssad("export", "texture", "--help").returncode == 0
+    for words in (("LaneChanging/00", "LaneChanging/00"), ("nothing",)):
+        refused = ssad("export", *words, out, "--format", "openscenario")
+        assert refused.returncode == 2
+        assert len(refused.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("tool", "bundle", "suffix"), [
+    ("qc_openscenario", "xoscBundle", "xosc"), ("qc_opendrive", "xodrBundle", "xodr"),
+])  # fmt: skip
+def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, tmp_path: Path) -> None:
+    program = shutil.which(tool)
+    if program is None:
+        pytest.skip(f"no {tool}: install asam-qc-openscenarioxml and asam-qc-opendrive in an environment of their own")
+    files, _ = export_openscenario(load_scenarios("RedlightRunning"), tmp_path)
+    for path in (p for p in files if p.suffix == f".{suffix}"):
+        (tmp_path / "config.xml").write_text(
+            f'<Config><Param name="InputFile" value="{path}"/><CheckerBundle application="{bundle}">'
+            f'<Param name="resultFile" value="{tmp_path}/result.xqar"/></CheckerBundle></Config>'
+        )
+        subprocess.run([program, "-c", tmp_path / "config.xml"], cwd=tmp_path, check=True, capture_output=True)
+        found = (tmp_path / "result.xqar").read_text()
+        assert 'status="completed"' in found
+        assert re.findall('<Issue .*?description="(.*?)"', found) == []
+
+
+# ---------------------------------------------------------------- other programs' files
+
+FOREIGN = """<?xml version="1.0"?>
+<OpenSCENARIO><FileHeader revMajor="1" revMinor="0" date="2020-03-20T12:00:00" description="CARLA:Cut in" author=""/>
+<ParameterDeclarations><ParameterDeclaration name="fast" parameterType="double" value="9.0"/></ParameterDeclarations>
+<RoadNetwork><LogicFile filepath="ProvingGround"/></RoadNetwork>
+<Entities>
+<ScenarioObject name="hero"><Vehicle name="vehicle.lincoln.mkz_2017" vehicleCategory="car">
+ <BoundingBox><Center x="1.5" y="0" z="0.9"/><Dimensions width="2.06" length="4.9" height="1.51"/></BoundingBox>
+ </Vehicle></ScenarioObject>
+<ScenarioObject name="adversary"><Vehicle name="vehicle.some.body" vehicleCategory="car">
+ <BoundingBox><Center x="1.5" y="0" z="0.9"/><Dimensions width="2.0" length="4.5" height="1.8"/></BoundingBox>
+ </Vehicle></ScenarioObject>
+</Entities>
+<Storyboard><Init><Actions>
+ <GlobalAction><EnvironmentAction/></GlobalAction>
+ <Private entityRef="hero"><PrivateAction><TeleportAction><Position><WorldPosition x="217" y="5.25" h="0"/></Position>
+  </TeleportAction></PrivateAction></Private>
+ <Private entityRef="adversary"><PrivateAction><TeleportAction><Position>
+  <RelativeLanePosition entityRef="hero" dLane="1" ds="20"/></Position></TeleportAction></PrivateAction></Private>
+</Actions></Init>
+<Story name="s"><Act name="a"><ManeuverGroup name="g" maximumExecutionCount="1">
+ <Actors selectTriggeringEntities="false"><EntityRef entityRef="adversary"/></Actors><Maneuver name="m">
+ <Event name="go" priority="overwrite"><Action name="go"><PrivateAction><LongitudinalAction><SpeedAction>
+  <SpeedActionDynamics dynamicsShape="step" value="0" dynamicsDimension="time"/>
+  <SpeedActionTarget><AbsoluteTargetSpeed value="$fast"/></SpeedActionTarget></SpeedAction></LongitudinalAction>
+  </PrivateAction></Action><StartTrigger><ConditionGroup><Condition name="c" delay="0" conditionEdge="rising">
+  <ByEntityCondition><TriggeringEntities triggeringEntitiesRule="any"><EntityRef entityRef="hero"/></TriggeringEntities>
+  <EntityCondition><RelativeDistanceCondition entityRef="adversary" relativeDistanceType="cartesianDistance"
+   value="15" freespace="false" rule="lessThan"/></EntityCondition></ByEntityCondition></Condition></ConditionGroup>
+  </StartTrigger></Event>
+ <Event name="cut in" priority="overwrite"><Action name="cut"><PrivateAction><LateralAction><LaneChangeAction>
+  <LaneChangeActionDynamics dynamicsShape="linear" value="20" dynamicsDimension="distance"/>
+  <LaneChangeTarget><RelativeTargetLane entityRef="adversary" value="-1"/></LaneChangeTarget></LaneChangeAction>
+  </LateralAction></PrivateAction></Action><StartTrigger><ConditionGroup>
+  <Condition name="c" delay="0" conditionEdge="rising"><ByEntityCondition>
+  <TriggeringEntities triggeringEntitiesRule="any"><EntityRef entityRef="adversary"/></TriggeringEntities>
+  <EntityCondition><TraveledDistanceCondition value="10"/></EntityCondition></ByEntityCondition></Condition>
+  </ConditionGroup></StartTrigger></Event>
+ </Maneuver></ManeuverGroup><StartTrigger/></Act></Story>
+<StopTrigger><ConditionGroup><Condition name="end" delay="0" conditionEdge="none"><ByValueCondition>
+ <SimulationTimeCondition value="20" rule="greaterThan"/></ByValueCondition></Condition></ConditionGroup></StopTrigger>
+</Storyboard></OpenSCENARIO>
+"""
+
+
+def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
+    """CARLA's frame, a place beside the ego, a trigger by distance, a parameter, a lane change after 10 m."""
+    path = tmp_path / "cut_in.xosc"
+    path.write_text(FOREIGN)
+    found = read_openscenario(path)
+    (actor,) = found.scenario.actors
+    assert found.scenario.name == "Cut-in"
+    assert (actor.pose.x, actor.pose.y) == pytest.approx((237.0, -1.75), abs=0.01)
+    assert actor.phases[0] == Phase(9.0, replace(actor.phases[0].when, kind="ego_distance", value=15.0))
+    assert found.scenario.limits.max_time == 20.0
+    lost = "\n".join(found.lost)
+    assert "EnvironmentAction at the start" in lost
+    assert "the body of 'adversary' (4.5 x 2 m) becomes 'suv'" in lost
+    passed = replace(found.scenario, limits=replace(found.scenario.limits, contact="count"))
+    (trace,) = drive(built([passed]), "blind")
+    moving = np.flatnonzero(trace.speed[:, 1] > 0.0)
+    gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
+    assert gap[moving[0] - 1] < 15.0 < gap[moving[0] - 2] + 1.5
+    way = trace.x[:, 1] - trace.x[0, 1]
+    assert np.abs(trace.y[way < 10.0, 1] + 1.75).max() < 0.2
+    assert np.abs(trace.y[way > 35.0, 1] + 5.25).max() < 0.3
+
+
+def _cut(old: str, new: str = "") -> Callable[[str], str]:
+    def change(text: str) -> str:
+        assert old in text
+        return text.replace(old, new)
+
+    return change
+
+
+ROOT = "<OpenSCENARIO>"
+HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
+    "empty": (lambda _: "", "not valid XML"),
+    "no XML": (lambda _: "\x00\x01 hello", "not valid XML"),
+    "cut short": (lambda text: text[: len(text) // 2], "not valid XML"),
+    "entities": (_cut(ROOT, f'<!DOCTYPE a [<!ENTITY b "c">]>{ROOT}'), "refused"),
+    "external": (_cut(ROOT, f'<!DOCTYPE a SYSTEM "/etc/passwd">{ROOT}'), "refused"),
+    "another format": (lambda _: "<OpenDRIVE/>", "not OpenSCENARIO"),
+    "no header": (lambda text: re.sub("<FileHeader.*?/>", "", text), "FileHeader is missing"),
+    "another revision": (_cut('revMajor="1"', 'revMajor="0"'), "revision 0"),
+    "no map": (_cut('<LogicFile filepath="ProvingGround"/>'), "names no LogicFile"),
+    "unknown map": (_cut("ProvingGround", "../../etc/passwd"), "there is no town 'passwd'"),
+    "no entities": (lambda text: re.sub("(?s)<Entities>.*</Entities>", "", text), "no ScenarioObject"),
+    "twins": (_cut('name="adversary"', 'name="hero"'), "two entities 'hero'"),
+    "nobody": (_cut('<EntityRef entityRef="adversary"/></A', '<EntityRef entityRef="x"/></A'), "no entity 'x'"),
+    "no number": (_cut('ds="20"', 'ds="far"'), "'far', not a number"),
+    "not finite": (_cut('x="217"', 'x="nan"'), "not a finite number"),
+    "beyond everything": (_cut('x="217"', 'x="1e300"'), "does not stand on a road"),
+    "no parameter": (_cut('name="fast"', 'name="slow"'), "parameter $fast is not declared"),
+    "expression": (_cut("$fast", "${2 * $fast}"), "expressions are not read"),
+    "in a ring": (_cut('entityRef="hero" dLane', 'entityRef="adversary" dLane'), "depends on itself"),
+    "off the road": (_cut('y="5.25"', 'y="70"'), "does not stand on a road"),
+    "empty condition": (lambda text: re.sub("<RelativeDistanceCondition.*?/>", "", text, flags=re.DOTALL), "is empty"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_broken_and_hostile_files_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    change, message = HOSTILE[name]
+    path = tmp_path / "bad.xosc"
+    path.write_text(change(FOREIGN))
+    done = ssad("import", "openscenario", path, tmp_path / "out.yaml")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert message in done.stderr
+    assert "bad.xosc" in done.stderr
+    assert not (tmp_path / "out.yaml").exists()
