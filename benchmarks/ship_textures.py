@@ -36,17 +36,18 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         if margin is None or margin <= 0:
             print(f"{title} in {line['test']} is not stronger than the controls: left out")
             continue
-        pair = line["spec"]["pair"]
+        spec, pair, around = line["spec"], line["spec"]["pair"], line["spec"]["around"]
         data = (
-            f"{pair['train_images']} pictures of drives in {pair['train']}, {suite['behind']:g} m behind; metrics: "
+            f"{pair['train_images']} pictures of drives in {pair['train']}, {suite['behind']:g} m behind"
+            f"{f', and {around} from all around' if around else ''}; metrics: "
             f"{pair['test_images']} in {pair['test']}; suite {suite['name']}, seed {suite['seed']}"
         )
         card = TextureCard(
-            line["attack"], line["carrier"], line["spec"]["options"], line["source"], weights[line["source"]],
+            spec["attack"], spec["carrier"], spec["options"], line["source"], weights[line["source"]],
             suite["target"], data, f"ssad run {suite['name']}", int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
         )  # fmt: skip
-        name = f"{line['attack']}-{line['source']}-{pair['train'].lower()}"
+        name = f"{line['attack'].replace(', ', '-').replace(' ', '-')}-{line['source']}-{pair['train'].lower()}"
         found[name] = (line, card)
     make_folder(SHIPPED)
     for name, (line, card) in found.items():

@@ -39,6 +39,7 @@ class Grid(BaseModel):
         azimuths: degrees from the front to the left of the target.
         elevations: degrees.
         weathers: kinds (`ssad.recording.nuscenes_recorder.WEATHERS`).
+        towns: Of the tests that are seen from all around; None: all.
     """
 
     model_config = _STRICT
@@ -47,6 +48,7 @@ class Grid(BaseModel):
     azimuths: list[float] = Field(default=list(AZIMUTHS), min_length=1)
     elevations: list[float] = Field(default=list(ELEVATIONS), min_length=1)
     weathers: list[str] = Field(default=list(WEATHERS), min_length=1)
+    towns: list[str] | None = None
 
     @property
     def count(self) -> int:
@@ -62,7 +64,9 @@ class Entry(BaseModel):
         carrier: patch or camouflage, with its settings as `options`; default: the attack's own.
         options: of the carrier.
         settings: fields of `TextureAttack` that differ.
-        of: of the control shuffled: the attack whose texture is shuffled.
+        around: pictures from all around the target, in the town of the training, that the texture is trained on beside
+            those from behind.
+        of: of the control shuffled: the attack whose texture is shuffled (the one with the same `around`).
         texture: a shipped texture, or the card of one (NAME.json): it is shown in place of training; carrier, options
             and the detector that it was trained against are those of the card.
     """
@@ -73,6 +77,7 @@ class Entry(BaseModel):
     carrier: Literal["patch", "camouflage"] | None = None
     options: dict[str, Any] = {}
     settings: dict[str, Any] = {}
+    around: int = Field(default=0, ge=0)
     of: str | None = None
     texture: str | None = None
 
@@ -139,6 +144,7 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     """
     carrier = entry.carrier or default_carrier(entry.of or entry.name)
     found = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}, "of": None}
+    found["around"] = entry.around
     if entry.texture is not None:
         return found | _ready(suite, entry)
     if entry.name not in CONTROLS:
@@ -146,13 +152,16 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
         settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
         make_physical(entry.name, **settings)
         return found | {"settings": settings}
-    if entry.settings:
+    if entry.settings or (entry.around and entry.of is None):
         raise ConfigError(f"suite {suite.name}: {entry.name} is not trained and has no settings")
     if (entry.name == "shuffled") != (entry.of is not None):
         raise ConfigError(f"suite {suite.name}: shuffled, and it alone, says of which attack (of: NAME)")
     if entry.of is None:
         return found
-    sources = [one for one in suite.attacks if one.name == entry.of and one.name not in CONTROLS]
+    sources = [
+        one for one in suite.attacks
+        if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
+    ]  # fmt: skip
     if len(sources) != 1:
         raise ConfigError(f"suite {suite.name}: shuffled of '{entry.of}': there must be one such attack")
     return {**row_of(suite, sources[0]), "attack": "shuffled", "of": entry.of}
@@ -168,7 +177,7 @@ def _ready(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     """What the card of a texture says of a row. ConfigError: the suite says otherwise."""
     assert entry.texture is not None
     colour, card = load_texture(entry.texture)
-    if entry.carrier or entry.options or entry.settings or entry.of:
+    if entry.carrier or entry.options or entry.settings or entry.of or entry.around:
         raise ConfigError(f"suite {suite.name}: texture {entry.texture}: its card says carrier, options and settings")
     if (card.attack, card.target) != (entry.name, suite.target):
         raise ConfigError(

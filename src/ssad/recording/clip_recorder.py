@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import islice, product
 from pathlib import Path
@@ -35,10 +36,10 @@ from ssad.core.seeding import digest, generator
 from ssad.core.types import F64, U8, EpisodeTrace
 from ssad.datasets.coco import coco_data
 from ssad.jobs.machine import quiet_warp
-from ssad.jobs.pool import open_pool
+from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
-from ssad.recording.nuscenes_recorder import HELD_OUT, SENSOR, WEATHERS, draw_weather, drive, run_parts
+from ssad.recording.nuscenes_recorder import HELD_OUT, PART_S, SENSOR, WEATHERS, check_parts, draw_weather, drive
 from ssad.recording.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
 from ssad.recording.street_signs import free_places, plate_and_post
 from ssad.recording.target import TargetCar, TargetSign
@@ -436,36 +437,70 @@ def record_clips(
     Each file's `info` says what was recorded, how many objects there are of each class, and how many pictures were
     taken elsewhere instead, and why. StoreError, ConfigError.
     """
-    out, identity, tasks = clips.out, clips.identity(), []
-    finished = out / "annotations" / "all.json"
-    if finished.is_file() and not (out / ".parts").is_dir():
+    return record_all([clips], workers=workers, ray=ray, progress=progress)[0]
+
+
+def record_all(
+    recordings: Sequence[Clips],
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Path]:
+    """Several recordings as `record_clips` takes them, all their parts side by side; their folders.
+
+    Raises:
+        StoreError: As `record_clips`.
+        ConfigError: As `record_clips`.
+    """
+    tasks: list[list[tuple[Clips, str, int, int, str]]] = []
+    for clips in recordings:
+        _check_other(clips)
+        tasks.append([
+            (clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}")
+            for town, count in clips.images for number, start in enumerate(range(0, count, EACH))
+        ])  # fmt: skip
+    every = [task for own in tasks for task in own]
+    with ExitStack() as held:
+        for clips in recordings:
+            held.enter_context(locked(clips.out, "ssad record"))
+            check_parts(clips.out, clips.identity())
+        pool = open_pool(len(every), workers=workers, ray=ray, device=recordings[0].device)
+        run_all(pool, _part, every, timeout_s=PART_S, progress=progress)
+        for clips, own in zip(recordings, tasks, strict=True):
+            _write_pages(clips, own)
+    return [clips.out for clips in recordings]
+
+
+def _check_other(clips: Clips) -> None:
+    """StoreError: the folder holds another recording."""
+    finished = clips.out / "annotations" / "all.json"
+    if finished.is_file() and not (clips.out / ".parts").is_dir():
         data = safeio.read_json(finished)
         info = data.get("info") if isinstance(data, dict) else None
-        if not isinstance(info, dict) or info.get("recording") != identity:
-            raise StoreError(f"{out}: holds another recording; choose another folder")
-    for town, count in clips.images:
-        for number, start in enumerate(range(0, count, EACH)):
-            tasks.append((clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}"))
-    pool = open_pool(len(tasks), workers=workers, ray=ray, device=clips.device)
-    with locked(out, "ssad record"):
-        run_parts(out, identity, _part, tasks, pool=pool, progress=progress)
-        splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
-                  "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
-        for split, members in splits.items():
-            rows: list[dict[str, Any]] = []
-            skipped: Counter[str] = Counter()
-            for task in members:
-                part = safeio.read_json(out / ".parts" / task[4] / "part.json")
-                rows += part["images"]
-                skipped.update(part["skipped"])
-            counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
-            about = {
-                "recording": identity, "split": split, "towns": sorted({t[1] for t in members}), "images": len(rows),
-                "objects": counts, "weathers": Counter(row["weather"] for row in rows), "skipped": skipped,
-            }  # fmt: skip
-            page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
-            safeio.write_atomic(out / "annotations" / f"{split}.json", page)
-    return out
+        if not isinstance(info, dict) or info.get("recording") != clips.identity():
+            raise StoreError(f"{clips.out}: holds another recording; choose another folder")
+
+
+def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]) -> None:
+    """annotations/{train,test,all}.json of parts that are all there."""
+    splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
+              "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
+    for split, members in splits.items():
+        rows: list[dict[str, Any]] = []
+        skipped: Counter[str] = Counter()
+        for task in members:
+            part = safeio.read_json(clips.out / ".parts" / task[4] / "part.json")
+            rows += part["images"]
+            skipped.update(part["skipped"])
+        counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
+        about = {
+            "recording": clips.identity(), "split": split, "towns": sorted({t[1] for t in members}),
+            "images": len(rows), "objects": counts, "weathers": Counter(row["weather"] for row in rows),
+            "skipped": skipped,
+        }  # fmt: skip
+        page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
+        safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
 
 
 @dataclass(frozen=True, slots=True)

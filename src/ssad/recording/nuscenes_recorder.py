@@ -382,7 +382,7 @@ def record_nuscenes(
     if (out / recording.version / "splits.json").is_file():  # written last
         if not (out / ".parts" / "recording.json").is_file():
             raise StoreError(f"{out}: holds a data set, but not how it was recorded (.parts); choose another folder")
-        _check_page(out, recording.identity())
+        check_parts(out, recording.identity())
         return out
     pool = open_pool(len(tasks), workers=workers, ray=ray, device=recording.device)
     with locked(out, "ssad record"):
@@ -391,8 +391,9 @@ def record_nuscenes(
     return out
 
 
-def _check_page(out: Path, identity: dict[str, Any]) -> None:
+def check_parts(out: Path, identity: dict[str, Any]) -> None:
     """Writes what is recorded here, or compares. StoreError: something else."""
+    safeio.make_folder(out / ".parts")
     page = out / ".parts" / "recording.json"
     if page.is_file():
         if safeio.read_json(page) != identity:
@@ -411,8 +412,7 @@ def run_parts(
     progress: Callable[[int, int], None],
 ) -> None:
     """Records every part that is not there yet. StoreError: another recording, or parts that failed (see `run_all`)."""
-    safeio.make_folder(out / ".parts")
-    _check_page(out, identity)
+    check_parts(out, identity)
     run_all(pool, record, tasks, timeout_s=PART_S, progress=progress)
 
 

@@ -221,9 +221,7 @@ def textured_clips(
         FormatError: No recording of this version, or a kept file is broken.
         StoreError: Nothing can be written there.
     """
-    recording = recording_of(folder, split)
-    name = digest("textured clips", _drawing(), recording, [_layer_key(layer) for layer in layers])[:16]
-    kept = folder / KEPT / name
+    kept = _kept_in(folder, layers, split)
     rows = clip_rows(folder, split)
     missing = {row["file_name"] for row, _ in rows if not (kept / f"{row['file_name']}.npz").is_file()}
     views = clip_views(folder, split=split, device=device, only=missing)
@@ -237,6 +235,47 @@ def textured_clips(
         corner = int(arrays["corner"][0]), int(arrays["corner"][1])
         exposure = float(arrays["exposure"])
         yield TexturedClip(file, row, objects, image, corner, arrays["radiance"], exposure, arrays["fragments"])
+
+
+def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer]]) -> list[int]:
+    """The parts of a recording of which not all is kept that is seen of each of several sets of layers.
+
+    Raises:
+        FormatError: No recording of this version.
+    """
+    kept = [_kept_in(folder, layers, "all") for layers in variants]
+    there = [{path.name for path in one.glob("*.npz")} for one in kept]
+    missing = (row["part"] for row, _ in clip_rows(folder) if any(f"{row['file_name']}.npz" not in k for k in there))
+    return list(dict.fromkeys(missing))
+
+
+def see_clips(folder: Path, variants: Sequence[Sequence[Layer]], *, part: int, device: str = "cpu") -> None:
+    """Render what a part of a recording shows of each of several sets of layers, for `textured_clips`.
+
+    Args:
+        folder: What `record_clips` wrote.
+        variants: What the targets wear, one set after the other.
+        part: Whose pictures.
+        device: Where to render.
+
+    Raises:
+        FormatError: No recording of this version.
+        StoreError: Nothing can be written there.
+    """
+    kept = [_kept_in(folder, layers, "all") for layers in variants]
+    for one in kept:
+        safeio.make_folder(one)
+    wanted = {row["file_name"] for row, _ in clip_rows(folder) if row["part"] == part}
+    for clip in clip_views(folder, device=device, only=wanted):
+        for one, layers in zip(kept, variants, strict=True):
+            if not (one / f"{clip.file}.npz").is_file():
+                safeio.save_npz(one / f"{clip.file}.npz", _kept(clip, layers))
+
+
+def _kept_in(folder: Path, layers: Sequence[Layer], split: str) -> Path:
+    """Where what is seen of layers is kept."""
+    keys = [_layer_key(layer) for layer in layers]
+    return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
 
 
 def seen_part(picture: Picture) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
 from ssad.bench.physical_lights import light_cells, light_edit, light_pieces, light_result, light_sheet
 from ssad.bench.physical_suite import Pair, PhysicalSuite, carrier_title, row_of, target_of
+from ssad.camera.scene import Layer
 from ssad.core import safeio
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
@@ -30,10 +31,10 @@ from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
-from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.clip_recorder import Clips, record_all
 from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.target_views import TargetClips
-from ssad.recording.textured_clips import textured_clips
+from ssad.recording.textured_clips import see_clips, unseen_parts
 from ssad.roads import town_names
 from ssad.scenarios.static.physical import CONTROLS, Surface, TextureSpec, View, albedo_of, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
@@ -83,7 +84,12 @@ class Physical(Kind):
         cells: dict[str, Cell] = {}
         if suite.grid is not None:
             _grid_clips(suite, Path(), suite.pairs[0].test, device)
-        for pair, view, detector in product(suite.pairs, VIEWS[: 2 if suite.grid else 1], weights):
+        for town in (suite.grid.towns or ()) if suite.grid is not None else ():
+            if town not in {pair.test for pair in suite.pairs}:
+                raise ConfigError(f"suite {suite.name}: grid: no pair is tested in {town}")
+        for pair, view, detector in product(suite.pairs, VIEWS, weights):
+            if view == GRID and not _seen_around(suite, pair):
+                continue
             for row in [{"attack": None}, *rows] if rows or not suite.lights else []:
                 for cell in self._cells(suite, pair, view, detector, row, weights, device):
                     cells.setdefault(cell.key, cell)
@@ -103,18 +109,18 @@ class Physical(Kind):
         """The cells of an attack on a detector in a pair of towns."""
         attack = row["attack"]
         trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
-        moved = trained and (suite.transfer or detector in suite.judges)
+        moved = trained and ((suite.transfer and row["of"] is None) or detector in suite.judges)
         sources = [row["source"]] if "file" in row else suite.detectors if moved else [detector]
         seeds = range(suite.seeds) if attack in ("random", "noise", "shuffled") else (0,)
         found = []
         for source in sources:
             for seed in seeds:
-                spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, **row}
+                spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
                 spec["source"] = source if trained else ""
                 fields = {
                     "test": pair.test, "train": pair.train, "view": view, "detector": detector,
                     "carrier": carrier_title(row),
-                    "attack": CLEAN if attack is None else attack if not row["of"] else f"shuffled {row['of']}",
+                    "attack": _title(row),
                     "source": source if trained else "", "number": seed,
                 }  # fmt: skip
                 title = "/".join(
@@ -132,8 +138,9 @@ class Physical(Kind):
         return found
 
     def order(self, cell: Cell) -> float:
-        """Clean first, then controls, then what is trained."""
-        return 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
+        """From behind before from all around; clean first, then controls, then what is trained."""
+        shown = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
+        return shown + 3 * (cell.fields["view"] == GRID)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Records the pictures, and renders once what they see of each carrier."""
@@ -151,13 +158,18 @@ class Physical(Kind):
             for town, count in images.items()
         ]  # fmt: skip
         if suite.grid is not None:
-            tests = dict.fromkeys(pair.test for pair in suite.pairs)
+            tests = dict.fromkeys(pair.test for pair in suite.pairs if _seen_around(suite, pair))
             recordings += [_grid_clips(suite, folder, town, plan.device) for town in tests]
-        for clips in recordings:
-            with Live(f"recording {clips.out.name}", 1, 0, console=resources.console, unit="parts") as live:
-                record_clips(clips, workers=resources.workers, ray=resources.ray, progress=live.show)
-        surfaces = dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"])
-        tasks = [(clips.out, suite.target, surface, plan.device) for clips in recordings for surface in surfaces]
+        further = max((entry.around for entry in suite.attacks), default=0)
+        for town in dict.fromkeys(pair.train for pair in suite.pairs) if further else ():
+            recordings.append(replace(_around(folder, town, suite, plan.device), images=((town, further),)))
+        with Live("recording", 1, 0, console=resources.console, unit="parts") as live:
+            record_all(recordings, workers=resources.workers, ray=resources.ray, progress=live.show)
+        surfaces = list(dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"]))
+        tasks = [
+            (clips.out, part, suite.target, surfaces, plan.device)
+            for clips in recordings if surfaces for part in unseen_parts(clips.out, _layers(suite.target, surfaces))
+        ]  # fmt: skip
         if tasks:
             pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
             with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
@@ -263,12 +275,15 @@ def _surface(target: str, surface: str) -> Surface:
     return make_carrier(row["carrier"], row["options"]).on(car.mesh())
 
 
-def _see(task: tuple[Path, str, str, str]) -> None:
-    """In a worker: render what all pictures of a recording see of a carrier, and keep it."""
-    folder, target, surface, device = task
+def _layers(target: str, surfaces: Sequence[str]) -> list[tuple[Layer, ...]]:
+    return [(_surface(target, surface).layer,) for surface in surfaces]
+
+
+def _see(task: tuple[Path, int, str, Sequence[str], str]) -> None:
+    """In a worker: render what the pictures of a part of a recording see of carriers, and keep it."""
+    folder, part, target, surfaces, device = task
     quiet_warp()
-    for _ in textured_clips(folder, (_surface(target, surface).layer,), device=device):
-        pass
+    see_clips(folder, _layers(target, surfaces), part=part, device=device)
 
 
 def _textures(job: Job) -> TextureFolder:
@@ -283,8 +298,10 @@ def texture_of(job: Job, spec: TextureSpec) -> Tensor:
     def views() -> list[View]:
         town, count = spec.pair["train"], spec.pair["train_images"]
         classes = tuple(make_detector(spec.source).classes)
-        clips = TargetClips(job.folder / "data" / town, count, classes, job.device)
-        return [view for _, view in clips.wearing(surface)]
+        clips = [TargetClips(job.folder / "data" / town, count, classes, job.device)]
+        if spec.around:
+            clips.append(TargetClips(job.folder / "data" / f"{town}-around", spec.around, classes, job.device))
+        return [view for one in clips for _, view in one.wearing(surface)]
 
     return _textures(job).texture(
         spec, surface, views=views, detector=lambda: make_detector(spec.source, device=job.device)
@@ -322,6 +339,27 @@ def _grid_clips(suite: PhysicalSuite, folder: Path, town: str, device: str) -> C
         size=suite.size, seed=suite.seed, device=device, distances=tuple(grid.distances),
         azimuths=tuple(grid.azimuths), elevations=tuple(grid.elevations), weathers=tuple(grid.weathers),
     )  # fmt: skip
+
+
+def _around(folder: Path, town: str, suite: PhysicalSuite, device: str) -> Clips:
+    """The recording of pictures from all around for trainings in a town."""
+    return Clips(
+        folder / "data" / f"{town}-around", ((town, 1),), (), mode="orbit", target=target_of(suite), size=suite.size,
+        seed=suite.seed, device=device,
+    )  # fmt: skip
+
+
+def _seen_around(suite: PhysicalSuite, pair: Pair) -> bool:
+    """Whether the grid is seen in the test of a pair."""
+    return suite.grid is not None and (suite.grid.towns is None or pair.test in suite.grid.towns)
+
+
+def _title(row: Mapping[str, Any]) -> str:
+    """What tables call the attack of a row: such as "shuffled vanishing, all sides"."""
+    if row["attack"] is None:
+        return CLEAN
+    sides = ", all sides" if row.get("around") else ""
+    return f"shuffled {row['of']}{sides}" if row["of"] else f"{row['attack']}{sides}"
 
 
 def _sheet(

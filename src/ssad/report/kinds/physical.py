@@ -89,12 +89,18 @@ def title_of(attack: tuple[str, str]) -> str:
         return f"{name}, {carrier.removeprefix(LIGHT)}"
     _, _, options = carrier.partition(", ")
     if first == "shuffled":
-        title = f"shuffled {TITLES.get(rest, rest)}"
+        title = f"shuffled {_attack(rest)}"
     elif name in CONTROLS:
         return f"{name} {carrier}"
     else:
-        title = TITLES.get(name, name)
+        title = _attack(name)
     return f"{title}, {options}" if options else title
+
+
+def _attack(name: str) -> str:
+    """The title of an attack's name, which may end in ", all sides"."""
+    first, comma, rest = name.partition(", ")
+    return f"{TITLES.get(first, first)}{comma}{rest}"
 
 
 def score(lines: Sequence[Line], metric: str) -> Cell:

@@ -29,6 +29,7 @@ class TextureSpec:
         source: The detector that is attacked; "" for what is not trained.
         number: Of a control that is drawn at random.
         pair: What it is trained and tested on, as the suite says it.
+        around: Pictures from all around the target that it is trained on too.
         file: A texture that is there already (see `load_texture`); None: it is trained.
     """
 
@@ -40,6 +41,7 @@ class TextureSpec:
     source: str
     number: int
     pair: Mapping[str, Any]
+    around: int = 0
     file: str | None = None
 
     @classmethod
@@ -60,6 +62,7 @@ class TextureSpec:
             return f"{attack}-{Path(self.file).stem}"
         about = attack, self.source, self.carrier, safeio.dump_json(self.options)
         rest = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
+        rest += (self.around,) if self.around else ()
         return f"{attack}-{digest('texture', *about, *rest)[:12]}"
 
     @property
