@@ -162,16 +162,17 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="Output folder.  [default: DIR/replays]")] = None,
     video: Annotated[Video, typer.Option(help="Video format.")] = Video.mp4,
     wear: Annotated[
-        Path | None, typer.Option(metavar="TEXTURE", help="Also film the drive with a car that wears this texture.")
+        Path | None, typer.Option(metavar="ATTACK", help="Also film the drive with this texture or light on a car.")
     ] = None,
     wearer: Annotated[
-        int | None, typer.Option(min=1, help="Number of the agent that wears it.  [default: the car nearest ahead]")
+        int | None, typer.Option(min=1, help="Number of the agent that is attacked.  [default: the car nearest ahead]")
     ] = None,
     detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
 ) -> None:
     """Run one cell again, compare it with its record bit by bit, and write a video and the trace.
 
-    TEXTURE is a folder of `ssad export texture`. The film shows what the ego's camera sees, clean and attacked.
+    ATTACK is a folder of `ssad export texture` or `ssad export light`; a light shines at its own hour. The film shows
+    what the ego's camera sees, clean and attacked.
     Exit code 1: the new run differs from the record.
     """
     from ssad.bench.replay import replay as run_again
@@ -193,24 +194,27 @@ def replay(
 
 
 def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any, Any, Path], Path] | None:
-    """What films a drive with a car that wears a texture; None without one. SSADError: no such texture or detector."""
+    """What films a drive with an attack on a car; None without one. SSADError: no such attack or detector."""
     if wear is None:
         if wearer is not None:
-            raise ConfigError("--wearer says who wears a texture: give --wear TEXTURE as well")
+            raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
         return None
     from ssad.detectors import make_detector
     from ssad.recording.attacked_film import attacked_frames, first_car
-    from ssad.recording.texture_export import load_print
+    from ssad.recording.light_export import load_worn
+    from ssad.recording.lit_clips import at_hour
+    from ssad.recording.loop_sensors import DAY
     from ssad.report.video import save_frames
 
-    worn, judge = load_print(wear), None if detector == "none" else make_detector(detector)
+    worn, judge = load_worn(wear), None if detector == "none" else make_detector(detector)
     worn.live(1)
 
     def film(trace: Any, graph: Any, path: Path) -> Path:
         agent = first_car(trace) if wearer is None else wearer
         if agent is None:
             raise ConfigError(f"{trace.key}: no car is ahead of the ego at any time; name the agent with --wearer")
-        shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2)
+        weather = at_hour(DAY, worn.hour)
+        shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2, weather=weather)
         return save_frames(shown, path, dt=2 * trace.dt)
 
     return film
@@ -231,6 +235,21 @@ def export_texture(
     from ssad.bench.texture_export import export_cell_texture
 
     for path in export_cell_texture(folder, cell, out, dots=dots):
+        print(path)
+
+
+@exports.command("light")
+def export_light(
+    folder: Dir,
+    cell: Annotated[
+        str, typer.Argument(metavar="CELL", help="Key of a cell of a physical run, the start of one, or its name.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
+) -> None:
+    """Write the settings of a light attack, and what a projector shows."""
+    from ssad.bench.texture_export import export_cell_light
+
+    for path in export_cell_light(folder, cell, out):
         print(path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,18 @@ import torch
 
 from ssad.assets.mesh import Mesh
 from ssad.camera.scene_edit import SceneEdit
+from ssad.core.errors import FormatError, SSADError
 from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
 from ssad.recording.attacked_film import attacked_frames, first_car
+from ssad.recording.light_export import Shining, export_light, load_worn
+from ssad.recording.lit_clips import at_hour
 from ssad.recording.live_attack import LiveAttack
+from ssad.recording.loop_sensors import DAY
 from ssad.recording.target import TargetCar
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
+from ssad.scenarios.static.physical.noninvasive import Projector, Target, make_light
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
@@ -68,3 +74,27 @@ def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:
         left, right = np.split(frame[:90].astype(int), 2, axis=1)
         changed = np.abs(left - right).max(-1) > 30
         assert 20 < changed.sum() < 0.2 * changed.size, "the car, and not the rest"
+
+
+def test_a_light_is_exported_and_shines_in_a_drive(trace: EpisodeTrace, tmp_path: Path) -> None:
+    """By night, on the car; a picture that was changed after its export is refused."""
+    shape = Projector().surface(Target(4.9, 2.06, 1.51)).size
+    projector = Shining("projector", {"lumens": 800.0}, "night", "sedan:black:0", {}, torch.full((3, *shape), 1.0))
+    export_light(tmp_path / "projector", projector)
+    flashlight = make_light("flashlight", {})
+    values = {
+        name: low + 0.5 * (high - low) for name, (low, high) in flashlight.ranges(Target(4.9, 2.06, 1.51)).items()
+    }
+    export_light(tmp_path / "flashlight", Shining("flashlight", {}, "night", "sedan:black:0", values))
+    for name in ("projector", "flashlight"):
+        made = load_worn(tmp_path / name)
+        night = at_hour(DAY, made.hour)
+        frames = attacked_frames(trace, load_town("ProvingGround"), made.live(1), width=160, every=9, weather=night)
+        left, right = np.split(next(frames)[:90].astype(int), 2, axis=1)
+        brighter = (right - left).max(-1) > 30
+        assert 20 < brighter.sum() < 0.3 * brighter.size, name
+    (tmp_path / "projector" / "picture.npz").write_bytes(b"other")
+    with pytest.raises(FormatError, match=r"not what light\.json describes"):
+        load_worn(tmp_path / "projector")
+    with pytest.raises(SSADError):
+        load_worn(tmp_path)

@@ -143,8 +143,8 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
         UnknownNameError, ConfigError: No such attack, or settings that it does not have.
     """
     carrier = entry.carrier or default_carrier(entry.of or entry.name)
-    found = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}, "of": None}
-    found["around"] = entry.around
+    found: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
+    found |= {"of": None, "around": entry.around}
     if entry.texture is not None:
         return found | _ready(suite, entry)
     if entry.name not in CONTROLS:

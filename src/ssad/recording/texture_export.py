@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,14 @@ class Print:
         carrier: Name of its carrier (`ssad.scenarios.static.physical.CARRIERS`).
         options: Of the carrier.
         target: Whom it is made for, as for `ssad record --target`.
+        hour: When it is shown: as it comes.
     """
 
     colour: Tensor
     carrier: str
     options: Mapping[str, Any]
     target: str
+    hour: str = field(default="recorded", init=False)
 
     def on(self, mesh: Mesh) -> Surface:
         """Where it goes on a body. ConfigError: it does not fit."""

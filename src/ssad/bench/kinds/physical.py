@@ -140,7 +140,7 @@ class Physical(Kind):
     def order(self, cell: Cell) -> float:
         """From behind before from all around; clean first, then controls, then what is trained."""
         shown = 0 if cell.spec["attack"] is None else 1 if not cell.spec["source"] else 2
-        return shown + 3 * (cell.fields["view"] == GRID)
+        return shown + (3 if cell.fields["view"] == GRID else 0)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Records the pictures, and renders once what they see of each carrier."""

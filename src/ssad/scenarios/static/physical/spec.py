@@ -62,8 +62,8 @@ class TextureSpec:
             return f"{attack}-{Path(self.file).stem}"
         about = attack, self.source, self.carrier, safeio.dump_json(self.options)
         rest = safeio.dump_json(self.settings), self.pair["train"], self.pair["train_images"]
-        rest += (self.around,) if self.around else ()
-        return f"{attack}-{digest('texture', *about, *rest)[:12]}"
+        more = (self.around,) if self.around else ()
+        return f"{attack}-{digest('texture', *about, *rest, *more)[:12]}"
 
     @property
     def picture(self) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
+from torch import Tensor
 
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core import safeio
@@ -130,8 +131,14 @@ class LightFolder:
                 about = {"values": values, "queries": 0}
             about["lumens"] = attack.power(about["values"])  # type: ignore[arg-type]
             _write(path, about)
-        values = safeio.read_json(path)["values"]
+        values, _ = self.found(spec)
         return attack.edit(values, target)
+
+    def found(self, spec: LightSpec) -> tuple[dict[str, float], Tensor | None]:
+        """The settings of an attack that was found; of a projector none, and its picture [3, H, W] in sRGB."""
+        if spec.device != "projector":
+            return dict(safeio.read_json(self.kept(spec))["values"]), None
+        return {}, torch.from_numpy(safeio.load_npz(self.kept(spec).with_suffix(".npz"))["colour"].copy())
 
     def _projected(
         self,
@@ -163,7 +170,9 @@ class LightFolder:
             safeio.save_npz(numbers, {"colour": colour.numpy()})
             save_picture(self.picture(spec), texture_picture(colour, surface.mask))
             _write(path, about | {"values": {"white": attack.lumens}, "lumens": attack.power(colour)})
-        return attack.edit(torch.from_numpy(safeio.load_npz(numbers)["colour"].copy()), target)
+        _, shown = self.found(spec)
+        assert shown is not None
+        return attack.edit(shown, target)
 
     def history(self, spec: LightSpec) -> dict[str, Any]:
         """Power, settings and queries of an attack that was found, for records."""
