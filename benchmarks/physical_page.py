@@ -18,7 +18,10 @@ from ssad.detectors import make_detector
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "physical_results.md"
-SUITES = {"physical": "ssad run physical --device cuda", "physical-quick": "ssad run physical-quick"}
+SUITES = {
+    "physical": "ssad run physical --device cuda", "physical-gpu": "ssad run physical-gpu --device cuda",
+    "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
+}  # fmt: skip
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 OTHERS = ("margins", "transfer", "grid", "others", "effort")
 
@@ -49,7 +52,7 @@ def part(name: str) -> list[str]:
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
     lines += [
-        f"Command: `{SUITES[name]}`. Software: torch {about['versions']['torch']}. Weights: "
+        f"Command: `{about.get('command') or SUITES[name]}`. Software: torch {about['versions']['torch']}. Weights: "
         + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items())
         + ".",
         "",

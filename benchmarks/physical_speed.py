@@ -23,7 +23,8 @@ import torch
 
 from ssad.detectors import make_detector
 from ssad.jobs.machine import quiet_warp
-from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.clip_recorder import record_clips
+from ssad.recording.clips import Clips
 from ssad.recording.target import TargetCar
 from ssad.recording.target_views import TargetClips
 from ssad.scenarios.static.digital.objectives import Situation, make_objective

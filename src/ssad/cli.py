@@ -424,7 +424,8 @@ def record(
             bar.update(task, completed=done, total=of)
 
         if clips is not None:
-            from ssad.recording.clip_recorder import Clips, pair_images, record_clips
+            from ssad.recording.clip_recorder import record_clips
+            from ssad.recording.clips import Clips, pair_images
             from ssad.recording.target import parse_target
 
             pairs = pair_images(names(towns), names(images))

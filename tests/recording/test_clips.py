@@ -29,20 +29,8 @@ from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
 from ssad.core.types import F64, EpisodeTrace
-from ssad.recording.clip_recorder import (
-    CLASSES,
-    FOCAL,
-    HIDDEN,
-    SECONDS,
-    SEEN,
-    SMALL,
-    TARGET,
-    Clips,
-    _named,
-    clip_views,
-    pair_images,
-    record_clips,
-)
+from ssad.recording.clip_recorder import CLASSES, HIDDEN, SECONDS, SEEN, TARGET, _named, clip_views, record_clips
+from ssad.recording.clips import FOCAL, SMALL, Clips, pair_images
 from ssad.recording.drives import make_drive
 from ssad.recording.nuscenes_recorder import drive
 from ssad.recording.scene_objects import SceneObjects

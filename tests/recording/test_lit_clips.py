@@ -13,7 +13,8 @@ from helpers.bodies import plain_bodies
 from ssad.camera.render import Weather
 from ssad.core.errors import UnknownNameError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.clip_recorder import record_clips
+from ssad.recording.clips import Clips
 from ssad.recording.lit_clips import HOURS, LitClip, at_hour, lit_clips
 from ssad.scenarios.static.physical.noninvasive import Flashlight, Projector, Shadow
 from ssad.scenarios.static.physical.noninvasive.light import at_values

@@ -35,7 +35,8 @@ from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.scene_shifter import SceneShifter
-from ssad.recording.clip_recorder import Clips, record_clips
+from ssad.recording.clip_recorder import record_clips
+from ssad.recording.clips import Clips
 from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
 from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
 from ssad.recording.scene_objects import RACK, SceneObjects, place_objects

@@ -14,7 +14,8 @@ from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, LaneType
 from ssad.datasets.coco import coco_data
-from ssad.recording.clip_recorder import BEHIND, CLASSES, faces, label_of
+from ssad.recording.clip_recorder import CLASSES, faces, label_of
+from ssad.recording.clips import BEHIND
 from ssad.recording.scene_objects import Clear, SceneObjects, _signs
 from ssad.recording.street_signs import StreetSign, plate_and_post, street_signs
 from ssad.roads import load_town

@@ -19,7 +19,8 @@ from ssad.camera.torch_jpeg import jpeg
 from ssad.camera.torch_sensor import develop
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import Clips, clip_views, record_clips
+from ssad.recording.clip_recorder import clip_views, record_clips
+from ssad.recording.clips import Clips
 from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.recording.textured_clips import KEPT, Wearing, textured_clips
 

@@ -11,7 +11,7 @@ from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
 from ssad.bench.physical_lights import LightEntry
 from ssad.core.errors import ConfigError
-from ssad.recording.clip_recorder import AZIMUTHS, ELEVATIONS
+from ssad.recording.clips import AZIMUTHS, ELEVATIONS
 from ssad.recording.nuscenes_recorder import WEATHERS
 from ssad.recording.target import TargetCar, parse_target
 from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical

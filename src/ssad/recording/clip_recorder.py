@@ -14,7 +14,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import islice, product
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.scene import Layer, Scene, Thing
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
+from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -38,8 +38,9 @@ from ssad.datasets.coco import coco_data
 from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.store import locked
-from ssad.recording.drives import check_streets, drive_street, make_drive
-from ssad.recording.nuscenes_recorder import HELD_OUT, PART_S, SENSOR, WEATHERS, check_parts, draw_weather, drive
+from ssad.recording.clips import BEHIND, FOCAL, SMALL, Clips
+from ssad.recording.drives import drive_street, make_drive
+from ssad.recording.nuscenes_recorder import PART_S, SENSOR, check_parts, draw_weather, drive
 from ssad.recording.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
 from ssad.recording.street_signs import free_places, plate_and_post
 from ssad.recording.target import TargetCar, TargetSign
@@ -56,115 +57,18 @@ from ssad.recording.viewpoints import (
     turn_of,
     weather_name,
 )
-from ssad.roads import load_town, town_names
+from ssad.roads import load_town
 
 CLASSES: Final = (*MMDET3D_CLASSES, *PLAIN_CLASSES)  # category ids are 1 and more in this order
-AZIMUTHS: Final = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)  # of an orbit, degrees
-ELEVATIONS: Final = (0.0, 15.0, 30.0)
-SIGN_AZIMUTHS: Final = (0.0, 30.0, 60.0, 300.0, 330.0)  # as long as its face is seen
-TALL: Final = {"car": 1.35, "sign": 0.35}  # m, least extent of a target
-BEHIND: Final = 75.0  # degrees from the front of a sign from which its face is hardly seen: it is crowd then
-IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 EACH: Final = 25  # pictures of a part: of one drive, if all can be taken there
 DRIVES: Final = 12  # tried for a part; from the fourth on, an orbit takes other cells than it should
 TRIES: Final = (3, 6, 12, 24)  # places tried for one view of an orbit in each turn of one drive
 TARGETS: Final = 5  # bodies that an orbit shows in turn
 SECONDS: Final = 24.0  # of a drive
 TARGET: Final = 1_000_000  # its tag
-FOCAL: Final = 1.1  # focal length in widths of the picture: 49 degrees across
-SMALL, HIDDEN = 8.0, 0.25  # px of a side, visible share: below, an object is crowd
+HIDDEN: Final = 0.25  # visible share below which an object is crowd, as one with a side below SMALL
 SEEN: Final = 0.6  # least visible share of the target, and least share of it inside the picture
 NEAR: Final = 0.2  # largest share of the picture that something right before the camera may cover
-
-
-@dataclass(frozen=True, slots=True)
-class Clips:
-    """What to record.
-
-    images: town -> how many pictures; mode; size: pixels a side; target: the car (None: another one in each part), or
-    the stop sign that an orbit shows; behind, height: m of the following camera; distances (m), azimuths, elevations
-    (degrees) of an orbit, those of the target where none are given (round a sign: one elevation, 0, which stands for
-    the heights of cameras of cars); weathers: of an orbit, a further factor of its cells (none: drawn as they come);
-    quality: of JPEG files; device: where pictures are rendered; streets: see `drive_street`.
-    ConfigError for what cannot be.
-    """
-
-    out: Path
-    images: tuple[tuple[str, int], ...] = tuple(IMAGES.items())
-    held_out: tuple[str, ...] = HELD_OUT
-    mode: Literal["drive", "orbit"] = "drive"
-    size: int = 640
-    target: TargetCar | TargetSign | None = None
-    behind: float = 20.0
-    height: float = 2.0
-    distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
-    azimuths: tuple[float, ...] = ()
-    elevations: tuple[float, ...] = ()
-    seed: int = 0
-    quality: int = 92
-    device: str = "cpu"
-    streets: str = "town"
-    weathers: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for town in (*(t for t, _ in self.images), *self.held_out):
-            if town not in town_names():
-                raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
-        check_streets(self.streets)
-        if not self.images or self.mode not in ("drive", "orbit"):
-            raise ConfigError("name a town to record, and drive or orbit")
-        for town, count in self.images:
-            if count < 1:
-                raise ConfigError(f"{town}: {count} pictures; ask for one or more")
-            if sum(t == town for t, _ in self.images) > 1:
-                raise ConfigError(f"{town} is named twice; name each town once")
-        if not 3.0 <= self.behind <= 60.0 or not 0.5 <= self.height <= 30.0 or not 1 <= self.quality <= 100:
-            raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
-        sign = isinstance(self.target, TargetSign)
-        object.__setattr__(self, "azimuths", self.azimuths or (SIGN_AZIMUTHS if sign else AZIMUTHS))
-        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if sign else ELEVATIONS))
-        if sign and self.mode != "orbit":
-            raise ConfigError("a stop sign stands still: record it with --clips orbit")
-        if not self.distances:
-            raise ConfigError("an orbit needs distances")
-        if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
-            raise ConfigError("distances: 3 to 80 m; elevations: 0 to 75 degrees")
-        for weather in self.weathers:
-            if weather not in WEATHERS:
-                raise unknown_name("weather", weather, WEATHERS)
-        if self.weathers and self.mode != "orbit":
-            raise ConfigError("weathers are those of an orbit; a drive has its own")
-        if not np.isfinite(self.azimuths).all():
-            raise ConfigError("azimuths: finite numbers of degrees")
-        if sign and (np.cos(np.radians(self.azimuths)) < np.cos(np.radians(BEHIND))).any():
-            raise ConfigError(f"azimuths of a sign: less than {BEHIND:g} degrees to either side of its front")
-        if sign and self.elevations != (0.0,):
-            raise ConfigError("a sign is seen from the heights of cars: give no elevations")
-        far = self.behind if self.mode == "drive" else max(self.distances)
-        what = "sign" if sign else "car"
-        if not FOCAL * self.size * TALL[what] / far >= SMALL or self.size > 4096:
-            least = int(np.ceil(SMALL * far / FOCAL / TALL[what]))
-            raise ConfigError(
-                f"pictures of {self.size} pixels: a {what} {far:g} m away needs {least}, and 4096 is the most"
-            )
-
-    def identity(self) -> dict[str, Any]:
-        """What decides the bytes."""
-        found = asdict(replace(self, out=Path())) | {"clips": self.mode, "images": [list(pair) for pair in self.images]}
-        skipped = {"out", "mode"} | ({"weathers"} if not self.weathers else set())
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in found.items() if k not in skipped}
-
-
-def pair_images(towns: Sequence[str], images: Sequence[str]) -> tuple[tuple[str, int], ...]:
-    """Towns with their numbers of pictures; one number stands for all. ConfigError."""
-    try:
-        counts = [int(text) for text in images]
-    except ValueError:
-        raise ConfigError(f"--images {','.join(images)}: expected whole numbers with commas between them") from None
-    counts = counts * len(towns) if len(counts) == 1 else counts
-    if len(counts) != len(towns):
-        raise ConfigError(f"--images: {len(counts)} numbers for {len(towns)} towns; give one for each, or one for all")
-    return tuple(zip(towns, counts, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,8 @@ from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
-from ssad.recording.clip_recorder import Clips, record_all
+from ssad.recording.clip_recorder import record_all
+from ssad.recording.clips import Clips
 from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.target_views import TargetClips
 from ssad.recording.textured_clips import see_clips, unseen_parts
