@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.insert import insert
 from benchmarks.traffic import ROUTES, town_routes, traffic
 from ssad.core.driving import Belief, Driver, Observation
 from ssad.core.lane_graph import LaneGraph
@@ -72,8 +73,6 @@ TITLES = {name: name for name in SYSTEMS} | {
     "all missed": "nothing (all missed)",
     "blind": "nobody (`blind`, not the Autopilot)",
 }
-DOCUMENT = Path(__file__).resolve().parents[1] / "docs" / "loop.md"
-MARKERS = ("<!-- beliefs: begin -->", "<!-- beliefs: end -->")
 
 
 def crowd(repetitions: int) -> tuple[list[Episode], dict[str, LaneGraph]]:
@@ -132,9 +131,7 @@ def page(figures: dict[str, dict[str, Any]]) -> None:
         rows = [figures[name][system] for name in sets]
         cells = [f"{text(row['CR'])} | {text(row['RC'])}" for row in rows]
         lines.append(f"| {title} | {' | '.join(cells)} | {sum(row['other'] for row in rows)} of {total} |")
-    before, _, rest = DOCUMENT.read_text().partition(MARKERS[0])
-    after = rest.partition(MARKERS[1])[2]
-    DOCUMENT.write_text("\n".join([before + MARKERS[0], *lines, MARKERS[1] + after]))
+    insert("loop.md", "beliefs", lines)
 
 
 def main() -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.insert import insert
 from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode, Route
@@ -24,8 +24,6 @@ from ssad.world.world import World
 PICK_UP = 2.5  # m/s^2 with which the ego is expected to start: the Autopilot's
 WITHIN = 4.0  # s between two at the same place that count as an encounter
 ACROSS = 0.5  # rad between the way of the ego and who crosses it
-DOCUMENT = Path(__file__).parents[1] / "docs" / "scenarios.md"
-MARKERS = ("<!-- crossing traffic: begin -->\n", "<!-- crossing traffic: end -->")
 
 
 def schedule(route: Route, speed: float, target: float, step: float) -> npt.NDArray[np.float64]:
@@ -111,9 +109,7 @@ def main() -> None:
         lines.append(row(name, given.repetitions))
         print(lines[-1], flush=True)
     if given.page:
-        before, _, rest = DOCUMENT.read_text().partition(MARKERS[0])
-        after = rest.partition(MARKERS[1])[2]
-        DOCUMENT.write_text("\n".join([before + MARKERS[0], *lines, MARKERS[1] + after]))
+        insert("scenarios.md", "crossing traffic", ["", *lines])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """How well background traffic drives: contacts between vehicles, vehicles off the road, queues that do not clear.
 
-`python benchmarks/traffic.py --hours 50` drives 50 vehicle-hours in every town; `--towns` takes names and files
+`python -m benchmarks.traffic --hours 50` drives 50 vehicle-hours in every town; `--towns` takes names and files
 (.xodr, .npz), `--signals green` switches all real signals to green, as in recorded drives, so that priority alone
-decides. Prints a table and where it happened; `--json FILE` writes both.
+decides. Prints a table and where it happened; `--json FILE` writes both, `--page` the table of docs/loop.md, together
+with the towns of earlier runs (`--also FILE`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.insert import insert
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import (
@@ -176,6 +178,8 @@ def main() -> None:
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene: others are other traffic")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json that hold other towns")
+    parser.add_argument("--page", action="store_true", help="write docs/loop.md")
     given = parser.parse_args()
     quiet_warp()
     rows = []
@@ -192,6 +196,7 @@ def main() -> None:
         for kind in ("contacts", "off_road", "stuck"):
             for one in row[kind][: given.show]:
                 print("   ", kind, json.dumps(one), flush=True)
+    rows = [*(row for file in given.also for row in json.loads(file.read_text())["towns"]), *rows]
     total = {"town": "all", "hours": sum(row["hours"] for row in rows)} | {
         kind: [one for row in rows for one in row[kind]] for kind in ("contacts", "off_road", "stuck")
     }
@@ -199,6 +204,23 @@ def main() -> None:
     if given.json:
         about = {"vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
         given.json.write_text(json.dumps(about | {"towns": rows}, indent=1) + "\n", encoding="utf-8")
+    if given.page:
+        page([*rows, total])
+
+
+def page(rows: Sequence[dict[str, Any]]) -> None:
+    """Write the table of docs/loop.md."""
+    lines = [
+        "| town | vehicle-hours | contacts | per 100 h | upper 95 % limit | off the road | in a lasting queue |",
+        "|---" * 7 + "|",
+    ]
+    for row in rows:
+        mean, most = rate(row)
+        lines.append(
+            f"| {row['town']} | {row['hours']:,.0f} | {len(row['contacts'])} | {mean:.2f} | {most:.2f} | "
+            f"{len(row['off_road'])} | {len(row['stuck'])} |"
+        )
+    insert("loop.md", "traffic", lines)
 
 
 def _line(row: dict[str, Any]) -> str:

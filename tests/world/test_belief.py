@@ -11,13 +11,13 @@ import pytest
 from ssad.core.driving import Belief, Believer, Planner
 from ssad.core.errors import ConfigError
 from ssad.core.traces import trace_hash
-from ssad.core.types import AgentKind, Controller, EpisodeAgent, Pose, SignalState
+from ssad.core.types import ENDS, AgentKind, Controller, EpisodeAgent, Pose, SignalState
 from ssad.drivers import make_system
 from ssad.drivers.belief import DegradedBelief, LineOfSight, in_sight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
-from ssad.world.belief import Lanes
+from ssad.world.belief import Lanes, rested
 from ssad.world.rollout import Loop, rollout
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
@@ -312,6 +312,48 @@ def test_what_is_left_open_is_made_up_from_the_lanes() -> None:
     assert np.allclose(forecast[4, :, 1], 3.5, atol=1e-3)
     assert np.allclose(np.cos(forecast[4, :, 2]), -1.0, atol=1e-3)
     assert world.array("seen.gives_way")[0, world.agents + 1 : world.agents + 5].tolist() == [1, 1, 0, 1]
+
+
+class Bare(Autopilot):
+    """The Autopilot over pose, speed, size and kind alone."""
+
+    sensors = ("truth",)
+
+    def believe(self, view):
+        return bare(view.readings["truth"])
+
+
+def test_how_long_somebody_has_stood_is_remembered_from_earlier_beliefs() -> None:
+    """So that it is passed as early as by who is told."""
+    parked = standing(80.0, model="compact")
+    scene = episode(ego(speed=8.0, controller=Controller.AUTOPILOT), parked)
+    ways = [rollout(World([scene], GRAPHS), driver)[0] for driver in (Autopilot(), Bare())]
+    assert ways[0].end == ways[1].end == "complete"
+    assert abs(len(ways[0].speed) - len(ways[1].speed)) <= 10  # steps of 0.1 s
+    moved = {"pose": np.array([[[0.0, 0, 0], [5, 0, 0], [9, 0, 0]]]), "speed": np.array([[0.1, 0.0, 4.0]])}
+    now = moved | {"kind": np.array([[1, 1, 1]])}
+    before = now | {"pose": now["pose"] + [0.5, 0, 0], "waited": np.array([[2.0, 3.0, 4.0]])}
+    before["kind"] = np.array([[1, 0, 1]])  # nobody was known of where the second is
+    assert rested(now, before, np.array([0.5]))[0] == pytest.approx([2.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("driver", [Autopilot(), Bare()])
+@pytest.mark.parametrize("height", [0.0, 6.0])
+def test_who_is_on_a_bridge_is_neither_met_nor_touched(height: float, driver) -> None:
+    road = GRAPHS["Straight"]
+    xy, z, yaw, points = road.xy.copy(), road.z.copy(), road.yaw.copy(), road.points(1)
+    xy[points] = np.stack([np.full(201, 100.0), np.arange(-100.0, 301.0, 2.0)], 1)
+    z[points], yaw[points] = height, np.pi / 2
+    north = replace(
+        line_route(-60.0, 200.0), lane=np.ones(261, np.int32), yaw=np.full(261, np.pi / 2, np.float32),
+        xy=np.stack([np.full(261, 100.0), np.arange(-60.0, 201.0)], 1).astype(np.float32),
+    )  # fmt: skip
+    other = ego(speed=8.0, controller=Controller.FOLLOW, name="other", pose=Pose(100.0, -60.0, np.pi / 2), route=north)
+    world = World([episode(ego(x=40.0, speed=8.0, controller=Controller.AUTOPILOT), other)],
+                  {"Straight": replace(road, xy=xy, z=z, yaw=yaw)})  # fmt: skip
+    speed = rollout(world, driver)[0].speed[:, 0]
+    assert (speed[5:100].min() > 7.5) == (height > 0.0)
+    assert world.ended()[0] == ENDS.index("complete")
 
 
 def test_made_up_ways_are_those_of_the_routes_before_a_junction() -> None:

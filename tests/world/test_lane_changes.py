@@ -9,7 +9,18 @@ import pytest
 from world.worlds import GRAPHS, NO_PASSING, ego, episode, line_route, straight_graph
 
 from ssad.core.lane_graph import LaneGraph
-from ssad.core.types import ENDS, Controller, Episode, EpisodeAgent, LaneType, Limits, Phase, Pose, SignalState
+from ssad.core.types import (
+    ENDS,
+    Condition,
+    Controller,
+    Episode,
+    EpisodeAgent,
+    LaneType,
+    Limits,
+    Phase,
+    Pose,
+    SignalState,
+)
 from ssad.world.world import World
 
 LONG = Limits(max_steps=600)
@@ -229,3 +240,18 @@ def test_who_is_taken_over_while_passing_changes_no_lane_any_more() -> None:
         world.step()
         assert not world.array("touch").any()
     assert abs(world.array("pose")[0, 0, 1]) < 0.3
+
+
+@pytest.mark.parametrize("back", [True, False])
+def test_a_pass_on_the_oncoming_lane_is_broken_off_when_somebody_comes(back: bool) -> None:
+    """Who comes is slow and far away when the pass begins, and fast soon afterwards; it sees nobody."""
+    coming = steady("coming", 190.0, 3.5, 1.0, yaw=np.pi)
+    fast = Phase(14.0, when=Condition("time", 4.5 if back else 6.5))
+    coming = replace(coming, phases=(*coming.phases, fast))
+    found = drive(episode(autopilot(), parked(80.0), coming, limits=LONG), GRAPHS)
+    x, y = found["pose"][:, 0, 0], found["pose"][:, 0, 1]
+    before = found["pose"][:, 2, 0] > x
+    assert y[before].max() > 0.5  # it had begun
+    beside = before & (np.abs(x - 80.0) < 4.0)
+    assert beside.any() == (not back)
+    assert ENDS[found["end"][0]] == "complete"

@@ -206,10 +206,13 @@ class Belief:
             next junction (0 inside; 1e6: none), how it turns there (0 straight, 1 right, 2 left; 3 more with a stop or
             yield sign), and m that its path ahead leaves the straight line along its heading.
         line_signal: [B, K] signal of the stop line before it, -1 none.
-        stood: [B, K] s that it has been at rest while wanting to go.
+        stood: [B, K] s that it has been at rest while wanting to go. None: as long as earlier beliefs have had somebody
+            at rest where it is.
         gives_way: [B, K] whether it can be relied on to give way to those who go first.
         change: [B, K, 2] turn signal of a lane change (1 left, -1 right, 0 none), and 1 while it passes somebody on an
             oncoming lane. None: nobody changes lane.
+        height: [B, K] m, of the road under it: who is on, or below, a bridge does not count. None: of the lane under
+            it; NaN: not known.
         signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: as it is. None: all as
             they are.
     """
@@ -224,6 +227,7 @@ class Belief:
     stood: F32 | None = None
     gives_way: Bool | None = None
     change: I32 | None = None
+    height: F32 | None = None
     signal: npt.NDArray[np.int8] | None = None
 
     def keep(self, mask: Bool) -> Self:

@@ -18,8 +18,11 @@ from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, TurnRank
+from ssad.world.kernels.shared import BRIDGE
 
 FITS = 0.5  # cosine of the angle between an object and a lane that goes its way
+RESTS = 0.5  # m/s: who is slower is at rest
+SAME = 1.0  # m between the places of one who is at rest, in two beliefs
 HOPS = 24  # lanes that a forecast may run through
 VEHICLES = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE, AgentKind.BICYCLE)
 
@@ -52,7 +55,7 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
         expected = (batch, signals) if field.name == "signal" else (*kind.shape, *tails.get(field.name, ()))
         if value.shape != expected:
             raise ConfigError(f"belief: {field.name} has shape {value.shape}; expected {expected}")
-        if field.name != "signal" and not np.isfinite(value[used]).all():
+        if field.name not in ("signal", "height") and not np.isfinite(value[used]).all():
             raise ConfigError(f"belief: {field.name} holds a number that is not finite")
     if not (np.asarray(belief.size)[used] > 0).all():
         raise ConfigError("belief: size must be above 0 m")
@@ -97,11 +100,44 @@ def complete(belief: Belief, lanes: Sequence[Lanes], scenes: Bool) -> dict[str, 
     out["forecast"] = np.asarray(forecast, np.float32)
     out["way"] = np.asarray(way, np.float32)
     out["signal"] = np.asarray(signal, np.int32)
+    height = _heights(pose, used, lanes) if belief.height is None else belief.height
+    out["height"] = np.asarray(height, np.float32)
     out["waited"] = np.zeros(kind.shape, np.float32) if belief.stood is None else np.asarray(belief.stood, np.float32)
     change = np.zeros((*kind.shape, 2), np.int32) if belief.change is None else np.asarray(belief.change, np.int32)
     out["change"] = change
     places = np.concatenate([pose[:, :, None, :2], out["forecast"][..., :2]], 2)
     out["span"] = np.concatenate([places.min(2), places.max(2)], -1)
+    return out
+
+
+def rested(
+    now: Mapping[str, npt.NDArray[Any]], before: Mapping[str, npt.NDArray[Any]], seconds: npt.NDArray[Any]
+) -> F32:
+    """How long objects have been at rest: as long as somebody has stood where they stand.
+
+    Args:
+        now: `pose` [B, K, 3], `speed` and `kind` [B, K] of a belief.
+        before: The same of the belief before, [B, L], and `waited` [B, L] s there.
+        seconds: [B] s from that one to this.
+
+    Returns:
+        [B, K] s; 0 for who moves.
+    """
+    rest = [(one["kind"] != AgentKind.NONE) & (np.abs(one["speed"]) < RESTS) for one in (now, before)]
+    away = np.hypot(*np.moveaxis(now["pose"][:, :, None, :2] - before["pose"][:, None, :, :2], -1, 0))
+    same = rest[0][:, :, None] & rest[1][:, None] & (away < SAME)
+    known = before["waited"] + np.asarray(seconds)[:, None]
+    out: F32 = np.where(same, known[:, None], 0.0).max(-1, initial=0.0).astype(np.float32)
+    return out
+
+
+def _heights(pose: F32, used: Bool, lanes: Sequence[Lanes]) -> F32:
+    """[B, K] height of the lane under each object, NaN where it is on none that goes its way; 0 without bridges."""
+    out = np.zeros(used.shape, np.float32)
+    for town in dict.fromkeys(one for one in lanes if one.hilly):
+        scene, row = np.nonzero(used & np.array([one is town for one in lanes])[:, None])
+        lane, s, _ = town.match(pose[scene, row].astype(np.float64))
+        out[scene, row] = town.height(lane, s)
     return out
 
 
@@ -159,6 +195,7 @@ class Lanes:
         self._gap = float(self._length.max()) + 10.0
         owner = np.repeat(np.arange(count), np.diff(graph.offset))
         self._axis = owner * self._gap + graph.s.astype(np.float64)
+        self.hilly = bool(np.ptp(graph.z) > BRIDGE)
         self._line = np.full(count, FAR)
         self._lamp = np.full(count, -1, np.int32)
         for k in range(len(graph.stop_lane)):
@@ -214,6 +251,10 @@ class Lanes:
         s[who] = grid.seg_s[pick[good]] + t[good] * np.sqrt(square[good])
         left[who] = np.copysign(away[good], dx[good] * py[good] - dy[good] * px[good])
         return lane, s, left
+
+    def height(self, lane: npt.NDArray[np.int64], s: F64) -> F64:
+        """Height [n] of places on lanes, m; NaN on none."""
+        return np.where(lane >= 0, np.interp(np.maximum(lane, 0) * self._gap + s, self._axis, self.graph.z), np.nan)
 
     def ahead(self, lane: npt.NDArray[np.int64], s: F64) -> tuple[F64, I32]:
         """The first three columns of `Belief.way` [n, 3], and `Belief.line_signal` [n], for places on lanes."""

@@ -15,10 +15,13 @@ from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
 from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
+from ssad.world.kernels.shared import BRIDGE
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route
 SLOW_DOWN = 2.0  # m/s^2 at which a route's speed profile falls towards a bend
+CAREFUL = 6.0  # m/s at most into a turn without a signal
+BEFORE = 15  # points of a route before a junction between which its stop line lies
 GREEN, YELLOW, ALL_RED = 12.0, 3.0, 1.0  # s of a signal phase
 ON_AND_ON = 1000.0  # m that a lane goes on beyond the end of a route
 FADE = 30  # m over which a lane that ends is led back to the route
@@ -36,6 +39,7 @@ class PathTable:
         bend: [N] m that the next 64 m leave the straight line along the point's heading.
         ahead: [N, 3] m to the line of the next stop sign and the route point there (FAR: none), m to the end of the
             next junction.
+        height: [N] m.
         lane: [N] of the town, -1 none.
         beside: [N, 4] as in `Roads`.
         town: Name of the town.
@@ -46,6 +50,7 @@ class PathTable:
     signal: npt.NDArray[np.int32]
     bend: F32
     ahead: F32
+    height: F32
     lane: npt.NDArray[np.int32]
     beside: F32
     town: str
@@ -69,14 +74,20 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
     kernel = np.ones(3) / 3.0
     smooth = np.convolve(np.pad(kappa, 1, mode="edge"), kernel, mode="valid")
     cap = np.minimum(route.speed_limit, np.sqrt(LATERAL_COMFORT / np.maximum(np.abs(smooth), 1e-4)))
+    entry, leave, rank = _junctions(route, graph, yaw)
+    stop, signal = _next_line(route, graph, graph.stop_lane, graph.stop_s, graph.stop_signal)
+    # who turns where no signal tells when comes slowly
+    lit = np.append(~graph.signal_virtual, False)[signal]
+    enters = np.flatnonzero((entry[1:] == 0.0) & (entry[:-1] > 0.0) & (rank[:-1] % TurnRank.YIELD != TurnRank.STRAIGHT))
+    before = np.maximum(enters - BEFORE, 0)
+    free = enters[~lit[before] | (stop[before] > entry[before] + 3.0)]
+    cap[free] = np.minimum(cap[free], CAREFUL)
     # v^2 may fall by 2 a a metre: the least over all points ahead, in one sweep
     fall = 2.0 * SLOW_DOWN * route.spacing * np.arange(n)
     cap = np.sqrt(np.minimum.accumulate((cap.astype(np.float64) ** 2 + fall)[::-1])[::-1] - fall)
-    stop, signal = _next_line(route, graph, graph.stop_lane, graph.stop_s, graph.stop_signal)
     signs = graph.sign_kind[graph.rule_sign] == SignKind.STOP
     distance, _ = _next_line(route, graph, graph.rule_lane[signs], graph.rule_s[signs], graph.rule_sign[signs])
     line = np.floor(np.arange(n) * route.spacing + distance + 0.5)
-    entry, leave, rank = _junctions(route, graph, yaw)
     path = np.stack([route.xy[:, 0], route.xy[:, 1], route.yaw, smooth], 1)
     return PathTable(
         path.astype(np.float32),
@@ -84,6 +95,7 @@ def path_table(route: Route, graph: LaneGraph) -> PathTable:
         signal,
         _bend(route),
         np.stack([distance, line, leave], 1).astype(np.float32),
+        _height(route, graph),
         route.lane.astype(np.int32),
         _beside(route, graph),
         graph.name,
@@ -141,6 +153,18 @@ def _junctions(
         entry[start:stop] = 0.0
         rank[start:stop] = kind
     return entry, leave, rank
+
+
+def _height(route: Route, graph: LaneGraph) -> F32:
+    """[N] height of the lane under each point of a route; 0 where the town has no bridge."""
+    out = np.zeros(len(route.xy), np.float32)
+    if np.ptp(graph.z) > BRIDGE:
+        for lane in np.unique(route.lane[route.lane >= 0]).tolist():
+            part, span = np.flatnonzero(route.lane == lane), graph.points(lane)
+            away = route.xy[part, None] - graph.xy[span]
+            out[part] = graph.z[span][(away**2).sum(-1).argmin(1)]
+        out[route.lane < 0] = np.nan
+    return out
 
 
 def _lane_left(
@@ -421,6 +445,7 @@ def _roads(graphs: Sequence[LaneGraph], pool: _Pool, device: str) -> Roads:
     roads = Roads()
     parts["path"] = [t.path for t in pool.tables]
     parts["rule"] = [t.rule for t in pool.tables]
+    parts["height"] = [t.height for t in pool.tables]
     parts["path_signal"] = [t.signal for t in pool.tables]
     parts["bend"] = [t.bend for t in pool.tables]
     parts["track"] = [np.array(pool.tracks or [(0.0,) * 4])]

@@ -16,7 +16,7 @@ from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
-from ssad.world.belief import Lanes, check, complete, lanes_of
+from ssad.world.belief import Lanes, check, complete, lanes_of, rested
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import see
 from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
@@ -29,9 +29,10 @@ from ssad.world.kernels.traffic import meet, sight
 from ssad.world.models import MODELS
 from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 
-VERSION = "5"  # part of every cell's key: raise it when the same episode no longer gives the same bits
+VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
+_OF_SCENES = ("believes", "told", "light")  # arrays of `Seen` that have no rows of objects
 
 
 @dataclass(frozen=True)
@@ -116,9 +117,11 @@ class World:
         old = {name: self.array(f"seen.{name}").copy() for name in _SEEN} if self.believed else {}
         self.believed = believed
         for name, array in _SEEN.items():
-            shape = {"believes": (self.batch,), "light": (self.batch, self.bank.forced.shape[1])}.get(
-                name, (self.batch, rows, HORIZON)[: array.ndim]
-            )
+            shape = {
+                "believes": (self.batch,),
+                "told": (self.batch,),
+                "light": (self.batch, self.bank.forced.shape[1]),
+            }.get(name, (self.batch, rows, HORIZON)[: array.ndim])
             setattr(self.seen, name, wp.zeros(shape, dtype=array.dtype, device=self.device))
             self._views.pop(f"seen.{name}", None)
         for name, value in old.items():
@@ -164,7 +167,7 @@ class World:
             self.launch(
                 move, few, [bank, roads, state, self.controls, self.places, self.agents, threads, dt, substeps]
             ),
-            self.launch(contact, few, [bank, state, self.work, self.agents, threads]),
+            self.launch(contact, few, [bank, roads, state, self.work, self.agents, threads]),
             self.launch(record, self.batch, [bank, roads, state, self.ego, self.agents, dt]),
         ]
         self._graph: Any = None
@@ -380,12 +383,20 @@ class World:
             check(belief, self.batch, light.shape[1], which)
             towns = [self.episodes[k].town for k in self.array("episode")]
             rows = complete(belief, lanes_of(self.graphs, towns, self._lanes), which)
+            step = self.array("step")
+            if belief.stood is None:
+                old = {
+                    name: self.array(f"seen.{name}")[:, self.agents :] for name in ("pose", "speed", "kind", "waited")
+                }
+                old["kind"] = np.where(self.array("seen.believes")[:, None], old["kind"], AgentKind.NONE)
+                rows["waited"] = rested(rows, old, self.dt * (step - self.array("seen.told")))
             count = rows["kind"].shape[1]
             if count > self.believed:
                 self._make_room(-(-count // 16) * 16)
             for name, value in rows.items():
                 self._put_rows(name, value, which)
             told = np.full(light.shape, -1) if belief.signal is None else np.asarray(belief.signal)
+            self.put("seen.told", np.where(which, step, self.array("seen.told")).astype(np.int32))
             self.put("seen.light", np.where(which[:, None], told, light).astype(np.int32))
         self.put("seen.believes", believes.astype(np.int32))
 
@@ -406,7 +417,7 @@ class World:
         """
         self._see.launch()
         seen = {name: self.array(f"seen.{name}") for name in _SEEN}
-        own = {name: a[:, : self.agents].copy() for name, a in seen.items() if name not in ("believes", "light")}
+        own = {name: a[:, : self.agents].copy() for name, a in seen.items() if name not in _OF_SCENES}
         own["kind"][:, 0] = AgentKind.NONE
         own["kind"][self.ended() != 0] = AgentKind.NONE
         return Belief(
@@ -420,6 +431,7 @@ class World:
             stood=own["waited"],
             gives_way=own["gives_way"] != 0,
             change=own["change"],
+            height=own["height"],
         )
 
     def state(self) -> WorldState:
@@ -499,7 +511,7 @@ class World:
         arrays += [self.array(f"ego.{name}") for name in _EGO]
         arrays += [self.array(f"noise.{name}") for name in self._noisy]
         believes = self.array("seen.believes")
-        rows = [self.array(f"seen.{name}") for name in _SEEN if name not in ("believes", "light")]
+        rows = [self.array(f"seen.{name}") for name in _SEEN if name not in _OF_SCENES]
         kind, light = self.array("seen.kind"), self.array("seen.light")
         order = self.array("episode")
         out = []

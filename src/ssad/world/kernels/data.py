@@ -85,6 +85,7 @@ class Roads:
     ahead: wp.array(dtype=wp.vec3)  # [N] m to the next stop sign's line, its route point, m to the next junction's end
     # [N] m to the lane's centre on the left (0: none) and how far it goes on (negative: oncoming lane); right likewise
     beside: wp.array(dtype=wp.vec4)
+    height: wp.array(dtype=wp.float32)  # [N] m: what is much higher or lower is on, or below, a bridge
     path_signal: wp.array(dtype=wp.int32)  # [N] signal of the next stop line, -1 none
     track: wp.array(dtype=wp.vec4)  # [N] s, x, y, yaw: trajectories
     segment: wp.array(dtype=wp.vec4)  # [M] x0, y0, x1, y1
@@ -152,10 +153,12 @@ class Seen:
     way: wp.array2d(dtype=wp.vec4)
     # [B, rows] turn signal of a lane change (1 left, -1 right, 0 none), and whether it is on an oncoming lane (1)
     change: wp.array2d(dtype=wp.vec2i)
+    height: wp.array2d(dtype=wp.float32)  # [B, rows] m, of the road under it; NaN: not known
     signal: wp.array2d(dtype=wp.int32)  # [B, rows] signal of its next stop line, -1 none
     waited: wp.array2d(dtype=wp.float32)  # [B, rows] s at rest while wanting to go
     gives_way: wp.array2d(dtype=wp.int32)  # [B, rows] 1: can be relied on to give way
     believes: wp.array(dtype=wp.int32)  # [B] 1: the ego plans over the rows from A on, not over the truth
+    told: wp.array(dtype=wp.int32)  # [B] step at which the ego was last told what to believe
     light: wp.array2d(dtype=wp.int32)  # [B, S] SignalState that such an ego believes, -1: as it is
 
 

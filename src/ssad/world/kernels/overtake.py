@@ -2,14 +2,15 @@
 
 The lane beside is taken where it is free: nobody on it would have to brake hard (the safety criterion of MOBIL,
 Kesting et al. 2007), and it leads on for as long as the manoeuvre takes. An oncoming lane is used only to pass who
-stands, where the line may be crossed and everybody who comes is far enough away. A queue is not passed.
+stands, where the line may be crossed and everybody who comes is far enough away; if somebody comes after all, it is
+left again while there is room behind who stands. A queue is not passed.
 """
 
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, LEADERS, NO_LEADER, End, EpisodeArrays, Presence, Roads, Seen, State, Work
-from ssad.world.kernels.lanes import lanes_left, metres_left, way_frame
+from ssad.world.kernels.lanes import lanes_left, metres_left, on_oncoming_lane, way_frame
 from ssad.world.kernels.shared import boxes_touch, route_frame
 from ssad.world.kernels.traffic import idm_gap, line_ahead
 
@@ -219,6 +220,37 @@ def way_is_clear(
 
 
 @wp.func
+def break_off(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, e: int, rows: wp.vec2i
+) -> bool:
+    """Go back behind who was to be passed on the oncoming lane, if somebody comes and there is room to stop there."""
+    route = bank.route[e, i]
+    shift = state.shift[b, i]
+    own = bank.body[bank.model[e, i]]
+    u0 = state.aim[b, i][0]
+    v = wp.max(state.speed[b, i], 0.0)
+    top = state.aim[b, i][1]
+    shortest = 2.0 * RAMP_LEAST * own[0]
+    home = gaps(bank, roads, state, seen, b, i, e, rows, 0.0, v, 0.0, 0.0)
+    room = home[0] - wp.max(0.5 * v * v / -FIRM, shortest * lanes_left(shift, u0))
+    if home[3] != 0.0 or home[0] >= FAR or home[1] > 0.5 or room < 1.0:
+        return False
+    line = line_ahead(roads, route[0] + state.progress[b, i], u0 - float(state.progress[b, i]), 0.0)
+    beyond = end_of_block(bank, roads, state, seen, b, i, e, rows, own[0] + home[0], line)
+    if beyond < 0.0:
+        return False
+    goal = beyond + own[0] + wp.max(shortest, RAMP_TIME * top)
+    time = passing_time(v, top, goal)
+    # less cautious than who has not begun yet, or it would give up what was allowed
+    found = gaps(bank, roads, state, seen, b, i, e, rows, 1.0, v, wp.max(time - 1.0, 0.0), goal - 5.0)
+    if found[4] == 0.0:
+        return False
+    ramp = wp.max(home[0] - PULL_OUT, shortest * lanes_left(shift, u0))
+    state.shift[b, i] = wp.vec4(u0, u0 + wp.min(ramp, RAMP_TIME * v + shortest), lanes_left(shift, u0), 0.0)
+    return True
+
+
+@wp.func
 def choose_lane(
     bank: EpisodeArrays,
     roads: Roads,
@@ -243,11 +275,14 @@ def choose_lane(
     if shift[3] == 0.0 and leader == NO_LEADER:
         return
     u0 = state.aim[b, i][0]
-    if u0 < shift[1]:
-        return  # changes lane already
     rows = wp.vec2i(0, agents)
     if i == 0 and seen.believes[b] == 1:
         rows = wp.vec2i(agents, all_rows)
+    if shift[3] > 0.0 and on_oncoming_lane(roads, route[0] + state.progress[b, i], shift):
+        if break_off(bank, roads, state, seen, b, i, e, rows):
+            return
+    if u0 < shift[1]:
+        return  # changes lane already
     first = route[0] + state.progress[b, i]
     part = u0 - float(state.progress[b, i])
     v = wp.max(state.speed[b, i], 0.0)

@@ -16,7 +16,7 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
-from ssad.world.kernels.shared import boxes_touch, on_track, sign_line, signal_state, wrap
+from ssad.world.kernels.shared import BRIDGE, boxes_touch, height_of, on_track, sign_line, signal_state, wrap
 
 
 @wp.func
@@ -26,7 +26,7 @@ def halfway(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def look_for_contacts(bank: EpisodeArrays, state: State, b: int, i: int, agents: int):
+def look_for_contacts(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int, agents: int):
     """Which agents an agent touches, at the end of the step and half-way through it; wakes it near the ego."""
     mask = wp.int64(0)
     if state.active[b, i] != Presence.ABSENT:
@@ -48,6 +48,9 @@ def look_for_contacts(bank: EpisodeArrays, state: State, b: int, i: int, agents:
                         q0 = state.previous[b, j]
                         hit = boxes_touch(halfway(p0, p), pb[0], pb[1], halfway(q0, q), qb[0], qb[1])
                     if hit:
+                        higher = height_of(bank, roads, state, b, i) - height_of(bank, roads, state, b, j)
+                        hit = not wp.abs(higher) > BRIDGE  # NaN: not known
+                    if hit:
                         mask = mask | (wp.int64(1) << wp.int64(j))
         if state.active[b, i] == Presence.ASLEEP:
             ego = state.pose[b, 0]
@@ -57,14 +60,14 @@ def look_for_contacts(bank: EpisodeArrays, state: State, b: int, i: int, agents:
 
 
 @wp.kernel(enable_backward=False)
-def contact(bank: EpisodeArrays, state: State, work: Work, agents: int, threads: int):
+def contact(bank: EpisodeArrays, roads: Roads, state: State, work: Work, agents: int, threads: int):
     """Contacts of all agents; wakes sleeping traffic."""
     b, first = wp.tid()
     if b == 0 and first == 0:
         work.count[0] = 0  # for the next step's `sight`
     if state.end[b] == End.RUNNING:
         for i in range(first, agents, threads):
-            look_for_contacts(bank, state, b, i, agents)
+            look_for_contacts(bank, roads, state, b, i, agents)
 
 
 @wp.func

@@ -3,10 +3,11 @@
 import warp as wp
 
 from ssad.core.types import SignalState
-from ssad.world.kernels.data import FAR, EpisodeArrays, Roads
+from ssad.world.kernels.data import FAR, EpisodeArrays, Roads, State
 
 IDM_ACCEL = wp.constant(2.5)
 NO_LINE = wp.constant(1 << 30)
+BRIDGE = wp.constant(4.5)  # m between two roads of which one leads over the other
 
 
 @wp.func
@@ -38,6 +39,16 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
     dy = b[1] - a[1]
     r = 1.0 / wp.sqrt(wp.max(dx * dx + dy * dy, 1.0e-12))
     return wp.vec4(a[0] + f * dx, a[1] + f * dy, dx * r, dy * r)
+
+
+@wp.func
+def height_of(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: int) -> float:
+    """Height of the road under an agent, m: its route's, where it is now; NaN without a route."""
+    route = bank.route[state.episode[b], i]
+    height = float(wp.nan)
+    if route[1] > 1:
+        height = roads.height[route[0] + state.progress[b, i]]
+    return height
 
 
 @wp.func

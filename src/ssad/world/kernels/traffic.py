@@ -27,6 +27,7 @@ from ssad.world.kernels.data import (
 from ssad.world.kernels.drive import room_behind
 from ssad.world.kernels.lanes import ASIDE, change_priority, change_speed, changes, way_frame
 from ssad.world.kernels.shared import (
+    BRIDGE,
     IDM_ACCEL,
     boxes_touch,
     sign_line,
@@ -150,14 +151,38 @@ def waits(
 
 
 @wp.func
+def clears(
+    bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, me: int, j: int, e: int, dt: float
+) -> bool:
+    """Whether j can no longer stop before the junction though its signal, as `me` sees it, is not green any more."""
+    index = seen.signal[b, j]
+    line = seen.way[b, j][0] - seen.half[b, j][0]
+    v = seen.speed[b, j]
+    late = bool(False)
+    if index >= 0 and v * v >= 8.0 * (wp.max(line, 0.0) + 1.5):
+        lit = light(bank, roads, state, seen, b, me, e, index, dt)
+        late = lit == SignalState.YELLOW or lit == SignalState.RED
+    return late
+
+
+@wp.func
+def first_there(far_i: float, v_i: float, i: int, far_j: float, v_j: float, j: int) -> bool:
+    """Whether i is at a place sooner than j; the same bits whoever asks."""
+    mine = far_i * (wp.max(v_j, 0.0) + 1.0)
+    other = far_j * (wp.max(v_i, 0.0) + 1.0)
+    return mine < other or (mine == other and i < j)
+
+
+@wp.func
 def has_priority(
     bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, j: int, e: int, dt: float
 ) -> bool:
     """Whether i goes before j (rows of `seen`) where their paths cross; of each two exactly one goes first.
 
     Another Autopilot is relied on to give way, and so is the ego, whoever drives it: traffic does not know who is under
-    test. Scripted actors and walkers are not. Whoever is inside the junction goes first (see `waits`), then whoever has
-    no stop or yield sign, straight before right before left, then whoever is nearer to it, then the lower number.
+    test. Scripted actors and walkers are not. Whoever is inside the junction goes first (see `waits`), then who has got
+    there too late to stop at a signal (see `clears`), then whoever has no stop or yield sign, straight before right
+    before left, then whoever is nearer to it, then the lower number.
     """
     if seen.gives_way[b, j] == 0:
         return False
@@ -169,10 +194,26 @@ def has_priority(
         return True
     if inside_j and not inside_i and waits(bank, roads, state, seen, b, i, i, j, e, dt):
         return False
+    if not inside_i and not inside_j:
+        late_i = clears(bank, roads, state, seen, b, i, i, e, dt)
+        late_j = clears(bank, roads, state, seen, b, i, j, e, dt)
+        if late_i != late_j:
+            return late_i
     if a[2] != c[2]:
         return a[2] < c[2]
     if wp.abs(a[1] - c[1]) > 1.0:
         return a[1] < c[1]
+    if inside_i and inside_j:
+        p = seen.pose[b, i]
+        q = seen.pose[b, j]
+        across = wp.sin(q[2] - p[2])
+        if wp.abs(across) > 0.5:
+            # who is first where their straight ways cross; who brakes for the other stays second
+            dx = q[0] - p[0]
+            dy = q[1] - p[1]
+            far_i = (dx * wp.sin(q[2]) - dy * wp.cos(q[2])) / across
+            far_j = (dx * wp.sin(p[2]) - dy * wp.cos(p[2])) / across
+            return first_there(far_i, seen.speed[b, i], i, far_j, seen.speed[b, j], j)
     return i < j
 
 
@@ -199,10 +240,14 @@ def conflict_gap(
     gap = FAR
     u = float(0.0)
     w = v
-    reach = own[0] + other[0] + 2.0
+    # so long that who is fast and short is not first before my way and then behind it
+    long = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
+    reach = own[0] + long + 2.0
     reach2 = reach * reach
     for k in range(HORIZON):
-        after = wp.min(w + 2.0 * STRIDE, wp.max(target, w))
+        # it slows down for bends as the route's speed profile says
+        spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
+        after = wp.min(w + 2.0 * STRIDE, wp.min(wp.max(target, w), wp.max(roads.rule[spot][0], w - 4.0 * STRIDE)))
         u = u + 0.5 * (w + after) * STRIDE
         w = after
         at = way_frame(roads, route[0], route[1], shift, u0 + u)
@@ -219,8 +264,8 @@ def conflict_gap(
                 qs = wp.sin(q[2])
                 ct = wp.abs(qc * at[2] + qs * at[3])
                 st = wp.abs(qs * at[2] - qc * at[3])
-                he = other[0] * ct + other[1] * st
-                we = other[0] * st + other[1] * ct
+                he = long * ct + other[1] * st
+                we = long * st + other[1] * ct
                 if wp.abs(across) < own[1] + we + lat_margin and wp.abs(along) < own[0] + he + 1.0:
                     edge = u + along - he - own[0]
                     # already past the near edge with j behind the middle: braking would only stay in its way
@@ -344,7 +389,8 @@ def look_around(
     for j in range(from_row, to_row):
         if j != i and seen.kind[b, j] != AgentKind.NONE:
             box = seen.span[b, j]
-            if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
+            bridge = wp.abs(seen.height[b, j] - seen.height[b, i]) > BRIDGE
+            if not bridge and box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
                 other = seen.half[b, j]
                 q = seen.pose[b, j]
                 dx = q[0] - pose[0]
