@@ -273,6 +273,31 @@ def test_resizing_moves_no_box() -> None:
     torch.testing.assert_close(two.box, 2 * one.box)
 
 
+@BOTH
+def test_the_horizon_lies_between_the_rows_as_in_training_whatever_the_width(config: Mono3DConfig) -> None:
+    """Trained at a width of 128, used at 64: as if so many rows stood above the picture; boxes know nothing of it."""
+    size, above = (64, 64), 26  # 0.4 * (128 - 64), rounded
+    moved = lively(replace(config, input_width=64, trained_width=128, horizon=0.4), seed=3)
+    plain = lively(replace(config, input_width=64), seed=3)
+    picture, k = pictures(1, 3, *size), lens(60.0, size).float()[None]
+    grey = plain.get_buffer("mean").flip(0)[None] / 255
+    under = torch.cat([grey.expand(1, 3, above, 64), picture], 2)
+    lower = k.clone()
+    lower[:, 1, 2] += above
+    one, two = moved.dense(picture, k), plain.dense(under, lower)
+    torch.testing.assert_close(one.logit, two.logit, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(one.place, two.place - torch.tensor([0.0, above]))
+    shown = (two.box - two.box.new_tensor([0, 26, 0, 26])).clamp_min(0).minimum(two.box.new_tensor([64, 64, 64, 64]))
+    torch.testing.assert_close(one.box, shown, rtol=1e-3, atol=1e-2)
+    assert float((one.box[..., 2:] - one.box[..., :2]).amax()) > 5.0
+    truth = some_truth(3, size=size, focal=60.0)
+    low = replace(truth, box=truth.box + torch.tensor([0.0, 26, 0, 26]), intrinsic=lower[0])
+    for name, value in moved.assign(one, [truth]).extra.items():
+        torch.testing.assert_close(value, plain.assign(two, [low]).extra[name], equal_nan=True, rtol=1e-4, atol=1e-4)
+    at_home = lively(replace(config, input_width=64, trained_width=64), seed=3)
+    torch.testing.assert_close(at_home.dense(picture, k).logit, plain.dense(picture, k).logit, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("width", [None, 320])
 def test_rays_are_tangents_to_the_right_and_down(width: int | None) -> None:
     """Four times the tangents, as the regression's first layer gets them; 45 degrees to the right is 4."""

@@ -43,6 +43,11 @@ class Mono3DConfig:
         before: Places kept of each level before suppression.
         most: Maximum number of detections in an image.
         input_width: Width to which pictures are resized inside; None: they are not.
+        trained_width: `input_width` while the weights were trained. The trunk halves the rows five times, and what it
+            finds depends on where the horizon lies between the rows that are left; cameras that look level always show
+            it at one height, so that training has met one case only. Pictures of another width get rows above them, so
+            that the horizon lies as in training. None: no rows are added.
+        horizon: Height of the horizon in the pictures of the training, as a share from their top.
         virtual_focal: Focal length (pixels, after resizing) of the camera for which depth is predicted; the depth is
             then scaled to the real one. None: no scaling.
         mean: Mean of B, G and R in 0..255.
@@ -69,6 +74,8 @@ class Mono3DConfig:
     before: int = 1000
     most: int = 200
     input_width: int | None = None
+    trained_width: int | None = None
+    horizon: float = 492.0 / 900.0
     virtual_focal: float | None = None
     mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -102,8 +109,8 @@ FCOS3D = Mono3DConfig("fcos3d")
 PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)
 FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
-    deformable=False, input_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395), start=(20.0, 4.0, 1.7, 1.8),
-    rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.6,
+    deformable=False, input_width=800, trained_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
+    start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.6,
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
     FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None,

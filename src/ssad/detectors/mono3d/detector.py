@@ -84,7 +84,7 @@ class Mono3D(nn.Module):
         """
         size, lens = self._check(images, intrinsic)
         scale = self._scale(size, lens)
-        lens = self._scaled(lens, scale)
+        lens, above = self._inside(lens, size, scale), self._above(size)
         features = self.neck(self.backbone(self._prepare(images)))
         maps = self.bbox_head(features, self._factor(lens), self._rays(features, lens))
         flat = flatten(maps)
@@ -96,9 +96,9 @@ class Mono3D(nn.Module):
                 solids = self._solids(flat, places.xy, lens[:, None])
                 box = self._boxes(flat, places.xy, solids, lens=lens[:, None], size=size)
         return Dense(
-            logit=flat.logit, quality=flat.centreness, box=box, place=places.xy / scale,
-            stride=places.stride / scale[0], level=places.level, size=size, maps={**maps, "intrinsic": [lens]},
-            features=tuple(features),
+            logit=flat.logit, quality=flat.centreness, box=box,
+            place=(places.xy - places.xy.new_tensor([0.0, above])) / scale, stride=places.stride / scale[0],
+            level=places.level, size=size, maps={**maps, "intrinsic": [lens]}, features=tuple(features),
         )  # fmt: skip
 
     @torch.no_grad()
@@ -209,7 +209,9 @@ class Mono3D(nn.Module):
         lens = dense.maps["intrinsic"][0]
         places = places_of(dense.maps["cls_scores"], self.config.strides)
         with _exact(lens):
-            return assign(self.config, places, truth, lens, self._scale(dense.size, lens))
+            return assign(
+                self.config, places, truth, lens, self._scale(dense.size, lens), above=self._above(dense.size)
+            )
 
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
@@ -251,6 +253,7 @@ class Mono3D(nn.Module):
         else:
             box = hull(project(corners(*solids), lens[..., None, :, :]))
         limit = torch.tensor([size[1], size[0]] * 2, dtype=box.dtype, device=box.device)
+        box = box - box.new_tensor([0.0, self._above(size)]).repeat(2)
         return (box / self._scale(size, box).repeat(2)).clamp_min(0.0).minimum(limit)
 
     def _check(self, images: Tensor, intrinsic: Tensor | None) -> tuple[tuple[int, int], Tensor]:
@@ -269,11 +272,20 @@ class Mono3D(nn.Module):
     def _scale(self, size: tuple[int, int], like: Tensor) -> Tensor:
         return scale_of(size_inside(size, self.config.input_width), size, like)[:2]
 
-    def _scaled(self, lens: Tensor, scale: Tensor) -> Tensor:
-        """Intrinsics of the resized picture."""
-        if self.config.input_width is None:
+    def _above(self, size: tuple[int, int]) -> int:
+        """Rows that are added above the resized picture, see `Mono3DConfig.trained_width`."""
+        trained = self.config.trained_width
+        if trained is None or self.config.input_width == trained:
+            return 0
+        heights = [size_inside(size, width)[0] for width in (trained, self.config.input_width)]
+        return round(self.config.horizon * (heights[0] - heights[1])) % MULTIPLE
+
+    def _inside(self, lens: Tensor, size: tuple[int, int], scale: Tensor) -> Tensor:
+        """Intrinsics in the network's input."""
+        if self.config.input_width is None and self.config.trained_width is None:
             return lens
-        return torch.cat([lens[:, :2] * scale[:, None], lens[:, 2:]], 1)
+        added = lens.new_tensor([[0.0, 0.0, 0.0], [0.0, 0.0, self._above(size)]])
+        return torch.cat([lens[:, :2] * scale[:, None] + added, lens[:, 2:]], 1)
 
     def _factor(self, lens: Tensor) -> Tensor | None:
         if self.config.virtual_focal is None:
@@ -296,7 +308,7 @@ class Mono3D(nn.Module):
         return found
 
     def _prepare(self, images: Tensor) -> Tensor:
-        """BGR in 0..255, less the mean, padded with 0 at the right and bottom."""
+        """BGR in 0..255, less the mean, padded with 0 at the right and bottom, and above (see `_above`)."""
         images = images.to(self._dtype())
         size = (images.shape[2], images.shape[3])
         resized = size_inside(size, self.config.input_width)
@@ -305,7 +317,8 @@ class Mono3D(nn.Module):
             images = functional.interpolate(images, resized, mode="bilinear", align_corners=False, antialias=small)
         mean, std = self.get_buffer("mean"), self.get_buffer("std")
         images = (images.flip(1) * 255 - mean) / std
-        return functional.pad(images, (0, -resized[1] % MULTIPLE, 0, -resized[0] % MULTIPLE))
+        above = self._above(size)
+        return functional.pad(images, (0, -resized[1] % MULTIPLE, above, -(resized[0] + above) % MULTIPLE))
 
 
 def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:

@@ -18,7 +18,9 @@ from ssad.detectors.mono3d.decode import Places, project
 FAR = 1e8
 
 
-def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: Tensor, scale: Tensor) -> Assignment:
+def assign(
+    config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: Tensor, scale: Tensor, *, above: int = 0
+) -> Assignment:
     """Targets of B images.
 
     extra: reg [B, P, 13]: offset (place minus projected centre, in strides), depth, size, local yaw, velocity (NaN
@@ -30,6 +32,7 @@ def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: T
         truth: Truth of each image.
         lens: Intrinsics of the pictures [B, 3, 3].
         scale: Factors (x, y) from the picture to the network's input [2].
+        above: Rows that the network's input has above the picture.
 
     Raises:
         ConfigError: The truth has no 3D boxes.
@@ -50,7 +53,7 @@ def assign(config: Mono3DConfig, places: Places, truth: Sequence[Truth], lens: T
             "centreness": reg[..., 0].clone(),
         }
         return Assignment(none, none.clone(), tuple(truth), extra)
-    label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale)
+    label, owner, extra = _all(config, places, _pad(truth, device, dtype), lens, scale, above=above)
     return Assignment(label, owner, tuple(truth), extra)
 
 
@@ -84,11 +87,11 @@ def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _P
 
 
 def _all(
-    config: Mono3DConfig, places: Places, objects: _Padded, lens: Tensor, scale: Tensor
+    config: Mono3DConfig, places: Places, objects: _Padded, lens: Tensor, scale: Tensor, *, above: int
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """Label and owner [B, P] of every place, and what it should say."""
     centre = project(objects.centre, lens[:, None])  # [B, Q, 2] in the network's input
-    box = objects.box * scale.to(objects.box).repeat(2)
+    box = objects.box * scale.to(objects.box).repeat(2) + objects.box.new_tensor([0.0, above]).repeat(2)
     away = places.xy[:, None] - centre[:, None]  # [B, P, Q, 2]
     xy = places.xy[:, None]
     sides = torch.cat([xy - box[:, None, :, :2], box[:, None, :, 2:] - xy], -1)
