@@ -83,7 +83,7 @@ def drop_table(run: Run) -> Table:
     rows = [
         Row(
             (system, perturbation, str(severity)),
-            tuple(_change(run, (system, perturbation, severity), n) for n in DROPS),
+            tuple(change(run, (system, perturbation, severity), n) for n in DROPS),
         )
         for system, perturbation, severity in conditions(run)
         if severity
@@ -101,10 +101,10 @@ def rank_table(run: Run) -> Table:
         own = [condition for condition in perturbed if condition[0] == system]
         families = [condition[1] for condition in own]
         for part in ("AP", "target_recall"):
-            lost = [-_change(run, c, part).mean for c in own]
+            lost = [-change(run, c, part).mean for c in own]
             cells = []
             for name, sign in (("collision", 1.0), ("route_completion", -1.0)):
-                harm = [sign * _change(run, c, name).mean for c in own]
+                harm = [sign * change(run, c, name).mean for c in own]
                 cells.append(Cell.of(family_correlation(lost, harm, families)))
             rows.append(Row((system, DROPS[part], f"{len(own)} in {len(set(families))}"), tuple(cells)))
     note = (
@@ -141,7 +141,7 @@ def cause_table(run: Run) -> Table:
 
 def scatter(run: Run) -> str:
     """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
-    points = [(c, _change(run, c, "AP"), _change(run, c, "collision")) for c in conditions(run) if c[2]]
+    points = [(c, change(run, c, "AP"), change(run, c, "collision")) for c in conditions(run) if c[2]]
     points = [(c, a, b) for c, a, b in points if not math.isnan(a.mean) and not math.isnan(b.mean)]
     if not points:
         return ""
@@ -228,7 +228,8 @@ def _cell(lines: Sequence[Line], name: str) -> Cell:
     return Cell.of(estimate(values, "bounded" if name in BOUNDED else "mean"))
 
 
-def _change(run: Run, condition: Condition, name: str) -> Cell:
+def change(run: Run, condition: Condition, name: str) -> Cell:
+    """What a condition changes in a metric against the same drives without it."""
     every = conditions(run)
     clean = every.get((condition[0], "none", 0), [])
     return Cell.of(paired_difference(_values(every[condition], name), _values(clean, name)))
