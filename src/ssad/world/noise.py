@@ -40,8 +40,9 @@ class Noise:
         choice_time: Time in which lapses and carelessness forget, s: about how long they last.
         ramp: How long a careless lane change takes, s.
         stretches: Into how many stretches of time the normal numbers behind the processes are divided, so that their
-            means can be moved (`noise.push`) and their sums be read (`noise.total`).
-        stretch: Steps of a stretch; the last one goes on to the end.
+            means can be moved (`noise.push`) and their sums be read (`noise.total`). The first is the first step alone,
+            which says where the processes begin.
+        stretch: Steps of each of the others; the last one goes on to the end.
     """
 
     accel: float = 0.0

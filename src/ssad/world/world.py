@@ -173,6 +173,11 @@ class World:
         self._graph: Any = None
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """The arrays that say all that changes, as long as no ego plans over a belief."""
+        return (*_STATE, *(f"ego.{name}" for name in _EGO), *(f"noise.{name}" for name in self._noisy))
+
+    @property
     def _noisy(self) -> tuple[str, ...]:
         return () if self.chance is None else NAMES
 
@@ -476,9 +481,7 @@ class World:
 
     def snapshot(self) -> Snapshot:
         """Copy of all that changes."""
-        arrays = {name: self.array(name).copy() for name in _STATE}
-        arrays |= {f"ego.{name}": self.array(f"ego.{name}").copy() for name in _EGO}
-        arrays |= {f"noise.{name}": self.array(f"noise.{name}").copy() for name in self._noisy}
+        arrays = {name: self.array(name).copy() for name in self.names}
         if self.array("seen.believes").any():
             arrays |= {f"seen.{name}": self.array(f"seen.{name}").copy() for name in _SEEN}
         return Snapshot(arrays)
@@ -507,9 +510,7 @@ class World:
 
     def hashes(self) -> list[str]:
         """One hash a scene over all that changes (but its place in the batch and bank)."""
-        arrays = [self.array(name) for name in _STATE if name != "episode"]
-        arrays += [self.array(f"ego.{name}") for name in _EGO]
-        arrays += [self.array(f"noise.{name}") for name in self._noisy]
+        arrays = [self.array(name) for name in self.names if name != "episode"]
         believes = self.array("seen.believes")
         rows = [self.array(f"seen.{name}") for name in _SEEN if name not in _OF_SCENES]
         kind, light = self.array("seen.kind"), self.array("seen.light")

@@ -108,7 +108,9 @@ def chance(
     if state.end[b] != End.RUNNING:
         return
     step = state.step[b]
-    stretch = wp.min(step / rule.stretch, rule.stretches - 1)
+    stretch = int(0)
+    if step > 0:
+        stretch = wp.min(1 + (step - 1) / rule.stretch, rule.stretches - 1)
     for i in range(first, agents, threads):
         z = normals(noise.key[b], step, i) + noise.push[b, i, stretch]
         drift = z

@@ -124,6 +124,11 @@ def fits(body: str, route: Route) -> bool:
     return 0.5 * vehicle.length * slip + 0.5 * vehicle.width <= _NOSE
 
 
+def mixed_body(rng: np.random.Generator) -> str:
+    """A model as it is common in traffic."""
+    return str(rng.choice(list(_MIX), p=list(_MIX.values())))
+
+
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Vehicles that drive on their own."""
     from ssad.roads import random_route
@@ -139,7 +144,7 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         place, pose = places[int(index)]
         if any(math.hypot(pose.x - a.pose.x, pose.y - a.pose.y) < APART for a in agents):
             continue
-        body = str(rng.choice(list(_MIX), p=list(_MIX.values())))
+        body = mixed_body(rng)
         path = random_route(graph, place.lane, place.s, _ROUTE, rng)
         if not fits(body, path):
             body = "compact"

@@ -1,0 +1,129 @@
+"""Intervals of small probabilities: few events, and events of unlike weight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.types import F64
+from ssad.metrics.intervals import LEVEL, Clusters, mean_limits
+
+_TAIL = 0.5 - 0.5 * LEVEL
+
+
+@dataclass(frozen=True)
+class RareEstimate:
+    """A small probability and how sure it is.
+
+    Attributes:
+        probability: Of failure in an episode.
+        low: Lower 95 % limit.
+        high: Upper 95 % limit.
+        method: How it was estimated.
+        episodes: Simulated for the estimate itself.
+        events: Failures among them.
+        effective: Effective number of failures: as many of equal weight would say as much.
+        work: Agent-steps simulated in all.
+        training: Agent-steps of it that went into learning how to simulate.
+    """
+
+    probability: float
+    low: float
+    high: float
+    method: str
+    episodes: int
+    events: int
+    effective: float
+    work: float
+    training: float = 0.0
+
+    @property
+    def half_width(self) -> float:
+        """Half the interval's width as a share of the probability; NaN where that is 0."""
+        return 0.5 * (self.high - self.low) / self.probability if self.probability > 0.0 else math.nan
+
+    def as_dict(self) -> dict[str, Any]:
+        """Field name -> value."""
+        return asdict(self)
+
+
+def weighted_limits(
+    total: npt.ArrayLike, square: npt.ArrayLike, most: npt.ArrayLike, n: npt.ArrayLike
+) -> tuple[F64, F64]:
+    """95 % limits of a mean of n values that are 0 but for some rare events.
+
+    The values of the events (1, or weights) are those of a compound Poisson process whose sum is close to a scaled
+    Poisson number; mid-p gamma limits of that. With equal values they are the mid-p limits of a Poisson mean.
+
+    Args:
+        total: [...] sum of the values.
+        square: Sum of their squares.
+        most: The largest value that one more event could have; for weights, the largest weight seen or possible.
+        n: How many values there are, zeros included.
+
+    Returns:
+        Lower and upper limits of the mean.
+
+    Source:
+        Fay and Feuer, "Confidence intervals for directly standardized rates: a method based on the gamma distribution"
+        (1997); Fay and Kim, "Confidence intervals for directly standardized rates using mid-p gamma intervals" (2017).
+    """
+    from scipy.special import gammainc
+
+    total, square, most, n = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (total, square, most, n)))
+    # events that are not rare at all leave less to chance than a Poisson number of them would
+    variance = np.maximum(square - total**2 / n, 1e-9 * square)
+    some = total > 0.0
+    safe, spread = np.where(some, total, 1.0), np.where(some, variance, 1.0)
+    more, wider = total + most, variance + most**2
+
+    def beyond(x: F64) -> F64:
+        """Chance that the mid-p variable is at most x."""
+        lower = np.where(some, gammainc(safe**2 / spread, x * safe / spread), 1.0)
+        return np.asarray(0.5 * lower + 0.5 * gammainc(more**2 / wider, x * more / wider))
+
+    def quantile(share: float) -> F64:
+        low, high = np.zeros(total.shape), more + 20.0 * np.sqrt(wider) + 20.0 * most
+        for _ in range(80):
+            middle = 0.5 * (low + high)
+            less = beyond(middle) < share
+            low, high = np.where(less, middle, low), np.where(less, high, middle)
+        return np.asarray(0.5 * (low + high))
+
+    return np.where(some, quantile(_TAIL), 0.0) / n, quantile(1.0 - _TAIL) / n
+
+
+def weighted_estimate(values: F64, method: str, *, most: float, work: float, training: float = 0.0) -> RareEstimate:
+    """The mean of the values of episodes, which are 0 where nothing happened.
+
+    Args:
+        values: [n] 0, or the weight of an episode that failed.
+        method: How it was estimated.
+        most: The largest weight an episode could have.
+        work: Agent-steps simulated in all.
+        training: Of those, for learning.
+    """
+    total, square = float(values.sum()), float((values**2).sum())
+    largest = float(values.max()) if total > 0.0 else most
+    low, high = weighted_limits(total, square, largest, len(values))
+    events = int((values > 0.0).sum())
+    effective = total**2 / square if square > 0.0 else 0.0
+    return RareEstimate(
+        total / len(values), float(low), float(high), method, len(values), events, effective, work, training
+    )
+
+
+def repeated_estimate(values: Sequence[float], method: str, *, episodes: int, events: int, work: float) -> RareEstimate:
+    """The mean of independent unbiased estimates, with Student limits that leave room for skew; at least 0."""
+    found = np.asarray(values, np.float64)
+    limits = mean_limits(found, Clusters(np.ones(len(found)), np.zeros(len(found), np.intp)))
+    mean = float(found.mean())
+    variance = float(found.var(ddof=1)) / len(found) if len(found) > 1 else math.nan
+    effective = mean**2 / variance if variance > 0.0 else math.nan
+    low, high = max(float(limits.low), 0.0), float(limits.high)
+    return RareEstimate(mean, low, high, method, episodes, events, effective, work)

@@ -1,0 +1,176 @@
+"""Importance sampling: episodes in which chance is led towards failure, and each failure weighed by how likely it was.
+
+The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
+means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
+the cross-entropy method, from those of each round's episodes, each with its weight. The weights are exact, since the
+likelihood ratio of moved normal numbers needs only their sums.
+
+Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Rubinstein and
+Kroese, "The Cross-Entropy Method" (2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.types import F64, Bool
+from ssad.metrics.rare_events import RareEstimate, weighted_estimate
+from ssad.world.noise import Keys
+from ssad.world.rare.brute import draw_keys, run
+from ssad.world.rare.process import Process
+from ssad.world.rare.splitting import splitting
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A mixture of the process as it is and of K moved ones.
+
+    Attributes:
+        share: [K + 1] of the components, the process as it is first.
+        means: [K, D] by how much each moves the means of the normal numbers.
+    """
+
+    share: F64
+    means: F64
+
+    def log_ratios(self, total: F64, count: F64) -> F64:
+        """[n, K] log of each moved component's likelihood over that of the process as it is."""
+        return np.asarray(total @ self.means.T - 0.5 * (count @ (self.means**2).T))
+
+    def weights(self, total: F64, count: F64) -> F64:
+        """[n] likelihood of the process as it is over that of the mixture: at most 1 / share[0]."""
+        ratios = np.exp(np.minimum(self.log_ratios(total, count), 700.0))
+        return np.asarray(1.0 / (self.share[0] + ratios @ self.share[1:]))
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Episodes from a proposal, [n].
+
+    Attributes:
+        failed: Which have failed.
+        weight: How likely each was without the proposal, to how likely with it.
+        total: [n, D] sums of the normal numbers.
+        count: [n, D] how many they are.
+        keys: Their keys.
+        component: Which component of the proposal each is from, 0: the process as it is.
+    """
+
+    failed: Bool
+    weight: F64
+    total: F64
+    count: F64
+    keys: Keys
+    component: npt.NDArray[np.int64]
+
+
+def sample(process: Process, proposal: Proposal, random: np.random.Generator, *, episodes: int) -> Sample:
+    """Run at least `episodes` episodes, whole batches, of a proposal."""
+    parts: list[Sample] = []
+    means = np.vstack([np.zeros(process.width), proposal.means])
+    while sum(len(part.keys) for part in parts) < episodes:
+        keys = draw_keys(random, process.batch)
+        component = random.choice(len(proposal.share), process.batch, p=proposal.share)
+        process.reset(keys)
+        process.push(means[component])
+        failed = run(process)
+        total, count = process.totals()
+        weight = proposal.weights(total, count)
+        parts.append(Sample(failed, weight, total, count, keys, component))
+    names = Sample.__dataclass_fields__
+    return Sample(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def learn(
+    process: Process,
+    random: np.random.Generator,
+    *,
+    components: int = 2,
+    rounds: int = 2,
+    episodes: int = 1000,
+    defence: float = 0.1,
+    shrink: float = 20.0,
+) -> Proposal:
+    """Learn a proposal: from the failures that splitting finds, then by the cross-entropy method from weighted ones.
+
+    Splitting begins because chance alone finds no failure to learn from, and a level of the score that many episodes
+    reach need not have to do with failing. It may be off; only what is learned hangs on it, not the estimate.
+
+    Args:
+        process: The process; its batch is the number of splitting's particles.
+        random: Source of chance.
+        components: Moved components, so that several ways to fail can be learned.
+        rounds: Of the cross-entropy method.
+        episodes: Of each round.
+        defence: Share of the process as it is.
+        shrink: Steps of no movement that are added to what is learned from, so that few episodes move little.
+    """
+    found = splitting(process, random, repeats=1)
+    best = process.score()
+    chosen = found.failed if found.failed.any() else best >= np.quantile(best, 0.9)
+    total, count = (values[chosen] for values in process.totals())
+    weight = np.ones(len(total))
+    for number in range(rounds + 1):
+        proposal = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
+        if number == rounds:
+            break
+        drawn = sample(process, proposal, random, episodes=episodes)
+        if drawn.failed.sum() < 10:
+            break  # too few to learn more from
+        total, count, weight = (v[drawn.failed] for v in (drawn.total, drawn.count, drawn.weight))
+        # few episodes must not decide alone
+        weight = np.minimum(weight, 10.0 * weight.mean())
+    return proposal
+
+
+def _fit(
+    total: F64,
+    count: F64,
+    weight: F64,
+    random: np.random.Generator,
+    *,
+    components: int,
+    defence: float,
+    shrink: float,
+) -> Proposal:
+    """The mixture of moved processes under which weighted episodes are likeliest: expectation and maximisation."""
+    weight = weight / weight.sum()
+    size = 1.0 / float((weight**2).sum())  # episodes of equal weight that would say as much
+    start = random.choice(len(weight), components, p=weight)
+    means = 0.3 * total[start] / np.maximum(count[start], 1.0)
+    share = np.full(components, 1.0 / components)
+    for _ in range(30):
+        logs = np.log(share) + Proposal(share, means).log_ratios(total, count)
+        logs -= logs.max(axis=1, keepdims=True)
+        belongs = np.exp(logs)
+        belongs *= (size * weight / belongs.sum(axis=1))[:, None]
+        means = (belongs.T @ total) / (belongs.T @ count + shrink)
+        share = np.maximum(belongs.sum(axis=0) / size, 1e-3)
+        share /= share.sum()
+    return Proposal(np.concatenate([[defence], (1.0 - defence) * share]), means)
+
+
+def importance(
+    process: Process, proposal: Proposal, random: np.random.Generator, *, episodes: int, training: float = 0.0
+) -> tuple[RareEstimate, Sample]:
+    """Estimate the probability of failure with a proposal that does not depend on these episodes.
+
+    Args:
+        process: The process.
+        proposal: What to draw from.
+        random: Source of chance.
+        episodes: How many, in whole batches.
+        training: Agent-steps that learning the proposal took; they count.
+
+    Returns:
+        The estimate, and its episodes.
+    """
+    before = process.work()
+    drawn = sample(process, proposal, random, episodes=episodes)
+    values = np.where(drawn.failed, drawn.weight, 0.0)
+    work = process.work() - before + training
+    most = 1.0 / float(proposal.share[0])
+    return weighted_estimate(values, "importance sampling", most=most, work=work, training=training), drawn

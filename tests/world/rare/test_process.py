@@ -1,0 +1,94 @@
+"""The world as a process: futures by key, moved means with exact weights, and a score that says what is near."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ssad.core.errors import ConfigError
+from ssad.core.seeding import generator
+from ssad.core.types import Controller, End
+from ssad.drivers import make_system
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.noise import Noise
+from ssad.world.rare.importance import Proposal, sample
+from ssad.world.rare.process import WorldProcess, closeness
+from ssad.world.rare.splitting import keys_of, splitting
+from ssad.world.rollout import Loop
+from ssad.world.world import World
+from tests.world.worlds import GRAPHS, ego, episode, line_route
+
+NOISE = Noise(accel=2.0, accel_time=1.5, lapse=0.2, choice_time=2.0, stretches=3, stretch=10)
+
+
+def process(batch: int, noise: Noise = NOISE) -> WorldProcess:
+    (found,) = load_scenarios("lane-traffic/05")
+    graphs = {found.town: load_town(found.town)}
+    bank = [build_episode(found, graphs[found.town], seed=0)]
+    return WorldProcess(
+        Loop(World(bank, graphs, assign=np.zeros(batch, int), noise=noise), {0: make_system("autopilot")})
+    )
+
+
+def test_rows_with_the_same_key_are_the_same_episode() -> None:
+    rows = process(4)
+    rows.reset(np.array([5, 6, 5, 6], np.uint64))
+    rows.run()
+    hashes = rows.world.hashes()
+    assert hashes[0] == hashes[2] != hashes[1] == hashes[3]
+    assert rows.work() == 3 * rows.world.array("step").sum()
+
+
+def test_what_splitting_finds_collides_again_by_its_keys_alone() -> None:
+    rows = process(60, replace(NOISE, lapse=0.3))
+    found = splitting(rows, generator("world splitting"), repeats=1)
+    assert 0.0 < found.estimates[0] < 0.2
+    poses = rows.world.array("pose").copy()
+    row = int(np.flatnonzero(found.failed)[-1])
+    keys = keys_of(found, row)
+    again = process(1, replace(NOISE, lapse=0.3))
+    again.reset(np.array([keys[0]], np.uint64))
+    for step in range(again.steps):
+        if step in keys:
+            again.rekey(np.array([0]), np.array([keys[step]], np.uint64))
+        again.step()
+    assert again.failed()[0]
+    np.testing.assert_array_equal(again.world.array("pose")[0], poses[row])
+
+
+def test_weights_of_a_proposal_average_1_and_sums_are_those_of_what_was_drawn() -> None:
+    rows = process(400)
+    assert rows.width == 9  # the ego's lapses and the acceleration of two others, in three stretches
+    means = generator("means").normal(0.0, 0.15, (2, rows.width))
+    drawn = sample(rows, Proposal(np.array([0.2, 0.4, 0.4]), means), generator("w"), episodes=1200)
+    assert drawn.weight.mean() == pytest.approx(1.0, abs=4.0 * drawn.weight.std() / np.sqrt(len(drawn.weight)))
+    rest = drawn.total - drawn.count * np.vstack([np.zeros(rows.width), means])[drawn.component]
+    spread = (rest**2 / drawn.count).mean(axis=0)
+    assert np.abs(spread - 1.0).max() < 0.25
+
+
+def test_the_score_rises_towards_a_collision() -> None:
+    slow = ego(x=60.0, speed=2.0, controller=Controller.NONE, name="slow", route=line_route(60.0, 390.0))
+    world = World([episode(ego(speed=14.0, controller=Controller.FOLLOW, target_speed=14.0), slow)], GRAPHS)
+    scores = []
+    while world.ended()[0] == End.RUNNING:
+        scores.append(float(closeness(world.state())[0]))
+        world.step()
+    assert world.ended()[0] == End.COLLISION
+    assert np.all(np.diff(scores) >= -1e-6)
+    assert scores[0] < 0.4
+    assert scores[-1] > 0.8
+
+
+def test_who_passes_at_a_distance_is_no_danger() -> None:
+    other = ego(x=60.0, name="other", controller=Controller.NONE, pose=replace(ego().pose, x=60.0, y=30.0))
+    world = World([episode(ego(speed=14.0), other)], GRAPHS)
+    assert closeness(world.state())[0] < 0.05
+
+
+def test_a_world_without_noise_is_no_process() -> None:
+    with pytest.raises(ConfigError, match="chance"):
+        WorldProcess(Loop(World([episode(ego())], GRAPHS), {}))
