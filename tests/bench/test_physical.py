@@ -11,7 +11,7 @@ import pytest
 from helpers.command import ssad
 
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.physical import Physical, texture_of
+from ssad.bench.kinds.physical import Physical, attacks_of
 from ssad.bench.physical_suite import PhysicalSuite
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite
@@ -204,7 +204,7 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.0, "replicates": 0})
     cell = next(cell for cell in plan.cells if cell.fields["attack"] == "vanishing, all sides")
     spec = TextureSpec.of_row(cell.spec)
-    colour = texture_of(job, spec)
+    colour = attacks_of(job).texture(spec)
     picture = read_image(tmp_path / trained["artefacts"]["texture"])
     assert picture.shape == (128, 128, 3)
     kept = np.abs(picture / 255 - colour.permute(1, 2, 0).numpy()).max(2) < 0.005
@@ -217,11 +217,11 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert (tmp_path / "results.jsonl").read_bytes() == results
     texture = tmp_path / trained["artefacts"]["texture"].replace(".png", ".npz")
     texture.unlink()
-    assert np.array_equal(texture_of(job, spec), colour), "the checkpoint goes on where it ended"
+    assert np.array_equal(attacks_of(job).texture(spec), colour), "the checkpoint goes on where it ended"
     texture.unlink()
     texture.with_suffix(".checkpoint.npz").unlink()
     Physical().execute([cell], job)  # which needs no piece of work done before it
-    assert np.array_equal(texture_of(job, spec), colour), "trained anew, the same to the bit"
+    assert np.array_equal(attacks_of(job).texture(spec), colour), "trained anew, the same to the bit"
 
 
 @pytest.mark.slow

@@ -9,12 +9,15 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
-from ssad.bench.physical_lights import LightEntry
+from ssad.camera.render import Weather
 from ssad.core.errors import ConfigError
 from ssad.recording.clips import AZIMUTHS, ELEVATIONS
+from ssad.recording.lit_clips import at_hour
 from ssad.recording.nuscenes_recorder import WEATHERS
 from ssad.recording.target import TargetCar, parse_target
 from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical
+from ssad.scenarios.static.physical.noninvasive import Projector, make_light
+from ssad.scenarios.static.physical.noninvasive.kept import budget_of
 from ssad.scenarios.static.physical.shipped import load_texture
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
@@ -80,6 +83,24 @@ class Entry(BaseModel):
     around: int = Field(default=0, ge=0)
     of: str | None = None
     texture: str | None = None
+
+
+class LightEntry(BaseModel):
+    """Rows of the table for one light: searched, and with settings drawn at random.
+
+    Attributes:
+        name: an attack (`ssad.scenarios.static.physical.noninvasive`).
+        hour: noon, low_sun, night, or recorded: as the pictures were.
+        options: fields of the attack that differ.
+        settings: of its search (`Budget`); of a projector, of `TextureAttack`.
+    """
+
+    model_config = _STRICT
+
+    name: str = Field(min_length=1)
+    hour: str = "night"
+    options: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
 
 
 class PhysicalSuite(SuiteBase):
@@ -165,6 +186,20 @@ def row_of(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     if len(sources) != 1:
         raise ConfigError(f"suite {suite.name}: shuffled of '{entry.of}': there must be one such attack")
     return {**row_of(suite, sources[0]), "attack": "shuffled", "of": entry.of}
+
+
+def check_lights(suite: PhysicalSuite) -> None:
+    """ConfigError, UnknownNameError: an attack, an hour or a setting that does not exist."""
+    for entry in suite.lights:
+        attack = make_light(entry.name, entry.options)
+        at_hour(Weather(), entry.hour)
+        try:
+            if isinstance(attack, Projector):
+                attack.training(**entry.settings)
+            else:
+                budget_of(entry.settings)
+        except (TypeError, ConfigError) as error:
+            raise ConfigError(f"suite {suite.name}: {entry.name}: {error}") from None
 
 
 def carrier_title(row: Mapping[str, Any]) -> str:

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import torch
+from torch import Tensor
 
 from ssad.camera.render import Weather, render
 from ssad.camera.scene import Scene
 from ssad.camera.scene_edit import NO_EDIT, SceneEdit, render_with
+from ssad.core.detections import Truth
 from ssad.core.errors import unknown_name
 from ssad.core.images import decode_image, encode_jpeg
 from ssad.core.types import U8
 from ssad.recording.clip_recorder import TARGET, ClipView, clip_rows, clip_views
+from ssad.recording.target_views import TargetClips, drive_of, target_truth
 from ssad.recording.textured_clips import BLOCK, MARGIN, TexturedClip, seen_part
 from ssad.scenarios.static.physical.noninvasive.light import Target
 from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND, LitPicture, lit_picture
@@ -126,3 +130,50 @@ def lit_clips(
         if made is None or made[0] is not clip.scene:
             made = clip.scene, Scene(clip.scene.street, [*clip.scene.meshes, BLIND.mesh()], device=device)
         yield LitClip(clip, made[1], len(clip.scene.meshes))
+
+
+@dataclass(frozen=True, slots=True)
+class LitPictures:
+    """The first pictures of a recording at an hour, for a detector.
+
+    Attributes:
+        folder: What `record_clips` wrote.
+        hour: See `HOURS`.
+        count: Number of pictures.
+        classes: Names of the detector's classes, in its order.
+        device: Where they are rendered and shown.
+    """
+
+    folder: Path
+    hour: str
+    count: int
+    classes: tuple[str, ...]
+    device: str = "cpu"
+
+    @classmethod
+    def of(cls, clips: TargetClips, hour: str) -> Self:
+        """The same pictures at an hour."""
+        return cls(clips.folder, hour, clips.count, clips.classes, clips.device)
+
+    def clips(self) -> tuple[LitClip, ...]:
+        """Kept, since their scenes take longer to make than their pictures. FormatError as for `lit_clips`."""
+        return _kept(self.folder, self.hour, self.count, self.device)
+
+    def truth(self, clip: LitClip) -> Truth:
+        """What is annotated in a picture, the target first."""
+        return target_truth(clip.clip.row, clip.clip.objects, self.classes)
+
+    def under(self, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, with an edit around the target."""
+        for clip in self.clips():
+            image = torch.from_numpy(clip.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
+            yield drive_of(clip.clip.row), image, self.truth(clip)
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """The same without an edit."""
+        return self.under(NO_EDIT)
+
+
+@lru_cache(maxsize=4)
+def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ...]:
+    return tuple(lit_clips(folder, hour, count=count, device=device))

@@ -44,7 +44,7 @@ class TargetClips:
         """Drive, picture [1, 3, H, W] in 0 to 1 and truth, as they were recorded. FormatError as for `rows`."""
         for row, objects in clip_rows(self.folder)[: self.count]:
             image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
-            yield _drive(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(row, objects, self.classes)
+            yield drive_of(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(row, objects, self.classes)
 
     def wearing(self, surface: Surface) -> Iterator[tuple[str, View]]:
         """Drive and picture with a target that waits for a texture, one after another.
@@ -60,7 +60,7 @@ class TargetClips:
         for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
             wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             seen |= bool(len(wearing.taps[0].pixel))
-            yield _drive(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))
+            yield drive_of(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))
         if not seen:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
@@ -93,6 +93,6 @@ def target_truth(row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], c
     )
 
 
-def _drive(row: Mapping[str, Any]) -> str:
+def drive_of(row: Mapping[str, Any]) -> str:
     """Name of the drive that a picture is of."""
     return f"{row['part']}/{row['attempt']}"

@@ -2,45 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
-from itertools import islice, product
+from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
-from ssad.bench.physical_lights import light_cells, light_edit, light_pieces, light_result, light_sheet
+from ssad.bench.physical_lights import CLEAN, light_cells, lights_shown
 from ssad.bench.physical_suite import Pair, PhysicalSuite, carrier_title, row_of, target_of
-from ssad.camera.scene import Layer
 from ssad.core import safeio
-from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
-from ssad.core.protocols import Detector
-from ssad.core.types import U8
 from ssad.detectors import make_detector
 from ssad.evaluation.target_grid import grid_scores
 from ssad.evaluation.target_scores import Sighting, sightings, target_scores
-from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import record_all
 from ssad.recording.clips import Clips
-from ssad.recording.target import TargetCar, parse_target
+from ssad.recording.lit_clips import LitPictures
+from ssad.recording.target_attacks import TargetAttacks, layers_of, see_surfaces
 from ssad.recording.target_views import TargetClips
-from ssad.recording.textured_clips import see_clips, unseen_parts
+from ssad.recording.textured_clips import unseen_parts
 from ssad.roads import town_names
-from ssad.scenarios.static.physical import CONTROLS, Surface, TextureSpec, View, albedo_of, make_carrier
-from ssad.scenarios.static.physical.kept import TextureFolder
+from ssad.scenarios.static.physical import CONTROLS, TextureSpec, make_carrier
+from ssad.scenarios.static.physical.noninvasive.kept import LightSpec
 
-CLEAN, GRID = "clean", "grid"
+GRID = "grid"
 VIEWS = ("drive", GRID)
 SIDES = (0.0, 90.0, 180.0, 270.0)  # of the grid that pictures show
 
@@ -169,12 +161,12 @@ class Physical(Kind):
         surfaces = list(dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"]))
         tasks = [
             (clips.out, part, suite.target, surfaces, plan.device)
-            for clips in recordings if surfaces for part in unseen_parts(clips.out, _layers(suite.target, surfaces))
+            for clips in recordings if surfaces for part in unseen_parts(clips.out, layers_of(suite.target, surfaces))
         ]  # fmt: skip
         if tasks:
             pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
             with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
-                run_all(pool, _see, tasks, progress=live.show)
+                run_all(pool, see_surfaces, tasks, progress=live.show)
         return {
             "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
             "grid": suite.grid.count if suite.grid else 0,
@@ -187,74 +179,90 @@ class Physical(Kind):
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
         """The training of the cell's texture, or the search of its light, unless it is done."""
-        if "light" in cell.spec:
-            return light_pieces(cell, job)
-        if cell.spec["attack"] is None:
-            return {}
-        spec = TextureSpec.of_row(cell.spec)
-        if not spec.trained or _textures(job).kept(spec).is_file():
+        attacks, light = attacks_of(job), cell.spec.get("light")
+        if light:
+            searched = LightSpec.of_row(light) if light["source"] else None
+            missing = searched is not None and not attacks.lights.kept(searched).is_file()
+            return {f"light {searched.name}": dict(cell.spec)} if searched and missing else {}
+        spec = TextureSpec.of_row(cell.spec) if cell.spec["attack"] is not None else None
+        if spec is None or not spec.trained or attacks.textures.kept(spec).is_file():
             return {}
         return {f"texture {spec.name}": dict(cell.spec)}
 
     def make(self, name: str, data: Any, systems: Sequence[str], job: Job) -> None:
         """Train a texture, or search a light."""
         if "light" in data:
-            light_edit(job, data["light"])
-            return
-        texture_of(job, TextureSpec.of_row(data))
+            attacks_of(job).light(LightSpec.of_row(data["light"]))
+        else:
+            attacks_of(job).texture(TextureSpec.of_row(data))
 
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
         """Scores in the town of the test."""
-        return {cell.key: light_result(cell, job) if "light" in cell.spec else self._score(cell, job) for cell in cells}
+        return {cell.key: self._score(cell, job) for cell in cells}
 
     def _score(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Scores of a cell. CellError: the detector does not find the clean car."""
-        settings, detector, grid = job.settings, cell.system, cell.spec["view"] == GRID
-        clips = _test_clips(job, cell.spec, detector)
-        clean = _clean_sightings(clips, detector)
+        attacks, settings, detector = attacks_of(job), job.settings, cell.system
+        light, grid, floor = cell.spec.get("light"), cell.fields["view"] == GRID, settings["floor"]
         draws = {"replicates": settings["replicates"], "seed": settings["seed"]}
+        pair = (light or cell.spec)["pair"]
+        count = settings["grid"] if grid else pair["test_images"]
+        clips = attacks.clips(f"{pair['test']}{'-grid' if grid else ''}", count, detector)
+        lit = LitPictures.of(clips, light["hour"]) if light else None
+        clean = _clean_sightings(lit or clips, detector)
         before = target_scores(clean, **draws)
-        if cell.spec["attack"] is None:
-            return before | (grid_scores(clips.rows(), clean, None, floor=settings["floor"]) if grid else {})
-        floor, have = settings["floor"], before["metrics"]["AP50"] or 0.0
+        if cell.fields["attack"] == CLEAN:
+            return before | (grid_scores(clips.rows(), clean, None, floor=floor) if grid else {})
+        have = before["metrics"]["AP50"] or 0.0
         if have < floor:
+            when = f" ({light['hour']})" if light else ""
             raise CellError(
-                f"{detector} finds the clean car with AP50 {have:.3f}, which is less than the floor of {floor:g}"
+                f"{detector} finds the clean car{when} with AP50 {have:.3f}, which is less than the floor of {floor:g}"
             )
-        spec, kept = TextureSpec.of_row(cell.spec), _textures(job)
-        attacked = list(sightings(make_detector(detector, device=job.device), _worn(job, clips, spec)))
-        found = target_scores(attacked, clean, **draws)
+        if lit:
+            spec = LightSpec.of_row(light or {})
+            shown, about = attacks.under(lit, spec), partial(attacks.about_light, spec)
+        else:
+            texture = TextureSpec.of_row(cell.spec)
+            shown, about = attacks.worn(clips, texture), partial(attacks.about, texture)
+        attacked = list(sightings(attacks.detector(detector), shown))
+        found = target_scores(attacked, clean, **draws) | {"clean_AP50": have}
         if grid:
             found |= grid_scores(clips.rows(), clean, attacked, floor=floor)
-        artefacts = {"texture": str(kept.picture(spec).relative_to(job.folder))}
-        return {**found, "clean_AP50": have, "artefacts": artefacts, **kept.history(spec)}
+        return found | about()  # which may be trained or searched only now
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
         suite: PhysicalSuite = plan.suite
-        captions = light_sheet(plan, folder)
-        job = Job(folder, plan.device, {"target": suite.target, "seed": suite.seed})
-        name = suite.detectors[0]
-        detector = make_detector(name, device=plan.device)
+        attacks = attacks_of(Job(folder, plan.device, {"target": suite.target, "seed": suite.seed}))
+        captions, name = {}, suite.detectors[0]
+        lights, path = lights_shown(plan.cells, suite, attacks.lights), folder / "pictures" / "lights.jpg"
+        if lights and not path.is_file() and (folder / "data" / suite.pairs[0].test / "annotations").is_dir():
+            save_picture(path, attacks.light_sheet(name, suite.pairs[0].test, lights))
+        if path.is_file():
+            captions[path.name] = (
+                f"What {name} finds (orange, score at least 0.25) in a picture of {suite.pairs[0].test} under each "
+                "light."
+            )
         for pair in suite.pairs:
-            chosen = self._chosen(plan, job, pair, name)
-            for view, places in (("drive", (None,)), (GRID, SIDES)):
+            chosen = self._chosen(plan, attacks, pair, name)
+            trained = [(title, spec) for title, spec in chosen.items() if spec.source and not spec.of]
+            for view, text, sides, shown in (
+                ("drive", "from behind", (None,), chosen),
+                (GRID, "from the front, the left, the rear and the right", SIDES, dict(trained[-1:])),
+            ):
                 path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
                 clips = TargetClips(folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}", 1)
-                trained = [(title, spec) for title, spec in chosen.items() if spec.source and not spec.of]
-                shown = chosen if view == "drive" else dict(trained[-1:])
-                if path.is_file() or not (clips.folder / "annotations").is_dir() or not chosen:
-                    continue
-                save_picture(path, _sheet(job, detector, clips, shown, places))
-            for view, text in (("drive", "from behind"), (GRID, "from the front, the left, the rear and the right")):
-                if (folder / "pictures" / f"{view}-{pair.test.lower()}.jpg").is_file():
-                    captions[f"{view}-{pair.test.lower()}.jpg"] = (
+                if chosen and not path.is_file() and (clips.folder / "annotations").is_dir():
+                    save_picture(path, attacks.sheet(name, clips, textures=shown, sides=sides, clean=CLEAN))
+                if path.is_file():
+                    captions[path.name] = (
                         f"What {name} finds (orange, score at least 0.25) in {pair.test}, clean and attacked, {text}."
                     )
         if captions:
             safeio.write_atomic(folder / "pictures" / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
 
-    def _chosen(self, plan: Plan, job: Job, pair: Pair, detector: str) -> dict[str, TextureSpec]:
+    def _chosen(self, plan: Plan, attacks: TargetAttacks, pair: Pair, detector: str) -> dict[str, TextureSpec]:
         """The textures of a pair of towns that are there, one of each attack, by title."""
         found: dict[str, TextureSpec] = {}
         for cell in plan.cells:
@@ -263,72 +271,20 @@ class Physical(Kind):
                 continue
             if cell.system == detector and spec["source"] in ("", detector):
                 texture = TextureSpec.of_row(spec)
-                if not texture.trained or _textures(job).kept(texture).is_file():
+                if not texture.trained or attacks.textures.kept(texture).is_file():
                     found.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", texture)
         return found
 
 
-@lru_cache(maxsize=16)
-def _surface(target: str, surface: str) -> Surface:
-    """Where a texture goes, from plain data."""
-    car, row = parse_target(target), safeio.parse_json(surface)
-    assert isinstance(car, TargetCar)
-    return make_carrier(row["carrier"], row["options"]).on(car.mesh())
-
-
-def _layers(target: str, surfaces: Sequence[str]) -> list[tuple[Layer, ...]]:
-    return [(_surface(target, surface).layer,) for surface in surfaces]
-
-
-def _see(task: tuple[Path, int, str, Sequence[str], str]) -> None:
-    """In a worker: render what the pictures of a part of a recording see of carriers, and keep it."""
-    folder, part, target, surfaces, device = task
-    quiet_warp()
-    see_clips(folder, _layers(target, surfaces), part=part, device=device)
-
-
-def _textures(job: Job) -> TextureFolder:
-    """The textures of a run."""
-    return TextureFolder(job.folder / "textures", job.settings["seed"], job.device)
-
-
-def texture_of(job: Job, spec: TextureSpec) -> Tensor:
-    """A texture of a run [3, H, W], sRGB; trained now if it has to be."""
-    surface = _surface(job.settings["target"], spec.surface)
-
-    def views() -> list[View]:
-        town, count = spec.pair["train"], spec.pair["train_images"]
-        classes = tuple(make_detector(spec.source).classes)
-        clips = [TargetClips(job.folder / "data" / town, count, classes, job.device)]
-        if spec.around:
-            clips.append(TargetClips(job.folder / "data" / f"{town}-around", spec.around, classes, job.device))
-        return [view for one in clips for _, view in one.wearing(surface)]
-
-    return _textures(job).texture(
-        spec, surface, views=views, detector=lambda: make_detector(spec.source, device=job.device)
-    )
-
-
-def _test_clips(job: Job, spec: Mapping[str, Any], detector: str) -> TargetClips:
-    """The pictures that a cell is scored on, for a detector."""
-    town, grid = spec["pair"]["test"], spec["view"] == GRID
-    count = job.settings["grid"] if grid else spec["pair"]["test_images"]
-    classes = tuple(make_detector(detector).classes)
-    return TargetClips(job.folder / "data" / (f"{town}-grid" if grid else town), count, classes, job.device)
-
-
-def _worn(job: Job, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
-    """Drive, picture and truth of clips under a texture."""
-    colour = albedo_of(texture_of(job, spec)).to(job.device)  # may be trained now, so gradients are on
-    for drive, view in clips.wearing(_surface(job.settings["target"], spec.surface)):
-        with torch.no_grad():
-            yield drive, view.picture.together([view.picture], {0: colour[None]}), view.truth
+def attacks_of(job: Job) -> TargetAttacks:
+    """The textures and lights of a run."""
+    return TargetAttacks(job.folder, job.settings["target"], job.settings["seed"], job.device)
 
 
 @lru_cache(maxsize=8)
-def _clean_sightings(clips: TargetClips, detector: str) -> tuple[Sighting, ...]:
+def _clean_sightings(pictures: TargetClips | LitPictures, detector: str) -> tuple[Sighting, ...]:
     """What a detector finds in pictures as they were recorded; kept, since every cell needs it."""
-    return tuple(sightings(make_detector(detector, device=clips.device), clips.clean()))
+    return tuple(sightings(make_detector(detector, device=pictures.device), pictures.clean()))
 
 
 def _grid_clips(suite: PhysicalSuite, folder: Path, town: str, device: str) -> Clips:
@@ -361,35 +317,3 @@ def _title(row: Mapping[str, Any]) -> str:
         return CLEAN
     sides = ", all sides" if row.get("around") else ""
     return f"shuffled {row['of']}{sides}" if row["of"] else f"{row['attack']}{sides}"
-
-
-def _sheet(
-    job: Job, detector: Detector, clips: TargetClips, textures: Mapping[str, TextureSpec], sides: Sequence[float | None]
-) -> U8:
-    """Views under textures below each other: the first one, or one from each side (azimuths in degrees)."""
-    everything = replace(clips, count=len(replace(clips, count=1 << 30).rows()))
-    rows = everything.rows()
-    numbers = [k for side in sides for k in _from(rows, side)] or [0]
-    clean = [one for k, one in enumerate(everything.clean()) if k in numbers]
-    worn = {
-        title: [one for k, one in enumerate(islice(_worn(job, everything, spec), max(numbers) + 1)) if k in numbers]
-        for title, spec in textures.items()
-    }
-    sheets = []
-    for k, (_, image, truth) in enumerate(clean):
-        shown = [(CLEAN, image), *((title, views[k][1]) for title, views in worn.items())]
-        columns = min(len(shown), COLUMNS)
-        sheets.append(target_sheet(detector, shown, truth.box[0].tolist(), job.device, columns))
-    return np.concatenate(sheets)
-
-
-def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:
-    """The number of the first view from a side at some 10 m, by day; of any view where no side is wanted."""
-    if side is None:
-        return [0]
-    near = sorted({abs(float(row["distance"]) - 10.0) for row in rows})[0]
-    own = [
-        k for k, row in enumerate(rows)
-        if float(row["azimuth"]) == side and abs(float(row["distance"]) - 10.0) == near and row["weather"] != "night"
-    ]  # fmt: skip
-    return own[:1]
