@@ -9,8 +9,8 @@ import torch
 from ssad.core.checkpoints import Card
 from ssad.core.types import Controller
 from ssad.drivers import make_system
-from ssad.training.driver import Candidate, draw_episodes, find_scenarios
-from ssad.world.policy import policy_of, tensors_of
+from ssad.training.driver import draw_episodes, find_scenarios
+from ssad.world.policy import PolicyDriver, policy_of, tensors_of
 from ssad.world.rollout import Loop
 from ssad.world.selection import FreaSelection
 from ssad.world.world import World
@@ -43,7 +43,7 @@ def test_an_adversary_drives_in_training_as_it_does_in_the_loop(monkeypatch) -> 
     observation = env.reset()
     episodes, graphs = scenes()
     world = World(episodes, graphs)
-    loop = Loop(world, {0: make_system("autopilot"), FreaSelection(count=1): Candidate(policy)})
+    loop = Loop(world, {0: make_system("autopilot"), FreaSelection(count=1): PolicyDriver(policy, name="own")})
     loop.reset()
     seen = 0
     for _ in range(80):

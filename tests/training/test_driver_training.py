@@ -15,7 +15,7 @@ from helpers.command import ssad
 
 from ssad.core.checkpoints import load_card
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
-from ssad.drivers.rl.learned import Learned
+from ssad.drivers.rl.learned import PPO
 from ssad.training.adversary import AdversaryPlan, run_adversary_training
 from ssad.training.driver import DriverPlan, draw_episodes, find_scenarios, run_driver_training
 from ssad.training.reinforcement import LEARNINGS, find_learning, learn, make_model, read_log
@@ -45,7 +45,7 @@ def test_a_training_writes_weights_that_drive(tmp_path: Path) -> None:
     assert [row["step"] for row in rows] == [128, 256, 384, 512]
     assert all(0.0 <= row["CR"] <= 1.0 and math.isfinite(row["score"]) for row in rows)
     assert (tmp_path / "curves.png").stat().st_size > 5000
-    driver = Learned("own", tmp_path / "ppo.safetensors")
+    driver = PPO(tmp_path / "ppo.safetensors")
     assert (driver.sensors, driver.version) == (("traffic",), card.hash)
     assert driver.policy.actions(np.zeros((3, 69), np.float32)).shape == (3, 2)
     # all of it is done: nothing is trained again

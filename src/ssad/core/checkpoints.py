@@ -305,6 +305,24 @@ def _groups(state: Mapping[str, Tensor], *, limit: int) -> list[dict[str, Tensor
 # ---------------------------------------------------------------- into a detector
 
 
+def read_state(path: str | Path, key: str) -> dict[str, Any] | None:
+    """The state of an interrupted training, whose own check is under `key`; None if there is none.
+
+    Raises:
+        FormatError: The file is broken or something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise FormatError(f"{path}: not a checkpoint of a training ({type(error).__name__}); delete it") from None
+    if not isinstance(state, dict) or key not in state:
+        raise FormatError(f"{path}: not a checkpoint of a training; delete it")
+    return state
+
+
 def check_finite(state: Mapping[str, Tensor], where: str) -> None:
     """Check that no tensor holds NaN or infinite values.
 

@@ -39,9 +39,7 @@ def find_system(name: str) -> Any:
 
     kind, _, weights = name.partition(":")
     if kind in LEARNED and weights:
-        from ssad.drivers.rl.learned import Learned
-
-        return Learned(kind, weights)
+        return resolve("system", SYSTEMS, kind)(weights)
     return resolve("system", SYSTEMS, name)
 
 

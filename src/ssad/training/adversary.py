@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ssad.core.checkpoints import Card, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Proposal
@@ -18,9 +17,10 @@ from ssad.core.seeding import digest
 from ssad.core.types import Scenario
 from ssad.drivers import make_system
 from ssad.scenarios.dynamic.generate import Trials
-from ssad.training.driver import VALIDATION_SEED, Candidate, draw_episodes, find_scenarios
-from ssad.training.reinforcement import LEARNINGS, Learning, Say, draw_curves, export, find_learning, learn, make_model
-from ssad.world.policy import Policy, policy_of
+from ssad.training.driver import VALIDATION_SEED, draw_episodes, find_scenarios
+from ssad.training.recipe import set_words
+from ssad.training.reinforcement import LEARNINGS, Learning, Say, find_learning, finish, learn, make_model
+from ssad.world.policy import Policy, PolicyDriver
 from ssad.world.selection import FreaSelection
 
 ADVERSARIES = {
@@ -126,14 +126,21 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     held = {"ego": plan.ego, "scenarios": scenarios, "graphs": graphs, "seed": VALIDATION_SEED}
 
     def validate(policy: Policy) -> dict[str, float]:
-        found = measure_adversary(Candidate(policy), **held)  # type: ignore[arg-type]
+        found = measure_adversary(PolicyDriver(policy, name="candidate"), **held)  # type: ignore[arg-type]
         return found | {"score": found["valid"]}
 
     about = digest("adversary training", plan.ego, plan.literal, plan.off_road, *(e.key for e in episodes))[:16]
     state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about)
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
-    yield _finish(plan, learning, model, state)
+    data = (
+        f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}; ego {plan.ego}"
+    )
+    path = plan.out / f"{plan.algorithm}.safetensors"
+    yield finish(
+        path, learning, model, state=state, data=data, command=command_of(plan), test=measure_all(plan),
+        about={"ego": plan.ego},
+    )  # fmt: skip
 
 
 def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs: Any, ego: Driver) -> Any:
@@ -148,26 +155,18 @@ def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs:
     )  # fmt: skip
 
 
-def _finish(plan: AdversaryPlan, learning: Learning, model: Any, state: Any) -> str:
-    """Write the best policy with its card and curves; returns a line about it."""
-    _, about = export(model, learning)
-    config = about | asdict(learning) | {"steps_done": state["best_row"]["step"], "ego": plan.ego}
-    policy = policy_of(Card("", "", learning.seed, (), config=config), state["best"], str(plan.out))
-    metrics: dict[str, float] = {}
-    for ref in plan.test:
-        scenarios, graphs = natural_only([ref])
-        measured = measure_adversary(Candidate(policy), plan.ego, scenarios, graphs, seed=0)
-        metrics |= {f"{Path(ref).stem}_{name}": round(value, 4) for name, value in measured.items()}
-    names, graphs = natural_only(plan.scenarios)
-    card = Card(
-        data=f"{', '.join(plan.scenarios)}: {len(names)} scenarios with traffic in {', '.join(graphs)}; ego {plan.ego}",
-        command=command_of(plan), seed=learning.seed, classes=(), metrics=metrics, config=config,
-    )  # fmt: skip
-    path = plan.out / f"{plan.algorithm}.safetensors"
-    save_weights(path, state["best"], card=card)
-    draw_curves(plan.out)
-    numbers = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())
-    return f"{path}: best at step {state['best_row']['step']}: {numbers}; card, log.jsonl and curves.png beside it"
+def measure_all(plan: AdversaryPlan) -> Callable[[Driver], dict[str, float]]:
+    """A function that measures a driver in the sets of a plan, as `SET_CR`, `SET_valid` and so on."""
+
+    def found(driver: Driver) -> dict[str, float]:
+        metrics: dict[str, float] = {}
+        for ref in plan.test:
+            scenarios, graphs = natural_only([ref])
+            measured = measure_adversary(driver, plan.ego, scenarios, graphs, seed=0)
+            metrics |= {f"{Path(ref).stem}_{name}": round(value, 4) for name, value in measured.items()}
+        return metrics
+
+    return found
 
 
 def command_of(plan: AdversaryPlan) -> str:
@@ -179,6 +178,4 @@ def command_of(plan: AdversaryPlan) -> str:
     words += ["--test", ",".join(plan.test)] if plan.test != usual.test else []
     words += ["--literal"] if plan.literal else []
     words += ["--off-road", f"{plan.off_road:g}"] if plan.off_road != usual.off_road else []
-    for key, value in plan.changes:
-        words += ["--set", f"{key}={'[' + ','.join(map(str, value)) + ']' if isinstance(value, tuple) else value}"]
-    return shlex.join(words)
+    return shlex.join([*words, *set_words(plan.changes)])

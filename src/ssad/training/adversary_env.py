@@ -20,6 +20,7 @@ from ssad.world.policy import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
 from ssad.world.rewards import distance_to_goal
 from ssad.world.rollout import Loop
+from ssad.world.sb3 import Alike
 from ssad.world.selection import FreaSelection, Note
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
@@ -27,7 +28,7 @@ from ssad.world.world import World
 _ADVERSARY = 1_000  # number of the driver of adversaries, beyond those of the loop
 
 
-class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
+class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
     """`num_envs` scenes with one adversary at a time, which FREA's rules choose and let go.
 
     An adversary's time from choice to release is an episode of the learner. It is terminated by a contact or by the
@@ -151,22 +152,3 @@ class AdversaryEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not b
         agents = np.stack([np.arange(self.num_envs), np.maximum(who, 0)], 1).astype(np.int32)
         rows = SENSORS["adversary"](self.world, agents)
         return np.where((who >= 0)[:, None], rows, 0.0).astype(np.float32)
-
-    def close(self) -> None:
-        """Nothing to close: no process, no window."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of this environment, once for each scene."""
-        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of this environment: the scenes have none of their own."""
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
-        """Call a method of this environment, once for each scene."""
-        return [getattr(self, method_name)(*args, **options) for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Scenes are never wrapped."""
-        return [False for _ in self._get_indices(indices)]

@@ -32,7 +32,7 @@ from ssad.evaluation.detection import score_2d, score_3d
 from ssad.training.batches import Item, PictureSet, fill
 from ssad.training.data import nuscenes_items
 from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row
-from ssad.training.recipe import Recipe, find_recipe, recipe_data
+from ssad.training.recipe import Recipe, find_recipe, recipe_data, set_words
 
 Say = Callable[[str], None]
 VAL_SCENES = 4  # of a data set in the nuScenes schema, while training; at the end all are used
@@ -316,9 +316,7 @@ def command_of(plan: Plan) -> str:
         ("--seconds", plan.seconds, None),
     ):  # fmt: skip
         words += [option, str(value)] if value != usual else []
-    for key, value in plan.changes:
-        words += ["--set", f"{key}={'[' + ','.join(map(str, value)) + ']' if isinstance(value, tuple) else value}"]
-    return shlex.join(words)
+    return shlex.join([*words, *set_words(plan.changes)])
 
 
 def _validation(plan: Plan, device: str, *, three: bool) -> Callable[..., dict[str, float]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,28 +12,27 @@ from typing import Any
 import torch
 
 from ssad.core import safeio
-from ssad.core.checkpoints import Card, save_weights
-from ssad.core.driving import Driver, Observation
+from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import digest
-from ssad.core.types import F32, Controller, Episode, Scenario
+from ssad.core.types import Episode, Scenario
 from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.training.recipe import set_words
 from ssad.training.reinforcement import (
     LEARNINGS,
-    Learning,
     Say,
-    draw_curves,
     find_learning,
+    finish,
     learn,
     make_model,
     require,
 )
 from ssad.world.env import VectorEnv, reward_of
-from ssad.world.policy import Policy
+from ssad.world.policy import Policy, PolicyDriver
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
@@ -62,24 +61,6 @@ class DriverPlan:
     changes: tuple[tuple[str, Any], ...] = ()
     seconds: float | None = None
     device: str = "cpu"
-
-
-class Candidate:
-    """A policy in training, as a driver."""
-
-    name = "candidate"
-    controller = Controller.EXTERNAL
-
-    def __init__(self, policy: Policy) -> None:
-        self.policy = policy
-        self.sensors = (policy.observation,)
-
-    def reset(self, episodes: Sequence[Episode]) -> None:
-        """Nothing to forget."""
-
-    def act(self, view: Observation) -> F32:
-        """What the policy does."""
-        return self.policy.controls(view.readings[self.policy.observation])
 
 
 @lru_cache(maxsize=16)
@@ -165,7 +146,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     held = held[:: max(len(held) // MOST_VALIDATION, 1)]
 
     def validate(policy: Policy) -> dict[str, float]:
-        found = measure(Candidate(policy), held, graphs)
+        found = measure(PolicyDriver(policy, name="candidate"), held, graphs)
         return found | {"score": found["RC"] - found["CR"] - 2.0 * found["OF"]}
 
     about = digest("driver training", *(safeio.dump_json([e.key, e.seed]) for e in episodes))[:16]
@@ -174,7 +155,9 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     )  # fmt: skip
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
-    yield finish(plan, learning, model, state, measure_all(plan.test))
+    data = f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios in {', '.join(graphs)}"
+    path = plan.out / f"{plan.algorithm}.safetensors"
+    yield finish(path, learning, model, state=state, data=data, command=command_of(plan), test=measure_all(plan.test))
 
 
 def measure_all(refs: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
@@ -191,34 +174,6 @@ def measure_all(refs: Sequence[str]) -> Callable[[Driver], dict[str, float]]:
     return found
 
 
-def finish(
-    plan: DriverPlan,
-    learning: Learning,
-    model: Any,
-    state: Mapping[str, Any],
-    test: Callable[[Driver], dict[str, float]],
-) -> str:
-    """Write the best policy of a training with its card and curves; returns a line about it."""
-    from ssad.training.reinforcement import export
-    from ssad.world.policy import policy_of
-
-    _, about = export(model, learning)
-    best = state["best_row"]
-    config = about | {f.name: getattr(learning, f.name) for f in fields(learning)} | {"steps_done": best["step"]}
-    draft = Card("", "", learning.seed, (), config=config)
-    metrics = test(Candidate(policy_of(draft, state["best"], str(plan.out))))
-    names, graphs = find_scenarios(plan.scenarios)
-    card = Card(
-        data=f"{', '.join(plan.scenarios)}: {len(names)} scenarios in {', '.join(graphs)}",
-        command=command_of(plan), seed=learning.seed, classes=(), metrics=metrics, config=config,
-    )  # fmt: skip
-    path = plan.out / f"{plan.algorithm}.safetensors"
-    save_weights(path, state["best"], card=card)
-    draw_curves(plan.out)
-    numbers = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())
-    return f"{path}: best at step {best['step']}: {numbers}; card, log.jsonl and curves.png beside it"
-
-
 def command_of(plan: DriverPlan) -> str:
     """The command that trains this anew."""
     words = ["ssad", "train", "driver", plan.algorithm]
@@ -226,6 +181,4 @@ def command_of(plan: DriverPlan) -> str:
         words += ["--scenarios", ",".join(plan.scenarios)]
     if plan.test != ("precrash", "natural"):
         words += ["--test", ",".join(plan.test)]
-    for key, value in plan.changes:
-        words += ["--set", f"{key}={'[' + ','.join(map(str, value)) + ']' if isinstance(value, tuple) else value}"]
-    return shlex.join(words)
+    return shlex.join([*words, *set_words(plan.changes)])

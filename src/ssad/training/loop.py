@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from ssad.core import safeio
+from ssad.core.checkpoints import read_state
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.seeding import seed32
@@ -297,14 +298,9 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
         FormatError: The file is broken, or comes from another recipe, other data, other first weights or another number
             of GPUs.
     """
-    if not path.is_file():
+    state = read_state(path, "recipe")
+    if state is None:
         return None
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise FormatError(f"{path}: not a checkpoint of a training ({type(error).__name__}); delete it") from None
-    if not isinstance(state, dict) or "recipe" not in state:
-        raise FormatError(f"{path}: not a checkpoint of a training; delete it")
     if state["recipe"] != safeio.dump_json(recipe_data(recipe)):
         raise FormatError(f"{path}: of another recipe; choose another folder, or delete it")
     if state.get("about", "") != about:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from ssad.core.errors import ConfigError, unknown_name
 
+T = TypeVar("T")
 Whole = Annotated[int, Field(ge=1)]
 FromNone = Annotated[int, Field(ge=0)]
 Above = Annotated[float, Field(gt=0.0)]
@@ -149,17 +151,38 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    known = sorted(f.name for f in fields(Recipe) if f.name != "detector")
+    return changed(RECIPES[name], changes, fixed="detector", what=f"recipe {name}")
+
+
+def changed(usual: T, changes: Mapping[str, Any], *, fixed: str, what: str) -> T:
+    """A recipe with some of its values changed.
+
+    Args:
+        usual: A dataclass of pydantic.
+        changes: By field.
+        fixed: The field that cannot be changed.
+        what: What messages call it: a word and its name.
+
+    Raises:
+        ConfigError: A value does not fit.
+    """
+    known = sorted(f.name for f in fields(usual) if f.name != fixed)  # type: ignore[arg-type]
     for key in changes:
         if key not in known:
-            raise ConfigError(f"a recipe has no value '{key}'; it has {', '.join(known)}")
+            raise ConfigError(f"a {what.partition(' ')[0]} has no value '{key}'; it has {', '.join(known)}")
     try:
-        return replace(RECIPES[name], **changes)
+        return replace(usual, **changes)  # type: ignore[type-var]
     except ValidationError as error:
         problem = error.errors(include_url=False)[0]
         key = str(problem["loc"][0]) if problem["loc"] else ""
         text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it is written with --set
-        raise ConfigError(f"recipe {name}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
+        raise ConfigError(f"{what}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
+
+
+def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:
+    """Changed values as words of the command line."""
+    texts = [(key, "[" + ",".join(map(str, v)) + "]" if isinstance(v, tuple) else v) for key, v in changes]
+    return [word for key, text in texts for word in ("--set", f"{key}={text}")]
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:

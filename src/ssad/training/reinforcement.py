@@ -8,20 +8,21 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import ConfigDict, ValidationError
+from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from ssad.core import safeio
-from ssad.core.checkpoints import Card
+from ssad.core.checkpoints import Card, read_state, save_weights
+from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
-from ssad.training.recipe import Above, Decay, FromNone, Part, Whole
-from ssad.world.policy import Policy, policy_of, tensors_of
+from ssad.training.recipe import Above, Decay, FromNone, Part, Whole, changed
+from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
 
 LOG, LAST = "log.jsonl", "last.pt"
 Say = Callable[[str], None]
@@ -97,17 +98,7 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
-    known = sorted(f.name for f in fields(Learning) if f.name != "algorithm")
-    for key in changes:
-        if key not in known:
-            raise ConfigError(f"a training has no value '{key}'; it has {', '.join(known)}")
-    try:
-        return replace(table[name], **changes)
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = str(problem["loc"][0]) if problem["loc"] else ""
-        text = problem["msg"].replace("tuple", "list")
-        raise ConfigError(f"training {name}: {key}={changes.get(key)!r}: {text}") from None
+    return changed(table[name], changes, fixed="algorithm", what=f"training {name}")
 
 
 def require() -> Any:
@@ -328,15 +319,8 @@ def _put_back(model: Any, state: Mapping[str, Any], path: Path) -> None:
 
 
 def _read_last(path: Path, key: str) -> dict[str, Any] | None:
-    if not path.is_file():
-        return None
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise FormatError(f"{path}: not a checkpoint of a training ({type(error).__name__}); delete it") from None
-    if not isinstance(state, dict) or "key" not in state:
-        raise FormatError(f"{path}: not a checkpoint of a training; delete it")
-    if state["key"] != key:
+    state = read_state(path, "key")
+    if state is not None and state["key"] != key:
         raise FormatError(f"{path}: of another recipe or other scenarios; choose another folder, or delete it")
     return state
 
@@ -378,3 +362,38 @@ def draw_curves(out: Path) -> None:
     with safeio.atomic_path(out / "curves.png") as path:
         figure.savefig(path, dpi=110, format="png")
     pyplot.close(figure)
+
+
+def finish(
+    path: Path,
+    learning: Learning,
+    model: Any,
+    *,
+    state: Mapping[str, Any],
+    data: str,
+    command: str,
+    test: Callable[[Driver], dict[str, float]],
+    about: Mapping[str, Any] | None = None,
+) -> str:
+    """Write the best policy of a training with its card and curves; returns a line about it.
+
+    Args:
+        path: NAME.safetensors in the folder of the training.
+        learning: Its recipe.
+        model: The model.
+        state: What `learn` returned.
+        data: What it learned from, for the card.
+        command: What trains it anew.
+        test: Measures a driver.
+        about: What else the card says of the training.
+    """
+    best = state["best_row"]
+    own = {f.name: getattr(learning, f.name) for f in fields(learning)}
+    config = export(model, learning)[1] | own | {"steps_done": best["step"], **(about or {})}
+    draft = Card("", "", learning.seed, (), config=config)
+    metrics = test(PolicyDriver(policy_of(draft, state["best"], str(path.parent)), name=path.stem))
+    card = Card(data=data, command=command, seed=learning.seed, classes=(), metrics=metrics, config=config)
+    save_weights(path, state["best"], card=card)
+    draw_curves(path.parent)
+    numbers = "  ".join(f"{name} {value:.3f}" for name, value in metrics.items())
+    return f"{path}: best at step {best['step']}: {numbers}; card, log.jsonl and curves.png beside it"

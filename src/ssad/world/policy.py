@@ -6,7 +6,7 @@ A policy is a stack of linear layers with ReLU between them, from one sensor of 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from ssad.core.checkpoints import Card, load_card
+from ssad.core.driving import Observation
 from ssad.core.errors import FormatError
-from ssad.core.types import F32
+from ssad.core.types import F32, Controller, Episode
 
 WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversary": 24}
 """Sensors that a policy can look at, and how many numbers they have."""
@@ -94,6 +95,30 @@ class Policy:
     def controls(self, rows: F32) -> F32:
         """Throttle, brake, steer and reverse [N, 4] from readings [N, width]."""
         return to_controls(self.action, self.actions(rows))
+
+
+class PolicyDriver:
+    """Drives by a policy; deterministic, without memory, for any number of agents at once.
+
+    Attributes:
+        name: What tables call it.
+        policy: What it does.
+        version: Hash of its weights.
+        sensors: What it looks at.
+    """
+
+    controller = Controller.EXTERNAL
+
+    def __init__(self, policy: Policy, *, name: str) -> None:
+        self.name, self.policy, self.version = name, policy, policy.card.hash
+        self.sensors = (policy.observation,)
+
+    def reset(self, episodes: Sequence[Episode]) -> None:
+        """Nothing to forget."""
+
+    def act(self, view: Observation) -> F32:
+        """Throttle, brake, steer and reverse [N, 4] from what its sensor shows."""
+        return self.policy.controls(view.readings[self.policy.observation])
 
 
 def load_policy(path: str | Path) -> Policy:

@@ -13,7 +13,36 @@ from stable_baselines3.common.vec_env import VecEnv
 from ssad.world.env import VectorEnv
 
 
-class SB3VecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
+class Alike:
+    """What a vector environment of stable-baselines3 answers of scenes that have nothing of their own."""
+
+    num_envs: int
+
+    def close(self) -> None:
+        """Nothing to close: no process, no window."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of this environment, once for each scene."""
+        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute of this environment: the scenes have none of their own."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+        """Call a method of this environment, once for each scene."""
+        return [getattr(self, method_name)(*args, **options) for _ in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Scenes are never wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _get_indices(self, indices: Any) -> Sequence[int]:
+        found: Sequence[int] = range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()
+        return found
+
+
+class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be installed
     """All scenes of a `VectorEnv` as stable-baselines3 wants them, without a process or a wrapper a scene.
 
     An ended scene starts another episode in the same step. `infos` of its row then hold `terminal_observation`,
@@ -67,26 +96,3 @@ class SB3VecEnv(VecEnv):  # type: ignore[misc]  # stable-baselines3 may not be i
         self._returns[done] = 0.0
         self._lengths[done] = 0
         return observation, reward.astype(np.float32), done, infos
-
-    def close(self) -> None:
-        """Nothing to close: no process, no window."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of this environment, once for each scene."""
-        return [getattr(self, attr_name) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of this environment: the scenes have none of their own."""
-        setattr(self, attr_name, value)
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
-        """Call a method of this environment, once for each scene."""
-        return [getattr(self, method_name)(*args, **options) for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Scenes are never wrapped."""
-        return [False for _ in self._get_indices(indices)]
-
-    def _get_indices(self, indices: Any) -> Sequence[int]:
-        found: Sequence[int] = range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()
-        return found

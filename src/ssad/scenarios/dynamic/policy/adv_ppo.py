@@ -15,25 +15,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from ssad.core.driving import Driver, Observation, Selector
+from ssad.core.driving import Driver, Selector
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome, Proposal
-from ssad.core.types import F32, Controller, Episode
-from ssad.world.policy import Policy, load_policy
+from ssad.core.types import Controller
+from ssad.world.policy import PolicyDriver, load_policy
 from ssad.world.selection import VEHICLES, FreaSelection
 
 SHIPPED = Path(__file__).parent / "weights"
 
 
-class Adversary:
-    """Drives whom it is given by a policy that looks at the ego's next way; deterministic, without memory.
-
-    Attributes:
-        policy: What it does.
-        version: Hash of its weights.
-    """
-
-    controller = Controller.EXTERNAL
+class Adversary(PolicyDriver):
+    """Drives whom it is given by a policy that looks at the ego's next way; deterministic, without memory."""
 
     def __init__(self, weights: str | Path | None = None, *, name: str = "adv-ppo") -> None:
         """A driver of adversaries.
@@ -46,17 +39,7 @@ class Adversary:
         Raises:
             FormatError: The weights are missing or broken, or are not those of a policy.
         """
-        self.name = name
-        self.policy: Policy = load_policy(SHIPPED / f"{name}.safetensors" if weights is None else weights)
-        self.version = self.policy.card.hash
-        self.sensors = (self.policy.observation,)
-
-    def reset(self, episodes: Sequence[Episode]) -> None:
-        """Nothing to forget."""
-
-    def act(self, view: Observation) -> F32:
-        """Throttle, brake, steer and reverse [N, 4] from what its sensor shows."""
-        return self.policy.controls(view.readings[self.policy.observation])
+        super().__init__(load_policy(SHIPPED / f"{name}.safetensors" if weights is None else weights), name=name)
 
 
 class AdvPPO:
