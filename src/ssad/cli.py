@@ -169,13 +169,15 @@ def replay(
     ] = None,
     detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
 ) -> None:
-    """Run one cell again, compare it with its record bit by bit, and write a video and the trace.
+    """Run one cell again, compare it with its record bit by bit, and write a video and the trace, or a picture.
 
-    ATTACK is a folder of `ssad export texture` or `ssad export light`; a light shines at its own hour. The film shows
-    what the ego's camera sees, clean and attacked.
+    Drives give a video and the trace; cells of shifts and digital attacks give a picture of one moment, clean and under
+    the cell's condition. ATTACK is a folder of `ssad export texture` or `ssad export light`; a light shines at its own
+    hour. The film shows what the ego's camera sees, clean and attacked.
     Exit code 1: the new run differs from the record.
     """
     from ssad.bench.replay import replay as run_again
+    from ssad.core.images import save_picture
     from ssad.core.safeio import make_folder
     from ssad.core.traces import save_trace
     from ssad.report import write_video
@@ -183,9 +185,17 @@ def replay(
     film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
     found = run_again(folder, cell)
     target = make_folder(out or folder / "replays") / found.cell.key
+    verdict = f"differs: {found.difference}" if found.difference else "identical"
+    if found.trace is None or found.graph is None:
+        print(f"{found.cell.key} {found.cell.name}: {found.compared}, {verdict}")
+        if film_of is not None:
+            raise ConfigError(f"--wear: cell {found.cell.key} ({found.cell.name}) is no drive")
+        if found.picture is not None:
+            save_picture(target.with_suffix(".jpg"), found.picture())
+            print(f"picture: {target.with_suffix('.jpg')}")
+        raise typer.Exit(1 if found.difference else 0)
     save_trace(target.with_suffix(".npz"), found.trace)
     film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
-    verdict = f"differs: {found.difference}" if found.difference else "identical"
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
     print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
     if film_of is not None:

@@ -136,6 +136,26 @@ def test_a_stopped_run_goes_on_to_the_same_records(folder: Path, root: Path, tmp
     assert sorted(map(str, map(plain, lines(again)))) == sorted(map(str, map(plain, lines(folder))))
 
 
+def test_replay_finds_the_boxes_of_a_cell_again_and_says_what_differs(folder: Path, tmp_path: Path) -> None:
+    again = tmp_path / "run"
+    again.mkdir()
+    shutil.copy(folder / "run.json", again)
+    text = (folder / "results.jsonl").read_text()
+    record = next(r for r in lines(folder) if (r["shift"], r["severity"]) == ("gaussian", 3))
+    for changed, code, verdict in (
+        ({}, 0, "metrics, boxes of 2 scenes, identical"),
+        ({"hashes": dict.fromkeys(record["hashes"], "0")}, 1, "differs: hashes: detections/"),
+    ):
+        own = json.dumps(record | changed) + "\n"
+        (again / "results.jsonl").write_text("".join(x for x in text.splitlines(True) if record["key"] not in x) + own)
+        found = CliRunner().invoke(app, ["replay", str(again), record["key"], "--out", str(tmp_path / "out")])
+        assert (found.exit_code, verdict in found.output.replace("\n", " ")) == (code, True), found.output
+    assert (tmp_path / "out" / f"{record['key']}.jpg").stat().st_size > 10_000
+    assert not (again / "detections").exists(), "nothing is written to the run"
+    changed = {**record, "metrics": record["metrics"] | {"mAP": 0.25}}
+    assert detection._difference(changed, record) == f"metrics: mAP is {record['metrics']['mAP']}, was 0.25"
+
+
 def test_cells_are_scored_as_soon_as_their_boxes_are_there(
     folder: Path, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

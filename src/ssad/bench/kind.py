@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import digest
-from ssad.core.types import EpisodeTrace
+from ssad.core.types import U8, EpisodeTrace
 
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
 
@@ -134,14 +134,18 @@ class Replay:
     Attributes:
         cell: The cell.
         difference: None if the result is equal to the bit, else where the two differ.
-        trace: What happened in the drive.
+        trace: What happened in the drive; None for a cell that is no drive.
         graph: The town of the drive.
+        compared: What was compared, in words.
+        picture: Makes a picture of what the system was shown and found, clean and under the cell's condition.
     """
 
     cell: Cell
     difference: str | None
-    trace: EpisodeTrace
-    graph: LaneGraph
+    trace: EpisodeTrace | None = None
+    graph: LaneGraph | None = None
+    compared: str = ""
+    picture: Callable[[], U8] | None = None
 
 
 class CellError(SSADError):

@@ -6,14 +6,18 @@ It also has what other kinds that score 3D detectors under conditions need.
 from __future__ import annotations
 
 import hashlib
+import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+from rich.console import Console
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
+from ssad.bench.run import hash_artefacts
 from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.checkpoints import hash_state
@@ -129,8 +133,14 @@ class DetectorKind(Kind):
         return {}
 
     @abstractmethod
-    def sheet(self, examination: Examination, suite: Any) -> tuple[Callable[[], U8], str]:
-        """How the picture for the report is made, which shows the first detector at work, and its caption."""
+    def sheet(self, examination: Examination, suite: Any, cell: Cell | None = None) -> tuple[Callable[[], U8], str]:
+        """How the picture for the report is made, which shows the first detector at work, and its caption.
+
+        Args:
+            examination: Data, detectors, device.
+            suite: The suite.
+            cell: Whose condition alone is shown, beside the clean data; None: those of the suite.
+        """
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Records the data set if none is given; which scenes there are."""
@@ -203,6 +213,26 @@ class DetectorKind(Kind):
                 return
         safeio.write_atomic(path.with_name("pictures.json"), safeio.dump_json({path.name: caption}, indent=1) + "\n")
 
+    def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
+        """Finds the boxes of the cell again, in an empty folder, and compares boxes, metrics and all else."""
+        quiet = Resources(device=plan.device, console=Console(quiet=True))
+        settings = self.prepare(plan, folder, quiet)  # the data are there, or are recorded again
+        with tempfile.TemporaryDirectory() as temporary:
+            job = Job(Path(temporary), plan.device, settings)
+            self.start(job)
+            result = safeio.parse_json(safeio.dump_json(dict(self.execute([cell], job)[cell.key])))
+            result["hashes"] = hash_artefacts(job.folder, result["artefacts"]["detections"])
+        # the folders of a run have the boxes of other cells too
+        recorded = {**record, "hashes": {name: record["hashes"].get(name) for name in result["hashes"]}}
+        examination = replace(_examination(job), folder=folder)
+        system = examination.defended.get(cell.system, (cell.system, None))[0]
+        examination = replace(examination, detectors=((system, dict(examination.detectors)[system]),))
+        shown, _ = self.sheet(examination, plan.suite, cell)
+        return Replay(
+            cell, _difference(recorded, result), picture=shown,
+            compared=f"{len(result['metrics'])} metrics, boxes of {len(result['hashes'])} scenes",
+        )  # fmt: skip
+
 
 class Detection(DetectorKind):
     """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
@@ -268,14 +298,20 @@ class Detection(DetectorKind):
         """See `DetectorKind`."""
         return {"calibration": suite.calibration}
 
-    def sheet(self, examination: Examination, suite: DetectionSuite) -> tuple[Callable[[], U8], str]:
+    def sheet(
+        self, examination: Examination, suite: DetectionSuite, cell: Cell | None = None
+    ) -> tuple[Callable[[], U8], str]:
         """One moment under each shift."""
-        severity = min([s for s in suite.severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
+        shifts, severities = suite.shifts, suite.severities
+        if cell is not None:
+            shifts = [cell.fields["shift"]] if cell.fields["shift"] else []
+            severities = [cell.fields["severity"]]
+        severity = min([s for s in severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
         caption = (
             f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
             f"and under each shift at severity {severity}."
         )
-        return lambda: detection_sheet(examination, suite.split, suite.shifts, severity), caption
+        return lambda: detection_sheet(examination, suite.split, shifts, severity), caption
 
 
 def detectors_of(
@@ -365,3 +401,16 @@ def _examination(job: Job) -> Examination:
         job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["seed"], job.device,
         own["threads"], own.get("calibration", "physical"), defended,
     )  # fmt: skip
+
+
+def _difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
+    """Where a result differs from the record, in words; None: nowhere."""
+    for part, value in result.items():
+        if isinstance(value, dict):
+            old = recorded.get(part, {})
+            for name in value:
+                if value[name] != old.get(name):
+                    return f"{part}: {name} is {value[name]}, was {old.get(name)}"
+        elif value != recorded.get(part):
+            return f"{part} is {value}, was {recorded.get(part)}"
+    return None

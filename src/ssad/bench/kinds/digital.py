@@ -194,9 +194,13 @@ class Digital(DetectorKind):
             raise ConfigError(f"object {spec.object}: no moment of these scenes has it; nothing was attacked")
         return found
 
-    def sheet(self, examination: Examination, suite: DigitalSuite) -> tuple[Callable[[], U8], str]:
+    def sheet(
+        self, examination: Examination, suite: DigitalSuite, cell: Cell | None = None
+    ) -> tuple[Callable[[], U8], str]:
         """One moment under the attacks of the table."""
         rows = [one.specs[0] for one in rows_of(suite) if one.row and len(one.specs) == 1]
+        if cell is not None:  # against the bare detector, also where the cell's pictures were made against another
+            rows = [_told_spec(one) for one in cell.spec["attacks"]]
         specs = [one for one in dict.fromkeys(rows) if not isinstance(one.make(), UniversalFit)]
         caption = (
             f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the "
