@@ -179,6 +179,69 @@ def stream(*key: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(zlib.crc32(repr(key).encode())))
 
 
+def exact_limits(method: str, n: int) -> tuple[F64, F64]:
+    """Limits [n + 1] of a share, by the number of events in n independent cases."""
+    from scipy import special, stats
+
+    k = np.arange(n + 1.0)
+    tail, z = 0.025, float(stats.norm.ppf(0.975))
+    if method == "here":
+        events = (np.arange(n)[None] < k[:, None]).astype(np.float64)
+        found = bounded_limits(events, design(n, 1), cap=2.0 * n)
+        return found.low, found.high
+    if method == "Wilson":
+        centre, half = k / n + z * z / (2 * n), z * np.sqrt(k / n * (1 - k / n) / n + z * z / (4 * n * n))
+        return (centre - half) / (1 + z * z / n), (centre + half) / (1 + z * z / n)
+    if method.startswith("logit"):  # with half an event on either side
+        wide = (z if method == "logit" else stats.t.ppf(0.975, n - 1)) * np.sqrt(1 / (k + 0.5) + 1 / (n - k + 0.5))
+        odds = np.log((k + 0.5) / (n - k + 0.5))
+        return special.expit(odds - wide), special.expit(odds + wide)
+    part = {"Clopper-Pearson": 0.0, "Jeffreys": 0.5}.get(method)
+    if part is not None:
+        low = special.betaincinv(np.maximum(k + part, 1e-300), n - k + 1 - part, tail)
+        high = special.betaincinv(k + 1 - part, np.maximum(n - k + part, 1e-300), 1 - tail)
+    else:  # mid-P: half of what was seen counts as more extreme
+        low, high = np.zeros(n + 1), np.ones(n + 1)
+        for _ in range(60):  # a bisection of all at once, the upper limit by symmetry
+            middle = 0.5 * (low + high)
+            beyond = stats.binom.sf(k, n, middle) + 0.5 * stats.binom.pmf(k, n, middle)
+            low, high = np.where(beyond < tail, middle, low), np.where(beyond < tail, high, middle)
+        high = 1.0 - low[::-1]
+    return np.where(k == 0, 0.0, low), np.where(k == n, 1.0, high)
+
+
+def exact_coverage(n: int, low: F64, high: F64, shares: F64) -> F64:
+    """Coverage for the share of events in n independent cases, computed, not simulated."""
+    from scipy import stats
+
+    chance = stats.binom.pmf(np.arange(n + 1)[:, None], n, shares)
+    held = (low[:, None] <= shares + 1e-12) & (high[:, None] >= shares - 1e-12)
+    return np.asarray((chance * held).sum(axis=0))
+
+
+def least_possible(n: int, shares: F64) -> F64:
+    """The least coverage of 93 % or more that any interval can have: of an unbroken range of numbers of events."""
+    from scipy import stats
+
+    sums = np.concatenate([np.zeros((1, len(shares))), stats.binom.pmf(np.arange(n + 1)[:, None], n, shares)]).cumsum(0)
+    ranges = np.stack([sums[b] - sums[a] for a in range(n + 1) for b in range(a + 1, n + 2)])
+    return np.asarray(np.where(ranges >= 0.93, ranges, 1.0).min(axis=0))
+
+
+def exact_lines() -> list[str]:
+    """Methods for few independent cases, as Markdown: least and greatest coverage where p is from 0.1 to 0.9."""
+    shares, counts = np.linspace(0.1, 0.9, 801), (5, 6, 8, 16, 32)
+    lines = [
+        "Few independent yes-or-no cases, computed: least–greatest coverage for p from 0.1 to 0.9. Last row: what no",
+        "interval can go below where it is 93 or more.", "", *head("Method", [f"{n} cases" for n in counts]),
+    ]  # fmt: skip
+    for method in ("here", "Clopper-Pearson", "mid-P", "Wilson", "Jeffreys", "logit", "logit, Student"):
+        found = [exact_coverage(n, *exact_limits(method, n), shares) for n in counts]
+        lines.append(row(method, [f"{percent(one.min())}–{percent(one.max())}" for one in found]))
+    found = [least_possible(n, shares) for n in counts]
+    return [*lines, row("least possible", [f"{percent(one.min())}–{percent(one.max())}" for one in found])]
+
+
 def row(head: str, cells: list[str]) -> str:
     """A line of a Markdown table."""
     return f"| {head} | " + " | ".join(cells) + " |"
@@ -213,6 +276,7 @@ def tables(draws: int, detector_draws: int) -> list[str]:
             name = f"{clusters} x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")
             found = [share_coverage(p, design(clusters, cases), correlation, draws) for p in SHARES]
             lines.append(row(name, [percent(value) for value in found]))
+    lines += ["", *exact_lines()]
     kinds = [(1, 0.0), *((10, c) for c in CORRELATIONS)]
     titles = ["1 case", *(f"10 cases, correlation {c:g}" for c in CORRELATIONS)]
     lines += ["", "The average of eight groups with four clusters each; p in the groups:", "", *head("p", titles)]
