@@ -64,7 +64,8 @@ def test_a_key_covers_what_decides_the_result() -> None:
     [
         ({"detectors": ["fcos3d-light"]}, ConfigError, "fcos3d-light is no 2D detector"),
         ({"pairs": [PAIR | {"test": "Nowhere"}]}, ConfigError, "unknown town 'Nowhere'"),
-        ({"target": "stop_sign"}, ConfigError, "only cars are driven"),
+        ({"target": "stop_sign"}, ConfigError, "no panel 'rear'"),
+        ({"target": "stop_sign", "attacks": [], "lights": ["laser"]}, ConfigError, "lights and around are for cars"),
         ({"judges": ["yolov5n"]}, ConfigError, "named twice"),
         ({"grid": {"distances": [1.0]}}, ConfigError, "distances: 3 to 80 m"),
         ({"grid": {"weathers": ["hail"]}}, UnknownNameError, "hail"),

@@ -34,7 +34,7 @@ from ssad.recording.clips import FOCAL, SMALL, Clips, pair_images
 from ssad.recording.drives import make_drive
 from ssad.recording.nuscenes_recorder import drive
 from ssad.recording.scene_objects import SceneObjects
-from ssad.recording.target import TargetCar, TargetSign, parse_target
+from ssad.recording.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
 from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 from ssad.roads import load_town
 
@@ -524,9 +524,11 @@ def test_a_drive_that_stands_or_is_too_short_gives_no_shot(market: EpisodeTrace)
         ("sedan:white:7", TargetCar("sedan", "white", seed=7)),
         ("stop_sign", TargetSign("standard")),
         ("stop_sign:worn:3", TargetSign("worn", seed=3)),
+        ("pedestrian", TargetWalker("standing")),
+        ("pedestrian:child:2", TargetWalker("child", seed=2)),
     ],
 )
-def test_targets_are_named_by_style_paint_and_seed(text: str, expected: TargetCar | TargetSign) -> None:
+def test_targets_are_named_by_style_paint_and_seed(text: str, expected: Target) -> None:
     assert parse_target(text) == expected
     assert expected.mesh().bounds()[1][2] == pytest.approx(expected.full_size[2], abs=1e-3)
 

@@ -22,7 +22,9 @@ from ssad.core.images import read_image
 from ssad.recording.clip_recorder import clip_views, record_clips
 from ssad.recording.clips import Clips
 from ssad.recording.nuscenes_recorder import SENSOR
+from ssad.recording.target import TargetCar
 from ssad.recording.textured_clips import KEPT, Wearing, textured_clips
+from ssad.scenarios.static.physical.carrier import Road
 
 LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
 SIZES: dict[int, int | tuple[int, int]] = {0: 32, 1: (16, 24)}
@@ -116,6 +118,27 @@ def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
     slopes = [torch.autograd.grad((shown * weight).sum(), leaves) for shown in (alone, together)]
     for one, other in zip(*slopes, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
+
+
+def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path) -> None:
+    surface = Road(width=1.5, length=3.0).on(TargetCar().mesh())
+    (clip,) = textured_clips(folder, (surface.layer,))
+    ready = clip.prepare({0: surface.size})
+    black, white = (ready.show({0: torch.full((3, *surface.size), value)}) for value in (0.05, 0.9))
+    brighter = ((white - black).amax(1)[0] > 0.1).numpy()
+    (seen,) = clip_views(folder)
+    picture = render(seen.scene, [seen.view])
+    assert (picture.tag[0][brighter] == 0).mean() > 0.9, "on the street"
+    x, y, w, h = next(o["bbox"] for o in seen.objects if o["target"])
+    rows, columns = np.nonzero(brighter)
+    assert brighter.sum() > 0.1 * w * h
+    assert rows.mean() > y + h - 2, "nearer than the car"
+    assert x < columns.mean() < x + w
+    anew = render(seen.scene, [seen.wearing(surface.layer)])
+    radiance = retexture(taps_of(anew, surface.size), torch.full((3, *surface.size), 0.9), torch.tensor(anew.radiance))
+    whole = jpeg(develop(radiance, float(anew.exposure[0]), SENSOR), 92)
+    changed = torch.as_tensor(brighter)
+    torch.testing.assert_close(white[..., changed], whole[..., changed], rtol=0, atol=1e-5)
 
 
 def test_gradients_noise_and_what_cannot_be(folder: Path) -> None:

@@ -14,7 +14,7 @@ from ssad.core.errors import ConfigError
 from ssad.recording.clips import AZIMUTHS, ELEVATIONS
 from ssad.recording.lit_clips import at_hour
 from ssad.recording.nuscenes_recorder import WEATHERS
-from ssad.recording.target import TargetCar, parse_target
+from ssad.recording.target import Target, TargetCar, parse_target
 from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical
 from ssad.scenarios.static.physical.noninvasive import Projector, make_light
 from ssad.scenarios.static.physical.noninvasive.kept import budget_of
@@ -64,7 +64,7 @@ class Entry(BaseModel):
 
     Attributes:
         name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
-        carrier: patch or camouflage, with its settings as `options`; default: the attack's own.
+        carrier: patch, camouflage or road, with its settings as `options`; default: the attack's own.
         options: of the carrier.
         settings: fields of `TextureAttack` that differ.
         around: pictures from all around the target, in the town of the training, that the texture is trained on beside
@@ -77,7 +77,7 @@ class Entry(BaseModel):
     model_config = _STRICT
 
     name: str = Field(min_length=1)
-    carrier: Literal["patch", "camouflage"] | None = None
+    carrier: Literal["patch", "camouflage", "road"] | None = None
     options: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     around: int = Field(default=0, ge=0)
@@ -108,7 +108,7 @@ class PhysicalSuite(SuiteBase):
 
     Attributes:
         detectors: 2D detectors with a class `car`.
-        target: the car, as for `ssad record --target`.
+        target: a car, stop_sign or pedestrian, as for `ssad record --target`; what is no car is seen from all around.
         pairs: towns.
         attacks: names, or mappings with the keys of `Entry`.
         lights: names of light attacks, or mappings with the keys of `LightEntry`.
@@ -120,7 +120,8 @@ class PhysicalSuite(SuiteBase):
         judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to; of 3D
             detectors the hulls of their boxes in the picture count.
         grid: views from all around, beside those from behind; None: none.
-        behind: m from the camera to the target.
+        behind: m from the camera to a car that drives.
+        distances: m from the camera to a target that is no car.
         size: of the pictures, px a side.
         floor: least AP50 of the clean pictures, below which no attack is reported.
         replicates: of the bootstrap over drives.
@@ -139,9 +140,15 @@ class PhysicalSuite(SuiteBase):
     judges: list[str] = Field(default=[])
     grid: Grid | None = None
     behind: float = Field(default=20.0, ge=3.0, le=60.0)
+    distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0], min_length=1)
     size: int = Field(default=640, ge=64)
     floor: float = Field(default=0.9, ge=0.0, le=1.0)
     replicates: int = Field(default=100, ge=0, le=10_000)
+
+    @property
+    def place(self) -> float | list[float]:
+        """Where the camera is: m behind a car, or the distances of what is no car."""
+        return self.behind if isinstance(parse_target(self.target), TargetCar) else self.distances
 
     @field_validator("attacks", "lights", mode="before")
     @classmethod
@@ -226,9 +233,9 @@ def _ready(suite: PhysicalSuite, entry: Entry) -> dict[str, Any]:
     return about | {"file": entry.texture, "hash": card.hash}
 
 
-def target_of(suite: PhysicalSuite) -> TargetCar:
-    """The car of a suite. ConfigError: it names a sign."""
+def target_of(suite: PhysicalSuite) -> Target:
+    """The target of a suite. ConfigError: what it asks for is only there for cars."""
     target = parse_target(suite.target)
-    if not isinstance(target, TargetCar):
-        raise ConfigError(f"suite {suite.name}: target {suite.target}: only cars are driven")
+    if not isinstance(target, TargetCar) and (suite.lights or any(entry.around for entry in suite.attacks)):
+        raise ConfigError(f"suite {suite.name}: target {suite.target}: lights and around are for cars")
     return target

@@ -25,7 +25,7 @@ from ssad.assets.mesh import Point
 from ssad.camera.labels import label_picture
 from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.render import Picture, View, Weather, render
-from ssad.camera.scene import Layer, Scene, Thing
+from ssad.camera.scene import Decal, Layer, Scene, Thing
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
@@ -43,7 +43,7 @@ from ssad.recording.drives import drive_street, make_drive
 from ssad.recording.nuscenes_recorder import PART_S, SENSOR, check_parts, draw_weather, drive
 from ssad.recording.scene_objects import Clear, ObjectBody, PlacedObject, SceneObjects, place_objects, take_still
 from ssad.recording.street_signs import free_places, plate_and_post
-from ssad.recording.target import TargetCar, TargetSign
+from ssad.recording.target import STANDING, TargetCar, TargetSign, TargetWalker, class_of_target
 from ssad.recording.viewpoints import (
     AIM,
     Place,
@@ -124,9 +124,10 @@ def _drawn(cast: SceneObjects, draws: np.random.Generator) -> ObjectBody:
     return _body(mesh, style, size, draw_paint(draws))
 
 
-def _named(cast: SceneObjects, target: TargetCar) -> ObjectBody:
-    """The target car in the place of the ego, with its mesh in the cast."""
-    return _body(cast.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
+def _named(cast: SceneObjects, target: TargetCar | TargetWalker) -> ObjectBody:
+    """The target in the place of the ego, with its mesh in the cast."""
+    body = _body(cast.meshes.add(target.mesh()), target.style, target.full_size, target.colour)
+    return replace(body, kind=class_of_target(target))
 
 
 def _sign(cast: SceneObjects, target: TargetSign) -> ObjectBody:
@@ -425,10 +426,13 @@ class ClipView:
     view: View
     objects: tuple[Mapping[str, Any], ...]
 
-    def wearing(self, *layers: Layer) -> View:
-        """The view with layers on the target."""
+    def wearing(self, *shown: Layer | Decal) -> View:
+        """The view with layers on the target, and with decals, given in the target's frame, around it."""
         target, *others = self.view.things
-        return replace(self.view, things=(replace(target, layers=layers), *others))
+        layers = tuple(one for one in shown if isinstance(one, Layer))
+        decals = tuple(replace(one, pose=target.pose @ one.pose) for one in shown if isinstance(one, Decal))
+        dressed = replace(target, layers=layers)
+        return replace(self.view, things=(dressed, *others), decals=(*self.view.decals, *decals))
 
 
 Row = Mapping[str, Any]
@@ -520,6 +524,7 @@ def _clips_of(about: Mapping[str, Any], folder: Path, device: str) -> Clips:
     given["images"] = tuple((town, count) for town, count in about["images"])
     if about["target"] is not None:
         size = about["target"]["size"]
-        make = TargetSign if "kind" in about["target"] else TargetCar
-        given["target"] = make(**about["target"] | {"size": None if size is None else tuple(size)})
+        about_it = {k: v for k, v in about["target"].items() if k != "kind"}
+        make: Any = STANDING[about["target"]["kind"]] if "kind" in about["target"] else TargetCar
+        given["target"] = make(**about_it | {"size": None if size is None else tuple(size)})
     return Clips(folder, **given | {"mode": about["clips"], "device": device})

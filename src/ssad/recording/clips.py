@@ -12,13 +12,13 @@ import numpy as np
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.recording.drives import check_streets
 from ssad.recording.nuscenes_recorder import HELD_OUT, WEATHERS
-from ssad.recording.target import TargetCar, TargetSign
+from ssad.recording.target import Target, TargetSign, TargetWalker
 from ssad.roads import town_names
 
 AZIMUTHS: Final = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)  # of an orbit, degrees
 ELEVATIONS: Final = (0.0, 15.0, 30.0)
 SIGN_AZIMUTHS: Final = (0.0, 30.0, 60.0, 300.0, 330.0)  # as long as its face is seen
-TALL: Final = {"car": 1.35, "sign": 0.35}  # m, least extent of a target
+TALL: Final = {"car": 1.35, "walker": 0.5, "sign": 0.35}  # m, least extent of a target
 BEHIND: Final = 75.0  # degrees from the front of a sign from which its face is hardly seen: it is crowd then
 IMAGES: Final = {"Twinford": 600, "Crossgate": 400, "Oldmarket": 400, "Larkhill": 400}
 FOCAL: Final = 1.1  # focal length in widths of the picture: 49 degrees across
@@ -42,7 +42,7 @@ class Clips:
     held_out: tuple[str, ...] = HELD_OUT
     mode: Literal["drive", "orbit"] = "drive"
     size: int = 640
-    target: TargetCar | TargetSign | None = None
+    target: Target | None = None
     behind: float = 20.0
     height: float = 2.0
     distances: tuple[float, ...] = (5.0, 10.0, 15.0, 20.0, 30.0)
@@ -70,9 +70,11 @@ class Clips:
             raise ConfigError("behind: 3 to 60 m; height: 0.5 to 30 m; quality: 1 to 100")
         sign = isinstance(self.target, TargetSign)
         object.__setattr__(self, "azimuths", self.azimuths or (SIGN_AZIMUTHS if sign else AZIMUTHS))
-        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if sign else ELEVATIONS))
-        if sign and self.mode != "orbit":
-            raise ConfigError("a stop sign stands still: record it with --clips orbit")
+        walker = isinstance(self.target, TargetWalker)
+        object.__setattr__(self, "elevations", self.elevations or ((0.0,) if sign or walker else ELEVATIONS))
+        if (sign or walker) and self.mode != "orbit":
+            who = "stop sign stands still" if sign else "walker is not followed"
+            raise ConfigError(f"a {who}: record it with --clips orbit")
         if not self.distances:
             raise ConfigError("an orbit needs distances")
         if not all(3.0 <= d <= 80.0 for d in self.distances) or not all(0.0 <= e <= 75.0 for e in self.elevations):
@@ -89,7 +91,7 @@ class Clips:
         if sign and self.elevations != (0.0,):
             raise ConfigError("a sign is seen from the heights of cars: give no elevations")
         far = self.behind if self.mode == "drive" else max(self.distances)
-        what = "sign" if sign else "car"
+        what = "sign" if sign else "walker" if walker else "car"
         if not FOCAL * self.size * TALL[what] / far >= SMALL or self.size > 4096:
             least = int(np.ceil(SMALL * far / FOCAL / TALL[what]))
             raise ConfigError(

@@ -1,9 +1,8 @@
-"""The target of attacks, a car or a stop sign, named once: the same metal in every town and clip."""
+"""The target of attacks, a car, a stop sign or a walker, named once: the same metal in every town and clip."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
 
 from ssad.assets.bodies import BODIES, PAINTS, make_body
 from ssad.assets.mesh import Mesh, Point
@@ -51,20 +50,20 @@ class TargetCar:
 
 
 @dataclass(frozen=True, slots=True)
-class TargetSign:
-    """A stop sign that is the same wherever it is made.
+class _Standing:
+    """What is no car and the same wherever it is made.
 
     Attributes:
         style: Body style, see `ssad.assets.bodies.BODIES`.
         size: Length, width, height, m; the mean of the style where None.
-        seed: Of what else differs between signs of a style.
+        seed: Of what else differs between bodies of a style.
         kind: Of its body.
     """
 
-    style: str = "standard"
+    style: str
     size: Point | None = None
     seed: int = 0
-    kind: Literal["stop_sign"] = "stop_sign"
+    kind: str = ""
 
     def __post_init__(self) -> None:
         styles = BODIES[self.kind].styles
@@ -76,22 +75,55 @@ class TargetSign:
         """Length, width, height, m."""
         return self.size or BODIES[self.kind].styles[self.style].size
 
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """Linear RGB: what has no paint is grey."""
+        return (0.5, 0.5, 0.5)
+
     def mesh(self) -> Mesh:
-        """Its body, plate and post."""
-        draws = generator("target sign", self.style, self.seed)
+        """Its body; of a sign plate and post."""
+        noun = "sign" if self.kind == "stop_sign" else self.kind
+        draws = generator(f"target {noun}", self.style, self.seed)
         return make_body(self.kind, style=self.style, size=self.full_size, generator=draws)
 
 
-def parse_target(text: str) -> TargetCar | TargetSign:
-    """STYLE[:PAINT[:SEED]] of a car or stop_sign[:STYLE[:SEED]] as a target. ConfigError."""
-    if text.partition(":")[0] == "stop_sign":
+@dataclass(frozen=True, slots=True)
+class TargetSign(_Standing):
+    """A stop sign that is the same wherever it is made."""
+
+    style: str = "standard"
+    kind: str = field(default="stop_sign", init=False)
+
+
+@dataclass(frozen=True, slots=True)
+class TargetWalker(_Standing):
+    """A person on foot who is the same wherever they are; their shirt is the panels torso_front and torso_back."""
+
+    style: str = "standing"
+    kind: str = field(default="pedestrian", init=False)
+
+
+Target = TargetCar | TargetSign | TargetWalker
+STANDING: dict[str, type[TargetSign] | type[TargetWalker]] = {"stop_sign": TargetSign, "pedestrian": TargetWalker}
+
+
+def class_of_target(target: Target) -> str:
+    """The class of detectors that finds a target."""
+    return "car" if isinstance(target, TargetCar) else target.kind
+
+
+def parse_target(text: str) -> Target:
+    """STYLE[:PAINT[:SEED]] of a car, stop_sign[:STYLE[:SEED]] or pedestrian[:STYLE[:SEED]] as a target. ConfigError."""
+    kind = text.partition(":")[0]
+    if kind in STANDING:
         _, style, seed = [*text.split(":"), "", ""][:3]
         if text.count(":") > 2 or (seed and not seed.isdigit()):
-            raise ConfigError(f"--target {text}: expected stop_sign, stop_sign:STYLE or stop_sign:STYLE:SEED")
-        return TargetSign(style or TargetSign().style, seed=int(seed or 0))
+            raise ConfigError(f"--target {text}: expected {kind}, {kind}:STYLE or {kind}:STYLE:SEED")
+        make = STANDING[kind]
+        return make(style or make().style, seed=int(seed or 0))
     style, paint, seed = [*text.split(":"), "", "", ""][:3]
     if text.count(":") > 2 or (seed and not seed.isdigit()):
         raise ConfigError(f"--target {text}: expected STYLE, STYLE:PAINT or STYLE:PAINT:SEED, such as sedan:silver:0")
     if style not in BODIES["car"].styles:
-        raise unknown_name("target", style, (*BODIES["car"].styles, TargetSign().kind))
+        raise unknown_name("target", style, (*BODIES["car"].styles, *STANDING))
     return TargetCar(style, paint or TargetCar().paint, seed=int(seed or 0))

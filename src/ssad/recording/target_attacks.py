@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssad.camera.scene import Layer
+from ssad.camera.scene import Decal, Layer
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core import safeio
 from ssad.core.detections import Truth
@@ -38,7 +38,7 @@ class TargetAttacks:
 
     Attributes:
         folder: Recordings are in data, textures and lights beside it.
-        target: The car, as for `ssad record --target`.
+        target: As for `ssad record --target`; lights are for cars.
         seed: Root of the random numbers of trainings and searches.
         device: Where pictures are rendered and detectors are.
     """
@@ -93,7 +93,8 @@ class TargetAttacks:
 
     def light(self, spec: LightSpec) -> SceneEdit:
         """A light as an edit of a scene; searched now if it has to be. ConfigError as for `LightFolder.edit`."""
-        car = _car(self.target)
+        car = parse_target(self.target)
+        assert isinstance(car, TargetCar)
 
         def pictures() -> LitPictures:
             return LitPictures.of(self.clips(spec.pair["train"], spec.pair["train_images"], spec.source), spec.hour)
@@ -180,7 +181,7 @@ def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
     see_clips(folder, layers_of(target, surfaces), part=part, device=device)
 
 
-def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer, ...]]:
+def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal, ...]]:
     """Where textures go, each alone, as `see_clips` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
 
@@ -189,13 +190,7 @@ def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer, ...]]:
 def surface_of(target: str, surface: str) -> Surface:
     """Where a texture goes, from a target and `TextureSpec.surface`."""
     row = safeio.parse_json(surface)
-    return make_carrier(row["carrier"], row["options"]).on(_car(target).mesh())
-
-
-def _car(target: str) -> TargetCar:
-    car = parse_target(target)
-    assert isinstance(car, TargetCar)
-    return car
+    return make_carrier(row["carrier"], row["options"]).on(parse_target(target).mesh())
 
 
 def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:

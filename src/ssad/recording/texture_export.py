@@ -16,12 +16,13 @@ from torch import Tensor
 
 from ssad.assets.mesh import Mesh
 from ssad.assets.obj_writer import write_obj
+from ssad.camera.scene import Decal
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.types import U8
 from ssad.recording.live_attack import LiveAttack
-from ssad.recording.target import TargetCar, TargetSign, parse_target
+from ssad.recording.target import Target, TargetCar, parse_target
 from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
 from ssad.scenarios.static.physical.carrier import metres_of
 from ssad.scenarios.static.physical.inks import printable_colours
@@ -62,7 +63,10 @@ class Print:
     def edit(self, mesh: Mesh) -> SceneEdit:
         """The body wears it."""
         surface = self.on(mesh)
-        return SceneEdit((surface.layer,), textures={0: albedo_of(self.colour)}, masks={0: surface.mask})
+        shown, masks = {0: albedo_of(self.colour)}, {0: surface.mask}
+        if isinstance(surface.layer, Decal):
+            return SceneEdit(decals=(surface.layer,), textures=shown, masks=masks)
+        return SceneEdit((surface.layer,), textures=shown, masks=masks)
 
     def live(self, agent: int) -> LiveAttack:
         """An agent of the closed loop wears it. ConfigError: it is made for a sign."""
@@ -116,9 +120,7 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
     safeio.make_folder(out)
     _save(out / "print.png", _resized(texels, (height, width)), dots)
     _save(out / "atlas.png", _atlas(texels, surface, target), None)
-    painted = replace(
-        mesh, materials=tuple(replace(m, colour=_paint(target)) if m.paint else m for m in mesh.materials)
-    )
+    painted = replace(mesh, materials=tuple(replace(m, colour=target.colour) if m.paint else m for m in mesh.materials))
     write_obj(out / "target.obj", painted, texture="atlas.png")
     numbers = safeio.npz_bytes({"colour": colour.numpy()})
     safeio.write_atomic(out / "texture.npz", numbers)
@@ -127,7 +129,7 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
         "name": name, "target": made.target, "carrier": made.carrier, "options": dict(made.options),
         "dots_per_metre": dots, "sha256": hashlib.sha256(numbers).hexdigest(),
         "metres": [round(one, 4) for one in surface.metres], "texels": [colour.shape[2], colour.shape[1]],
-        "rectangle": [round(v, 6) for v in surface.layer.rectangle], "panels": _panels(mesh),
+        "rectangle": [round(v, 6) for v in _rectangle(surface)], "panels": _panels(mesh),
         "non_printability": round(score, 4),
     }  # fmt: skip
     safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
@@ -142,12 +144,17 @@ def _resized(texels: Any, size: tuple[int, int]) -> U8:
     return np.asarray((whole.clip(0.0, 1.0) * 255).round(), np.uint8)
 
 
-def _atlas(texels: Any, surface: Surface, target: TargetCar | TargetSign) -> U8:
+def _rectangle(surface: Surface) -> tuple[float, float, float, float]:
+    """What a texture covers of the atlas; nothing if it lies beside the target."""
+    return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, Decal) else surface.layer.rectangle
+
+
+def _atlas(texels: Any, surface: Surface, target: Target) -> U8:
     """The picture of the whole atlas: paint, and the texture where it is."""
-    u0, v0, u1, v1 = surface.layer.rectangle
+    u0, v0, u1, v1 = _rectangle(surface)
     if (u0, v0, u1, v1) == (0.0, 0.0, 1.0, 1.0):
         return _resized(texels, (max(ATLAS, texels.shape[0]), max(ATLAS, texels.shape[1])))
-    paint = np.asarray(_paint(target))
+    paint = np.asarray(target.colour)
     srgb = np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055)
     whole = np.empty((ATLAS, ATLAS, 3), np.uint8)
     whole[:] = (srgb * 255).round()
@@ -155,11 +162,6 @@ def _atlas(texels: Any, surface: Surface, target: TargetCar | TargetSign) -> U8:
     if right > left and bottom > top:  # else smaller than a texel
         whole[top:bottom, left:right] = _resized(texels, (bottom - top, right - left))
     return whole
-
-
-def _paint(target: TargetCar | TargetSign) -> tuple[float, float, float]:
-    """Linear RGB of what the texture does not cover."""
-    return target.colour if isinstance(target, TargetCar) else (0.5, 0.5, 0.5)
 
 
 def _panels(mesh: Mesh) -> dict[str, dict[str, list[float]]]:

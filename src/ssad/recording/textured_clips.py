@@ -19,7 +19,7 @@ from torch import Tensor
 
 import ssad
 from ssad.camera.render import Picture, render
-from ssad.camera.scene import Layer
+from ssad.camera.scene import Decal, Layer
 from ssad.camera.sensor import Sensor
 from ssad.camera.texture import Taps, joined, retexture, taps_of
 from ssad.camera.torch_sensor import Rectangle, Window
@@ -207,7 +207,7 @@ def _moved(taps: Taps, own: Rectangle, wanted: Rectangle, number: int = 0) -> Ta
 
 
 def textured_clips(
-    folder: Path, layers: Sequence[Layer] = (Layer(0),), *, split: str = "all", device: str = "cpu"
+    folder: Path, layers: Sequence[Layer | Decal] = (Layer(0),), *, split: str = "all", device: str = "cpu"
 ) -> Iterator[TexturedClip]:
     """The pictures of a recording whose targets wear layers, in order; each is rendered once and then kept.
 
@@ -237,7 +237,7 @@ def textured_clips(
         yield TexturedClip(file, row, objects, image, corner, arrays["radiance"], exposure, arrays["fragments"])
 
 
-def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer]]) -> list[int]:
+def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer | Decal]]) -> list[int]:
     """The parts of a recording of which not all is kept that is seen of each of several sets of layers.
 
     Raises:
@@ -249,7 +249,7 @@ def unseen_parts(folder: Path, variants: Sequence[Sequence[Layer]]) -> list[int]
     return list(dict.fromkeys(missing))
 
 
-def see_clips(folder: Path, variants: Sequence[Sequence[Layer]], *, part: int, device: str = "cpu") -> None:
+def see_clips(folder: Path, variants: Sequence[Sequence[Layer | Decal]], *, part: int, device: str = "cpu") -> None:
     """Render what a part of a recording shows of each of several sets of layers, for `textured_clips`.
 
     Args:
@@ -272,7 +272,7 @@ def see_clips(folder: Path, variants: Sequence[Sequence[Layer]], *, part: int, d
                 safeio.save_npz(one / f"{clip.file}.npz", _kept(clip, layers))
 
 
-def _kept_in(folder: Path, layers: Sequence[Layer], split: str) -> Path:
+def _kept_in(folder: Path, layers: Sequence[Layer | Decal], split: str) -> Path:
     """Where what is seen of layers is kept."""
     keys = [_layer_key(layer) for layer in layers]
     return folder / KEPT / digest("textured clips", _drawing(), recording_of(folder, split), keys)[:16]
@@ -291,7 +291,7 @@ def seen_part(picture: Picture) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _kept(clip: ClipView, layers: Sequence[Layer]) -> dict[str, Any]:
+def _kept(clip: ClipView, layers: Sequence[Layer | Decal]) -> dict[str, Any]:
     return seen_part(render(clip.scene, [clip.wearing(*layers)]))
 
 
@@ -303,9 +303,11 @@ def _span(places: Any, most: int) -> tuple[int, int]:
     return low, min(int(places.max()) + MARGIN + 1, most)
 
 
-def _layer_key(layer: Layer) -> tuple[object, ...]:
-    """All that decides what of a layer is seen."""
+def _layer_key(layer: Layer | Decal) -> tuple[object, ...]:
+    """All that decides what of a layer or decal is seen."""
     mask = None if layer.mask is None else (layer.mask.shape, hashlib.sha256(layer.mask.tobytes()).hexdigest())
+    if isinstance(layer, Decal):
+        return layer.texture, layer.pose.tolist(), layer.size, layer.depth, layer.tag, layer.opacity, mask
     return layer.texture, layer.rectangle, layer.opacity, mask
 
 

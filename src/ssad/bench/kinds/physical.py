@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
 from ssad.bench.kinds.detection import state_hash
@@ -25,6 +25,7 @@ from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import record_all
 from ssad.recording.clips import Clips
 from ssad.recording.lit_clips import LitPictures
+from ssad.recording.target import TargetCar, class_of_target
 from ssad.recording.target_attacks import TargetAttacks, layers_of, see_surfaces
 from ssad.recording.target_views import TargetClips
 from ssad.recording.textured_clips import unseen_parts
@@ -62,8 +63,8 @@ class Physical(Kind):
             if name in weights:
                 raise ConfigError(f"suite {suite.name}: {name} is named twice among detectors and judges")
             detector = make_detector(name)
-            if "car" not in detector.classes:
-                raise ConfigError(f"suite {suite.name}: {name} has no class car")
+            if class_of_target(target) not in detector.classes:
+                raise ConfigError(f"suite {suite.name}: {name} has no class {class_of_target(target)}")
             if detector.task != "2d" and name in suite.detectors:
                 raise ConfigError(f"suite {suite.name}: {name} is no 2D detector; 3D detectors can be judges")
             weights[name] = state_hash(detector)
@@ -122,7 +123,7 @@ class Physical(Kind):
                 if view == GRID:
                     title += f"/{GRID}"
                 grid = suite.grid.model_dump_json() if suite.grid and view == GRID else ""
-                inputs = suite.target, suite.behind, suite.size, suite.floor, suite.replicates, grid, device
+                inputs = suite.target, suite.place, suite.size, suite.floor, suite.replicates, grid, device
                 found.append(
                     self.make_cell(
                         title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights.get(source, "")
@@ -143,10 +144,11 @@ class Physical(Kind):
             for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
                 images[town] = max(images.get(town, 0), count)
         target = target_of(suite)
+        mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
         recordings = [
             Clips(
-                folder / "data" / town, ((town, count),), (), target=target, behind=suite.behind, size=suite.size,
-                seed=suite.seed, device=plan.device,
+                folder / "data" / town, ((town, count),), (), mode, suite.size, target, suite.behind, seed=suite.seed,
+                device=plan.device, distances=tuple(suite.distances),
             )
             for town, count in images.items()
         ]  # fmt: skip

@@ -137,7 +137,7 @@ def main_table(run: PhysicalRun, number: int) -> Table:
             rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
     columns = tuple(f"{detector} {title}" for detector in run.detectors for title in SCORES.values())
     note = (
-        f"Percent, of the target alone, from {float(run.run.suite['behind']):g} m behind it as it drives. AP50 counts "
+        f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
         "not found attacked. [a, b]: 95 % interval over drives; a–b: the range over several draws of a control."
     )
@@ -147,6 +147,17 @@ def main_table(run: PhysicalRun, number: int) -> Table:
         )
     title = f"Trained in {train}, tested in {test}"
     return Table(f"physical-{test.lower()}", title, ("Attack",), columns, tuple(rows), note, SOURCE)
+
+
+def _place(suite: Mapping[str, Any]) -> str:
+    """From where the pictures of a test are taken."""
+    kind = str(suite["target"]).partition(":")[0]
+    distances = ", ".join(f"{one:g}" for one in suite.get("distances", ()))
+    if kind == "stop_sign":
+        return f"{distances} m before it, as cars see it"
+    if kind == "pedestrian":
+        return f"{distances} m from it on all sides, as cars see it"
+    return f"from {float(suite['behind']):g} m behind it as it drives"
 
 
 def margin_table(run: PhysicalRun) -> Table:

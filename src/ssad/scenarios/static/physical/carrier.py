@@ -1,4 +1,4 @@
-"""What a physical attack is printed on: a patch on a panel of the target, or its whole paint."""
+"""What a physical attack is printed on: a patch on a panel of the target, its whole paint, or the road behind it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from ssad.assets.mesh import Mesh, Rectangle
-from ssad.camera.scene import Layer
+from ssad.camera.scene import Decal, Layer
 from ssad.camera.texture import paint_mask, printable, to_linear
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
@@ -22,16 +22,23 @@ class Surface:
     """A carrier on a certain body: all that is needed to show a texture on it.
 
     Attributes:
-        layer: What the target wears (texture 0).
+        layer: What the target wears, or what lies beside it, in its own frame (texture 0).
         size: Height and width of the texture, texels.
         mask: Texels [H, W] that are somewhere on the body; what others hold is never seen.
         metres: Width and height of what the whole texture covers, m; for a camouflage those of the whole atlas.
     """
 
-    layer: Layer
+    layer: Layer | Decal
     size: tuple[int, int]
     mask: Bool
     metres: tuple[float, float]
+
+    @property
+    def place(self) -> tuple[float, ...]:
+        """Where it is, as plain numbers: u0, v0, u1, v1 on the atlas, or the pose and size of what lies beside."""
+        if isinstance(self.layer, Layer):
+            return self.layer.rectangle
+        return (*self.layer.pose.ravel().tolist(), *self.layer.size)
 
     @property
     def texels_per_metre(self) -> float:
@@ -127,6 +134,42 @@ class Camouflage:
         if not (mesh.panel >= 0).any():
             raise ConfigError("this body has no panels to paint")
         return _surface(mesh, (0.0, 0.0, 1.0, 1.0), (self.texels, self.texels), metres_of(mesh))
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """A rectangle painted on the road behind the target, which takes it along: a stand-in for one at a place.
+
+    Attributes:
+        width: In m.
+        length: Along the road, m.
+        behind: From the target's rear to where it begins, m.
+        texels: Along the longer side.
+        name: What tables call it.
+    """
+
+    width: float = 2.5
+    length: float = 5.0
+    behind: float = 0.3
+    texels: int = 96
+    name: str = "road"
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0.0 and self.length > 0.0 and self.behind >= 0.0):
+            raise ConfigError(f"{self.name}: width and length are above 0 m, behind is 0 m or more")
+        _check_texels(self.texels)
+
+    def on(self, mesh: Mesh) -> Surface:
+        """See `Carrier`."""
+        low, _ = mesh.bounds()
+        pose = np.eye(4)
+        # read from behind: right is the target's right, down is towards who looks, into the road
+        pose[:3, 0], pose[:3, 1], pose[:3, 2] = (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+        pose[0, 3] = low[0] - self.behind - self.length / 2
+        longest = max(self.width, self.length)
+        size = max(1, round(self.texels * self.length / longest)), max(1, round(self.texels * self.width / longest))
+        decal = Decal(0, pose, (self.width, self.length), tag=0)
+        return Surface(decal, size, np.ones(size, np.bool_), (self.width, self.length))
 
 
 def _check_texels(texels: int) -> None:

@@ -157,7 +157,7 @@ def train_texture(
     else:
         optimiser = torch.optim.SGD([colour], lr=attack.rate, momentum=0.9)
     state = _State(colour, optimiser, np.zeros(len(views)), [], [])
-    name = digest("texture", replace(attack, epochs=1), surface.size, surface.layer.rectangle, len(views), key)
+    name = digest("texture", replace(attack, epochs=1), surface.size, surface.place, len(views), key)
     if checkpoint is not None and checkpoint.is_file():
         state.load(checkpoint, name)
     mask = torch.as_tensor(surface.mask, device=device)

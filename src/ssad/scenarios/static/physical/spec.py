@@ -10,10 +10,12 @@ from typing import Any, Self
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
-from ssad.scenarios.static.physical.carrier import Camouflage, Carrier, Patch
+from ssad.scenarios.static.physical.carrier import Camouflage, Carrier, Patch, Road
 from ssad.scenarios.static.physical.textures import CONTROLS
 
-CARRIERS: dict[str, type[Patch] | type[Camouflage]] = {"patch": Patch, "camouflage": Camouflage}
+CARRIERS: dict[str, type[Patch] | type[Camouflage] | type[Road]] = {
+    "patch": Patch, "camouflage": Camouflage, "road": Road,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
