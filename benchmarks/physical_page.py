@@ -21,6 +21,7 @@ PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
     "physical": "ssad run physical --device cuda", "physical-gpu": "ssad run physical-gpu --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
+    **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
 }  # fmt: skip
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 OTHERS = ("margins", "transfer", "grid", "others", "effort")

@@ -10,7 +10,7 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.recording.light_export import Shining, export_light
 from ssad.recording.target import parse_target
 from ssad.recording.texture_export import Print, export_texture
-from ssad.scenarios.static.physical import CONTROLS, TextureSpec, make_carrier
+from ssad.scenarios.static.physical import TextureSpec, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
 from ssad.scenarios.static.physical.noninvasive.kept import LightFolder, LightSpec
 
@@ -41,7 +41,7 @@ def export_cell_texture(folder: Path, name: str, out: Path, *, dots: int = 1000)
         )
     spec, suite = TextureSpec.of_row(cell.spec), plan.suite
     kept = TextureFolder(folder / "textures", suite.seed, "cpu")
-    if (spec.attack not in CONTROLS or spec.source) and not kept.kept(spec).is_file():
+    if spec.trained and not kept.kept(spec).is_file():
         raise StoreError(f"{folder}: the texture of cell {cell.key} ({cell.name}) is not trained yet; run the suite")
 
     def never() -> list[object]:

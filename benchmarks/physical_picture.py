@@ -1,0 +1,59 @@
+"""The six panels of the paper's figure of physical attacks, as docs/physical.jpg: python benchmarks/physical_picture.py
+
+One picture of a drive in Oldmarket, where no texture was trained: clean, under a random patch and camouflage, and under
+the shipped textures of Adv. Patch, DAS and TPA, each with what YOLOv5n finds.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from ssad.core.images import save_picture
+from ssad.detectors import make_detector
+from ssad.evaluation.target_sheet import target_sheet
+from ssad.jobs.machine import quiet_warp
+from ssad.recording.clip_recorder import record_clips
+from ssad.recording.clips import Clips
+from ssad.recording.target import TargetCar
+from ssad.recording.target_views import TargetClips
+from ssad.scenarios.static.physical import albedo_of, control, make_carrier
+from ssad.scenarios.static.physical.shipped import load_texture
+
+OUT = Path(__file__).parents[1] / "docs" / "physical.jpg"
+TOWN, DETECTOR = "Oldmarket", "yolov5n"
+PANELS = {
+    "benign": None, "random patch": "adv-patch", "Adv. Patch": "adv-patch", "random camouflage": "das", "DAS": "das",
+    "TPA": "tpa",
+}  # fmt: skip
+
+
+@torch.no_grad()
+def main() -> None:
+    """Record, show, write."""
+    quiet_warp()
+    detector, target = make_detector(DETECTOR), TargetCar()
+    with tempfile.TemporaryDirectory() as folder:
+        record_clips(Clips(Path(folder), ((TOWN, 1),), (), target=target), workers=0)
+        clips = TargetClips(Path(folder), 1, tuple(detector.classes))
+        ((_, clean, truth),) = clips.clean()
+        shown = []
+        for title, texture in PANELS.items():
+            image = clean
+            if texture is not None:
+                colour, card = load_texture(f"{texture}-{DETECTOR}-twinford")
+                surface = make_carrier(card.carrier, card.options).on(target.mesh())
+                colour = control("random", surface.size) if title.startswith("random") else colour
+                ((_, view),) = clips.wearing(surface)
+                image = view.picture.together([view.picture], {0: albedo_of(colour)[None]})
+            shown.append((title, image))
+    sheet = target_sheet(detector, shown, truth.box[0].tolist(), "cpu")
+    save_picture(OUT, np.asarray(cv2.resize(sheet, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA), np.uint8))
+
+
+if __name__ == "__main__":
+    main()
