@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -268,6 +268,15 @@ class Kind(ABC):
         described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
         key = digest("cell", self.name, self.code, safeio.dump_json(described), system, seed, *inputs)
         return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
+
+
+def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:
+    """Batches of cells with a value in common, of `chunk` at most, and smaller where cells are few for the workers."""
+    size = max(1, min(chunk, -(-len(cells) // workers)))
+    groups: dict[Hashable, list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault(by(cell), []).append(cell)
+    return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
 
 
 def find_cell(cells: Sequence[Cell], text: str) -> Cell:

@@ -11,9 +11,11 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase, grouped
 from ssad.bench.kinds.driving import (
     DrivingSuite,
+    keep_towns,
+    load_world,
     plain,
     scenario_json,
     suite_scenarios,
@@ -25,12 +27,10 @@ from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
-from ssad.core.lane_graph import save_graph, town_file
 from ssad.core.seeding import seed32
 from ssad.core.traces import motion_hash, save_trace
 from ssad.core.types import Episode
 from ssad.evaluation.search_scores import distinct, likeness, reference, summary
-from ssad.jobs.machine import quiet_warp
 
 
 class AdversarialSuite(SuiteBase):
@@ -141,30 +141,17 @@ class Adversarial(Kind):
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
-        for name in plan.inputs["towns"]:
-            path = folder / "towns" / town_file(name)
-            if not path.exists():
-                save_graph(town(name), path)
-        safeio.make_folder(folder / "traces")
+        keep_towns(plan.inputs["towns"], folder)
         safeio.make_folder(folder / "found")
         return {}
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Cells of one generator and one system, whose bases it works on side by side."""
-        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
-        groups: dict[tuple[str, str], list[Cell]] = {}
-        for cell in cells:
-            groups.setdefault((cell.fields["generator"], cell.system), []).append(cell)
-        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+        return grouped(cells, plan.suite.chunk, workers=workers, by=lambda c: (c.fields["generator"], c.system))
 
     def start(self, job: Job) -> None:
         """Loads the world's kernels, which are compiled on first use."""
-        import warp
-
-        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
-
-        quiet_warp()
-        warp.force_load(device=job.device)
+        load_world(job.device)
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Runs one generator on the bases that the system survives."""

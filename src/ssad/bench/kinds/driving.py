@@ -6,7 +6,7 @@ import hashlib
 import math
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, grouped
 from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.driving import Driver, Sensor
@@ -121,29 +121,16 @@ class Driving(Kind):
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
-        for name in plan.inputs["towns"]:
-            path = folder / "towns" / town_file(name)
-            if not path.exists():
-                save_graph(town(name), path)
-        safeio.make_folder(folder / "traces")
+        keep_towns(plan.inputs["towns"], folder)
         return {"witness": plan.suite.witness}
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Cells that share a system and a simulator; with few cells a smaller batch keeps all workers busy."""
-        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
-        groups: dict[tuple[str, bool], list[Cell]] = {}
-        for cell in cells:
-            groups.setdefault((cell.system, in_highway(cell)), []).append(cell)
-        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+        return grouped(cells, plan.suite.chunk, workers=workers, by=lambda c: (c.system, in_highway(c)))
 
     def start(self, job: Job) -> None:
         """Loads the world's kernels, which are compiled on first use."""
-        import warp
-
-        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
-
-        quiet_warp()
-        warp.force_load(device=job.device)
+        load_world(job.device)
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drives the episodes as one batch of the world, measures them, writes their traces."""
@@ -184,6 +171,25 @@ class Driving(Kind):
     def finish(self, plan: Plan, folder: Path) -> None:
         """The pictures that the suite asks for, made once beside its results."""
         make_pictures(plan.suite.pictures, folder)
+
+
+def keep_towns(names: Iterable[str], folder: Path) -> None:
+    """Copies of towns in a results folder, for a report where they are not imported, and room for traces."""
+    for name in names:
+        path = folder / "towns" / town_file(name)
+        if not path.exists():
+            save_graph(town(name), path)
+    safeio.make_folder(folder / "traces")
+
+
+def load_world(device: str) -> None:
+    """Loads the world's kernels, which are compiled on first use."""
+    import warp
+
+    import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+    quiet_warp()
+    warp.force_load(device=device)
 
 
 @lru_cache(maxsize=8)

@@ -13,9 +13,11 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
+from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, grouped
 from ssad.bench.kinds.driving import (
     episode_of,
+    keep_towns,
+    load_world,
     plain,
     scenario_json,
     suite_scenarios,
@@ -29,7 +31,7 @@ from ssad.core import safeio
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
-from ssad.core.lane_graph import SignKind, save_graph, town_file
+from ssad.core.lane_graph import SignKind
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -219,30 +221,19 @@ class Gap(Kind):
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Copies of the towns lie beside the results."""
-        for name in plan.inputs["towns"]:
-            path = folder / "towns" / town_file(name)
-            if not path.exists():
-                save_graph(town(name), path)
-        safeio.make_folder(folder / "traces")
+        keep_towns(plan.inputs["towns"], folder)
         return {"seed": plan.suite.seed, "sheets": plan.suite.sheets > 0}
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Cells of one condition; a batch is of one town, whose street is then built once."""
-        size = max(1, min(plan.suite.chunk, -(-len(cells) // workers)))
-        groups: dict[tuple[Any, ...], list[Cell]] = {}
-        for cell in cells:
-            key = (cell.spec["scenario"]["town"], cell.system, cell.spec["perturbation"], cell.spec["severity"])
-            groups.setdefault(key, []).append(cell)
-        return [group[k : k + size] for group in groups.values() for k in range(0, len(group), size)]
+        return grouped(
+            cells, plan.suite.chunk, workers=workers,
+            by=lambda c: (c.spec["scenario"]["town"], c.system, c.spec["perturbation"], c.spec["severity"]),
+        )  # fmt: skip
 
     def start(self, job: Job) -> None:
         """Loads the world's kernels, which are compiled on first use."""
-        import warp
-
-        import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
-
-        quiet_warp()
-        warp.force_load(device=job.device)
+        load_world(job.device)
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drives the episodes as one batch, and measures component and system."""
