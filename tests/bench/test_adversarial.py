@@ -121,9 +121,9 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     kind = Adversarial()
     settings = [
         "generators=halton",
-        "budget=10",
+        "budget=20",
         "keep=1",
-        "scenarios=UnprotectedLeftTurn/02",
+        "scenarios=UnprotectedLeftTurn/00",
         "systems=[autopilot,blind]",
     ]
     plan = kind.plan(load_suite("adversarial-quick", settings))
@@ -137,7 +137,7 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert 0.0 < metrics["seconds_first"] <= metrics["seconds"]
     assert 0.0 < metrics["realism"] < 1.0
     (saved,) = read_scenarios(tmp_path / line["artefacts"]["scenarios"])
-    assert saved.name == "UnprotectedLeftTurn/02/halton-0"
+    assert saved.name == "UnprotectedLeftTurn/00/halton-0"
     trace = load_trace(tmp_path / line["artefacts"]["trace"])
     again = Trials(lambda: make_system("autopilot")).base(saved, load_town(saved.town), seed=1)
     assert np.array_equal(trace.x, again.trace.x)
