@@ -1,10 +1,10 @@
 """How often a driver fails: brute force beside splitting and importance sampling, in car following with lapses.
 
-    uv run python -m benchmarks.how_often brute --lapse 0.2 --crashes 10000 --device cuda --json FILE
-    uv run python -m benchmarks.how_often coverage --lapse 0.2 --repeats 1000 --truth FILE --json FILE
+    uv run python -m benchmarks.how_often brute --lapse 0.04 --crashes 10000 --device cuda --json FILE
+    uv run python -m benchmarks.how_often coverage --lapse 0.04 --repeats 1000 --json FILE
 
 `brute` runs episodes of one scenario of the set lane-traffic until so many have ended in a collision, and saves after
-each batch. `coverage` repeats both accelerated estimates and counts how many intervals hold the probability of `brute`.
+each batch. `coverage` repeats both accelerated estimates; how many intervals hold, benchmarks/how_often_page.py counts.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
 from ssad.world.rare.brute import monte_carlo
+from ssad.world.rare.importance import importance, learn
 from ssad.world.rare.process import WorldProcess
+from ssad.world.rare.splitting import splitting
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 
 SCENARIO = "lane-traffic/05"
+COLUMNS = ["probability", "low", "high", "effective", "work"]
 
 
 def noise_of(given: argparse.Namespace) -> Noise:
@@ -60,14 +63,12 @@ def brute(given: argparse.Namespace) -> None:
     random = generator("how often", "brute", given.lapse, given.accel, given.choice_time, given.seed)
     began = time.perf_counter()
     processor = time.process_time()
-    crashes: list[str] = []
     for found, keys in monte_carlo(process, random, episodes=given.episodes, events=given.crashes):
-        crashes += [str(k) for k in keys[: max(0, 8 - len(crashes))]]
         spent = time.perf_counter() - began
         data = {
             "scenario": SCENARIO, "device": given.device, "batch": given.batch, "noise": vars(noise_of(given)),
             "seconds": spent, "processor_s": time.process_time() - processor, "steps_per_s": found.work / spent,
-            "crash_keys": crashes, **found.as_dict(),
+            "crash_keys": [str(key) for key in keys[:8]], **found.as_dict(),
         }  # fmt: skip
         write(given.json, data)
         if spent > given.seconds:
@@ -76,6 +77,41 @@ def brute(given: argparse.Namespace) -> None:
         f"{found.events} crashes in {found.episodes:,} episodes: {found.probability:.4g} ({found.low:.4g} to "
         f"{found.high:.4g}), {found.work:.3g} agent-steps in {spent:.1f} s ({found.work / spent:,.0f} a second)"
     )
+
+
+def coverage(given: argparse.Namespace) -> None:
+    """Repeat both accelerated estimates, and keep every interval."""
+    sampling: list[list[float]] = []
+    training: list[float] = []
+    branching: list[list[float]] = []
+    began = time.perf_counter()
+    process = make_process(1500, noise_of(given), device=given.device)
+    for number in range(given.repeats):
+        random = generator("how often", "importance", given.lapse, given.seed, number)
+        if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
+            pupil = make_process(1000, noise_of(given), device=given.device)
+            proposal = learn(pupil, random, components=2, rounds=2, episodes=2000)
+            training.append(pupil.work())
+        found, _ = importance(process, proposal, random, episodes=1500, training=training[-1])
+        sampling.append([found.probability, found.low, found.high, found.effective, found.work])
+        if number % given.share == given.share - 1 and len(branching) < given.splittings:
+            branch = splitting(make_process(3000, noise_of(given), device=given.device), random, repeats=20).estimate()
+            branching.append([branch.probability, branch.low, branch.high, branch.effective, branch.work])
+        if number % 20 == 19 or number == given.repeats - 1:
+            data = {
+                "scenario": SCENARIO, "noise": vars(noise_of(given)), "repeats": number + 1, "share": given.share,
+                "training": training, "seconds": time.perf_counter() - began, "columns": COLUMNS,
+                "importance": rounded(sampling), "splitting": rounded(branching),
+            }  # fmt: skip
+            write(given.json, data)
+            mean = float(np.mean(sampling, axis=0)[0])
+            held = np.mean([low <= mean <= high for _, low, high, _, _ in sampling])
+            print(f"{number + 1} repeats: mean {mean:.4g}, held by {held:.1%}, {data['seconds']:.0f} s", flush=True)
+
+
+def rounded(rows: list[list[float]]) -> list[list[float]]:
+    """To five digits."""
+    return [[float(f"{value:.5g}") for value in row] for row in rows]
 
 
 def main() -> None:
@@ -92,11 +128,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1e9, help="no new batch after so long")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=100)
-    parser.add_argument("--truth", type=Path)
+    parser.add_argument("--share", type=int, default=10, help="estimates that share a proposal")
+    parser.add_argument("--splittings", type=int, default=40)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     quiet_warp()
-    brute(given)
+    {"brute": brute, "coverage": coverage}[given.what](given)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ KINDS: dict[str, str] = {
     "physical": "ssad.bench.kinds.physical:Physical",
     "adversarial": "ssad.bench.kinds.adversarial:Adversarial",
     "gap": "ssad.bench.kinds.gap:Gap",
+    "how-often": "ssad.bench.kinds.how_often:HowOften",
     "tour": "ssad.bench.kinds.tour:Tour",
 }
 """Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""

@@ -17,8 +17,8 @@ def test_the_chance_of_a_walk_is_that_of_a_closed_form() -> None:
     """A long walk of small steps: the reflection principle, with Siegmund's correction for discrete steps."""
     from scipy.special import ndtr
 
-    steps, height = 400, 60.0
-    assert chance_of(height, steps) == pytest.approx(2.0 * ndtr(-(height + 0.5826) / np.sqrt(steps)), rel=0.01)
+    steps, height = 100, 30.0
+    assert chance_of(height, steps) == pytest.approx(2.0 * ndtr(-(height + 0.5826) / np.sqrt(steps)), rel=0.03)
     assert chance_of(3.0902, 1) == pytest.approx(1e-3, rel=1e-3)
 
 
@@ -38,13 +38,13 @@ def test_plain_monte_carlo_counts() -> None:
 
 @pytest.mark.parametrize("grain", [0.0, 0.1])
 def test_splitting_is_unbiased_also_with_ties(grain: float) -> None:
-    height, steps, repeats = 9.26, 6, 600
+    height, steps, repeats = 9.26, 6, 500
     truth = chance_of(height, steps)
     walk = Walk(repeats * 50, height, steps=steps, grain=grain)
     found = splitting(walk, generator("splitting", grain), repeats=repeats)
     error = found.estimates.std() / np.sqrt(repeats)
     assert abs(found.estimates.mean() - truth) < 4.0 * error
-    assert error < 0.15 * truth
+    assert error < 0.2 * truth
     assert found.work.sum() == pytest.approx(walk.work())
 
 

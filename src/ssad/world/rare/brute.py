@@ -11,6 +11,8 @@ from ssad.metrics.rare_events import RareEstimate, weighted_limits
 from ssad.world.noise import Keys
 from ssad.world.rare.process import Process
 
+_KEPT = 100
+
 
 def draw_keys(random: np.random.Generator, count: int) -> Keys:
     """As many keys of episodes."""
@@ -39,10 +41,11 @@ def monte_carlo(
         events: Failures that are enough.
 
     Yields:
-        After each batch the estimate so far, and the keys of its failures. Stopping at a number of failures makes the
-        estimate too large by about one part in that number.
+        After each batch the estimate so far, and the keys of the first failures, up to 100. Stopping at a number of
+        failures makes the estimate too large by about one part in that number.
     """
     count = failures = 0
+    found = draw_keys(random, 0)
     before = process.work()
     while count < episodes and (events is None or failures < events):
         keys = draw_keys(random, process.batch)
@@ -50,11 +53,12 @@ def monte_carlo(
         failed = run(process)
         count += process.batch
         failures += int(failed.sum())
+        found = np.concatenate([found, keys[failed]])[:_KEPT]
         low, high = weighted_limits(failures, failures, 1.0, count)
         yield (
             RareEstimate(
                 failures / count, float(low), float(high), "Monte Carlo", count, failures, float(failures),
                 process.work() - before,
             ),
-            keys[failed],
+            found,
         )  # fmt: skip

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import WorldState
+from ssad.core.driving import Believer, WorldState
 from ssad.core.errors import ConfigError
-from ssad.core.types import F64, Bool, Controller, End
-from ssad.world.noise import Keys
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F64, Bool, Controller, End, Episode
+from ssad.world.noise import Keys, Noise
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 
@@ -74,6 +75,9 @@ class WorldProcess:
         world = loop.simulator
         if not isinstance(world, World) or world.chance is None:
             raise ConfigError("how often a driver fails needs chance: a World with noise")
+        for _, driver in loop.drivers:
+            if isinstance(driver, Believer):
+                raise ConfigError(f"how often {driver.name} fails cannot be estimated: it remembers what it has seen")
         self.loop, self.world, self.noise = loop, world, world.chance
         self.batch = world.batch
         self.steps = max(
@@ -172,6 +176,35 @@ class WorldProcess:
     def work(self) -> float:
         """Agent-steps so far."""
         return self._work
+
+
+class Told(World):
+    """A world of one scene whose future is told: from which step on which key, and by how much means are moved."""
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        graphs: Mapping[str, LaneGraph],
+        *,
+        keys: Mapping[int, int],
+        means: Sequence[float],
+        device: str,
+        noise: Noise,
+    ) -> None:
+        """Take keys by step, and the means of `Process.push` (none: not moved)."""
+        self._keys = keys
+        super().__init__(episodes, graphs, device=device, noise=noise)
+        if means:
+            push = np.zeros(self.array("noise.push").shape, np.float32)
+            push[:, used_numbers(self)] = means
+            self.put("noise.push", push)
+
+    def step(self, controls: npt.ArrayLike | None = None) -> None:
+        """Advance by one step, with the key of that step."""
+        key = self._keys.get(int(self.array("step")[0]))
+        if key is not None:
+            self.rekey(np.array([key], np.uint64))
+        super().step(controls)
 
 
 def used_numbers(world: World) -> Bool:

@@ -1,0 +1,150 @@
+"""Write docs/how_often.md from what was measured: python -m benchmarks.how_often_page"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssad.metrics.intervals import share_limits
+from ssad.scenarios.dynamic import load_scenarios
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+TEXT = """# How often does it crash?
+
+A failure probability of 1 in 10,000 drives or less cannot be measured by driving 100 scenarios. `ssad run how-often`
+estimates it in traffic with chance in it, by three methods that check each other:
+
+| method | what it does | what it needs |
+|---|---|---|
+| `monte-carlo` | drives many episodes and counts | 400 collisions for 10 % |
+| `splitting` | branches those that come nearest to a collision, again and again | a score; no model of the chance |
+| `importance` | leads chance towards collisions and weighs each by how likely it was | a learned proposal |
+
+```
+ssad run how-often                                    # a minute or two on two cores
+ssad run how-often --set noise.lapse=0.02 --set episodes=20000
+ssad replay runs/how-often importance/autopilot/lane-traffic/05
+```
+A suite of this kind names systems, scenarios, `noise`, `methods` and how many `episodes`, `particles` and `repeats`
+they get ([src/ssad/bench/kinds/how_often.py](../src/ssad/bench/kinds/how_often.py)). The table shows collisions in a
+million episodes with 95 % limits, the effective number of collisions, agent-steps simulated and those of them that went
+into learning, and collisions in 1,000 h and 1,000 km. A collision of each method is kept and driven again by
+`ssad replay`.
+
+## Chance
+`World(noise=Noise(...))` brings it in ([src/ssad/world/noise.py](../src/ssad/world/noise.py)); without, nothing
+changes, to the bit. Background Autopilots accelerate unevenly (an Ornstein-Uhlenbeck process of `accel` m/s^2 that
+forgets in `accel_time` s) and, for the share `careless` of the time, would change lane without looking. The ego, if
+the world drives it, has lapses for the share `lapse` of the time: it steers on, but leaves its pedals as they are. All
+of it comes from a key of each scene (`World.rekey`) and is part of snapshots and hashes. A scene restored with another
+key has another future.
+
+## Estimators
+[src/ssad/world/rare](../src/ssad/world/rare/process.py) holds them as functions over any batched `Process`.
+
+* **Splitting** keeps N particles, gives up the quarter with the least score (ties included) and branches the others
+  from where they passed that score. The mean of its estimate is the probability for any N and score. The interval comes
+  from independent repeats (Student's, with room for skew), at least 8 of them.
+* **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
+  a mixture of the noise as it is (10 %, so that no weight exceeds 10) and of moved ones, learned from the failures that
+  splitting finds and then by the cross-entropy method. Learning counts as work. Intervals are mid-p gamma limits of a
+  compound Poisson sum, which hold also for few events of unlike weight; n is the effective number.
+* Drivers must not remember anything between steps: those inside the world and learned policies do not.
+
+"""
+
+
+def read(name: str) -> dict[str, Any] | None:
+    """A measurement, if it is there."""
+    path = RESULTS / f"{name}.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+
+def brute_row(data: dict[str, Any]) -> str:
+    """One line of brute force."""
+    seconds = data["processor_s" if data["device"] == "cpu" else "seconds"]  # others may use the machine, too
+    return (
+        f"| {data['noise']['lapse']:.1%} | {data['device']} | {data['episodes']:,} | {data['events']:,} | "
+        f"{data['probability']:.3g} | {data['low']:.3g} to {data['high']:.3g} | {data['work']:.3g} | "
+        f"{data['work'] / seconds:,.0f} |"
+    )
+
+
+def main() -> None:
+    """Write the page."""
+    lines = [TEXT + "## A case measured"]
+    covered = read("how-often-coverage")
+    brutes = [data for data in (read("how-often-brute"), read("how-often-4"), read("how-often-6")) if data]
+    noise = (covered or brutes[0])["noise"]
+    (scenario,) = load_scenarios((covered or brutes[0])["scenario"])
+    lines += [
+        f"`{scenario.name}`: on a straight road of {scenario.town}, the Autopilot follows two vehicles at "
+        f"{scenario.parameters['ego_speed']:g} m/s for {0.1 * scenario.limits.max_steps:g} s. They accelerate and "
+        f"brake with a standard deviation of {noise['accel']:g} m/s^2; its lapses forget in {noise['choice_time']:g} s."
+        " Brute force (`python -m benchmarks.how_often brute --lapse 0.04`):",
+        "",
+        "| share of lapses | device | episodes | collisions | probability | 95 % limits | agent-steps | a second |",
+        "|---:|---|---:|---:|---:|---|---:|---:|",
+        *map(brute_row, brutes),
+        "",
+        "The last column counts processor time of one core on CPU, and time by the clock on a GPU.",
+        "",
+    ]
+    if covered:
+        lines += coverage(covered, brutes)
+    path = ROOT / "docs" / "how_often.md"
+    path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+
+
+def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
+    """The accelerated estimates beside each other, and how often their intervals hold."""
+    same = [b for b in brutes if b["noise"]["lapse"] == data["noise"]["lapse"]]
+    best = max(same, key=lambda b: b["events"], default=None)
+    rows = {name: np.array(data[name]) for name in ("importance", "splitting") if data[name]}
+    pooled = float(rows["importance"][:, 0].mean())
+    truth, named = pooled, "the mean of all estimates of importance sampling"
+    if best is not None and best["events"] >= 5000:
+        truth, named = best["probability"], "brute force"
+    steps = best["work"] / best["episodes"] if best else float("nan")
+    lines = [
+        f"`python -m benchmarks.how_often coverage --repeats {data['repeats']} --share {data['share']}`: every "
+        f"estimate has its own episodes; {data['share']} of importance sampling share a proposal, of which each counts "
+        f"the whole training. An interval holds if it contains {named} ({truth:.4g}). What brute force would "
+        "need is 1.96^2 (1 - p) / (p h^2) episodes for the half-width h, relative to p, that the estimates have in the "
+        "mean.",
+        "",
+        "| method | estimates | mean probability | intervals that hold | relative half-width | agent-steps each | of "
+        "these learning | fewer than brute force |",
+        "|---|---:|---:|---|---:|---:|---:|---:|",
+    ]
+    for name, found in rows.items():
+        good = ~np.isnan(found[:, 1])
+        p, low, high, _, work = found[good].T
+        held = int(((low <= truth) & (truth <= high)).sum())
+        half = float(np.mean(0.5 * (high - low)) / truth)
+        needed = steps * 1.96**2 * (1.0 - truth) / truth / half**2
+        learned = float(np.mean(data["training"])) if name == "importance" else 0.0
+        low, high = (float(v) for v in share_limits(held / len(p), len(p)))
+        holds = f"{held / len(p):.1%} ({low:.1%} to {high:.1%})" if len(p) >= 20 else f"{held} of {len(p)}"
+        lines.append(
+            f"| {name} | {len(p)} | {p.mean():.4g} | {holds} | "
+            f"{half:.0%} | {work.mean():.3g} | {learned:.2g} | {needed / work.mean():,.0f} times |"
+        )
+        if name == "importance":
+            rest = float((work - learned).mean())
+            fine = needed * (half / 0.02) ** 2
+            long = fine / (learned + rest * (half / 0.02) ** 2)
+            last = (
+                f"The advantage of importance sampling grows with what is wanted, since learning is paid once: for "
+                f"a half-width of 2 %, for which brute force needs about 10,000 collisions, it needs {long:,.0f} times "
+                "fewer agent-steps."
+            )
+    return [*lines, "", last, ""]
+
+
+if __name__ == "__main__":
+    main()
