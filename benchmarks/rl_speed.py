@@ -1,36 +1,39 @@
 """Speed of training with stable-baselines3: PPO's environment steps a second, beside highway-env in the same run.
 
-    uv run --extra train --group bench python benchmarks/rl_speed.py
+    uv run --extra train --group bench python benchmarks/rl_speed.py --json benchmarks/results/rl-speed.json
 
 64 scenes, 4 epochs, batches of 1,024, two layers of 64. highway-env runs 8 environments in one process (DummyVecEnv),
 as its users do; its step is one decision, as ours. torch takes one thread: networks this small lose by a second one.
-Wall clock, medians over interleaved repeats.
+Wall clock, medians over interleaved repeats; processor time beside it, which counts also where the machine has other
+things to do.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 
 from ssad.envs import make_sb3
 
 
-def train(make: Callable[[], object], steps: int, *, n_steps: int, batch: int) -> Callable[[], float]:
-    """A function that trains for `steps` more and says how many steps a second it made."""
+def train(make: Callable[[], object], steps: int, *, n_steps: int, batch: int) -> Callable[[], tuple[float, float]]:
+    """A function that trains for `steps` more and says how many steps it made a second, and a second of processor."""
     from stable_baselines3 import PPO
 
     model = PPO("MlpPolicy", make(), n_steps=n_steps, batch_size=batch, n_epochs=4, seed=0, device="cpu")
     model.learn(n_steps * 8)
 
-    def once() -> float:
-        began = time.perf_counter()
+    def once() -> tuple[float, float]:
+        began, used = time.perf_counter(), time.process_time()
         model.learn(steps)
-        return steps / (time.perf_counter() - began)
+        return steps / (time.perf_counter() - began), steps / (time.process_time() - used)
 
     return once
 
@@ -51,6 +54,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=64 * 128)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--no-highway", action="store_true")
+    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
     began = time.perf_counter()
@@ -60,15 +64,24 @@ def main() -> None:
     make_sb3(num_envs=64, scenarios=args.scenarios)
     print(f"second start, from the cache: {time.perf_counter() - began:.2f} s")
     theirs = None if args.no_highway else train(highway, 512, n_steps=64, batch=256)
-    rates: dict[str, list[float]] = {"ssad": [], "highway-env": []}
+    rates: dict[str, list[tuple[float, float]]] = {"ssad": [], "highway-env": []}
     for _ in range(args.repeats):
         rates["ssad"].append(ours())
         if theirs is not None:
             rates["highway-env"].append(theirs())
-    print(f"{os.cpu_count()} cores, {torch.get_num_threads()} torch threads")
+    load = os.getloadavg()[0]
+    print(f"{os.cpu_count()} cores, {torch.get_num_threads()} torch thread, load {load:.1f}")
+    found: dict[str, object] = {"cores": os.cpu_count(), "load": load}
     for name, values in rates.items():
         if values:
-            print(f"{name}: {statistics.median(values):,.0f} steps/s ({min(values):,.0f} to {max(values):,.0f})")
+            wall, own = ([value[k] for value in values] for k in (0, 1))
+            found[name] = {"steps_per_s": statistics.median(wall), "per_processor_s": statistics.median(own)}
+            print(
+                f"{name}: {statistics.median(wall):,.0f} steps/s ({min(wall):,.0f} to {max(wall):,.0f}); "
+                f"{statistics.median(own):,.0f} a second of processor time"
+            )
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -197,15 +197,20 @@ def main() -> None:
             for one in row[kind][: given.show]:
                 print("   ", kind, json.dumps(one), flush=True)
     rows = [*(row for file in given.also for row in json.loads(file.read_text())["towns"]), *rows]
-    total = {"town": "all", "hours": sum(row["hours"] for row in rows)} | {
-        kind: [one for row in rows for one in row[kind]] for kind in ("contacts", "off_road", "stuck")
-    }
+    total = together("all", rows)
     print(_line(total))
     if given.json:
         about = {"vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
         given.json.write_text(json.dumps(about | {"towns": rows}, indent=1) + "\n", encoding="utf-8")
     if given.page:
-        page([*rows, total])
+        page([*rows, together("our own", [row for row in rows if row["town"] in BUILT_IN]), total])
+
+
+def together(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row for several towns."""
+    kinds = ("contacts", "off_road", "stuck")
+    found = {kind: [one for row in rows for one in row[kind]] for kind in kinds}
+    return {"town": name, "hours": sum(row["hours"] for row in rows)} | found
 
 
 def page(rows: Sequence[dict[str, Any]]) -> None:

@@ -22,7 +22,7 @@ from ssad.world.kernels.data import (
     TurnRank,
 )
 from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
-from ssad.world.kernels.shared import height_of, signal_state, wrap
+from ssad.world.kernels.shared import signal_state, wrap
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -98,7 +98,6 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     seen.pose[b, i] = pose
     seen.speed[b, i] = speed
     seen.half[b, i] = wp.vec2(body[0], body[1])
-    seen.height[b, i] = height_of(bank, roads, state, b, i)
     # traffic does not know who is under test: the ego is relied on like anybody, whoever drives it
     relied = int(0)
     if i == 0 or (state.controller[b, i] == Controller.AUTOPILOT and state.active[b, i] == Presence.AWAKE):
@@ -111,6 +110,10 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     at = state.progress[b, i]
     shift = state.shift[b, i]
     change = wp.vec2i(0, 0)
+    height = float(wp.nan)
+    if route[1] > 1:
+        height = roads.height[route[0] + at]
+    seen.height[b, i] = height
     follows = route[1] > 1 and bank.kind[m] != AgentKind.WALKER
     if follows:
         follows = keeps_route(roads, route, shift, at, pose)

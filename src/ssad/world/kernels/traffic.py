@@ -244,6 +244,8 @@ def conflict_gap(
     long = wp.max(other[0], 0.5 * STRIDE * wp.abs(seen.speed[b, j]) - own[1])
     reach = own[0] + long + 2.0
     reach2 = reach * reach
+    before = seen.pose[b, j]
+    now = seen.forecast[b, j, 0]
     for k in range(HORIZON):
         # it slows down for bends as the route's speed profile says
         spot = route[0] + wp.clamp(int(u0 + u + 0.5), 0, route[1] - 1)
@@ -251,10 +253,15 @@ def conflict_gap(
         u = u + 0.5 * (w + after) * STRIDE
         w = after
         at = way_frame(roads, route[0], route[1], shift, u0 + u)
-        for n in range(k - 1, wp.min(k + 2, HORIZON)):
-            q = seen.pose[b, j]
-            if n >= 0:
-                q = seen.forecast[b, j, n]
+        later = now
+        if k + 1 < HORIZON:
+            later = seen.forecast[b, j, k + 1]
+        for n in range(3):
+            q = now
+            if n == 0:
+                q = before
+            elif n == 2:
+                q = later
             rx = q[0] - at[0]
             ry = q[1] - at[1]
             if rx * rx + ry * ry < reach2:
@@ -271,6 +278,8 @@ def conflict_gap(
                     # already past the near edge with j behind the middle: braking would only stay in its way
                     if edge > 0.0 or along > 0.0:
                         gap = wp.min(gap, wp.max(edge, 0.0))
+        before = now
+        now = later
     return gap
 
 
@@ -389,8 +398,7 @@ def look_around(
     for j in range(from_row, to_row):
         if j != i and seen.kind[b, j] != AgentKind.NONE:
             box = seen.span[b, j]
-            bridge = wp.abs(seen.height[b, j] - seen.height[b, i]) > BRIDGE
-            if not bridge and box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
+            if box[0] < high[0] and box[2] > low[0] and box[1] < high[1] and box[3] > low[1]:
                 other = seen.half[b, j]
                 q = seen.pose[b, j]
                 dx = q[0] - pose[0]
@@ -413,6 +421,8 @@ def look_around(
                         reach = own[0] + other[0] + 2.0
                     if not apart(seen, b, j, pose, c, s, lon, lat, goes + own[0], bend + bend_j + reach):
                         flags = flags + 2
+                if flags > 0 and wp.abs(seen.height[b, j] - seen.height[b, i]) > BRIDGE:
+                    flags = 0  # one of us is on a bridge
                 if flags > 0:
                     slot = wp.atomic_add(work.count, 0, 1)
                     work.pair[slot] = ((b * agents + i) * rows + j) * 4 + flags
