@@ -1,14 +1,16 @@
 """Our attacks beside those of other libraries, and beside bare forward and backward passes, in one run.
 
-    pip install --no-deps adversarial-robustness-toolbox torchattacks scikit-learn joblib threadpoolctl
+    pip install --no-deps adversarial-robustness-toolbox torchattacks scikit-learn joblib threadpoolctl narwhals six
     python benchmarks/attack_reference.py art CLIPS [--images 8] [--steps 10] [--json FILE]
     python benchmarks/attack_reference.py torchattacks [--steps 10] [--json FILE]
     python benchmarks/attack_reference.py overhead CLIPS [--images 2] [--repeats 9] [--json FILE]
+    python benchmarks/attack_reference.py precision CLIPS [--images 8] [--steps 10] [--device cuda] [--json FILE]
 
 art: PGD of adversarial-robustness-toolbox on YOLOv5n, wrapped as its estimator of object detectors, and ours, on the
 same pictures, loss, budget and number of steps. torchattacks: its APGD and ours on a small network trained on the
-handwritten digits of scikit-learn. CLIPS: a folder that `ssad record --clips` wrote. FILE, such as
-benchmarks/results/attacks.json, keeps the figures of the three side by side; benchmarks/page.py shows them.
+handwritten digits of scikit-learn. precision: PGD with gradients in float32 and in bfloat16.
+CLIPS: a folder that `ssad record --clips` wrote. FILE, such as benchmarks/results/attacks.json, keeps the figures of
+the four side by side; benchmarks/page.py shows them.
 """
 
 from __future__ import annotations
@@ -240,6 +242,30 @@ def overhead(folder: Path, count: int, repeats: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def precisions(folder: Path, count: int, steps: int, device: str) -> dict[str, Any]:
+    """What PGD leaves with gradients in float32 and in bfloat16, and how long it takes, in turn."""
+    images, truth = pictures(folder, count)
+    detector = make_detector("yolov5n", device=device)
+    rows: list[dict[str, Any]] = []
+    for loss in ("full", "margin"):
+        for precision in ("float32", "bfloat16"):
+            began = time.perf_counter()
+            found = run_attack(
+                make_attack("pgd", steps=steps), detector, images.to(device), truth, Budget(px(RADIUS)), objective=loss,
+                precision=precision, check=False,
+            )  # fmt: skip
+            value, used = float(found.after.mean()), time.perf_counter() - began
+            left = score(detector, found.images.cpu(), truth)
+            before = float(found.before.mean())
+            rows.append(
+                {"loss": loss, "precision": precision, "before": before, "after": value, "AP50": left, "s": used}
+            )
+    return {
+        "images": len(images), "radius_px": RADIUS, "steps": steps, "device": device,
+        "clean": score(detector, images, truth), "rows": rows,
+    }  # fmt: skip
+
+
 def _versions() -> dict[str, str]:
     wanted = ("torch", "adversarial-robustness-toolbox", "torchattacks")
     there = {one.metadata["Name"]: one.version for one in metadata.distributions()}
@@ -255,11 +281,12 @@ def _objective() -> Any:
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("art", "torchattacks", "overhead"))
+    parser.add_argument("what", choices=("art", "torchattacks", "overhead", "precision"))
     parser.add_argument("clips", type=Path, nargs="?")
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--steps", type=int, default=10)
     parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path)
     chosen = parser.parse_args()
     torch.set_num_threads(1)
@@ -268,6 +295,8 @@ def main() -> None:
         found = beside_torchattacks(chosen.steps)
     elif chosen.what == "art":
         found = beside_art(chosen.clips, chosen.images, chosen.steps)
+    elif chosen.what == "precision":
+        found = precisions(chosen.clips, chosen.images, chosen.steps, chosen.device)
     else:
         found = overhead(chosen.clips, chosen.images, chosen.repeats)
     print(json.dumps(found, indent=1))

@@ -230,6 +230,17 @@ def attacks() -> list[str]:
     for row in other["rows"]:
         left = " | ".join(f"{100 * row[name]:.1f} %" for name in columns)
         lines.append(f"| {row['radius_px']:.0f} | {left} |")
+    if mixed := data.get("precision"):
+        lines += [
+            "",
+            f"PGD with {mixed['steps']} steps, with gradients in float32 and in bfloat16, on {mixed['images']}",
+            f"of these images (clean AP50 {100 * mixed['clean']:.1f} %):",
+            "",
+            "| loss ascended | gradients | loss | AP50 |",
+            "|---|---|---:|---:|",
+        ]
+        for row in mixed["rows"]:
+            lines.append(f"| {row['loss']} | {row['precision']} | {row['after']:.4g} | {100 * row['AP50']:.1f} % |")
     return [
         *lines,
         "",

@@ -349,7 +349,7 @@ def test_a_scene_that_is_cut_off_goes_on_from_its_pictures(
     boxes, notes = zip(*(read_boxes(boxes_path(one.folder, LINEAR, view)) for one in out), strict=True)
     assert notes[0] == notes[1]
     assert [one.boxes.score.tolist() for one in boxes[0]] == [one.boxes.score.tolist() for one in boxes[1]]
-    assert not list((tmp_path / "cut" / "unfinished").rglob("*.npz")), "a finished scene needs them no more"
+    assert not (tmp_path / "cut" / "unfinished").exists(), "a finished scene needs them no more"
 
 
 def test_an_image_without_objects_is_left_as_it_is_by_a_loss_that_needs_some(root: Path) -> None:

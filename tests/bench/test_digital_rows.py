@@ -210,7 +210,9 @@ def test_of_all_objects_only_the_chosen_one_is_attacked(folder: Path, root: Path
     assert all(len(r.cells) == 4 for r in row)
 
 
-def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(root: Path) -> None:
+def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with NuScenes(root) as data:
         scene = data.scene(data.scenes()[0].name)
     sample = scene.samples[0].token
@@ -229,6 +231,9 @@ def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(roo
         assert chosen_object(scene, sample, found.instance[row], classes) == row
         frame = next(f for f in cameras if len(camera_truth(f, found.take(np.array([row]))).label))
         assert chosen_first(scene, frame, NEAREST, classes).token[0] == found.token[row]
+    first = chosen_object(scene, sample, NEAREST)
+    monkeypatch.setattr("ssad.evaluation.chosen_object._seen", lambda frame, found, row: row != first)
+    assert chosen_object(scene, sample, NEAREST) == np.argsort(gap, kind="stable")[1], "the nearest is hidden"
     assert chosen_object(scene, sample, "nobody") is None
     assert chosen_object(scene, sample, NEAREST, ("trailer",)) is None, "the tiny set has none"
 

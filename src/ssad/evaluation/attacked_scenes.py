@@ -350,19 +350,20 @@ class SceneAttacker:
 
         The gradient of the loss is compared with finite differences, on the image with most objects to attack; the
         coupling is how much this image's loss changes with what else is in the batch. Attacks on the same loss of the
-        same system share the results.
+        same system share the results. Pictures for the report's sheet, without a source, are of attacks that were
+        checked.
         """
         if self.watched.task == "3d" and self.watched.classes != MMDET3D_CLASSES:
             raise ConfigError(f"{self.watched.detector.name} finds other classes than the ten of nuScenes")
         frames = _key_frames(self.scene)
-        if self.attack.access == "none":
+        if self.attack.access == "none" or not self.view.source:
             return
         own, spec = self.examination, self.view.spec
         asked = (
             str(own.root), own.version, own.detectors, own.device, self.view.source, self.scene.record.name, spec.loss,
             spec.classes, spec.becomes, spec.object, self.attack.access,
         )  # fmt: skip
-        if not self.view.source or asked not in _INSPECTED:
+        if asked not in _INSPECTED:
             _INSPECTED[asked] = self._inspected(frames)
         self.tally.gradient_error, self.tally.coupling = _INSPECTED[asked]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,8 +55,11 @@ class SavedPictures:
         safeio.write_atomic(self._path(token), safeio.npz_bytes(columns))
 
     def forget(self) -> None:
-        """Remove all: the scene is finished."""
+        """Remove all, with the folders above that are empty then: the scene is finished."""
         shutil.rmtree(self.folder, ignore_errors=True)
+        with suppress(OSError):
+            self.folder.parent.rmdir()
+            self.folder.parent.parent.rmdir()
 
     def _path(self, token: str) -> Path:
         return self.folder / f"{token}.npz"
