@@ -30,8 +30,9 @@ def grown(stored: dict[str, Any]) -> list[str]:
     suite = load_suite("digital").model_dump(mode="json")
     known = [{k: v for k, v in one.items() if v} for one in stored["attacks"]]
     fresh = [{k: v for k, v in one.items() if v} for one in suite["attacks"]]
-    names = dict.fromkeys(f"`{one['name']}`" for one in fresh if one not in known)
-    missing = [f"the attack {' and '.join(names)}"] if len(names) == 1 else [f"the attacks {' and '.join(names)}"]
+    about = ("name", "loss", "object", "precision")
+    names = dict.fromkeys(f"`{' '.join(str(one[k]) for k in about if k in one)}`" for one in fresh if one not in known)
+    missing = [f"the attack{'s' if len(names) > 1 else ''} {', '.join(names)}"]
     others = [f"`{one}`" for one in suite["transfer_detectors"] if one not in stored.get("transfer_detectors", [])]
     return (missing if names else []) + ([f"transfer to and from {' and '.join(others)}"] if others else [])
 
