@@ -28,13 +28,19 @@ def outdated() -> list[str]:
 def grown(stored: dict[str, Any]) -> list[str]:
     """What the suite has by now that the stored run does not have: attacks of the table, detectors of the transfer."""
     suite = load_suite("digital").model_dump(mode="json")
-    known = [{k: v for k, v in one.items() if v} for one in stored["attacks"]]
-    fresh = [{k: v for k, v in one.items() if v} for one in suite["attacks"]]
+    known, fresh = ([_said(one) for one in told["attacks"]] for told in (stored, suite))
     about = ("name", "loss", "object", "precision")
     names = dict.fromkeys(f"`{' '.join(str(one[k]) for k in about if k in one)}`" for one in fresh if one not in known)
     missing = [f"the attack{'s' if len(names) > 1 else ''} {', '.join(names)}"]
     others = [f"`{one}`" for one in suite["transfer_detectors"] if one not in stored.get("transfer_detectors", [])]
     return (missing if names else []) + ([f"transfer to and from {' and '.join(others)}"] if others else [])
+
+
+def _said(told: Any) -> Any:
+    """What a suite says, without what it leaves open."""
+    if isinstance(told, list):
+        return [_said(one) for one in told]
+    return {k: _said(v) for k, v in told.items() if v} if isinstance(told, dict) else told
 
 
 def page() -> str:
