@@ -77,7 +77,7 @@ def target_table(run: DigitalRun) -> Table:
             count = metrics.get("targets")
             shares = (metrics.get(name) for name in ("success", "kept"))
             cells = [Cell(math.nan if share is None else 100 * share) for share in shares]
-            cells.insert(1, Cell(math.nan if count is None else count))
+            cells.insert(1, Cell(math.nan if count is None else count, digits=0))
             head = (detector, title_of(setting), size_of(setting._replace(target="")), setting.target)
             rows.append(Row((*head, scenes_of(setting)), (*cells, metric_cell(record, "mAP"))))
     note = (

@@ -104,7 +104,10 @@ def effort_table(run: DigitalRun) -> Table:
             continue
         values = [record.get(name) for name in (*names, "batch")]
         scaled = [
-            Cell(math.nan if v is None else float(v) * (100 if n in ("used", "gradient_error") else 1))
+            Cell(
+                math.nan if v is None else float(v) * (100 if n in ("used", "gradient_error") else 1),
+                digits=0 if n in ("idle", "batch") else 2,
+            )
             for n, v in zip((*names, "batch"), values, strict=True)
         ]
         system = ", ".join(part for part in [detector, defence_of(setting)] if part)
@@ -189,7 +192,13 @@ def published_attempts() -> list[Attempt]:
 def audit_table(verdict: Verdict) -> Table:
     """How often each rule was applied, and how often it was broken."""
     rows = [
-        Row((text,), (Cell(verdict.compared[name]), Cell(sum(fault.rule == name for fault in verdict.faults))))
+        Row(
+            (text,),
+            tuple(
+                Cell(count, digits=0)
+                for count in (verdict.compared[name], sum(fault.rule == name for fault in verdict.faults))
+            ),
+        )
         for name, (text, _) in RULES.items()
     ]
     note = " ".join([verdict.text, *(f"{fault.detector}: {fault.text}." for fault in verdict.faults)])
