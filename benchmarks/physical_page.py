@@ -32,7 +32,9 @@ def store(run: Path) -> None:
     about = json.loads((run / "run.json").read_text())
     folder = RESULTS / about["suite"]["name"]
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "run.json").write_text(json.dumps({k: v for k, v in about.items() if k != "cells"}, indent=1) + "\n")
+    rows = [json.loads(line) for line in (run / "results.jsonl").read_text().splitlines()]
+    counts = {"cells": len(about.pop("cells")), "cells_done": sum(row["status"] == "ok" for row in rows)}
+    (folder / "run.json").write_text(json.dumps(about | counts, indent=1) + "\n")
     for table in sorted((run / "tables").glob("*.md")):
         shutil.copy(table, folder / table.name)
 
@@ -58,6 +60,9 @@ def part(name: str) -> list[str]:
         + ".",
         "",
     ]
+    done, cells = about.get("cells_done"), about.get("cells")
+    if done != cells:
+        lines += [f"> **The run was stopped: {done} of {cells} cells are there.** What is missing is n/a.", ""]
     tables = [*sorted(folder.glob(f"{FIRST}*.md")), *(folder / f"{other}.md" for other in OTHERS)]
     for table in tables:
         if table.is_file():
