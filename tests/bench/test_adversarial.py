@@ -125,6 +125,7 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
         "keep=1",
         "scenarios=UnprotectedLeftTurn/00",
         "systems=[autopilot,blind]",
+        "transfer=[blind]",
     ]
     plan = kind.plan(load_suite("adversarial-quick", settings))
     job = Job(tmp_path, "cpu", kind.prepare(plan, tmp_path, Resources()))
@@ -136,6 +137,13 @@ def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeyp
     assert metrics["replayed"] == 1.0
     assert 0.0 < metrics["seconds_first"] <= metrics["seconds"]
     assert 0.0 < metrics["realism"] < 1.0
+    # the grade of the one that is saved: any careful driver, or at least a manoeuvre
+    careful = [metrics[f"avoided_by_{name}"] for name in ("cc", "reg157", "rss", "fsm")]
+    assert metrics["attributable"] == max(careful)
+    assert metrics["avoided_by_limit"] >= metrics["attributable"]
+    assert ("attributable_moving" in metrics) == (metrics["moving"] > 0.0)
+    assert set(line["transfer"]) == {"blind"}
+    assert line["transfer"]["blind"]["base"] == 1.0  # the blind follower does not survive the base either
     (saved,) = read_scenarios(tmp_path / line["artefacts"]["scenarios"])
     assert saved.name == "UnprotectedLeftTurn/00/halton-0"
     trace = load_trace(tmp_path / line["artefacts"]["trace"])

@@ -12,7 +12,15 @@ from helpers.metric_traces import make_trace
 
 from ssad.bench.kinds.adversarial import Adversarial
 from ssad.report.found_view import ADVERSARY, EGO, found_view
-from ssad.report.kinds.adversarial import against_table, budget_table, group_table, main_table, summary
+from ssad.report.kinds.adversarial import (
+    against_table,
+    budget_table,
+    careful_table,
+    group_table,
+    main_table,
+    summary,
+    transfer_table,
+)
 from ssad.report.load import Run
 from ssad.roads import load_town
 
@@ -54,7 +62,7 @@ def test_rates_count_survived_bases_alone(found: Run) -> None:
     assert cell(table, 1, column).low < 0.1 < cell(table, 1, column).high
     assert cell(table, 0, "plain replay survived").mean == pytest.approx(10 / 11)
     assert [row.head for row in table.rows] == [("king", "autopilot"), ("random", "autopilot")]
-    assert len(summary(found).columns) == len(summary(found).rows[0].cells) == 5
+    assert len(summary(found).columns) == len(summary(found).rows[0].cells) == 6
 
 
 def test_the_budget_is_shown_in_parts(found: Run) -> None:
@@ -95,3 +103,22 @@ def test_a_view_shows_ego_and_adversary_where_they_met() -> None:
     assert blue.sum() > 100
     assert red.sum() > 100
     assert np.nonzero(blue)[1].mean() < np.nonzero(red)[1].mean()  # east is to the right
+
+
+def test_grades_and_other_systems_have_tables_of_their_own(found: Run) -> None:
+    assert careful_table(found) is None
+    assert transfer_table(found) is None
+    lines = []
+    for k in range(8):
+        told = line("king", k, 1, transfer={"ppo": {"base": 0.0, "found": float(k < 6)}})
+        told["metrics"] |= {"attributable": float(k < 2), "avoided_by_cc": float(k < 2), "impact_speed": 4.0 + k}
+        lines.append(told)
+    graded = careful_table(run([*lines, line("king", 9, None)]))
+    assert graded is not None
+    assert cell(graded, 0, "any of these avoids").mean == pytest.approx(0.25)
+    assert cell(graded, 0, "any of these avoids").n == 8
+    assert cell(graded, 0, "impact speed, m/s").mean == pytest.approx(7.5)
+    moved = transfer_table(run(lines))
+    assert moved is not None
+    assert moved.rows[0].head == ("king", "autopilot", "ppo")
+    assert [c.mean for c in moved.rows[0].cells] == pytest.approx([0.75, 0.0, 0.75])

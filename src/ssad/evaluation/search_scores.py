@@ -23,6 +23,7 @@ EPISODES: Final = 12  # of the reference
 MOVED: Final = 5.0  # m; who moves less is parked and says nothing
 APART: Final = 1.0  # m by which motions before contact differ on average, to count as distinct
 BEFORE: Final = 3.0  # s of motion that are compared
+MOVING: Final = 0.5  # m/s; an ego that is slower when it is hit stands
 SHOWN: Final = ("speed", "acceleration", "yaw_rate", "nearest")
 
 
@@ -40,7 +41,7 @@ def summary(row: Sequence[Outcome]) -> dict[str, Any]:
         "CR": bool(valid), "CR_any": any(o.collision for o in row), "rollouts": first,
         "share": mean([o.valid for o in row]), "distinct": len(distinct(valid)),
         "off_road": mean([o.off_road for o in ran]), "hit_others": mean([o.hit_others for o in ran]),
-        "moving": mean([o.ego_speed is not None and o.ego_speed > 0.5 for o in valid]),
+        "moving": mean([o.ego_speed is not None and o.ego_speed > MOVING for o in valid]),
         "impact_speed": mean([o.impact_speed for o in valid]),
         "acceleration": mean([o.acceleration for o in valid]), "jerk": mean([o.jerk for o in valid]),
         "within_limits": mean([o.within_limits for o in valid]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -14,6 +15,7 @@ from pydantic import Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase, grouped
 from ssad.bench.kinds.driving import (
     DrivingSuite,
+    grade_of,
     keep_towns,
     load_world,
     plain,
@@ -29,8 +31,13 @@ from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.core.seeding import seed32
 from ssad.core.traces import motion_hash, save_trace
-from ssad.core.types import Episode
-from ssad.evaluation.search_scores import distinct, likeness, reference, summary
+from ssad.core.types import Episode, Scenario
+from ssad.evaluation.search_scores import MOVING, distinct, likeness, reference, summary
+
+AVOIDERS = {
+    "cc": "CC", "reg157": "Reg157", "rss": "RSS", "fsm": "FSM", "limit": "a manoeuvre",
+}  # fmt: skip
+"""Short name in a grade -> who avoids a collision: the careful drivers, and the kinematic limit."""
 
 
 class AdversarialSuite(SuiteBase):
@@ -44,6 +51,8 @@ class AdversarialSuite(SuiteBase):
         batch: how many of them it is asked for at once.
         repetitions: searches of each, with seeds of their own.
         keep: found scenarios that are saved, of each search, the most distinct first.
+        grade: tell of each of these who could have avoided the collision (docs/careful.md).
+        transfer: systems that the saved scenarios are also driven with.
         chunk: base scenarios that one generator works on side by side.
     """
 
@@ -55,6 +64,8 @@ class AdversarialSuite(SuiteBase):
     batch: int = Field(default=8, ge=1, le=1024)
     repetitions: int = Field(default=1, ge=1, le=1000)
     keep: int = Field(default=3, ge=0, le=100)
+    grade: bool = True
+    transfer: list[str] = Field(default_factory=list)
     chunk: int = Field(default=32, ge=1, le=1024)
 
     def beside(self, path: Path) -> Self:
@@ -84,6 +95,9 @@ class Adversarial(Kind):
         Column("hit_others", "rollouts with the adversary in others", "", "lower"),
         Column("moving", "collisions in which the ego moves", "", "higher"),
         Column("impact_speed", "impact speed", "m/s"),
+        *(Column(f"avoided_by_{name}", f"saved collisions that {who} avoids") for name, who in AVOIDERS.items()),
+        Column("attributable", "saved collisions that a careful driver avoids", "", "higher"),
+        Column("attributable_moving", "the same, with the ego moving", "", "higher"),
         Column("acceleration", "largest acceleration of the adversary", "m/s^2"),
         Column("jerk", "largest jerk of the adversary", "m/s^3"),
         Column("within_limits", "collisions within the adversary's limits", "", "higher"),
@@ -105,7 +119,9 @@ class Adversarial(Kind):
         for key in ("systems", "generators"):
             if len(set(getattr(suite, key))) != len(getattr(suite, key)):
                 raise ConfigError(f"suite {suite.name}: {key}: a name appears twice")
-        systems = {name: system_version(name) for name in suite.systems}
+        systems = {
+            name: system_version(name) for name in {**dict.fromkeys(suite.systems), **dict.fromkeys(suite.transfer)}
+        }
         factories = {name: generator_factory(name) for name in suite.generators}
         generators = {name: source_version(f.__module__) for name, f in factories.items()}
         scenarios = suite_scenarios(suite._driving())
@@ -133,7 +149,12 @@ class Adversarial(Kind):
                             "scenario": data, "generator": generator, "system": system, "repetition": repetition,
                             "budget": suite.budget, "batch": suite.batch, "keep": suite.keep,
                         }  # fmt: skip
-                        versions = systems[system], generators[generator], towns[scenario.town]
+                        if suite.transfer:
+                            spec["transfer"] = list(suite.transfer)
+                        if not suite.grade:
+                            spec["grade"] = False
+                        others = [systems[name] for name in suite.transfer]
+                        versions = systems[system], generators[generator], towns[scenario.town], *others
                         name = f"{generator}/{system}/{scenario.name}{mark}"
                         cells.append(self.make_cell(name, system, seed, fields, spec, *versions))
         inputs = {"towns": towns, "systems": systems, "generators": generators}
@@ -216,15 +237,66 @@ class Adversarial(Kind):
             for n, o in enumerate(found)
         ]
         # with another seed: what is saved must not depend on one
-        again = [trials.base(scenario, base.graph, seed=cell.seed + 1).trace.end == "collision" for scenario in made]
+        seed = cell.seed + 1
+        again = [trials.base(scenario, base.graph, seed=seed) for scenario in made]
+        hits = [one.trace.end == "collision" for one in again]
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
         save_scenarios(folder / artefacts["scenarios"], made)
         assert found[0].trace is not None
         save_trace(folder / artefacts["trace"], found[0].trace)
         return {
             "artefacts": artefacts, "adversaries": list(found[0].adversaries),
-            "metrics": {"replayed": float(np.mean(again))},
+            "metrics": {"replayed": float(np.mean(hits))}
+            | (grades([one for one, hit in zip(again, hits, strict=True) if hit], trials.device)
+               if cell.spec.get("grade", True) else {}),
+            "transfer": transfer(cell.spec.get("transfer", []), base, made, trials.device, seed=seed),
         }  # fmt: skip
+
+
+def grades(collisions: Sequence[Base], device: str) -> dict[str, float]:
+    """Shares of collisions that each careful driver, any of them, and the kinematic limit avoid; {} without any."""
+    if not collisions:
+        return {}
+    rows = [grade_of(base.episode, base.trace, device).metrics() for base in collisions]
+    careful = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
+    moving = [fine for fine, base in zip(careful, collisions, strict=True) if _moves(base)]
+    shares = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    shares["attributable"] = float(np.mean(careful))
+    return shares | ({"attributable_moving": float(np.mean(moving))} if moving else {})
+
+
+def _moves(base: Base) -> bool:
+    """Whether the ego moves when it is hit."""
+    return abs(float(base.trace.speed[int(np.flatnonzero(base.trace.contact)[0]), 0])) > MOVING
+
+
+def transfer(
+    systems: Sequence[str], base: Base, made: Sequence[Scenario], device: str, *, seed: int
+) -> dict[str, dict[str, float]]:
+    """How other systems fare in what was found against one.
+
+    Args:
+        systems: The others.
+        base: What was searched.
+        made: What was found.
+        device: Where the world computes.
+        seed: Of the episodes.
+
+    Returns:
+        Name of a system -> `base`, whether it collides in the base, and `found`, the share of `made` in which it does.
+    """
+    from ssad.drivers import make_system
+    from ssad.scenarios.dynamic.generate import Trials
+
+    rows = {}
+    for name in systems:
+        trials = Trials(partial(make_system, name), make_system, device=device)
+        hits = [
+            float(trials.base(scenario, base.graph, seed=seed).trace.end == "collision")
+            for scenario in (base.scenario, *made)
+        ]
+        rows[name] = {"base": hits[0], "found": float(np.mean(hits[1:]))}
+    return rows
 
 
 def refusal(factory: Any, episode: Episode) -> str:

@@ -22,14 +22,22 @@ from ssad.report.pages import render
 from ssad.report.tables import METHODS, Cell, Row, Table
 
 RANDOM = "random"
-SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving")
+SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving", "attributable")
+GRADES = {
+    "moving": "ego moves", "avoided_by_cc": "CC avoids", "avoided_by_reg157": "Reg157 avoids",
+    "avoided_by_rss": "RSS avoids", "avoided_by_fsm": "FSM avoids", "attributable": "any of these avoids",
+    "attributable_moving": "the same, ego moves", "avoided_by_limit": "a manoeuvre avoids",
+    "impact_speed": "impact speed, m/s",
+}  # fmt: skip
+NOTE = "CR: survived bases in which a collision is found; avoidable: of the saved collisions, by a careful driver"
 VIEWS = 24
 Line = Mapping[str, Any]
 
 
 def section(run: Run) -> tuple[str, Sequence[Table]]:
     """The page of a run and its tables."""
-    tables = [table for table in (main_table(run), budget_table(run), against_table(run), group_table(run)) if table]
+    makers = main_table, careful_table, budget_table, against_table, group_table, transfer_table
+    tables = [table for table in (make(run) for make in makers) if table]
     failed = [
         ([str(line.get(name, "")) for name in ("generator", "system", "cluster")], line["status"], line["reason"])
         for line in run.failures
@@ -42,8 +50,8 @@ def summary(run: Run) -> Table:
     wide = main_table(run)
     keep = [k for k, column in enumerate(run.header["columns"]) if column["name"] in SUMMARY]
     rows = tuple(replace(row, cells=tuple(row.cells[k] for k in keep)) for row in wide.rows)
-    columns = "survive plain replay", "CR", "rollouts to the first", "distinct", "ego moves"
-    return replace(wide, columns=columns, rows=rows, note="CR: survived bases in which a collision is found")
+    columns = "survive plain replay", "CR", "rollouts to the first", "distinct", "ego moves", "avoidable"
+    return replace(wide, columns=columns, rows=rows, note=NOTE)
 
 
 def main_table(run: Run) -> Table:
@@ -54,6 +62,51 @@ def main_table(run: Run) -> Table:
         f"{METHODS}"
     )
     return replace(wide, name="adversarial", title="Generators on equal terms", note=note)
+
+
+def careful_table(run: Run) -> Table | None:
+    """How avoidable the collisions are, and how hard."""
+    rows = []
+    for head, lines in _searches(run).items():
+        cells = [
+            Cell.of(
+                estimate([_case(line, _metric(line, name)) for line in lines], "mean" if "speed" in name else "bounded")
+            )
+            for name in GRADES
+        ]
+        rows.append(Row(head, tuple(cells)))
+    if all(math.isnan(_metric(line, "attributable")) for line in run.lines):
+        return None
+    note = (
+        "Of the saved collisions of each base in which one was found. Careful drivers (docs/careful.md) take the wheel "
+        "when the danger begins; a collision that one of them avoids is attributable to the system. Who has stopped is "
+        f"often hit all the same: see the columns with the ego moving. {METHODS}"
+    )
+    heads = ("Generator", "System")
+    return Table("careful", "Could it have been avoided?", heads, tuple(GRADES.values()), tuple(rows), note)
+
+
+def transfer_table(run: Run) -> Table | None:
+    """Other systems in what was found against one: CR, and how much more than in the bases."""
+    rows = []
+    for head, lines in _searches(run).items():
+        told = [line for line in lines if line.get("transfer")]
+        for system in dict.fromkeys(name for line in told for name in line["transfer"]):
+            found, base = (
+                {str(line["key"]): _case(line, float(line["transfer"][system][part])) for line in told}
+                for part in ("found", "base")
+            )
+            more = Cell.of(paired_difference(found, base))
+            ways = [Cell.of(estimate(list(part.values()), "bounded")) for part in (found, base)]
+            rows.append(Row((*head, system), (*ways, more)))
+    if not rows:
+        return None
+    note = (
+        "The saved scenarios of each base in which a collision was found against the system, driven by another one; "
+        f"the difference is paired by base. {METHODS}"
+    )
+    columns = "CR in what was found", "CR in the bases", "difference"
+    return Table("transfer", "Transfer", ("Generator", "System", "Driven by"), columns, tuple(rows), note)
 
 
 def budget_table(run: Run) -> Table:
@@ -87,7 +140,7 @@ def against_table(run: Run) -> Table | None:
             }
             for part in (lines, other)
         )
-        rows.append(Row((generator, system), (Cell.of(paired_difference(first, second)),)))
+        rows.append(Row((generator, system), (Cell.of(paired_difference(first, second, kind="share")),)))
     if not rows:
         return None
     note = f"CR of the generator minus that of random search in the same base scenarios with the same seeds. {METHODS}"
@@ -144,6 +197,12 @@ def _within(line: Line, most: float = math.inf) -> float:
     if line["status"] != "ok" or metrics.get("CR") is None:
         return math.nan
     return float(bool(metrics["CR"]) and metrics["rollouts"] <= most)
+
+
+def _metric(line: Line, name: str) -> float:
+    """A metric of a line; NaN if it was not measured."""
+    value = (line.get("metrics") or {}).get(name)
+    return math.nan if value is None else float(value)
 
 
 def _case(line: Line, value: float) -> CaseValue:

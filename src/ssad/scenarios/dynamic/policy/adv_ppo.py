@@ -51,9 +51,9 @@ class AdvPPO:
         """See `ssad.core.generators.GeneratorFactory`; seeds and budget beyond 1 make no difference."""
         for base in bases:
             if not any(_can_be(agent.controller) for agent in base.episode.agents[1:]):
-                raise ConfigError(f"scenario {base.scenario.name}: adv-ppo needs other agents than the ego")
+                raise ConfigError(f"scenario {base.scenario.name}: {self.name} needs other agents than the ego")
         self._bases = tuple(bases)
-        self._drivers: dict[Selector, Driver] = {FreaSelection(count=1, kinds=VEHICLES): Adversary()}
+        self._drivers: dict[Selector, Driver] = {FreaSelection(count=1, kinds=VEHICLES): Adversary(name=self.name)}
         self._asked = False
 
     def ask(self, count: int) -> Sequence[Sequence[Proposal]]:

@@ -1,0 +1,1 @@
+"""Generators that begin with what was recorded."""
