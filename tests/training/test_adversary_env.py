@@ -91,3 +91,15 @@ def test_leaving_the_road_costs(monkeypatch) -> None:
             total += float(env.step_wait()[1].sum())
         found[cost] = total
     assert found[0.5] < found[0.0] - 2.0
+
+
+@pytest.mark.parametrize("reward", ["colliding", "feasible"])
+def test_other_rewards_are_paid(monkeypatch, reward: str) -> None:
+    env = environment(monkeypatch, reward=reward)
+    env.reset()
+    paid = []
+    for _ in range(60):
+        env.step_async(np.full((env.num_envs, 2), (0.5, 0.0), np.float32))
+        paid.append(env.step_wait()[1])
+    assert np.isfinite(paid).all()
+    assert np.abs(paid).max() > 0.0

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ssad.core.driving import Driver
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.generators import Base, Proposal
 from ssad.core.seeding import digest
 from ssad.core.types import Scenario
@@ -29,7 +29,16 @@ ADVERSARIES = {
         gamma=0.98, lr=3e-4, noise=0.6, entropy=0.002, validate=50_000,
     )
 }  # fmt: skip
+ADVERSARIES |= {
+    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible"),
+    "adv-sac": replace(
+        LEARNINGS["sac"], steps=100_000, observation="adversary", action="adversary", reward="adversary", draws=6,
+        gamma=0.98, lr=3e-4, batch=256, validate=25_000,
+    ),
+}  # fmt: skip
 """How adversaries are trained."""
+REWARDS = ("adversary", "colliding", "feasible")
+"""What they may learn from; see `ssad.training.adversary_env`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +123,10 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
         FormatError: An interrupted training is broken or another one.
     """
     learning = find_learning(ADVERSARIES, plan.algorithm, dict(plan.changes))
+    if learning.reward not in REWARDS:
+        raise unknown_name("reward of an adversary", learning.reward, REWARDS)
+    if plan.literal and learning.reward != "adversary":
+        raise ConfigError(f"equation 6 as it is printed is no form of the reward {learning.reward}; leave one out")
     ego = make_system(plan.ego)
     torch.set_num_threads(1)
     scenarios, graphs = natural_only(plan.scenarios)
@@ -150,7 +163,7 @@ def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs:
     from ssad.training.adversary_env import AdversaryEnv
 
     return AdversaryEnv(
-        episodes, graphs, learning.scenes, ego=ego, seed=learning.seed, literal=plan.literal,
+        episodes, graphs, learning.scenes, ego=ego, seed=learning.seed, reward=learning.reward, literal=plan.literal,
         off_road=plan.off_road, scale=learning.reward_scale, action=learning.action,
     )  # fmt: skip
 

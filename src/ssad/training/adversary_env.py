@@ -18,7 +18,7 @@ from ssad.core.types import F64, I32, Bool, Controller, End, Episode
 from ssad.drivers import make_system
 from ssad.world.policy import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
-from ssad.world.rewards import distance_to_goal
+from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible
 from ssad.world.rollout import Loop
 from ssad.world.sb3 import Alike
 from ssad.world.selection import FreaSelection, Note
@@ -41,6 +41,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         num_envs: Scenes.
         ego: Drives the egos.
         seed: Of the draws of episodes.
+        reward: `adversary`, `colliding` (equation 5) or `feasible` of `ssad.world.rewards`.
         literal: Equation 6 as it is printed, see `ssad.world.rewards.adversary`.
         off_road: What a step off the road costs, likewise.
         scale: The reward is multiplied by it.
@@ -55,6 +56,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         *,
         ego: Driver,
         seed: int = 0,
+        reward: str = "adversary",
         literal: bool = False,
         off_road: float = 0.0,
         scale: float = 0.05,
@@ -67,7 +69,12 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         self.world = World(episodes, graphs, assign=np.arange(num_envs) % len(episodes))
         self.loop = Loop(self.world, {0: ego}, policies=make_system)
         self.select = FreaSelection(count=1)
-        self._reward = partial(adversary_reward, literal=literal, off_road=off_road)
+        self._reward: Any = {
+            "adversary": partial(adversary_reward, literal=literal, off_road=off_road),
+            "colliding": colliding,
+            "feasible": partial(feasible, off_road=off_road),
+        }[reward]
+        self._before = cost_of if reward == "colliding" else distance_to_goal
         self._scale, self._action = scale, action
         self._random = generator("adversary episodes", seed)
         self._who = np.full(num_envs, -1)  # agent of each scene's adversary, -1: none
@@ -93,7 +100,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         world, who = self.world, self._who.copy()
         acting = np.flatnonzero(who >= 0)
         agents = np.stack([acting, who[acting]], 1).astype(np.int32)
-        before = distance_to_goal(world.state(), agents)
+        before = self._before(world.state(), agents)
         controls = np.zeros((self.num_envs, world.agents, 4), np.float32)
         controls[acting, who[acting]] = to_controls(self._action, self._actions[acting])
         self.loop.step(controls)

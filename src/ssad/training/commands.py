@@ -81,7 +81,7 @@ def train_driver(
 
 @train_app.command("adversary")
 def train_adversary(
-    algorithm: Annotated[str, typer.Argument(metavar="ALGORITHM", help="adv-ppo.")] = "adv-ppo",
+    algorithm: Annotated[str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea or adv-sac.")] = "adv-ppo",
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[
         str, typer.Option(help="Comma-separated sets or files with background traffic to learn in.")
