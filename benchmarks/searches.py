@@ -1,0 +1,115 @@
+"""Do searches that learn find collisions sooner than random points? The table of docs/generators.md.
+
+`python -m benchmarks.searches --generators random,cma-es,bayesian,l2c` lets each search the pre-crash scenarios that
+the system survives as they are, with the same seeds and the same budget, and keeps what came of it in
+benchmarks/results/searches.json; `--page` writes the table of what is there. Each base scenario is a cluster: its
+searches with several seeds are one case, and differences to random search are paired by base.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ssad.drivers import make_system
+from ssad.metrics import CaseValue, Estimate, estimate, paired_difference
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import load_scenarios
+from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results" / "searches.json"
+DOCUMENT = ROOT / "docs" / "generators.md"
+BEGIN, END = "<!-- searches: begin -->", "<!-- searches: end -->"
+
+
+def measure(name: str, *, system: str, set_name: str, seeds: int, budget: int) -> dict[str, Any]:
+    """Rollouts to the first collision that counts (None: not found), of each base and seed."""
+    trials = Trials(lambda: make_system(system), make_system)
+    scenarios = load_scenarios(set_name)
+    bases = [trials.base(scenario, load_town(scenario.town), seed=0) for scenario in scenarios]
+    alive = [base for base in bases if base.trace.end != "collision"]
+    factory = generator_factory(name)
+    check = getattr(factory, "check", lambda episode: None)
+    found: dict[str, list[int | None]] = {}
+    share: dict[str, list[float]] = {}
+    for base in alive:
+        check(base.episode)
+    many = [base for base in alive for _ in range(seeds)]
+    roots = [seed for _ in alive for seed in range(seeds)]
+    outcomes = search(factory(many, seeds=roots, budget=budget), many, trials, budget=budget)
+    for base, row in zip(many, outcomes, strict=True):
+        first = next((k for k, outcome in enumerate(row, 1) if outcome.valid), None)
+        found.setdefault(base.scenario.name, []).append(first)
+        share.setdefault(base.scenario.name, []).append(float(np.mean([outcome.valid for outcome in row])))
+    return {"first": found, "share": share}
+
+
+def cases(rows: dict[str, list[Any]], value: Any) -> dict[str, CaseValue]:
+    """A mean over seeds for each base."""
+    return {name: CaseValue(float(np.mean([value(v) for v in row])), name, name) for name, row in rows.items()}
+
+
+def text(found: Estimate, *, sign: bool = False) -> str:
+    """A mean with its interval."""
+    form = "+.2f" if sign else ".2f"
+    return f"{found.mean:{form}} [{found.low:{form}}, {found.high:{form}}]"
+
+
+def table(data: dict[str, Any]) -> list[str]:
+    """Generators by how much of the bases they break, and how much sooner than random search."""
+    budget = data["budget"]
+    parts = [budget // 4, budget]
+    heads = [*(f"CR within {n}" for n in parts), *(f"CR within {n}, less random's" for n in parts), "share of rollouts",
+             "share, less random's"]  # fmt: skip
+    lines = [f"| | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
+    measured = data["generators"]
+    for name in measured:
+        cells, more = [], []
+        for most in parts:
+            own, random = (
+                cases(measured[who]["first"], lambda first, most=most: first is not None and first <= most)
+                for who in (name, "random")
+            )
+            cells.append(text(estimate(own.values(), "bounded")))
+            more.append("" if name == "random" else text(paired_difference(own, random), sign=True))
+        own, random = (cases(measured[who]["share"], float) for who in (name, "random"))
+        last = ["" if name == "random" else text(paired_difference(own, random), sign=True)]
+        lines.append(f"| `{name}` | {' | '.join([*cells, *more, text(estimate(own.values(), 'bounded')), *last])} |")
+    bases = len(measured["random"]["first"])
+    head = f"{bases} bases of `{data['set']}`, {data['seeds']} seeds each, {budget} rollouts, `{data['system']}`:"
+    return [head, "", *lines, ""]
+
+
+def main() -> None:
+    """Measure, keep, and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--generators", default="", help="names with commas; random must be among those kept")
+    parser.add_argument("--system", default="autopilot")
+    parser.add_argument("--set", default="precrash", dest="set_name")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--budget", type=int, default=32)
+    parser.add_argument("--page", action="store_true", help="write docs/generators.md")
+    given = parser.parse_args()
+    about = {"system": given.system, "set": given.set_name, "seeds": given.seeds, "budget": given.budget}
+    data: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+    if {key: data.get(key) for key in about} != about:
+        data = about | {"generators": {}}
+    for name in filter(None, given.generators.split(",")):
+        data["generators"][name] = measure(
+            name, system=given.system, set_name=given.set_name, seeds=given.seeds, budget=given.budget
+        )
+        RESULTS.write_text(json.dumps(data, separators=(",", ":")) + "\n")
+    print("\n".join(table(data)))
+    if given.page:
+        whole = DOCUMENT.read_text()
+        before, _, rest = whole.partition(BEGIN)
+        DOCUMENT.write_text("\n".join([before + BEGIN, *table(data), END + rest.partition(END)[2]]))
+
+
+if __name__ == "__main__":
+    main()
