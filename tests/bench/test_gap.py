@@ -18,11 +18,13 @@ from ssad.bench.run import run
 from ssad.bench.suite import load_suite, suite_files
 from ssad.core.errors import SSADError
 from ssad.core.traces import load_trace
-from ssad.recording.loop_perturbations import perturbation_names
+from ssad.core.types import AgentKind
+from ssad.recording.loop_perturbations import perturbation_names, texture_version, worn
 from ssad.report import check_artefacts, write_report
 from ssad.report.kinds.gap import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
 from ssad.report.load import load_run
 from ssad.report.terminal import summary
+from ssad.world.models import MODELS
 
 SHORT = """
 name: short
@@ -111,6 +113,40 @@ def test_the_page_has_tables_a_figure_and_drives(folder: Path) -> None:
     assert (folder / "tables" / "changes.csv").is_file()
     assert summary(folder).rows
     assert scatter(found) == "" or "<svg" in scatter(found)
+
+
+def test_a_collision_goes_where_the_object_that_was_hit_is_found(tmp_path: Path) -> None:
+    nothing = BRIGHT | {"name": "nothing", "detector": "helpers.gap_detectors:Nothing"}
+    suite = suite_of(tmp_path, nothing, ceilings=[], scenarios=["StraightObstacle/00"], sheets=0)
+    (line,) = go(Gap().plan(suite), tmp_path / "out")
+    assert line["metrics"]["collision"]
+    assert line["cause"]["cause"] == "missed"
+    assert line["repaired"] == {"collision": False, "same": False}
+    (row,) = cause_table(load_run(tmp_path / "out")).rows
+    assert [cell.mean for cell in row.cells[:3]] == [1.0, 0.0, 1.0]
+    assert row.cells[-1].mean == 1.0
+
+
+def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
+    names = ["wear-grey", "wear-das-yolov5n-twinford"]
+    suite = suite_of(tmp_path, BRIGHT, ceilings=[], perturbations=names, severities=[2, 5])
+    mixed = suite.model_copy(update={"scenarios": [*suite.scenarios, "LaneChanging/00"]})
+    cells = Gap().plan(mixed).cells
+    told = [(cell.fields["perturbation"], cell.fields["severity"], cell.fields["cluster"]) for cell in cells]
+    assert told == [
+        ("none", 0, "short"), ("none", 0, "LaneChanging/00"), ("wear-grey", 1, "LaneChanging/00"),
+        ("wear-das-yolov5n-twinford", 1, "LaneChanging/00"),
+    ]  # fmt: skip
+    assert perturbation_names()["wear-grey"] == "texture"
+    cars = sorted(name for name, model in MODELS.items() if model.kind == AgentKind.CAR)
+    for name in (name for name, family in perturbation_names().items() if family == "texture"):
+        for model in cars[::4]:
+            mesh, edit = worn(name, 1).body(model)
+            assert len(mesh.faces) > 100
+            assert len(edit.textures) == 1
+    assert cells[2].spec["wearer"] == 1
+    assert texture_version("wear-grey") == ""
+    assert len(texture_version("wear-das-yolov5n-twinford")) == 64
 
 
 def test_a_detector_that_returns_nan_fails_its_drives_alone(tmp_path: Path) -> None:

@@ -102,6 +102,7 @@ def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
         Tour().plan(suite.model_copy(update={"parts": [inner]}))
 
 
+@pytest.mark.slow
 def test_the_shipped_tour_can_be_planned() -> None:
     plan = Tour().plan(load_suite("tour"), check=False)
     assert {part.kind.name for part in plan.details.values()} == {

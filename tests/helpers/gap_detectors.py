@@ -1,4 +1,4 @@
-"""Detectors for the closed loop: one that finds a car where the picture is bright, and three that go wrong."""
+"""Detectors for the closed loop: one finds a car where the picture is bright, one nothing, and three go wrong."""
 
 from __future__ import annotations
 
@@ -29,6 +29,13 @@ class Bright:
             torch.tensor([[0.0, 0.8, 14.0]]), torch.tensor([[4.5, 1.6, 1.9]]), one, torch.zeros(1, 2), one.long()
         )  # fmt: skip
         return Detections(one + score, one.long(), torch.zeros(1, 4), solid)
+
+
+class Nothing(Bright):
+    """It finds nothing that it is sure of."""
+
+    def found(self, score: float) -> Detections:
+        return super().found(0.0)
 
 
 class Spoilt(Bright):

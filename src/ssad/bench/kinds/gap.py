@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, grouped
@@ -38,6 +39,7 @@ from ssad.core.traces import first_difference, load_trace, motion_hash, save_tra
 from ssad.core.types import Episode, EpisodeTrace
 from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.tracker import Tracking
 from ssad.evaluation.drive_perception import (
     BANDS,
@@ -51,7 +53,16 @@ from ssad.evaluation.drive_perception import (
 from ssad.evaluation.drive_sheet import drive_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import episode_metrics
-from ssad.recording.loop_perturbations import NONE, check_perturbation, perturbation_names, perturbed
+from ssad.recording.loop_perturbations import (
+    NONE,
+    TEXTURE,
+    check_perturbation,
+    first_car,
+    perturbation_names,
+    perturbed,
+    texture_version,
+    worn,
+)
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 
@@ -98,8 +109,10 @@ class System(BaseModel):
         """Whether it is told the truth."""
         return self.detector == "truth"
 
-    def make(self, watch: Callable[[Sighting | Known], None] | None = None) -> Perceiving:
-        """The driver; `watch` is told what it sees."""
+    def make(
+        self, watch: Callable[[Sighting | Known], None] | None = None, *, repair: Repair | None = None
+    ) -> Perceiving:
+        """The driver; `watch` is told what it sees, `repair` mends one error of it."""
         cameras = front(self.width, self.cameras)
         eyes: CameraEyes | PerfectEyes
         if self.perfect:
@@ -109,7 +122,9 @@ class System(BaseModel):
         else:
             eyes = CameraEyes(_detector(self.detector, self.weights, self.input_width), cameras, threshold=self.low)
         tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
-        return Perceiving(eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch)
+        return Perceiving(
+            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair
+        )  # fmt: skip
 
 
 class GapSuite(SuiteBase):
@@ -123,6 +138,8 @@ class GapSuite(SuiteBase):
         severities: 1 to 5.
         repetitions, spread, chunk: as in suites of kind driving.
         sheets: pictures of so many drives, collisions first.
+        repair: whether drives that end in a collision are driven again with the object that was hit found where it is,
+            which tells whether this error alone is to blame.
     """
 
     kind: Literal["gap"] = "gap"
@@ -136,6 +153,7 @@ class GapSuite(SuiteBase):
     timeout_s: float = Field(default=1200.0, gt=0, allow_inf_nan=False)
     chunk: int = Field(default=4, ge=1, le=4096)
     sheets: int = Field(default=6, ge=0)
+    repair: bool = True
 
     def beside(self, path: Path) -> Self:
         """Scenario files are looked for in the working folder, then beside the suite."""
@@ -184,20 +202,24 @@ class Gap(Kind):
         versions |= {name: system_version(name) for name in suite.ceilings}
         scenarios = suite_scenarios(suite)  # type: ignore[arg-type]  # the same attributes
         towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
+        conditions = _conditions(suite)
+        wearers: dict[str, int | None] = {}
+        if check or any(_family(condition) == TEXTURE for condition in conditions):
+            for scenario in scenarios:
+                clean = self._cell(suite, scenario, conditions[0], 0, versions, towns)
+                wearers[scenario.name] = first_car(episode_of(clean))
         cells = [
-            self._cell(suite, scenario, condition, repetition, versions, towns)
-            for condition in _conditions(suite)
+            self._cell(suite, scenario, condition, repetition, versions, towns, wearer=wearers.get(scenario.name))
+            for condition in conditions
             for scenario in scenarios
             for repetition in range(suite.repetitions)
+            if _family(condition) != TEXTURE or wearers[scenario.name] is not None
         ]
-        if check:
-            for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
-                episode_of(cell)
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
 
     def _cell(  # noqa: PLR0917  # plain values
         self, suite: GapSuite, scenario: Any, condition: tuple[Any, str, int], repetition: int,
-        versions: Mapping[str, str], towns: Mapping[str, str],
+        versions: Mapping[str, str], towns: Mapping[str, str], *, wearer: int | None = None,
     ) -> Cell:  # fmt: skip
         """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
         system, perturbation, severity = condition
@@ -210,13 +232,17 @@ class Gap(Kind):
             "scenario": data, "system": name, "repetition": repetition,
             "settings": None if isinstance(system, str) else system.model_dump(mode="json"),
             "spread": suite.spread if repetition else 0.0, "perturbation": perturbation, "severity": severity,
+            "repair": suite.repair and not isinstance(system, str),
         }  # fmt: skip
+        texture = ""
+        if _family(condition) == TEXTURE:
+            spec["wearer"], texture = wearer, texture_version(perturbation)
         fields = {
             "system": name, "perturbation": perturbation, "severity": severity,
             "family": perturbation_names()[perturbation], "group": scenario.group or scenario.type,
             "cluster": scenario.name,
         }  # fmt: skip
-        inputs = (versions[name], towns.get(scenario.town, ""), type_version(scenario.type), suite.seed)
+        inputs = (versions[name], towns.get(scenario.town, ""), type_version(scenario.type), suite.seed, texture)
         return self.make_cell(title, name, seed, fields, spec, *inputs)
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
@@ -228,7 +254,9 @@ class Gap(Kind):
         """Cells of one condition; a batch is of one town, whose street is then built once."""
         return grouped(
             cells, plan.suite.chunk, workers=workers,
-            by=lambda c: (c.spec["scenario"]["town"], c.system, c.spec["perturbation"], c.spec["severity"]),
+            by=lambda c: (
+                c.spec["scenario"]["town"], c.system, c.spec["perturbation"], c.spec["severity"], c.spec.get("wearer")
+            ),
         )  # fmt: skip
 
     def start(self, job: Job) -> None:
@@ -238,6 +266,7 @@ class Gap(Kind):
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drives the episodes as one batch, and measures component and system."""
         episodes, traces, seen = drive(cells, device=job.device, seed=job.settings["seed"])
+        repaired = _repaired(cells, traces, job) if cells[0].spec["repair"] else {}
         results: dict[str, dict[str, Any]] = {}
         for k, (cell, episode, trace) in enumerate(zip(cells, episodes, traces, strict=True)):
             artefacts = {"trace": f"traces/{cell.key}.npz"}
@@ -257,6 +286,7 @@ class Gap(Kind):
                     safeio.make_folder(job.folder / "sheets")
                     save_picture(job.folder / artefacts["sheet"], picture)
             metrics = {name: None if value is None else _rounded(value) for name, value in metrics.items()}
+            about |= {"repaired": repaired[k]} if k in repaired else {}
             results[cell.key] = {
                 "metrics": metrics, "artefacts": artefacts, "case": motion_hash(trace), **about,
                 "episode": {"scenario": episode.scenario.name, "metrics": metrics, **about},
@@ -271,7 +301,9 @@ class Gap(Kind):
         return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
 
 
-def drive(cells: Sequence[Cell], *, device: str, seed: int) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
+def drive(
+    cells: Sequence[Cell], *, device: str, seed: int, repair: Repair | None = None
+) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
     """Episodes and traces of cells of one condition, run as one batch, and what was perceived in them."""
     from ssad.recording.loop_sensors import Onboard
     from ssad.world.rollout import rollout
@@ -288,14 +320,38 @@ def drive(cells: Sequence[Cell], *, device: str, seed: int) -> tuple[list[Episod
     driver: Driver
     own = System.model_validate(first["settings"])
     watcher = Watcher(front(own.width, own.cameras), len(cells))
-    driver = own.make(watcher)
+    driver = own.make(watcher, repair=repair)
     driver.to(device)
-    onboard = Onboard(device=device)
+    texture = worn(first["perturbation"], first["wearer"]) if "wearer" in first else None
+    onboard = Onboard(device=device, attack=texture)
     sensors, changes = perturbed(
         onboard, driver.cameras, first["perturbation"], first["severity"], detector=driver.detector, seed=seed
     )
     traces = rollout(simulator, driver, sensors=sensors, perturbation=changes)
     return episodes, _named(traces, cells), watcher
+
+
+def _repaired(cells: Sequence[Cell], traces: Sequence[EpisodeTrace], job: Job) -> dict[int, dict[str, Any]]:
+    """Drives that ended in a collision driven again with whom they hit found where it is: does that one error decide?
+
+    Returns:
+        By the drive's number: whether there is a collision now, and whether with the same agent.
+    """
+    first = {k: np.flatnonzero(trace.contact_agent > 0) for k, trace in enumerate(traces)}
+    hit = {k: int(traces[k].contact_agent[steps[0]]) for k, steps in first.items() if len(steps)}
+    if not hit:
+        return {}
+    repair = Repair(dict(enumerate(hit.values())))
+    _, again, _ = drive([cells[k] for k in hit], device=job.device, seed=job.settings["seed"], repair=repair)
+    return {
+        k: {"collision": bool(episode_metrics(one, stop_signs=False).collision),
+            "same": bool((one.contact_agent == agent).any())}
+        for (k, agent), one in zip(hit.items(), again, strict=True)
+    }  # fmt: skip
+
+
+def _family(condition: tuple[Any, str, int]) -> str:
+    return perturbation_names()[condition[1]]
 
 
 def _paired(episode: Episode, cell: Cell) -> Episode:
@@ -313,7 +369,9 @@ def _conditions(suite: GapSuite) -> list[tuple[Any, str, int]]:
         found.append((system, NONE, 0))
         if not system.perfect:
             names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
-            found += [(system, name, severity) for name in names for severity in dict.fromkeys(suite.severities)]
+            for name in names:
+                once = perturbation_names()[name] == TEXTURE  # a texture has no severity
+                found += [(system, name, severity) for severity in ([1] if once else dict.fromkeys(suite.severities))]
     return found
 
 

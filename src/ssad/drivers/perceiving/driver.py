@@ -22,6 +22,7 @@ from ssad.core.types import F32, F64, I32, U8, Controller, Episode
 from ssad.drivers.perceiving.eyes import Eyes
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import I64, Objects, no_objects
+from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks, believed
 
 LATE = 1e-4  # s, less than a step: times are 32-bit numbers
@@ -70,6 +71,7 @@ class Perceiving:
         latency: s from a picture to its detections. Tracks are moved on to the present, so what is late is not
             misplaced, but unknown for so long.
         watch: Told of each look, and at each step of what is believed.
+        repair: Repairs one error of what is found, to see what it alone does.
 
     Raises:
         ConfigError: A value is out of its range.
@@ -87,12 +89,14 @@ class Perceiving:
         rate: float = 5.0,
         latency: float = 0.1,
         watch: Callable[[Sighting | Known], None] | None = None,
+        repair: Repair | None = None,
     ) -> None:
         if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
             raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
         self.eyes, self.lifting, self.tracking = eyes, lifting or Lifting(), tracking or Tracking()
         self.rate, self.latency, self.watch = rate, latency, watch
-        self.sensors: tuple[str, ...] = tuple(eyes.sensors)
+        self.repair = repair
+        self.sensors: tuple[str, ...] = tuple(dict.fromkeys((*eyes.sensors, *(("truth",) if repair else ()))))
         self._tracker = Tracker(self.tracking, 0)
         self._looks = np.zeros(0, np.int64)
         self._waiting: list[Sighting] = []
@@ -162,6 +166,8 @@ class Perceiving:
                     found = lift(one, camera, ego @ camera.to_ego, self.eyes.classes, settings=self.lifting)
                     parts.append(replace(found, scene=np.full(len(found), scene)))
             all_ = merged(Objects.joined(parts), self.lifting.merge) if parts else None
+            if self.repair is not None:
+                all_ = self.repair(view, row, all_ or no_objects(), self.eyes.cameras, self.lifting)
             shown = {} if self.watch is None else self._pictures(view, row)
             sightings.append(Sighting(scene, float(now[row]), all_, shown))
             if self.watch is not None:

@@ -1,0 +1,66 @@
+"""Perception with one error repaired: one object is seen as a perfect detector sees it, all others as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ssad.core.driving import Belief, Observation
+from ssad.core.frames import Camera
+from ssad.core.rotations import upright_pose
+from ssad.drivers.belief import in_sight
+from ssad.drivers.perceiving.eyes import PerfectEyes, boxes_of, projected
+from ssad.drivers.perceiving.lift import Lifting, lift
+from ssad.drivers.perceiving.objects import Objects, no_objects
+
+AROUND = 5.0  # m around the object within which what was found is taken for it
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """Whose detections are repaired, for `ssad.drivers.perceiving.driver.Perceiving`.
+
+    Where the object can be seen, it is found where it is, and what was found within 5 m of it and near nobody else is
+    left out; where it cannot be seen, nothing changes.
+
+    Attributes:
+        agents: Scene -> number of the agent.
+        reach: m to which a perfect detector sees.
+    """
+
+    agents: Mapping[int, int]
+    reach: float = 60.0
+
+    def __call__(
+        self, view: Observation, row: int, found: Objects, cameras: Mapping[str, Camera], lifting: Lifting
+    ) -> Objects:
+        """What was found in a row, with the error repaired.
+
+        Args:
+            view: What the egos see; the sensor `truth` among it.
+            row: Which row.
+            found: What was found there.
+            cameras: Through which was looked.
+            lifting: How detections become places.
+        """
+        agent = self.agents.get(int(view.scene[row]))
+        truth: Belief = view.readings["truth"].rows([row])
+        if agent is None or not in_sight(view.pose[[row], :2], truth, self.reach)[0, agent]:
+            return found
+        ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
+        parts = [no_objects()]
+        only = np.arange(truth.kind.shape[1]) == agent
+        for camera in cameras.values():
+            pose = ego @ camera.to_ego
+            one = projected(boxes_of(truth, 0, only), np.asarray(np.linalg.inv(pose), np.float64), camera)
+            parts.append(lift(one, camera, pose, PerfectEyes.classes, settings=lifting))
+        seen = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
+        if not len(seen):
+            return found
+        places = truth.pose[0, :, :2].astype(np.float64)
+        gap = np.linalg.norm(found.place[:, None] - places[None], axis=-1)
+        gap[:, truth.kind[0] == 0] = np.inf
+        own = (gap[:, agent] < AROUND) & (gap[:, agent] <= gap.min(1, initial=np.inf))
+        return Objects.joined([found.take(~own), replace(seen, scene=np.full(1, int(view.scene[row])))])
