@@ -173,7 +173,8 @@ def replay(
 
     Drives give a video and the trace; cells of shifts and digital attacks give a picture of one moment, clean and under
     the cell's condition. ATTACK is a folder of `ssad export texture` or `ssad export light`; a light shines at its own
-    hour. The film shows what the ego's camera sees, clean and attacked.
+    hour. The film shows what the ego's camera sees, clean and attacked. Cells of kind gap are also filmed as their
+    driver saw them, beside the same drive without the perturbation.
     Exit code 1: the new run differs from the record.
     """
     from ssad.bench.replay import replay as run_again
@@ -181,6 +182,7 @@ def replay(
     from ssad.core.safeio import make_folder
     from ssad.core.traces import save_trace
     from ssad.report import write_video
+    from ssad.report.video import save_frames
 
     film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
     found = run_again(folder, cell)
@@ -198,6 +200,9 @@ def replay(
     film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
     print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
+    if found.film is not None:
+        frames, dt = found.film
+        print(f"camera: {save_frames(frames, target.with_suffix(f'.camera.{video.value}'), dt=dt)}")
     if film_of is not None:
         print(f"film: {film_of(found.trace, found.graph, target.with_suffix(f'.worn.{video.value}'))}")
     raise typer.Exit(1 if found.difference else 0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -138,6 +138,7 @@ class Replay:
         graph: The town of the drive.
         compared: What was compared, in words.
         picture: Makes a picture of what the system was shown and found, clean and under the cell's condition.
+        film: Frames [H, W, 3] of what the driver saw, with the s from one to the next; None: there are none.
     """
 
     cell: Cell
@@ -146,6 +147,7 @@ class Replay:
     graph: LaneGraph | None = None
     compared: str = ""
     picture: Callable[[], U8] | None = None
+    film: tuple[Iterator[U8], float] | None = None
 
 
 class CellError(SSADError):

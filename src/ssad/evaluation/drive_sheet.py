@@ -1,8 +1,9 @@
-"""Three moments of a drive: the picture that the driver got, and from above what is there, found and believed."""
+"""Drives as their drivers saw them: the picture that they got, and from above what is there, found and believed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -36,19 +37,60 @@ def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[floa
         if len(struck)
         else [end * k / 4 for k in (1, 2, 3)]
     )
-    rows = []
-    for time in wanted:
-        when, picture = min(shots, key=lambda shot: abs(shot[0] - time))
-        step = min(round(when / trace.dt), len(trace.x) - 1)
-        height = TALL
-        wide = picture.shape[1] * height // picture.shape[0]
-        shown = cv2.resize(np.ascontiguousarray(picture), (wide, height), interpolation=cv2.INTER_AREA)
-        text = f"{when:.1f} s, {trace.speed[step, 0]:.1f} m/s"
-        left = captioned(np.asarray(_marked(shown, trace, step, when, seen), np.uint8), text, wide)
-        right = captioned(_above(trace, step, when, seen, graph), LEGEND, WIDTH)
-        tall = max(len(left), len(right))
-        rows.append(np.hstack([_padded(left, tall), _padded(right, tall)]))
-    return np.vstack(rows)
+    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in wanted])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A drive and what was seen in it.
+
+    Attributes:
+        title: What the film calls it.
+        trace: The drive.
+        perceived: What was perceived in it.
+        shots: Pictures that the driver got, with their times, s.
+    """
+
+    title: str
+    trace: EpisodeTrace
+    perceived: Perceived
+    shots: Sequence[tuple[float, U8]]
+
+    @property
+    def end(self) -> float:
+        """When it ended, s."""
+        return (len(self.trace.x) - 1) * self.trace.dt
+
+
+def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) -> Iterator[U8]:
+    """Drives side by side, moment by moment; one that has ended stays at its last moment.
+
+    Args:
+        drives: The drives; none without pictures.
+        graph: Their town.
+        every: s from one frame to the next.
+
+    Yields:
+        RGB frames [H, W, 3] of one size.
+    """
+    last = max(drive.end for drive in drives)
+    for k in range(int(last / every + 1.5)):
+        yield np.hstack([_row(drive, min(k * every, drive.end), graph, exact=True) for drive in drives])
+
+
+def _row(drive: Seen, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
+    """A moment of a drive; unless `exact`, all of it is shown at the time of the picture nearest to it."""
+    trace, seen = drive.trace, drive.perceived
+    when, picture = min(drive.shots, key=lambda shot: abs(shot[0] - time))
+    when = time if exact else when
+    step = min(round(when / trace.dt), len(trace.x) - 1)
+    wide = picture.shape[1] * TALL // picture.shape[0]
+    shown = cv2.resize(np.ascontiguousarray(picture), (wide, TALL), interpolation=cv2.INTER_AREA)
+    text = f"{drive.title}{', ' if drive.title else ''}{when:.1f} s, {trace.speed[step, 0]:.1f} m/s"
+    left = captioned(np.asarray(_marked(shown, trace, step, when, seen), np.uint8), text, wide)
+    right = captioned(_above(trace, step, when, seen, graph), LEGEND, WIDTH)
+    tall = max(len(left), len(right))
+    return np.hstack([_padded(left, tall), _padded(right, tall)])
 
 
 def _padded(picture: U8, height: int) -> U8:

@@ -50,7 +50,7 @@ from ssad.evaluation.drive_perception import (
     impact_speed,
     phantom_stop,
 )
-from ssad.evaluation.drive_sheet import drive_sheet
+from ssad.evaluation.drive_sheet import Seen, drive_film, drive_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import episode_metrics
 from ssad.recording.loop_perturbations import (
@@ -64,6 +64,7 @@ from ssad.recording.loop_perturbations import (
     worn,
 )
 
+EVERY = 0.2  # s from one frame of a film to the next
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 
 
@@ -294,11 +295,20 @@ class Gap(Kind):
         return results
 
     def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
-        """Drives the episode again and compares every bit of its trace."""
+        """Drives the episode again and compares every bit of its trace; films it beside the clean drive."""
         quiet_warp()
         recorded = load_trace(folder / record["artefacts"]["trace"])
-        _, (trace,), _ = drive([cell], device=plan.device, seed=plan.suite.seed)
-        return Replay(cell, first_difference(recorded, trace), trace, town(trace.town))
+        spec, graph = cell.spec, town(recorded.town)
+        clean = replace(cell, spec={k: v for k, v in spec.items() if k != "wearer"} | {"perturbation": NONE})
+        drives, again = [], []
+        for one in [cell] if spec["perturbation"] == NONE else [clean, cell]:
+            _, (trace,), seen = drive([one], device=plan.device, seed=plan.suite.seed)
+            again.append(trace)
+            if seen is not None and seen.shots[0]:
+                title = f"{spec['perturbation']} {spec['severity']}" if one is cell and spec["severity"] else "clean"
+                drives.append(Seen(title, trace, seen.perceived(0), seen.shots[0]))
+        film = (drive_film(drives, graph, every=EVERY), EVERY) if drives else None
+        return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film)
 
 
 def drive(
