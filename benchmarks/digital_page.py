@@ -57,7 +57,7 @@ def page() -> str:
         "`benchmarks/digital_page.py` makes this page from `benchmarks/results/digital`, which has the tables that one",
         "command wrote:",
         "```",
-        "ssad run digital --device cuda",
+        f"{about['command']} --device {versions['device']}",
         "```",
         f"Data: {data['scenes']} drives of {data['seconds']:g} s each in {towns}, which were not used for training;",
         f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
