@@ -185,7 +185,7 @@ def main() -> None:
     rows = []
     heads = ("town", "hours", "contacts", "per 100 h", "95 % up", "off road", "stuck", "s")
     print("{:22} {:>7} {:>8} {:>9} {:>8} {:>8} {:>6} {:>6}".format(*heads))
-    for name in given.towns.split(","):
+    for name in filter(None, given.towns.split(",")):
         began = time.process_time()
         row = drive_town(
             name, hours=given.hours, vehicles=given.vehicles, minutes=given.minutes, scenes=given.scenes,
