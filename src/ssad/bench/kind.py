@@ -213,6 +213,18 @@ class Kind(ABC):
         """
         return {}
 
+    def workers(self, plan: Plan, asked: int | None) -> int | None:
+        """How many may work at once.
+
+        Args:
+            plan: The cells of the run.
+            asked: What the user wants; None: what the machine allows.
+
+        Returns:
+            The same, or less.
+        """
+        return asked
+
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Cells in groups that `execute` is given at once; they share a system."""
         return [[cell] for cell in cells]

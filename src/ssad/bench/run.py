@@ -103,15 +103,16 @@ class _Schedule:
         ready = [cell for cell in missing if not self.left[cell.key]]
         count = len(self.data) + len(missing)
         place = self.resources
+        workers = self.kind.workers(self.plan, place.workers)
         begins = type(self.kind).start is not Kind.start
         start = (_start, (self.kind, self.job)) if begins else None
         total = len(self.plan.cells) + len(self.data)
         done = len(self.plan.cells) - len(missing)
         with (
-            open_pool(count, workers=place.workers, ray=place.ray, device=self.plan.device, start=start) as self.pool,
+            open_pool(count, workers=workers, ray=place.ray, device=self.plan.device, start=start) as self.pool,
             Live(self.plan.suite.name, total, done, console=place.console) as self.live,
         ):
-            for batch in self.kind.batches(self.plan, ready, min(count, place.workers or default_workers())):
+            for batch in self.kind.batches(self.plan, ready, min(count, workers or default_workers())):
                 self._add(batch)
             for name in self.data:
                 self._add_piece(name, list(self.sharing[name]))

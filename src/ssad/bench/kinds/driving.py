@@ -18,7 +18,7 @@ from pydantic import Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, grouped
 from ssad.bench.source import source_version
 from ssad.core import safeio
-from ssad.core.driving import Driver, Sensor
+from ssad.core.driving import Driver, Sensor, Simulator
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import LaneGraph, SignKind, load_graph, save_graph, town_file
@@ -32,6 +32,7 @@ from ssad.metrics import METRICS, episode_metrics
 if TYPE_CHECKING:
     from ssad.drivers.careful.grade import Grade
 
+EMBEDDED = "embedded"  # the name of SSAD's own world as a simulator
 HIGHWAY = "highway-env"  # as a set of scenarios
 HIGHWAY_TYPE = "ssad.interchange.highway_env:SCENARIO"
 
@@ -43,6 +44,7 @@ class DrivingSuite(SuiteBase):
         systems: names, or module:object.
         scenarios: what `load_scenarios` understands (sets, types, names, YAML files), or highway-env: that simulator's
             intersection and highway.
+        simulator: embedded, SSAD's own world; or carla://HOST:PORT, a CARLA server (docs/carla.md).
         repetitions: episodes of each pair; the first is the nominal case.
         spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
             not at all, then scenarios without traffic of their own give copies, which count once.
@@ -55,6 +57,7 @@ class DrivingSuite(SuiteBase):
     kind: Literal["driving"] = "driving"
     systems: Names
     scenarios: Names
+    simulator: str = EMBEDDED
     repetitions: int = Field(default=1, ge=1, le=100_000)
     spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
     timeout_s: float = Field(default=120.0, gt=0, allow_inf_nan=False)
@@ -86,6 +89,14 @@ class Driving(Kind):
         if len(systems) != len(suite.systems):
             raise ConfigError(f"suite {suite.name}: systems: a name appears twice")
         scenarios = suite_scenarios(suite)
+        if suite.simulator != EMBEDDED:
+            from ssad.interchange.carla import Server, probe
+
+            server = Server.of(suite.simulator)
+            if any(s.type == HIGHWAY_TYPE for s in scenarios):
+                raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {server}")
+            if check:
+                probe(server)
         towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
         cells = tuple(self._cells(suite, scenarios, systems=systems, towns=towns))
         if check:
@@ -115,6 +126,8 @@ class Driving(Kind):
                     name = f"{system}/{scenario.name}{f'#{repetition}' if repetition else ''}"
                     spec = {"scenario": data, "system": system, "repetition": repetition}
                     spec["spread"] = suite.spread if repetition else 0.0
+                    if suite.simulator != EMBEDDED:
+                        spec["simulator"] = suite.simulator
                     fields = {"system": system, "group": group, "cluster": scenario.name}
                     found.append(self.make_cell(name, system, seed, fields, spec, *versions))
         return found
@@ -122,11 +135,18 @@ class Driving(Kind):
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
         keep_towns(plan.inputs["towns"], folder)
+        if resources.ray and plan.suite.simulator != EMBEDDED:
+            raise ConfigError(f"suite {plan.suite.name}: one worker drives {plan.suite.simulator}; leave out --ray")
         return {"witness": plan.suite.witness}
+
+    def workers(self, plan: Plan, asked: int | None) -> int | None:
+        """A CARLA server runs one world: one worker drives it."""
+        return asked if asked == 0 or plan.suite.simulator == EMBEDDED else 1
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
         """Cells that share a system and a simulator; with few cells a smaller batch keeps all workers busy."""
-        return grouped(cells, plan.suite.chunk, workers=workers, by=lambda c: (c.system, in_highway(c)))
+        chunk = plan.suite.chunk if plan.suite.simulator == EMBEDDED else 1
+        return grouped(cells, chunk, workers=workers, by=lambda c: (c.system, in_highway(c)))
 
     def start(self, job: Job) -> None:
         """Loads the world's kernels, which are compiled on first use."""
@@ -145,7 +165,7 @@ class Driving(Kind):
             signs = bool((town(trace.town).sign_kind == SignKind.STOP).any())
             metrics = plain(episode_metrics(trace, stop_signs=signs).as_dict())
             found: Grade | None = None
-            if job.settings["witness"] and trace.end == "collision" and not in_highway(cell):
+            if job.settings["witness"] and trace.end == "collision" and embedded(cell):
                 found = grade_of(episode, trace, job.device)
                 metrics |= found.metrics()
             about = {"scenario": episode.scenario.name, "repetition": cell.spec["repetition"], "town": trace.town}
@@ -249,6 +269,11 @@ def in_highway(cell: Cell) -> bool:
     return bool(cell.spec["scenario"]["type"] == HIGHWAY_TYPE)
 
 
+def embedded(cell: Cell) -> bool:
+    """Whether SSAD's own world runs a cell."""
+    return not in_highway(cell) and "simulator" not in cell.spec
+
+
 def town_version(graph: LaneGraph) -> str:
     """12 hex digits over every array of a lane graph."""
     total = hashlib.sha256()
@@ -321,14 +346,24 @@ def drive(cells: Sequence[Cell], *, device: str) -> tuple[list[Episode], list[Ep
 
     episodes = [episode_of(cell) for cell in cells]
     graphs = {episode.town: town(episode.town) for episode in episodes}
-    simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
+    away = cells[0].spec.get("simulator")
+    simulator: Simulator
+    if away:
+        from ssad.interchange.carla import Carla, Server
+
+        simulator = Carla(episodes, graphs, server=Server.of(away))
+    else:
+        simulator = HighwayEnv(episodes, graphs) if in_highway(cells[0]) else World(episodes, graphs, device=device)
     system = system_of(cells[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
     for driver in (system, *policies.values()):
         if callable(getattr(driver, "to", None)):
             driver.to(device)  # type: ignore[attr-defined]
     sensors = onboard_sensors([system, *policies.values()], device)
-    return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
+    try:
+        return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
+    finally:
+        getattr(simulator, "close", lambda: None)()
 
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
