@@ -32,7 +32,7 @@ from ssad.world.world import World
 ROOT = Path(__file__).parent.parent.parent
 STAND_IN = Path(__file__).parent.parent / "helpers" / "carla_stand_in"
 SERVER = Server("here", 2000, timeout=5.0)
-FEW = ("StraightObstacle/00", "VehiclePassing/01")
+FEW = ("StraightObstacle/00",)
 
 
 @pytest.fixture

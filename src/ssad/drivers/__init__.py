@@ -29,6 +29,9 @@ SYSTEMS: dict[str, str] = {
 LEARNED = ("ppo", "sac", "td3")
 """Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""
 
+LEADERBOARD = "leaderboard"
+"""leaderboard:FILE.py is an agent of the CARLA leaderboard."""
+
 
 def find_system(name: str) -> Any:
     """The class or object behind a system's name, entry point or "module:object".
@@ -40,15 +43,19 @@ def find_system(name: str) -> Any:
     kind, _, weights = name.partition(":")
     if kind in LEARNED and weights:
         return resolve("system", SYSTEMS, kind)(weights)
+    if kind == LEADERBOARD and weights:
+        from ssad.drivers.leaderboard import Leaderboard
+
+        return Leaderboard(weights)
     return resolve("system", SYSTEMS, name)
 
 
 def weights_version(name: str) -> str:
-    """The hash of a learned system's weights; "" for a system without any, or of somebody else's.
+    """The hash of a learned system's weights, or of a leaderboard agent's file; "" for a system without any.
 
     Raises FormatError for weights that cannot be used.
     """
-    return str(make_system(name).version) if name.partition(":")[0] in LEARNED else ""  # type: ignore[attr-defined]
+    return str(make_system(name).version) if name.partition(":")[0] in (*LEARNED, LEADERBOARD) else ""  # type: ignore[attr-defined]
 
 
 def make_system(name: str) -> Driver:

@@ -17,6 +17,8 @@ class Format(StrEnum):
     """What scenarios can be exported to."""
 
     openscenario = "openscenario"
+    leaderboard = "leaderboard"
+    leaderboard1 = "leaderboard1"
 
 
 class ExportGroup(TyperGroup):
@@ -33,6 +35,7 @@ def register(exports: typer.Typer, imports: typer.Typer) -> None:
     """Add the commands of this module to `ssad export` and `ssad import`."""
     exports.command("scenarios")(export_scenarios)
     imports.command("openscenario")(import_openscenario)
+    imports.command("leaderboard")(import_leaderboard)
 
 
 def export_scenarios(
@@ -48,11 +51,16 @@ def export_scenarios(
     The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
     """
     from ssad.interchange.export import export_openscenario
+    from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios
 
     chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
-    written, lost = {Format.openscenario: export_openscenario}[to](chosen, out, seed=seed)
-    print(f"{len(chosen)} scenarios written to {out}: {len(written)} files")
+    writers = {
+        Format.openscenario: export_openscenario, Format.leaderboard: export_leaderboard,
+        Format.leaderboard1: export_leaderboard1,
+    }  # fmt: skip
+    written, lost = writers[to](chosen, out, seed=seed)
+    print(f"{len(chosen)} scenarios: {len(written)} files written to {out}")
     told("not carried over", lost)
 
 
@@ -73,6 +81,24 @@ def import_openscenario(
     scenario = found.scenario
     print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
     told("not carried over", found.lost)
+
+
+def import_leaderboard(
+    file: Annotated[Path, typer.Argument(metavar="ROUTES.xml", help="Routes of leaderboard 2.0 or Bench2Drive.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+) -> None:
+    """Turn routes of leaderboard 2.0 or Bench2Drive into scenarios; `ssad import routes` reads leaderboard 1.0.
+
+    Their towns must be imported before they are driven.
+    """
+    from ssad.interchange.leaderboard import read_leaderboard
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    found, lost = read_leaderboard(file)
+    save_scenarios(out, found)
+    print(f"{len(found)} scenarios on {', '.join(sorted({s.town for s in found}))}; written to {out}")
+    told("not carried over", lost)
 
 
 def check_yaml(out: Path) -> None:
