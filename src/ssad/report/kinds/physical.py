@@ -151,7 +151,7 @@ def main_table(run: PhysicalRun, number: int) -> Table:
 
 def _place(suite: Mapping[str, Any]) -> str:
     """From where the pictures of a test are taken."""
-    kind = str(suite["target"]).partition(":")[0]
+    kind = str(suite.get("target", "")).partition(":")[0]
     distances = ", ".join(f"{one:g}" for one in suite.get("distances", ()))
     if kind == "stop_sign":
         return f"{distances} m before it, as cars see it"
