@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Belief, Scenes, WorldState
+from ssad.core.driving import Scenes
 from ssad.core.errors import ConfigError, install_extra
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import parse_xml
@@ -32,7 +32,6 @@ from ssad.core.types import (
     F32,
     I32,
     AgentKind,
-    Bool,
     Contact,
     Controller,
     End,
@@ -41,6 +40,7 @@ from ssad.core.types import (
     SignalState,
 )
 from ssad.interchange.bodies import BLUEPRINTS
+from ssad.interchange.mirrored import Mirrored
 from ssad.roads import town_signals, town_xodr
 from ssad.world.kernels.data import Presence
 from ssad.world.models import MODELS, WALKER_RATE
@@ -158,7 +158,7 @@ def main(host: str, port: str) -> None:
         raise SystemExit(2) from None
 
 
-class Carla:
+class Carla(Mirrored):
     """A `Simulator` of `ssad.core.driving` in which a CARLA server moves everybody; see the module.
 
     `mirror` is the `World` that mirrors it. `close` gives the server back as it was found.
@@ -503,30 +503,6 @@ class Carla:
             self._clear()
             self._ask("change its settings", lambda: self.world.apply_settings(self._found))
             _KEPT[self.server] = _Kept(self.client, self.world, self.town, self._lights)
-
-    # ------------------------------------------------------------ what the mirror knows
-
-    def state(self) -> WorldState:
-        """Where everybody is."""
-        return self.mirror.state()
-
-    def ended(self) -> I32:
-        """[B] why scenes ended, an index into ENDS."""
-        return self.mirror.ended()
-
-    def take(
-        self, agents: Bool, controller: Controller | None, *, policy: int = -1, target_speed: float | None = None
-    ) -> None:
-        """Let somebody else drive agents, as `World.take`."""
-        self.mirror.take(agents, controller, policy=policy, target_speed=target_speed)
-
-    def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
-        """Hand in what egos believe, as `World.believe`."""
-        self.mirror.believe(belief, scenes)
-
-    def truth(self) -> Belief:
-        """The truth as a belief, as `World.truth`."""
-        return self.mirror.truth()
 
 
 def _same_roads(ours: str, theirs: str, where: str) -> bool:

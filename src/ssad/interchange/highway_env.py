@@ -17,14 +17,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.driving import Belief, Scenes, WorldState
+from ssad.core.driving import Scenes
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph, Marking, no_signals
 from ssad.core.types import (
     F32,
     I32,
     AgentKind,
-    Bool,
     Controller,
     Episode,
     EpisodeAgent,
@@ -35,6 +34,7 @@ from ssad.core.types import (
     Route,
     Scenario,
 )
+from ssad.interchange.mirrored import Mirrored
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.world.kernels.data import Presence
 from ssad.world.world import World
@@ -230,7 +230,7 @@ def _traffic(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.
 SCENARIO = ScenarioType("HighwayEnv", "highway-env", "none: the traffic of highway-env", _traffic)
 
 
-class HighwayEnv:
+class HighwayEnv(Mirrored):
     """A `Simulator` of `ssad.core.driving` in which highway-env moves everybody; a scene is one of its environments.
 
     `mirror` is the `World` that mirrors it. Agents that a driver takes over are driven by their controls or planned in
@@ -332,25 +332,3 @@ class HighwayEnv:
         push = throttle * MAX_ACCELERATION * (-1.0 if reverse > 0.5 else 1.0)
         drag = brake * MAX_ACCELERATION * float(np.sign(vehicle.speed))
         return {"acceleration": push - drag, "steering": -steer * MAX_STEER}
-
-    def state(self) -> WorldState:
-        """Where everybody is."""
-        return self.mirror.state()
-
-    def ended(self) -> I32:
-        """[B] why scenes ended, an index into ENDS."""
-        return self.mirror.ended()
-
-    def take(
-        self, agents: Bool, controller: Controller | None, *, policy: int = -1, target_speed: float | None = None
-    ) -> None:
-        """Let somebody else drive agents, as `World.take`."""
-        self.mirror.take(agents, controller, policy=policy, target_speed=target_speed)
-
-    def believe(self, belief: Belief | None, scenes: Bool | None = None) -> None:
-        """Hand in what egos believe, as `World.believe`."""
-        self.mirror.believe(belief, scenes)
-
-    def truth(self) -> Belief:
-        """The truth as a belief, as `World.truth`."""
-        return self.mirror.truth()

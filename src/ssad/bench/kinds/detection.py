@@ -222,7 +222,7 @@ class DetectorKind(Kind):
             self.start(job)
             result = safeio.parse_json(safeio.dump_json(dict(self.execute([cell], job)[cell.key])))
             files = hash_artefacts(job.folder, result["artefacts"]["detections"])
-        # with another number of threads the last digits of boxes may differ, those of metrics are rounded
+        # last digits of boxes were seen to differ (the number of threads may be why); those of metrics are rounded
         same = sum(record["hashes"].get(name) == value for name, value in files.items())
         examination = replace(_examination(job), folder=folder)
         system = examination.defended.get(cell.system, (cell.system, None))[0]
