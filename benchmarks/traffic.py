@@ -172,7 +172,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=20.0, help="vehicle-hours in each town")
     parser.add_argument("--vehicles", type=int, default=40, help="in each scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
-    parser.add_argument("--scenes", type=int, default=32, help="side by side")
+    parser.add_argument("--scenes", type=int, default=128, help="side by side")
     parser.add_argument("--signals", choices=("program", "green"), default="program")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")

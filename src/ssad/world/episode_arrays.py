@@ -58,11 +58,11 @@ class PathTable:
 
 def _bend(route: Route) -> F32:
     """[N] greatest lateral distance of the next 64 m of path from the line through each point along its heading."""
-    n = len(route.xy)
-    ahead = np.minimum(np.arange(n)[:, None] + np.arange(1, 65), n - 1)
-    d = route.xy[ahead] - route.xy[:, None]
-    c, s = np.cos(route.yaw)[:, None], np.sin(route.yaw)[:, None]
-    out: F32 = np.abs(d[..., 1] * c - d[..., 0] * s).max(1).astype(np.float32)
+    x, y = np.pad(route.xy, ((0, 64), (0, 0)), mode="edge").T
+    n, c, s = len(route.xy), np.cos(route.yaw), np.sin(route.yaw)
+    out = np.zeros(n, np.float32)
+    for k in range(1, 65):
+        np.maximum(out, np.abs((y[k : n + k] - y[:n]) * c - (x[k : n + k] - x[:n]) * s), out=out)
     return out
 
 
@@ -172,17 +172,17 @@ def _lane_left(
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """How far the centre of a lane is to the left of some points of a route (negative: right), and its width there."""
     span = graph.points(lane)
-    xy = graph.xy[span].astype(np.float64)
-    step = np.diff(xy, axis=0)
-    from_start = route.xy[part, None].astype(np.float64) - xy[:-1]
-    t = np.clip((from_start * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12), 0.0, 1.0)
-    off = from_start - t[..., None] * step
-    rows, best = np.arange(len(part)), np.hypot(off[..., 0], off[..., 1]).argmin(1)
-    t, off = t[rows, best], off[rows, best]
+    x, y = graph.xy[span].astype(np.float64).T
+    step_x, step_y = np.diff(x), np.diff(y)
+    from_x, from_y = (route.xy[part, d, None].astype(np.float64) - v[:-1] for d, v in enumerate((x, y)))
+    t = np.clip((from_x * step_x + from_y * step_y) / np.maximum(step_x**2 + step_y**2, 1e-12), 0.0, 1.0)
+    off_x, off_y = from_x - t * step_x, from_y - t * step_y
+    rows, best = np.arange(len(part)), (off_x**2 + off_y**2).argmin(1)
+    t, off_x, off_y = t[rows, best], off_x[rows, best], off_y[rows, best]
     width = graph.width[span].astype(np.float64)
     yaw = route.yaw[part].astype(np.float64)
-    left = off[:, 0] * np.sin(yaw) - off[:, 1] * np.cos(yaw)
-    return np.copysign(np.hypot(off[:, 0], off[:, 1]), left), width[best] + t * (width[best + 1] - width[best])
+    left = off_x * np.sin(yaw) - off_y * np.cos(yaw)
+    return np.copysign(np.hypot(off_x, off_y), left), width[best] + t * (width[best + 1] - width[best])
 
 
 def _beside(route: Route, graph: LaneGraph) -> F32:
@@ -215,14 +215,12 @@ def _beside(route: Route, graph: LaneGraph) -> F32:
             out[part, column + 1] = 1.0 if same else -1.0
     for column in (0, 2):
         away, way = out[:, column].copy(), out[:, column + 1].copy()
-        out[:, column + 1] = 0.0
+        goes_on = (away[1:] != 0.0) & (np.abs(np.diff(away)) < 0.3) & (way[:-1] == way[1:])
         run = ON_AND_ON if way[-1] > 0.0 else 0.0
-        for k in range(n - 1, -1, -1):
-            goes_on = k == n - 1 or (away[k + 1] != 0.0 and abs(away[k + 1] - away[k]) < 0.3 and way[k] == way[k + 1])
-            run = (run + route.spacing if k < n - 1 else run) if goes_on else 0.0
-            if away[k] == 0.0:
-                run = 0.0
-            out[k, column + 1] = way[k] * run
+        runs = [run if away[-1] != 0.0 else 0.0]
+        for there, on in zip((away[-2::-1] != 0.0).tolist(), goes_on[::-1].tolist(), strict=True):
+            runs.append(runs[-1] + route.spacing if there and on else 0.0)
+        out[:, column + 1] = way * runs[::-1]
         # who has not come back in time is led back to the route
         for k in np.flatnonzero((away[:-1] != 0.0) & (away[1:] == 0.0)).tolist():
             fade = np.arange(1, min(FADE, n - 1 - k) + 1)
