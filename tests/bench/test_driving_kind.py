@@ -20,11 +20,7 @@ from ssad.bench.kinds.driving import (
     Driving,
     DrivingSuite,
     make_pictures,
-    plain,
     suite_scenarios,
-    system_version,
-    town_version,
-    type_version,
 )
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.lane_graph import town_file
@@ -185,63 +181,6 @@ def test_cells_of_a_system_run_together(
     assert plan.kind.batches(plan, [], workers) == []
 
 
-class Thing:
-    """No system: it cannot act."""
-
-    def reset(self, episodes: Any) -> None:
-        """Nothing."""
-
-
-class Mute:
-    """No system: it cannot be reset."""
-
-    reset = 3
-
-    def act(self, view: Any) -> None:
-        """Nothing."""
-
-
-class Whole(Thing, Mute):
-    """A system; there are others of its class."""
-
-
-WHOLE = Whole()
-
-
-def test_a_system_must_have_its_methods(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driving, "source_version", lambda module: f"version of {module}")
-    for name in ("Thing", "Mute"):
-        with pytest.raises(
-            ConfigError, match=rf"system '{__name__}:{name}' needs the methods reset\(episodes\) and act"
-        ):
-            system_version(f"{__name__}:{name}")
-    for name in ("Whole", "WHOLE"):
-        assert system_version(f"{__name__}:{name}") == f"version of {__name__}"
-    with pytest.raises(UnknownNameError):
-        system_version("nobody")
-
-
-def test_a_scenario_type_of_ones_own_has_a_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driving, "source_version", lambda module: f"version of {module}")
-    assert type_version("own.module:Type") == "version of own.module"
-    assert type_version("StraightObstacle") == ""
-
-
-def test_the_version_of_a_town_depends_on_every_array() -> None:
-    def version(**changes: Any) -> str:
-        arrays = {"xy": np.zeros((2, 3)), "ids": np.arange(3)}
-        return town_version(SimpleNamespace(name="any", **(arrays | changes)))  # type: ignore[arg-type]
-
-    first = version()
-    assert len(first) == 12
-    assert version(index=[3]) == first, "what is no array does not count"
-    others = [
-        version(xy=np.ones((2, 3))), version(xy=np.zeros((3, 2))), version(xy=np.zeros((2, 3), np.int64)),
-        version(more=np.zeros(1)),
-    ]  # fmt: skip
-    assert len({first, *others}) == 5
-
-
 def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
     sets = {
         "one": (scenario("a"), scenario("b")),
@@ -262,21 +201,6 @@ def test_scenarios_of_a_suite_are_taken_once(monkeypatch: pytest.MonkeyPatch) ->
         suite_scenarios(suite(scenarios=["one", "bad"]))
     with pytest.raises(UnknownNameError, match="suite s: unknown scenario 'three'"):
         suite_scenarios(suite(scenarios=["one", "three"]))
-
-
-def test_plain_data() -> None:
-    given = {
-        "a": (1, [np.float32(0.5), math.nan]),
-        3: {"b": -math.inf},
-        "c": "text",
-        "d": np.int64(4),
-        "e": None,
-        "f": True,
-    }
-    assert plain(given) == {
-        "a": [1, [0.5, None]], "3": {"b": None}, "c": "text", "d": 4, "e": None, "f": True,
-    }  # fmt: skip
-    assert type(plain(np.int64(4))) is int
 
 
 def trace_of(end: str) -> Any:

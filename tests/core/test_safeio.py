@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import math
 import os
 import pickle
 import tempfile
@@ -353,3 +354,18 @@ def test_more_yaml_scalars(text: str, value: object) -> None:
     found = safeio.parse_yaml(text)
     assert found == value
     assert type(found) is type(value)
+
+
+def test_plain_data() -> None:
+    given = {
+        "a": (1, [np.float32(0.5), math.nan]),
+        3: {"b": -math.inf},
+        "c": "text",
+        "d": np.int64(4),
+        "e": None,
+        "f": True,
+    }
+    assert safeio.plain(given) == {
+        "a": [1, [0.5, None]], "3": {"b": None}, "c": "text", "d": 4, "e": None, "f": True,
+    }  # fmt: skip
+    assert type(safeio.plain(np.int64(4))) is int

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.kinds.driving import system_version
 from ssad.core.checkpoints import Card, load_card, save_weights
 from ssad.core.errors import FormatError
 from ssad.core.traces import trace_hash
 from ssad.drivers import LEARNED, SYSTEMS, make_system
 from ssad.drivers.rl.learned import SHIPPED
 from ssad.metrics import episode_metrics
+from ssad.recording.closed_loop import system_version
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_driver

@@ -269,7 +269,7 @@ def test_a_trace_has_no_further_agents_or_steps(driven) -> None:
 
 
 def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ssad.bench.kinds import driving
+    from ssad.recording import closed_loop as driving
 
     watcher = Watcher("CAM_BACK")
     short = replace(episodes()[0], limits=Limits(max_steps=2))

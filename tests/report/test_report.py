@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ssad.bench.kinds.driving import plain
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.safeio import plain
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
 from ssad.metrics import episode_metrics

@@ -17,11 +17,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
-from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import digest
+from ssad.core.source import source_version
 from ssad.core.types import U8, EpisodeTrace
 
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]

@@ -295,6 +295,17 @@ def dump_json(data: Any, *, indent: int | None = None) -> str:
     return json.dumps(data, sort_keys=True, ensure_ascii=False, allow_nan=False, indent=indent, separators=separators)
 
 
+def plain(value: Any) -> Any:
+    """Plain JSON data; a number that is not finite (no such event) becomes None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def parse_xml(text: str | bytes, name: str = "<text>") -> Element:
     """Root element of an XML text; DTDs, entities and external data are refused. FormatError with line."""
     from xml.etree.ElementTree import ParseError

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from ssad import World, build_episode, load_scenarios, load_town, make_system, rollout
-from ssad.bench.kinds.driving import system_version
 from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
@@ -22,6 +21,7 @@ from ssad.core.types import AgentKind, Episode, Limits
 from ssad.drivers.perceiving.driver import Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes
 from ssad.drivers.perceiving.tracker import Tracking
+from ssad.recording.closed_loop import system_version
 from ssad.world.rollout import Loop
 
 CAMERA = Camera.typical(64, 36)

@@ -13,26 +13,17 @@ import numpy as np
 from pydantic import Field
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase, grouped
-from ssad.bench.kinds.driving import (
-    DrivingSuite,
-    grade_of,
-    keep_towns,
-    load_world,
-    plain,
-    scenario_json,
-    suite_scenarios,
-    system_version,
-    town,
-    town_version,
-)
-from ssad.bench.source import source_version
+from ssad.bench.kinds.driving import DrivingSuite, keep_towns, suite_scenarios
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
+from ssad.core.safeio import plain
 from ssad.core.seeding import seed32
+from ssad.core.source import source_version
 from ssad.core.traces import motion_hash, save_trace
 from ssad.core.types import Episode, Scenario
 from ssad.evaluation.search_scores import MOVING, distinct, likeness, reference, summary
+from ssad.recording.closed_loop import grade_of, load_world, scenario_json, system_version, town, town_version
 
 AVOIDERS = {
     "cc": "CC", "reg157": "Reg157", "rss": "RSS", "fsm": "FSM", "limit": "a manoeuvre",

@@ -18,12 +18,12 @@ from rich.console import Console
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.run import hash_artefacts
-from ssad.bench.source import source_version
 from ssad.core import safeio
 from ssad.core.checkpoints import hash_state
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.source import source_version
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData

@@ -15,25 +15,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, grouped
-from ssad.bench.kinds.driving import (
-    episode_of,
-    keep_towns,
-    load_world,
-    plain,
-    scenario_json,
-    suite_scenarios,
-    system_of,
-    system_version,
-    town,
-    town_version,
-    type_version,
-)
+from ssad.bench.kinds.driving import keep_towns, suite_scenarios
 from ssad.core import safeio
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.lane_graph import SignKind
 from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.safeio import plain
 from ssad.core.seeding import digest, seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
 from ssad.core.types import Episode, EpisodeTrace
@@ -53,6 +42,16 @@ from ssad.evaluation.drive_perception import (
 from ssad.evaluation.drive_sheet import Seen, drive_film, drive_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.metrics import episode_metrics
+from ssad.recording.closed_loop import (
+    episode_of,
+    load_world,
+    scenario_json,
+    system_of,
+    system_version,
+    town,
+    town_version,
+    type_version,
+)
 from ssad.recording.loop_perturbations import (
     NONE,
     TEXTURE,

@@ -10,24 +10,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
-from ssad.bench.kinds.driving import (
-    DrivingSuite,
-    plain,
-    scenario_json,
-    suite_scenarios,
-    system_of,
-    system_version,
-    town,
-    town_version,
-    type_version,
-)
+from ssad.bench.kinds.driving import DrivingSuite, suite_scenarios
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import save_graph, town_file
+from ssad.core.safeio import plain
 from ssad.core.seeding import generator, seed32
 from ssad.core.traces import first_difference, load_trace, save_trace
 from ssad.core.types import EpisodeTrace
 from ssad.jobs.machine import quiet_warp
+from ssad.recording.closed_loop import scenario_json, system_of, system_version, town, town_version, type_version
 
 Method = Literal["monte-carlo", "splitting", "importance"]
 

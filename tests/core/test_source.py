@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ssad.bench.source import source_files, source_version
+from ssad.core.source import source_files, source_version
 
 Write = Callable[[Mapping[str, str]], None]
 

@@ -1,0 +1,204 @@
+"""Scenarios driven in the closed loop: towns, systems, episodes, and one loop over the simulators that there are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ssad.core import safeio
+from ssad.core.driving import Driver, Sensor, Simulator
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.nuscenes_names import CAMERAS, LIDAR
+from ssad.core.source import source_version
+from ssad.core.types import Episode, EpisodeTrace, Scenario
+from ssad.jobs.machine import quiet_warp
+
+if TYPE_CHECKING:
+    from ssad.drivers.careful.grade import Grade
+
+HIGHWAY = "highway-env"  # as a set of scenarios
+HIGHWAY_TYPE = "ssad.interchange.highway_env:SCENARIO"
+
+
+class Order(Protocol):
+    """An episode that is to be driven, as plain data."""
+
+    @property
+    def key(self) -> str:
+        """Of the episode and its trace."""
+
+    @property
+    def system(self) -> str:
+        """Who drives."""
+
+    @property
+    def seed(self) -> int:
+        """Of the episode."""
+
+    @property
+    def spec(self) -> Mapping[str, Any]:
+        """Scenario (see `scenario_json`), repetition (0: the nominal case), spread; simulator, if it is not ours."""
+
+
+def load_world(device: str) -> None:
+    """Loads the world's kernels, which are compiled on first use."""
+    import warp
+
+    import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+    quiet_warp()
+    warp.force_load(device=device)
+
+
+@lru_cache(maxsize=8)
+def town(name: str) -> LaneGraph:
+    """A town, read once a process."""
+    from ssad.interchange.highway_env import PLACES, highway_town
+    from ssad.roads import load_town
+
+    return highway_town(name) if name in PLACES else load_town(name)
+
+
+@lru_cache(maxsize=4)
+def system_of(name: str) -> Driver:
+    """A driving system, made once a process."""
+    from ssad.drivers import make_system
+
+    return make_system(name)
+
+
+def system_version(name: str) -> str:
+    """12 hex digits over the source of a system and all that it imports, and those of its weights if it was trained.
+
+    Raises:
+        UnknownNameError, ConfigError: there is no such system.
+        FormatError: its weights cannot be used.
+    """
+    from ssad.drivers import find_system, weights_version
+
+    found = find_system(name)
+    if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
+        raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
+    source = source_version((found if isinstance(found, type) else type(found)).__module__)
+    detector = getattr(found, "weights", "")
+    if detector:  # of a perceiving system, with the weights that are shipped
+        from ssad.detectors import SHIPPED
+
+        return f"{source} {safeio.read_json(SHIPPED / f'{detector}.json')['hash'][:12]}"
+    return f"{source} {weights_version(name)[:12]}".strip()
+
+
+def policies_of(scenario: Scenario) -> list[str]:
+    """The drivers that a scenario names for its actors, each once."""
+    return sorted({actor.policy for actor in scenario.actors} - {""})
+
+
+def type_version(name: str) -> str:
+    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one.
+
+    For the type that highway-env runs, with its version.
+    """
+    found = source_version(name.partition(":")[0]) if ":" in name else ""
+    return f"{found} {version('highway-env')}" if name == HIGHWAY_TYPE else found
+
+
+def in_highway(order: Order) -> bool:
+    """Whether highway-env runs an episode, and not the embedded world."""
+    return bool(order.spec["scenario"]["type"] == HIGHWAY_TYPE)
+
+
+def embedded(order: Order) -> bool:
+    """Whether SSAD's own world runs an episode."""
+    return not in_highway(order) and "simulator" not in order.spec
+
+
+def town_version(graph: LaneGraph) -> str:
+    """12 hex digits over every array of a lane graph."""
+    total = hashlib.sha256()
+    for name, value in sorted(vars(graph).items()):
+        if hasattr(value, "tobytes"):
+            total.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
+    return total.hexdigest()[:12]
+
+
+def scenario_json(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as plain data, as it stands in YAML, with its defaults written out."""
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return data
+
+
+def episode_of(order: Order) -> Episode:
+    """The concrete episode of an order.
+
+    Raises:
+        RouteError: It cannot be built.
+        MapError: It cannot be built.
+        ConfigError: It cannot be built.
+    """
+    from ssad.interchange.highway_env import highway_episode
+    from ssad.scenarios.dynamic import build_episode, scenario_from
+
+    scenario = scenario_from(order.spec["scenario"])
+    if in_highway(order):
+        seed = order.seed if order.spec["repetition"] else scenario.seed
+        return replace(highway_episode(scenario, seed), key=order.key)
+    return replace(
+        build_episode(scenario, town(scenario.town), seed=order.seed, spread=order.spec["spread"]), key=order.key
+    )
+
+
+def drive(orders: Sequence[Order], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
+    """Episodes and traces of orders that share a system and a simulator, run as one batch."""
+    from ssad.drivers import make_system
+    from ssad.interchange.highway_env import HighwayEnv
+    from ssad.world.rollout import rollout
+    from ssad.world.world import World
+
+    episodes = [episode_of(order) for order in orders]
+    graphs = {episode.town: town(episode.town) for episode in episodes}
+    away = orders[0].spec.get("simulator")
+    simulator: Simulator
+    if away:
+        from ssad.interchange.carla import Carla, Server
+
+        simulator = Carla(episodes, graphs, server=Server.of(away))
+    else:
+        simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
+    system = system_of(orders[0].system)
+    policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
+    for driver in (system, *policies.values()):
+        if callable(getattr(driver, "to", None)):
+            driver.to(device)  # type: ignore[attr-defined]
+    sensors = onboard_sensors([system, *policies.values()], device)
+    try:
+        return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
+    finally:
+        getattr(simulator, "close", lambda: None)()
+
+
+def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
+    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own cameras."""
+    asked = {name for driver in drivers for name in getattr(driver, "sensors", ())}
+    own = {name: camera for driver in drivers for name, camera in getattr(driver, "cameras", {}).items()}
+    if not asked & {*CAMERAS, LIDAR, *own}:
+        return {}
+    from ssad.recording.loop_sensors import Onboard
+
+    onboard = Onboard(device=device)
+    cameras = {name: onboard.camera(camera) for name, camera in own.items()}
+    return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras}
+
+
+def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
+    """Who could have avoided the collision of a drive."""
+    from ssad.drivers import make_system
+    from ssad.drivers.careful.grade import grade_collision
+
+    made = [make_system(name) for name in policies_of(episode.scenario)]
+    sensors = onboard_sensors(made, device)
+    return grade_collision(episode, town(episode.town), trace, device=device, policies=make_system, sensors=sensors)
