@@ -39,7 +39,7 @@ def main() -> None:
     idle = median(process("-c", "pass"))
     print(f"python alone   {idle:.3f} s")
     print(f"import ssad    {median(process('-c', 'import ssad')):.3f} s")
-    print(f"ssad --help    {median(process('-m', 'ssad.cli', '--help')):.3f} s")
+    print(f"ssad --help    {median(process('-m', 'ssad', '--help')):.3f} s")
     for name in town_names():
         graph = load_town(name)
         query = LaneQuery(graph)

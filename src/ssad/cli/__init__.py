@@ -1,0 +1,110 @@
+"""The command line: one short function per command. Heavy imports are inside them, so that --help is quick."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from ssad.cli import data, exchange, running
+from ssad.core.errors import SSADError, unknown_name
+from ssad.core.version import __version__
+from ssad.interchange.commands import ExportGroup, register
+from ssad.listing import ALIASES, LISTS
+from ssad.training.commands import train_app
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+imports = typer.Typer(
+    help="Import maps, routes and scenarios of other programs, and logged drives.", no_args_is_help=True
+)
+app.add_typer(imports, name="import")
+exports = typer.Typer(
+    help="Export scenarios, or what a run has made, for other programs.", no_args_is_help=True, cls=ExportGroup
+)
+app.add_typer(exports, name="export")
+register(exports, imports)
+exports.command("texture")(exchange.export_texture)
+exports.command("light")(exchange.export_light)
+imports.command("map")(exchange.import_map)
+imports.command("routes")(exchange.import_routes)
+imports.command("drive")(exchange.import_drive)
+
+
+def show_version(asked: bool) -> None:
+    """Print the version and stop, if it is asked for."""
+    if asked:
+        print(f"ssad {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def about(
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", is_eager=True, callback=show_version)
+    ] = False,
+) -> None:
+    """SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?"""
+
+
+for command in (running.run, running.report, running.compare, running.replay, data.shift, data.score, data.record):
+    app.command()(command)
+app.add_typer(train_app, name="train")
+
+
+@app.command("list")
+def list_names(
+    what: Annotated[str | None, typer.Argument(metavar="[WHAT]", help=f"One of: {', '.join(LISTS)}.")] = None,
+) -> None:
+    """List the names that other commands and suites accept. Without WHAT: all lists, scenarios by set and class."""
+    chosen = ALIASES.get(what or "", what)
+    if chosen is not None and chosen not in LISTS:
+        raise unknown_name("list", str(what), [*LISTS, *ALIASES])
+    for name, rows in LISTS.items():
+        if chosen not in (None, name):
+            continue
+        found = rows()
+        if chosen is None:
+            print(f"{name}:")
+            if name == "scenarios":  # hundreds of single ones: only when asked for
+                found = {key: text for key, text in found.items() if text.startswith(("set", "class"))}
+        width = max((len(key) for key in found), default=0)
+        for key, text in found.items():
+            print(f"{'  ' if chosen is None else ''}{key:<{width}}  {text}".rstrip())
+
+
+@app.command()
+def doctor() -> None:
+    """Check this machine: what works, what is missing. Exit code 1: something that every run needs is broken."""
+    from ssad.doctor import examine
+
+    broken = False
+    for finding in examine():
+        broken |= finding.state == "broken"
+        print(f"{finding.state:<8} {finding.what:<12} {finding.detail}")
+    raise typer.Exit(1 if broken else 0)
+
+
+def main() -> None:
+    """Entry point: an error that the user can fix becomes one line and exit code 2."""
+    # click's UsageError, which typer does not export
+    usage_error: Any = typer.BadParameter.__mro__[1]
+    try:
+        code = app(standalone_mode=False)
+    except SSADError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except typer.Abort:
+        sys.exit(130)
+    except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # its message is the help
+            print(error.format_message())
+            sys.exit(2)
+        command = error.ctx.command_path if error.ctx is not None else "ssad"
+        print(f"error: {error.format_message()} (see: {command} --help)", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(code if isinstance(code, int) else 0)

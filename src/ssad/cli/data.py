@@ -1,0 +1,200 @@
+"""Commands on data sets: shift, score, record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ssad.cli.options import Ray, Workers
+from ssad.core.errors import ConfigError
+
+
+def shift(
+    source: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, or an image file.")],
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="Folder for the shifted nuScenes roots, or FILE.png for a contact sheet."),
+    ],
+    shifts: Annotated[
+        str, typer.Option(help="Comma-separated names (ssad list shifts), or all: the paper's 11.")
+    ] = "all",
+    severity: Annotated[str, typer.Option(help="Comma-separated severities from 1 to 5, or random.")] = "random",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    calibration: Annotated[
+        str, typer.Option(help="physical: severities in units. paper: the published severities, image by image.")
+    ] = "physical",
+    labels: Annotated[
+        str, typer.Option(help="Boxes in the annotation table: original, or transformed with the objects.")
+    ] = "original",
+    version: Annotated[
+        str | None, typer.Option(help="Dataset version, such as v1.0-mini.  [default: the only one in DATAROOT]")
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="Only the scenes of this split, such as mini_val.")] = None,
+    scenes: Annotated[
+        str, typer.Option(help="Only these scenes, comma-separated. A contact sheet shows one scene.")
+    ] = "",
+    sweeps: Annotated[bool, typer.Option(help="Also shift the frames between keyframes.")] = True,
+    lidar: Annotated[bool, typer.Option(help="Also shift the LiDAR points.")] = True,
+    quality: Annotated[int, typer.Option(min=1, max=100, help="JPEG quality.")] = 95,
+    subsampling: Annotated[
+        str, typer.Option(help="JPEG chroma subsampling: auto (444 for sensor noise, else 420), 444, 422 or 420.")
+    ] = "auto",
+    workers: Workers = None,
+    ray: Ray = None,
+    channel: Annotated[str, typer.Option(help="Camera that a contact sheet shows.")] = "CAM_FRONT",
+    box: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X0,Y0,X1,Y1", help="2D box of an object in the image file, pixels; can be repeated."),
+    ] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Write nothing; compare every file in OUT with the manifests.")
+    ] = False,
+) -> None:
+    """Apply distribution shifts to a nuScenes folder (nuScenes-N), or to one image as a contact sheet.
+
+    To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
+    """
+    from ssad.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
+
+    if verify:
+        raise typer.Exit(verify_folder(out))
+    names = [name.strip() for name in shifts.split(",") if name.strip()]
+    listed = [name.strip() for name in scenes.split(",") if name.strip()]
+    if source.is_file() or out.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        write_contact_sheets(
+            source,
+            out,
+            version=version,
+            channel=channel,
+            split=split,
+            scenes=listed,
+            boxes=box or [],
+            severity=severity,
+            seed=seed,
+            calibration=calibration,
+        )
+        return
+    code = shift_folder(
+        source,
+        out,
+        shifts=names,
+        severity=severity,
+        version=version,
+        split=split,
+        scenes=listed,
+        workers=workers,
+        ray=ray,
+        settings={
+            "seed": seed, "calibration": calibration, "labels": labels, "sweeps": sweeps, "lidar": lidar,
+            "quality": quality, "subsampling": subsampling,
+        },
+    )  # fmt: skip
+    raise typer.Exit(code)
+
+
+def score(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS.json", help="Detections in the nuScenes results format.")],
+    dataroot: Annotated[Path, typer.Option(help="nuScenes or nuScenes-N folder.")],
+    version: Annotated[str, typer.Option(help="Dataset version, such as v1.0-trainval.")],
+    split: Annotated[str, typer.Option(help="val, mini_val, or a split that the folder's splits.json defines.")],
+    file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write all numbers to this file.")
+    ] = None,
+    intervals: Annotated[int, typer.Option(min=0, help="Bootstrap replicates for 95 % intervals; 0: none.")] = 0,
+) -> None:
+    """Compute mAP, NDS and the true-positive errors of the official nuScenes evaluation.
+
+    A shifted folder is first checked against its manifest, so that clean data cannot be scored as shifted.
+    """
+    from rich.console import Console
+
+    from ssad.evaluation.score import score_results, tables, write_summary
+    from ssad.toolbox.commands import checked
+
+    found = score_results(
+        results, dataroot=dataroot, version=version, split=split, replicates=intervals, check=checked(dataroot)
+    )
+    if file is not None:
+        write_summary(file, found)
+    console = Console()
+    for table in tables(found):
+        console.print(table)
+
+
+def record(
+    context: typer.Context,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the dataset.")],
+    towns: Annotated[
+        str, typer.Option(help="Comma-separated towns (see: ssad list towns).")
+    ] = "Twinford,Crossgate,Oldmarket,Larkhill",
+    held_out: Annotated[str, typer.Option(help="Towns of the split val; all others are train.")] = "Oldmarket,Larkhill",
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes per town.")] = 2,
+    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a scene, s.")] = 20.0,
+    width: Annotated[int, typer.Option(min=64, help="Image width in pixels (16:9).")] = 1600,
+    sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between two keyframes.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
+    clips: Annotated[
+        str | None,
+        typer.Option(help="Record images of one target car with COCO annotations instead: drive or orbit."),
+    ] = None,
+    streets: Annotated[
+        str, typer.Option(help="town: the town's own buildings. any: new ones for each drive, for training data.")
+    ] = "town",
+    images: Annotated[
+        str, typer.Option(help="With --clips: images per town, one number for each town or one for all.")
+    ] = "600,400,400,400",
+    target: Annotated[
+        str | None,
+        typer.Option(
+            help="With --clips: the target car, STYLE[:PAINT[:SEED]]; with orbit also stop_sign[:STYLE[:SEED]].  "
+            "[default: another car in each part]"
+        ),
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where to render: auto, cpu or cuda.")] = "cpu",
+    workers: Workers = None,
+    ray: Ray = None,
+) -> None:
+    """Record drives with the nuScenes sensors as a dataset in the nuScenes schema. To resume, repeat the command."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from ssad.jobs.machine import pick_device
+    from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+
+    def names(text: str) -> tuple[str, ...]:
+        return tuple(name.strip() for name in text.split(",") if name.strip())
+
+    idle = ("scenes", "seconds", "width", "sweeps") if clips is not None else ("images", "target")
+    for name in idle:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name == "COMMANDLINE":
+            raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("record", total=None)
+
+        def progress(done: int, of: int) -> None:
+            bar.update(task, completed=done, total=of)
+
+        if clips is not None:
+            from ssad.recording.clip_recorder import record_clips
+            from ssad.recording.clips import Clips, pair_images
+            from ssad.recording.target import parse_target
+
+            pairs = pair_images(names(towns), names(images))
+            todo = Clips(
+                out, pairs, names(held_out), clips, target=parse_target(target) if target else None, seed=seed,  # type: ignore[arg-type]
+                device=pick_device(device), streets=streets,
+            )  # fmt: skip
+            record_clips(todo, workers=workers, ray=ray, progress=progress)
+            text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"
+        else:
+            drives = Recording(
+                out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
+                seed=seed, device=pick_device(device), streets=streets,
+            )  # fmt: skip
+            record_nuscenes(drives, workers=workers, ray=ray, progress=progress)
+            text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
+    print(text)

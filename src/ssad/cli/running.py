@@ -1,0 +1,190 @@
+"""`ssad run` and what looks at a run: report, compare, replay."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ssad.cli.options import Device, Dir, Ray, Workers
+from ssad.core.errors import ConfigError
+
+
+class Video(StrEnum):
+    """Video formats that `ssad replay` can write."""
+
+    mp4 = "mp4"
+    gif = "gif"
+
+
+def run(
+    suite: Annotated[
+        str, typer.Argument(metavar="SUITE", help="Name of a suite (see: ssad list suites) or YAML file.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Results folder.  [default: runs/SUITE]")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the suite; can be repeated."),
+    ] = None,
+    device: Device = "auto",
+    workers: Workers = None,
+    ray: Ray = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Run failed cells again.")] = False,
+) -> None:
+    """Run a suite and write its report. To resume a stopped run, repeat the command.
+
+    Exit code 0: every cell ran. 1: some cells failed; the results give the reasons. 2: invalid input.
+    """
+    from rich.console import Console
+
+    from ssad.bench.kind import Resources
+    from ssad.bench.run import run as run_plan
+    from ssad.bench.suite import kind_of, load_suite
+    from ssad.jobs.machine import pick_device
+    from ssad.report.terminal import summary
+
+    chosen = load_suite(suite, settings or [])
+    folder = out or Path("runs") / chosen.name
+    where = pick_device(device)
+    kind = kind_of(chosen.kind)
+    plan = kind.plan(chosen, device=where)
+    names = {cell.key: cell.name for cell in plan.cells}
+    try:
+        records = run_plan(plan, folder, Resources(workers, ray, where), retry=retry)
+        kind.finish(plan, folder)
+    except KeyboardInterrupt:
+        print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
+        raise typer.Exit(130) from None
+    console = Console()
+    console.print(summary(folder))
+    failed = [r for r in records if r["status"] != "ok"]
+    for record in failed[:5]:
+        console.print(f"{record['status']}: {names[record['key']]}: {record['reason']}", markup=False, soft_wrap=True)
+    if len(failed) > 5:
+        console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
+    if failed:
+        console.print("to run the failed cells again, repeat the command with --retry")
+    report(folder)
+    raise typer.Exit(1 if failed else 0)
+
+
+def report(folder: Dir) -> None:
+    """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed."""
+    from ssad.jobs.store import read_run
+    from ssad.report import check_artefacts, write_report
+
+    read_run(folder)
+    print(f"report: {write_report(folder)}")
+    problems = check_artefacts(folder)
+    for problem in problems[:5]:
+        print(problem)
+    if problems:
+        print(f"{len(problems)} files are not as the run left them; what is made of them is not to be trusted")
+        raise typer.Exit(1)
+
+
+def compare(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR DIR...", help="Results folders of `ssad run`; all are compared with the first."),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Output folder.  [default: that of the last DIR]")] = None,
+) -> None:
+    """Compare runs with the first one, cell by cell: differences with intervals and a test, and what changed."""
+    from rich.console import Console
+
+    from ssad.report.compare import write_comparison
+    from ssad.report.terminal import comparison_table
+
+    page, found = write_comparison(folders, out or folders[-1])
+    console = Console()
+    for each in found:
+        console.print(comparison_table(each.table))
+        told = f"{each.both} cells in both, {each.equal} of them equal to the last digit"
+        console.print(told + f"; {len(each.verdicts)} with another outcome" if each.verdicts else told)
+        if each.left_out:
+            console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}")
+    print(f"comparison: {page}")
+
+
+def replay(
+    folder: Dir,
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key of a cell, the start of one, or SYSTEM/SCENARIO.")],
+    out: Annotated[Path | None, typer.Option(help="Output folder.  [default: DIR/replays]")] = None,
+    video: Annotated[Video, typer.Option(help="Video format.")] = Video.mp4,
+    wear: Annotated[
+        Path | None, typer.Option(metavar="ATTACK", help="Also film the drive with this texture or light on a car.")
+    ] = None,
+    wearer: Annotated[
+        int | None, typer.Option(min=1, help="Number of the agent that is attacked.  [default: the car nearest ahead]")
+    ] = None,
+    detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
+) -> None:
+    """Run one cell again, compare it with its record bit by bit, and write a video and the trace, or a picture.
+
+    Drives give a video and the trace; cells of shifts and digital attacks give a picture of one moment, clean and under
+    the cell's condition. ATTACK is a folder of `ssad export texture` or `ssad export light`; a light shines at its own
+    hour. The film shows what the ego's camera sees, clean and attacked. Cells of kind gap are also filmed as their
+    driver saw them, beside the same drive without the perturbation.
+    Exit code 1: the new run differs from the record.
+    """
+    from ssad.bench.replay import replay as run_again
+    from ssad.core.images import save_picture
+    from ssad.core.safeio import make_folder
+    from ssad.core.traces import save_trace
+    from ssad.report import write_video
+    from ssad.report.video import save_frames
+
+    film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
+    found = run_again(folder, cell)
+    target = make_folder(out or folder / "replays") / found.cell.key
+    verdict = f"differs: {found.difference}" if found.difference else "identical"
+    if found.trace is None or found.graph is None:
+        print(f"{found.cell.key} {found.cell.name}: {found.compared}, {verdict}")
+        if film_of is not None:
+            raise ConfigError(f"--wear: cell {found.cell.key} ({found.cell.name}) is no drive")
+        if found.picture is not None:
+            save_picture(target.with_suffix(".jpg"), found.picture())
+            print(f"picture: {target.with_suffix('.jpg')}")
+        raise typer.Exit(1 if found.difference else 0)
+    save_trace(target.with_suffix(".npz"), found.trace)
+    film = write_video(found.trace, found.graph, target.with_suffix(f".{video.value}"))
+    print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
+    print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
+    if found.film is not None:
+        frames, dt = found.film
+        print(f"camera: {save_frames(frames, target.with_suffix(f'.camera.{video.value}'), dt=dt)}")
+    if film_of is not None:
+        print(f"film: {film_of(found.trace, found.graph, target.with_suffix(f'.worn.{video.value}'))}")
+    raise typer.Exit(1 if found.difference else 0)
+
+
+def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any, Any, Path], Path] | None:
+    """What films a drive with an attack on a car; None without one. SSADError: no such attack or detector."""
+    if wear is None:
+        if wearer is not None:
+            raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
+        return None
+    from ssad.detectors import make_detector
+    from ssad.recording.attacked_film import attacked_frames, first_car
+    from ssad.recording.light_export import load_worn
+    from ssad.recording.lit_clips import at_hour
+    from ssad.recording.loop_sensors import DAY
+    from ssad.report.video import save_frames
+
+    worn, judge = load_worn(wear), None if detector == "none" else make_detector(detector)
+    worn.live(1)
+
+    def film(trace: Any, graph: Any, path: Path) -> Path:
+        agent = first_car(trace) if wearer is None else wearer
+        if agent is None:
+            raise ConfigError(f"{trace.key}: no car is ahead of the ego at any time; name the agent with --wearer")
+        weather = at_hour(DAY, worn.hour)
+        shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2, weather=weather)
+        return save_frames(shown, path, dt=2 * trace.dt)
+
+    return film
