@@ -1,9 +1,10 @@
 """How well background traffic drives: contacts between vehicles, vehicles off the road, queues that do not clear.
 
-`python -m benchmarks.traffic --hours 50` drives 50 vehicle-hours in every town; `--towns` takes names and files
-(.xodr, .npz), `--signals green` switches all real signals to green, as in recorded drives, so that priority alone
-decides. Prints a table and where it happened; `--json FILE` writes both, `--page` the table of docs/loop.md, together
-with the towns of earlier runs (`--also FILE`).
+`python -m benchmarks.traffic --hours 50` drives 50 vehicle-hours in every town that is here, imported ones too;
+`--towns` takes names and files (.xodr, .npz), `--signals green` switches all real signals to green, as in recorded
+drives, so that priority alone decides. Prints a table and where it happened. `--json FILE` keeps both after every batch
+of scenes; run again, it goes on to `--hours`. `--page` writes the table of docs/loop.md, with what other files hold
+(`--also FILE`; `--first` numbers their scenes, so that they are other traffic).
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from ssad.core.types import (
 )
 from ssad.jobs.machine import quiet_warp
 from ssad.roads import load_town, random_route
-from ssad.roads.library import BUILT_IN
+from ssad.roads.library import BUILT_IN, town_names
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
-from ssad.world.world import World
+from ssad.world.world import VERSION, World
 
 BODIES = {"car": 0.30, "suv": 0.20, "coupe": 0.10, "compact": 0.14, "van": 0.07, "motorcycle": 0.07, "truck": 0.07,
           "bus": 0.05}  # fmt: skip
@@ -48,6 +49,9 @@ LENGTH = 3500.0  # m of a route
 SETTLE = 10.0  # s at the start that do not count: vehicles begin where no traffic has put them
 CYCLES = 3.0  # signal cycles after which a vehicle that stood all the time is in a queue that does not clear
 LEAST_CYCLE = 32.0  # s, where a town has no signals
+KINDS = ("contacts", "off_road", "stuck")
+
+Row = dict[str, Any]  # of a town: its name, vehicle-hours, number of scenes, and what has happened, by kind
 
 
 def upper_limit(count: int, share: float = 0.95) -> float:
@@ -107,8 +111,12 @@ def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, de
     shape = (world.batch, world.agents)
     before, stood = np.zeros(shape, np.int64), np.zeros(shape)
     left, stuck = np.zeros(shape, bool), np.zeros(shape, bool)
-    found: dict[str, list[dict[str, Any]]] = {"contacts": [], "off_road": [], "stuck": []}
+    found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in KINDS}
     steps, longest = 0, patience(graph)
+    if device != "cpu":
+        world.step()  # compiles
+        world.reset()
+        world.capture()
 
     def about(scene: int, agent: int) -> dict[str, Any]:
         x, y, yaw = world.array("pose")[scene, agent].tolist()
@@ -137,26 +145,18 @@ def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, de
         for scene, agent in np.argwhere((stood > longest) & ~stuck).tolist():
             found["stuck"].append(about(scene, agent))
         stuck |= stood > longest
-    return {"hours": steps * world.dt / 3600.0, "vehicles": int((world.state().kind > 0).sum()), **found}
+    return {"hours": steps * world.dt / 3600.0, **found}
 
 
-def drive_town(
-    name: str, *, hours: float, vehicles: int, minutes: float, scenes: int, green: bool, device: str, first: int = 0
-) -> dict[str, Any]:
-    """One row of the table: as many batches of `scenes` as the hours need."""
-    graph = load_town(name)
-    routes = town_routes(graph, ROUTES, LENGTH)
-    total: dict[str, Any] = {"town": graph.name, "hours": 0.0, "vehicles": 0, "contacts": [], "off_road": [],
-                             "stuck": []}  # fmt: skip
-    key = first
-    while total["hours"] < hours:
-        count = max(1, min(scenes, math.ceil((hours - total["hours"]) * 60.0 / (vehicles * minutes))))
-        episodes = [traffic(graph, routes, vehicles, key=key + k, green=green) for k in range(count)]
-        key += count
-        part = measure(graph, episodes, seconds=60.0 * minutes, device=device)
-        for name_, value in part.items():
-            total[name_] += value
-    return total
+def drive_batch(row: Row, graph: LaneGraph, routes: Sequence[Route], given: argparse.Namespace) -> None:
+    """Add as many scenes to a town's row as its hours need, but no more than are driven side by side."""
+    need = math.ceil((given.hours - row["hours"]) * 60.0 / (given.vehicles * given.minutes))
+    keys = range(given.first + row["scenes"], given.first + row["scenes"] + max(1, min(given.scenes, need)))
+    episodes = [traffic(graph, routes, given.vehicles, key=k, green=given.signals == "green") for k in keys]
+    part = measure(graph, episodes, seconds=60.0 * given.minutes, device=given.device)
+    row["scenes"] += len(keys)
+    for name, value in part.items():
+        row[name] += value
 
 
 def rate(row: dict[str, Any]) -> tuple[float, float]:
@@ -165,51 +165,63 @@ def rate(row: dict[str, Any]) -> tuple[float, float]:
     return len(row["contacts"]) / hundred, upper_limit(len(row["contacts"])) / hundred
 
 
+def kept(file: Path, about: dict[str, Any]) -> dict[str, Row]:
+    """The rows of an earlier run, by town; SystemExit where it was another kind of traffic."""
+    data = json.loads(file.read_text())
+    other = [f"{name} {data.get(name)}" for name, value in about.items() if data.get(name) != value]
+    if other:
+        raise SystemExit(f"{file} holds other traffic ({', '.join(other)}); give another file")
+    return {row["town"]: row for row in data["towns"]}
+
+
 def main() -> None:
     """Drive, print, and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--towns", default=",".join(BUILT_IN), help="names or files, with commas")
+    parser.add_argument("--towns", default=",".join(town_names()), help="names or files, with commas")
     parser.add_argument("--hours", type=float, default=20.0, help="vehicle-hours in each town")
     parser.add_argument("--vehicles", type=int, default=40, help="in each scene")
     parser.add_argument("--minutes", type=float, default=5.0, help="of each scene")
-    parser.add_argument("--scenes", type=int, default=128, help="side by side")
+    parser.add_argument("--scenes", type=int, default=128, help="at most so many side by side")
     parser.add_argument("--signals", choices=("program", "green"), default="program")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--show", type=int, default=5, help="places of each kind to print for a town")
     parser.add_argument("--first", type=int, default=0, help="number of the first scene: others are other traffic")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json that hold other towns")
+    parser.add_argument("--also", type=Path, nargs="*", default=[], help="files of --json whose towns are added")
     parser.add_argument("--page", action="store_true", help="write docs/loop.md")
     given = parser.parse_args()
     quiet_warp()
-    rows = []
+    traffic_of = {"world": VERSION, "vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
+    about = traffic_of | {"first": given.first}
+    rows = kept(given.json, about) if given.json and given.json.is_file() else {}
     heads = ("town", "hours", "contacts", "per 100 h", "95 % up", "off road", "stuck", "s")
     print("{:22} {:>7} {:>8} {:>9} {:>8} {:>8} {:>6} {:>6}".format(*heads))
     for name in filter(None, given.towns.split(",")):
         began = time.process_time()
-        row = drive_town(
-            name, hours=given.hours, vehicles=given.vehicles, minutes=given.minutes, scenes=given.scenes,
-            green=given.signals == "green", device=given.device, first=given.first,
-        )  # fmt: skip
-        rows.append(row)
+        graph = load_town(name)
+        empty = {"town": graph.name, "hours": 0.0, "scenes": 0, **{kind: [] for kind in KINDS}}
+        row = rows.setdefault(graph.name, empty)
+        routes = town_routes(graph, ROUTES, LENGTH) if row["hours"] < given.hours else []
+        while row["hours"] < given.hours:
+            drive_batch(row, graph, routes, given)
+            if given.json:
+                given.json.write_text(json.dumps(about | {"towns": [*rows.values()]}) + "\n", encoding="utf-8")
         print(_line(row), f"{time.process_time() - began:6.0f}", flush=True)
-        for kind in ("contacts", "off_road", "stuck"):
+        for kind in KINDS:
             for one in row[kind][: given.show]:
                 print("   ", kind, json.dumps(one), flush=True)
-    rows = [*(row for file in given.also for row in json.loads(file.read_text())["towns"]), *rows]
-    total = together("all", rows)
+    every = [*rows.values(), *(row for file in given.also for row in kept(file, traffic_of).values())]
+    total = together("all", every)
     print(_line(total))
-    if given.json:
-        about = {"vehicles": given.vehicles, "minutes": given.minutes, "signals": given.signals}
-        given.json.write_text(json.dumps(about | {"towns": rows}, indent=1) + "\n", encoding="utf-8")
     if given.page:
-        page([*rows, together("our own", [row for row in rows if row["town"] in BUILT_IN]), total])
+        towns = {row["town"]: [other for other in every if other["town"] == row["town"]] for row in every}
+        own = together("our own", [row for row in every if row["town"] in BUILT_IN])
+        page([*(together(town, parts) for town, parts in towns.items()), own, total])
 
 
-def together(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One row for several towns."""
-    kinds = ("contacts", "off_road", "stuck")
-    found = {kind: [one for row in rows for one in row[kind]] for kind in kinds}
+def together(name: str, rows: Sequence[Row]) -> Row:
+    """One row for several."""
+    found = {kind: [one for row in rows for one in row[kind]] for kind in KINDS}
     return {"town": name, "hours": sum(row["hours"] for row in rows)} | found
 
 
