@@ -16,10 +16,9 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.digital_points import DigitalSuite
 from ssad.bench.kind import Job, Plan, Resources
 from ssad.bench.kinds import detection, digital
-from ssad.bench.kinds.digital import Digital
+from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
 from ssad.bench.suite import command_of, load_suite
 from ssad.core.errors import SSADError

@@ -14,9 +14,8 @@ import pytest
 from helpers.sharing import Shared
 from rich.console import Console
 
-from ssad.bench.digital_points import DigitalSuite
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.digital import Digital
+from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
 from ssad.core.errors import SSADError
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_CLASSES

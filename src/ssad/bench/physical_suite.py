@@ -7,10 +7,10 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from ssad.bench.digital_points import named
 from ssad.bench.kind import Names, SuiteBase
 from ssad.camera.render import Weather
 from ssad.core.errors import ConfigError
+from ssad.evaluation.digital_points import named
 from ssad.recording.clips import AZIMUTHS, ELEVATIONS
 from ssad.recording.lit_clips import at_hour
 from ssad.recording.nuscenes_recorder import WEATHERS

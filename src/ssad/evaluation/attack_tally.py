@@ -106,3 +106,24 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "halved": sum(one["halved"] for one in some),
         "gradient_error": largest("gradient_error"), "coupling": largest("coupling"),
     }  # fmt: skip
+
+
+def sum_members(noted: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
+    """What an attack noted in its scenes, summed; of an ensemble what its members noted together.
+
+    Args:
+        noted: of each member, what its scenes noted.
+
+    Returns:
+        The columns of `sum_notes`.
+    """
+    parts = [sum_notes(one) for one in noted]
+    found = dict(parts[0])
+    if len(parts) > 1:
+        for name in ("gradients", "queries"):
+            found[name] = sum(part[name] or 0.0 for part in parts)
+        for name in ("change_px", "gradient_error", "coupling"):
+            found[name] = max((part[name] for part in parts if part[name] is not None), default=None)
+        found |= dict.fromkeys(("loss_before", "loss_after", "used"))
+        found["idle"] = min(part["idle"] for part in parts)
+    return found

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -78,6 +78,18 @@ class AttackSpec:
     draws: int = 0
     object: str = ""
     precision: Precision = "float32"
+
+    @classmethod
+    def of_row(cls, row: Mapping[str, Any]) -> Self:
+        """From what `row` gave, with further keys perhaps, where JSON has made lists of tuples."""
+        told = {name: row[name] for name in cls.__slots__}
+        pairs = {name: tuple((key, value) for key, value in told[name]) for name in ("options", "becomes")}
+        return cls(**{**told, **pairs, "classes": tuple(told["classes"])})
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """Plain data."""
+        return asdict(self)
 
     @property
     def name(self) -> str:

@@ -5,12 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from ssad.bench.digital_points import (
-    ENSEMBLE,
-    DigitalSuite,
-    Point,
+from pydantic import Field
+
+from ssad.bench.kind import Cell, Column, Job, Plan, Resources
+from ssad.bench.kinds.detection import DetectorKind, DetectorSuite, data_of, detectors_of
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.types import U8
+from ssad.datasets.nuscenes.scene import SceneData
+from ssad.evaluation.attack_record import attack_record
+from ssad.evaluation.attack_sheet import attack_sheet
+from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec
+from ssad.evaluation.digital_points import (
+    AttackTable,
     bystander_points,
     guard_of,
     points_of,
@@ -18,34 +27,21 @@ from ssad.bench.digital_points import (
     system_name,
     transfers_of,
 )
-from ssad.bench.kind import Cell, Column, Job, Plan, Resources
-from ssad.bench.kinds.detection import DetectorKind, data_of, detectors_of
-from ssad.core import safeio
-from ssad.core.errors import ConfigError
-from ssad.core.types import F64, U8
-from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.datasets.nuscenes.scene import SceneData
-from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.evaluation.attack_scores import Match, by_distance, target_success, worst_of
-from ssad.evaluation.attack_sheet import attack_sheet
-from ssad.evaluation.attack_tally import sum_notes
-from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec
-from ssad.evaluation.chosen_object import chosen_places
-from ssad.evaluation.picture_scores import match_pictures
-from ssad.evaluation.scene_boxes import (
-    Condition,
-    Examination,
-    ShiftedScene,
-    boxes_path,
-    find_boxes,
-    picture_truth_of,
-    read_scenes,
-    score_found,
-    score_pictures,
-    system_of,
-    truth_of,
-)
+from ssad.evaluation.scene_boxes import Condition, Examination, ShiftedScene, boxes_path
 from ssad.scenarios.static.digital.universal import UniversalFit
+
+
+class DigitalSuite(DetectorSuite, AttackTable):
+    """One table: detectors x digital attacks, beside the clean data and random noise of the same size.
+
+    2D detectors are scored by AP50 of their boxes in the images; what a 3D box needs is absent.
+
+    Attributes:
+        transfer_detectors: detectors that take part in the transfer alone, as `detectors` names them.
+    """
+
+    kind: Literal["digital"]
+    transfer_detectors: list[str] = Field(default=[])
 
 
 class Digital(DetectorKind):
@@ -74,13 +70,12 @@ class Digital(DetectorKind):
             for point in [*(points if detector in main else bystander_points(suite)), *moved]:
                 system = system_name(detector, point.defence)
                 source = point.source or (system if point.aware or not point.defence else detector)
-                about = point.specs[0].name if len(point.specs) == 1 else ENSEMBLE if point.specs else "clean"
-                title = f"{system}/{about}{f'@{source}' if point.specs and source != system else ''}"
+                title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"
                 title += f"/{point.scenes}" if point.scenes else ""
                 inputs: list[Any] = [weights[detector], safeio.dump_json(data), device, suite.replicates]
                 inputs += [weights[point.source]] if point.source else []
-                told = {"attacks": [_told(one) for one in point.specs], "source": source, "scenes": point.scenes}
-                fields = {"detector": detector, **_fields(point), "task": tasks[detector]}
+                told = {"attacks": [one.row for one in point.specs], "source": source, "scenes": point.scenes}
+                fields = {"detector": detector, **point.fields, "task": tasks[detector]}
                 cells.append(self.make_cell(title, system, suite.seed, fields, told, *inputs))
         return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, {}, detectors)
 
@@ -111,7 +106,7 @@ class Digital(DetectorKind):
         if not cell.spec["attacks"]:
             return [ShiftedScene(None, 0, scene) for scene in scenes]
         batch, source = job.settings["batch"], cell.spec["source"]
-        specs = [_told_spec(one) for one in cell.spec["attacks"]]
+        specs = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
         return [AttackedScene(spec, scene, batch, source) for spec in specs for scene in scenes]
 
     def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
@@ -126,7 +121,7 @@ class Digital(DetectorKind):
             if not boxes_path(job.folder, cell.system, clean).is_file():
                 found[clean.name] = {"scene": one.scene}
             if isinstance(one, AttackedScene) and not boxes_path(job.folder, cell.system, one).is_file():
-                told = {"scene": one.scene, "batch": one.batch, "source": one.source, **_told(one.spec)}
+                told = {"scene": one.scene, "batch": one.batch, "source": one.source, **one.spec.row}
                 found[f"{one.source}/{one.name}"] = told
         return found
 
@@ -134,7 +129,7 @@ class Digital(DetectorKind):
         """See `DetectorKind`."""
         if "attack" not in data:
             return ShiftedScene(None, 0, data["scene"])
-        return AttackedScene(_told_spec(data), data["scene"], data["batch"], data["source"])
+        return AttackedScene(AttackSpec.of_row(data), data["scene"], data["batch"], data["source"])
 
     def settings(self, suite: DigitalSuite) -> dict[str, Any]:
         """See `DetectorKind`."""
@@ -157,42 +152,8 @@ class Digital(DetectorKind):
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
         """Metrics, what the attack took, and which share of the system's clean mAP it took away."""
-        count, specs = job.settings["replicates"], [_told_spec(one) for one in cell.spec["attacks"]]
-        eye = Eye(examination, cell.system)
-        whole = [ShiftedScene(None, 0, one.scene) for one in scenes[: len(scenes) // max(len(specs), 1)]]
-        for one in whole:
-            find_boxes(examination, one, [cell.system])
-        truth = truth_of(examination, [one.scene for one in whole])
-        clean, _ = read_scenes(examination, cell.system, whole)
-        before = eye.score(clean, truth, replicates=count if not specs else 0)
-        if not specs:
-            return {**before, "metrics": before["metrics"] | eye.by_distance(clean, truth)}
-        parts = [scenes[k : k + len(whole)] for k in range(0, len(scenes), len(whole))]
-        found, noted = zip(*(read_scenes(examination, cell.system, part) for part in parts), strict=True)
-        told: dict[str, Any] = {}
-        boxes = found[0]
-        if len(specs) > 1:
-            candidates = dict(zip((spec.name for spec in specs), found, strict=True))
-            told["worst"], boxes = worst_of(candidates, truth, eye.match(truth))
-        after = eye.score(boxes, truth, replicates=count)
-        metrics = after["metrics"] | eye.by_distance(boxes, truth)
-        clean_score = before["metrics"]["mAP"]
-        metrics["drop"] = round(1.0 - metrics["mAP"] / clean_score, 6) if clean_score > 0 else None
-        if not specs[0].aim.everything and not eye.flat:
-            places = self._places(examination, specs[0], whole)
-            metrics |= target_success(clean, boxes, truth, specs[0].wanted, becomes=dict(specs[0].becomes), at=places)
-        return {**after, **_noted(noted), **told, "metrics": metrics, "clean_mAP": clean_score}
-
-    def _places(self, examination: Examination, spec: AttackSpec, scenes: Sequence[Condition]) -> dict[str, F64] | None:
-        """Where the one object is that is attacked, by sample; None: more than one is. ConfigError: it is nowhere."""
-        if not spec.object:
-            return None
-        with NuScenes(examination.root, examination.version) as data:
-            parts = [chosen_places(data.scene(one.scene), spec.object, spec.wanted) for one in scenes]
-        found = {token: place for part in parts for token, place in part.items()}
-        if not found:
-            raise ConfigError(f"object {spec.object}: no moment of these scenes has it; nothing was attacked")
-        return found
+        specs = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
+        return attack_record(examination, cell.system, specs, scenes, replicates=job.settings["replicates"])
 
     def sheet(
         self, examination: Examination, suite: DigitalSuite, cell: Cell | None = None
@@ -200,100 +161,10 @@ class Digital(DetectorKind):
         """One moment under the attacks of the table."""
         rows = [one.specs[0] for one in rows_of(suite) if one.row and len(one.specs) == 1]
         if cell is not None:  # against the bare detector, also where the cell's pictures were made against another
-            rows = [_told_spec(one) for one in cell.spec["attacks"]]
+            rows = [AttackSpec.of_row(one) for one in cell.spec["attacks"]]
         specs = [one for one in dict.fromkeys(rows) if not isinstance(one.make(), UniversalFit)]
         caption = (
             f"What {examination.detectors[0][0]} is shown (left), what was changed (middle, magnified so that the "
             "largest change is black or white), what it finds (orange, score at least 0.3) and what is there (white)."
         )
         return lambda: attack_sheet(examination, suite.split, specs), caption
-
-
-class Eye:
-    """How the boxes of a system are scored: in the world those of 3D detectors, in the images those of 2D detectors.
-
-    Attributes:
-        flat: Whether it finds 2D boxes.
-    """
-
-    def __init__(self, examination: Examination, system: str) -> None:
-        self._examination, self._detector = examination, system_of(examination, system)
-        self.flat = self._detector.task == "2d"
-
-    def score(self, boxes: Sequence[Any], truth: GroundTruth, *, replicates: int) -> dict[str, Any]:
-        """See `score_found` and `score_pictures`."""
-        if self.flat:
-            return score_pictures(self._examination, self._detector, boxes, truth, replicates=replicates)
-        return score_found(self._examination, boxes, truth, replicates=replicates)
-
-    def match(self, truth: GroundTruth) -> Match | None:
-        """What `worst_of` compares by."""
-        if not self.flat:
-            return None
-        pictures = picture_truth_of(self._examination, truth)
-        return lambda boxes: match_pictures(boxes, pictures, self._detector.classes)
-
-    def by_distance(self, boxes: Sequence[Any], truth: GroundTruth) -> dict[str, float]:
-        """See `by_distance`; boxes in images are at no distance."""
-        return {} if self.flat else by_distance(boxes, truth)
-
-
-def _fields(point: Point) -> dict[str, Any]:
-    """Columns of a record that tell what its system was shown."""
-    about = {
-        "source": point.source, "defence": point.defence.text if point.defence else "", "aware": point.aware,
-        "subset": point.scenes, "row": point.row,
-    }  # fmt: skip
-    if not point.specs:
-        return {"attack": None, "loss": None, "norm": None, "radius": 0.0, "steps": 0, "options": "", "target": "",
-                **about}  # fmt: skip
-    spec = point.specs[0]
-    found = {
-        "attack": spec.attack, "loss": spec.loss if spec.attack != "noise" else None, "norm": spec.norm,
-        "radius": spec.radius, "steps": spec.steps, "options": _options(spec), "target": spec.target, **about,
-    }  # fmt: skip
-    if len(point.specs) > 1:
-        members = ", ".join(" ".join(filter(None, [one.attack, one.loss, _options(one)])) for one in point.specs)
-        found |= {"attack": ENSEMBLE, "loss": None, "steps": 0, "options": f"of {members}"}
-    return found
-
-
-def _options(spec: AttackSpec) -> str:
-    others = [(key, value) for key, value in spec.options if key != "steps"]
-    others += [("draws", spec.draws)] if spec.draws else []
-    others += [("precision", spec.precision)] if spec.precision != "float32" else []
-    return " ".join(f"{key}={value}" for key, value in others)
-
-
-def _noted(noted: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:
-    """What the attack took; of an ensemble what its members took together."""
-    parts = [sum_notes(one) for one in noted]
-    found = dict(parts[0])
-    if len(parts) > 1:
-        for name in ("gradients", "queries"):
-            found[name] = sum(part[name] or 0.0 for part in parts)
-        for name in ("change_px", "gradient_error", "coupling"):
-            found[name] = max((part[name] for part in parts if part[name] is not None), default=None)
-        found |= dict.fromkeys(("loss_before", "loss_after", "used"))
-        found["idle"] = min(part["idle"] for part in parts)
-    return found
-
-
-def _told(spec: AttackSpec) -> dict[str, Any]:
-    """A spec as plain data."""
-    return {
-        "attack": spec.attack, "loss": spec.loss, "norm": spec.norm, "radius": spec.radius,
-        "options": [list(pair) for pair in spec.options], "classes": list(spec.classes),
-        "becomes": [list(pair) for pair in spec.becomes], "draws": spec.draws, "object": spec.object,
-        "precision": spec.precision,
-    }  # fmt: skip
-
-
-def _told_spec(data: Mapping[str, Any]) -> AttackSpec:
-    """The spec from plain data."""
-    options = tuple((str(key), value) for key, value in data["options"])
-    becomes = tuple((one, other) for one, other in data["becomes"])
-    return AttackSpec(
-        data["attack"], data["loss"], data["norm"], data["radius"], options, tuple(data["classes"]), becomes,
-        data["draws"], data["object"], data["precision"],
-    )  # fmt: skip

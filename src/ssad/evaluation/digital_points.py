@@ -1,4 +1,4 @@
-"""What suites of kind `digital` say, and the points that follow: what each system is shown."""
+"""A table of digital attacks as a suite says it, and the points that follow: what each system is shown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from ssad.bench.kinds.detection import DetectorSuite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -112,30 +111,27 @@ def named(value: Any) -> Any:
     return [{"name": one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
 
 
-class DigitalSuite(DetectorSuite):
-    """One table: detectors x digital attacks, beside the clean data and random noise of the same size.
-
-    2D detectors are scored by AP50 of their boxes in the images; what a 3D box needs is absent.
+class AttackTable(BaseModel):
+    """Digital attacks, beside the clean data and random noise of the same size.
 
     Attributes:
+        name: of the suite.
         attacks: names, or mappings with the keys of `Entry`.
         sweeps: curves.
         transfer: attacks whose pictures, made against each detector, are shown to every other.
-        transfer_detectors: detectors that take part in the transfer alone, as `detectors` names them.
         radius: 8-bit code values that a picture may be moved by, where an attack does not say it.
         steps: gradient steps, likewise.
         batch: camera images that are attacked at once on a GPU; where memory does not suffice they are fewer.
         precision: of the gradients: bfloat16 is faster on a GPU. Losses that decide, and scores, are exact.
     """
 
-    kind: Literal["digital"]
+    name: str
     attacks: list[Entry] = Field(
         default=[Entry(name="fgsm"), Entry(name="pgd"), Entry(name="cw"), Entry(name="pgd", loss="margin")],
         min_length=1,
     )
     sweeps: list[Sweep] = Field(default=[])
     transfer: list[Row] = Field(default=[])
-    transfer_detectors: list[str] = Field(default=[])
     radius: Radius = Field(default=5.0, gt=0.0)
     steps: Steps = 10
     batch: int = Field(default=12, ge=1)
@@ -181,13 +177,38 @@ class Point:
     scenes: int = 0
     row: bool = field(default=False, compare=False)
 
+    @property
+    def attack(self) -> str:
+        """Name of the attack; "clean" without one."""
+        return self.specs[0].name if len(self.specs) == 1 else ENSEMBLE if self.specs else "clean"
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Columns of a record that tell what its system was shown."""
+        about = {
+            "source": self.source, "defence": self.defence.text if self.defence else "", "aware": self.aware,
+            "subset": self.scenes, "row": self.row,
+        }  # fmt: skip
+        if not self.specs:
+            none = dict.fromkeys(("attack", "loss", "norm"))
+            return {**none, "radius": 0.0, "steps": 0, "options": "", "target": "", **about}
+        spec = self.specs[0]
+        found = {
+            "attack": spec.attack, "loss": spec.loss if spec.attack != "noise" else None, "norm": spec.norm,
+            "radius": spec.radius, "steps": spec.steps, "options": _options(spec), "target": spec.target, **about,
+        }  # fmt: skip
+        if len(self.specs) > 1:
+            members = ", ".join(" ".join(filter(None, [one.attack, one.loss, _options(one)])) for one in self.specs)
+            found |= {"attack": ENSEMBLE, "loss": None, "steps": 0, "options": f"of {members}"}
+        return found
+
 
 def system_name(detector: str, guard: Guarded | None) -> str:
     """What a detector behind a defence is called."""
     return detector if guard is None else f"{detector}+{guard.text.replace(' ', '-')}"
 
 
-def guard_of(suite: DigitalSuite, entry: Entry) -> Guarded | None:
+def guard_of(suite: AttackTable, entry: Entry) -> Guarded | None:
     """The defence of a row; it is built in order to see whether it accepts its options.
 
     Raises:
@@ -204,7 +225,7 @@ def guard_of(suite: DigitalSuite, entry: Entry) -> Guarded | None:
     return found
 
 
-def rows_of(suite: DigitalSuite) -> list[Point]:
+def rows_of(suite: AttackTable) -> list[Point]:
     """The rows of the tables.
 
     Raises:
@@ -244,7 +265,7 @@ def rows_of(suite: DigitalSuite) -> list[Point]:
     return found
 
 
-def points_of(suite: DigitalSuite) -> list[Point]:
+def points_of(suite: AttackTable) -> list[Point]:
     """All conditions that every detector is shown, each once, without the transfer of attacks to other detectors.
 
     The clean data come first, then noise, rows and curves. Clean data on fewer scenes, or behind a defence, are
@@ -267,7 +288,7 @@ def points_of(suite: DigitalSuite) -> list[Point]:
     return list(dict.fromkeys([Point(row=True), *clean, *noise, *rows, *curves, *moved]))
 
 
-def bystander_points(suite: DigitalSuite) -> list[Point]:
+def bystander_points(suite: AttackTable) -> list[Point]:
     """The conditions of a detector that takes part in the transfer alone: clean data, and the attacks made against it.
 
     Raises:
@@ -277,7 +298,7 @@ def bystander_points(suite: DigitalSuite) -> list[Point]:
     return list(dict.fromkeys([*(Point(scenes=one.scenes) for one in moved), *moved]))
 
 
-def transfers_of(suite: DigitalSuite) -> list[Point]:
+def transfers_of(suite: AttackTable) -> list[Point]:
     """The attacks whose pictures are shown to other detectors.
 
     Raises:
@@ -286,7 +307,7 @@ def transfers_of(suite: DigitalSuite) -> list[Point]:
     return [Point((_spec(suite, one, one.radius, one.steps),), scenes=one.scenes or 0) for one in suite.transfer]
 
 
-def _spec(suite: DigitalSuite, method: Method, radius: float | None, steps: int | None) -> AttackSpec:
+def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int | None) -> AttackSpec:
     """An attack with all its settings; it is built, to see whether it takes them. ConfigError."""
     options = dict(method.options)
     if steps is not None or takes(method.name, "steps"):
@@ -311,7 +332,7 @@ def _spec(suite: DigitalSuite, method: Method, radius: float | None, steps: int 
     return replace(spec, precision=method.precision or suite.precision) if graded else spec
 
 
-def _swept(suite: DigitalSuite) -> list[Point]:
+def _swept(suite: AttackTable) -> list[Point]:
     """The points of the curves; a radius of 0 is the clean data. ConfigError."""
     found = []
     for one in suite.sweeps:
@@ -321,3 +342,10 @@ def _swept(suite: DigitalSuite) -> list[Point]:
         specs += [_spec(suite, one, None, steps) for steps in one.steps]
         found += [Point((spec,), scenes=one.scenes or 0) for spec in specs]
     return found
+
+
+def _options(spec: AttackSpec) -> str:
+    others = [(key, value) for key, value in spec.options if key != "steps"]
+    others += [("draws", spec.draws)] if spec.draws else []
+    others += [("precision", spec.precision)] if spec.precision != "float32" else []
+    return " ".join(f"{key}={value}" for key, value in others)
