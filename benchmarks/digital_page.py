@@ -9,8 +9,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ssad.bench.kinds.detection import state_hash
 from ssad.bench.suite import load_suite
+from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
 
 ROOT = Path(__file__).parents[1]

@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ssad.bench.kinds.detection import state_hash
+from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
 
 ROOT = Path(__file__).parents[1]

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ssad.bench.kinds.detection import state_hash
+from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
 from ssad.report.kinds.detection import title_of
 from ssad.report.paper import SHIFTS as PUBLISHED

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ssad.bench.kinds.detection import state_hash
+from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
 from ssad.scenarios.static.shifts import VERSIONS
 

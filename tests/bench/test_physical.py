@@ -11,8 +11,7 @@ import pytest
 from helpers.command import ssad
 
 from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.physical import Physical, attacks_of
-from ssad.bench.physical_suite import PhysicalSuite
+from ssad.bench.kinds.physical import Physical, PhysicalSuite, attacks_of
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite
 from ssad.core import safeio
@@ -179,7 +178,7 @@ def test_textures_of_a_run_are_exported(tmp_path: Path, monkeypatch: pytest.Monk
     """A control can be made any time; what is not trained, or shows no texture, is one line."""
     attacks = [{"name": "random", "carrier": "patch", "options": {"width": 1.2, "height": 0.3}}, "vanishing"]
     plan = Physical().plan(suite(attacks=attacks))
-    monkeypatch.setattr("ssad.bench.texture_export.read_plan", lambda folder: plan)
+    monkeypatch.setattr("ssad.bench.kinds.physical.read_plan", lambda folder: plan)
     clean, random, vanishing = plan.cells
     done = ssad("export", "texture", str(tmp_path), random.key, str(tmp_path / "out"), "--dots", "400")
     assert str(tmp_path / "out" / "target.obj") in done.stdout.replace("\n", "")

@@ -22,9 +22,11 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
-    from ssad.bench.texture_export import export_cell_texture
+    from ssad.bench.kinds.physical import shown_by
+    from ssad.recording.target_export import export_shown_texture
 
-    for path in export_cell_texture(folder, cell, out, dots=dots):
+    attacks, found = shown_by(folder, cell)
+    for path in export_shown_texture(attacks, found.spec, out, name=found.name, dots=dots):
         print(path)
 
 
@@ -36,9 +38,11 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and what a projector shows."""
-    from ssad.bench.texture_export import export_cell_light
+    from ssad.bench.kinds.physical import shown_by
+    from ssad.recording.target_export import export_shown_light
 
-    for path in export_cell_light(folder, cell, out):
+    attacks, found = shown_by(folder, cell)
+    for path in export_shown_light(attacks, found.spec, out, name=found.name):
         print(path)
 
 

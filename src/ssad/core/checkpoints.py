@@ -68,6 +68,11 @@ def hash_state(state: Mapping[str, Tensor]) -> str:
     return total.hexdigest()
 
 
+def state_hash(detector: Any) -> str:
+    """12 hex digits over the weights of a detector; "" for one that is no module."""
+    return hash_state(detector.state_dict())[:12] if hasattr(detector, "state_dict") else ""
+
+
 # ---------------------------------------------------------------- reading
 
 

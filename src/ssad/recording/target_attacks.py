@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
@@ -22,10 +22,12 @@ from ssad.core.types import U8
 from ssad.detectors import make_detector
 from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import quiet_warp
+from ssad.jobs.pool import open_pool, run_all
+from ssad.recording.clips import Clips
 from ssad.recording.lit_clips import LitPictures
 from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.target_views import TargetClips
-from ssad.recording.textured_clips import see_clips
+from ssad.recording.textured_clips import see_clips, unseen_parts
 from ssad.scenarios.static.physical import Surface, TextureSpec, View, albedo_of, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
 from ssad.scenarios.static.physical.noninvasive import LitView, Target
@@ -179,6 +181,29 @@ def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:
     folder, part, target, surfaces, device = task
     quiet_warp()
     see_clips(folder, layers_of(target, surfaces), part=part, device=device)
+
+
+def see_all(
+    recordings: Sequence[Clips],
+    target: str,
+    surfaces: Sequence[str],
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> None:
+    """Render once what the pictures of recordings see of carriers, all parts side by side; what is kept stays.
+
+    Raises:
+        StoreError: Some parts failed.
+    """
+    tasks = [
+        (clips.out, part, target, surfaces, clips.device)
+        for clips in recordings if surfaces for part in unseen_parts(clips.out, layers_of(target, surfaces))
+    ]  # fmt: skip
+    if tasks:
+        pool = open_pool(len(tasks), workers=workers, ray=ray, device=recordings[0].device)
+        run_all(pool, see_surfaces, tasks, progress=progress)
 
 
 def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal, ...]]:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.kinds.physical import Physical
-from ssad.bench.physical_suite import PhysicalSuite
+from ssad.bench.kinds.physical import Physical, PhysicalSuite
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import read_image, save_picture
 from ssad.core.types import U8

@@ -19,7 +19,7 @@ from rich.console import Console
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.run import hash_artefacts
 from ssad.core import safeio
-from ssad.core.checkpoints import hash_state
+from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
@@ -354,11 +354,6 @@ def detectors_of(
         own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
         weights[name], files[name] = state_hash(detector) + own, path
     return weights, files, tasks
-
-
-def state_hash(detector: Any) -> str:
-    """12 hex digits over the weights of a detector; "" for one that is no module."""
-    return hash_state(detector.state_dict())[:12] if hasattr(detector, "state_dict") else ""
 
 
 def data_of(suite: DetectorSuite) -> dict[str, Any]:

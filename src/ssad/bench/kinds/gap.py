@@ -395,7 +395,7 @@ def _detector(name: str, weights: str | None, width: int | None) -> Any:
 
 def _version(system: System) -> str:
     """Hash of the weights of a system's detector."""
-    from ssad.bench.kinds.detection import state_hash
+    from ssad.core.checkpoints import state_hash
 
     if system.perfect:
         return ""

@@ -3,39 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache, partial
-from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources
-from ssad.bench.kinds.detection import state_hash
-from ssad.bench.physical_lights import CLEAN, light_cells, lights_shown
-from ssad.bench.physical_suite import Pair, PhysicalSuite, carrier_title, row_of, target_of
-from ssad.core import safeio
+from pydantic import Field
+
+from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources, SuiteBase, find_cell
+from ssad.bench.run import read_plan
+from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError
-from ssad.core.images import save_picture
 from ssad.detectors import make_detector
 from ssad.evaluation.target_grid import grid_scores
 from ssad.evaluation.target_scores import Sighting, sightings, target_scores
 from ssad.jobs.machine import keep_memory, quiet_warp
-from ssad.jobs.pool import open_pool, run_all
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import record_all
-from ssad.recording.clips import Clips
 from ssad.recording.lit_clips import LitPictures
-from ssad.recording.target import TargetCar, class_of_target
-from ssad.recording.target_attacks import TargetAttacks, layers_of, see_surfaces
+from ssad.recording.target import class_of_target
+from ssad.recording.target_attacks import TargetAttacks, see_all
+from ssad.recording.target_sheets import write_sheets
+from ssad.recording.target_table import CLEAN, GRID, TargetTable, rows_of, target_of
 from ssad.recording.target_views import TargetClips
-from ssad.recording.textured_clips import unseen_parts
 from ssad.roads import town_names
-from ssad.scenarios.static.physical import CONTROLS, TextureSpec, make_carrier
+from ssad.scenarios.static.physical import TextureSpec
 from ssad.scenarios.static.physical.noninvasive.kept import LightSpec
 
-GRID = "grid"
-VIEWS = ("drive", GRID)
-SIDES = (0.0, 90.0, 180.0, 270.0)  # of the grid that pictures show
+
+class PhysicalSuite(SuiteBase, TargetTable):
+    """One table: 2D detectors x textures on a car, each trained on drives in one town and tested in another.
+
+    Attributes:
+        floor: least AP50 of the clean pictures, below which no attack is reported.
+        replicates: of the bootstrap over drives.
+    """
+
+    kind: Literal["physical"]
+    floor: float = Field(default=0.9, ge=0.0, le=1.0)
+    replicates: int = Field(default=100, ge=0, le=10_000)
 
 
 class Physical(Kind):
@@ -72,64 +77,19 @@ class Physical(Kind):
             for town in (pair.train, pair.test):
                 if town not in town_names():
                     raise ConfigError(f"suite {suite.name}: unknown town '{town}' (see: ssad list towns)")
-        rows = [row_of(suite, entry) for entry in suite.attacks]
-        for row in rows:
-            make_carrier(row["carrier"], row["options"]).on(target.mesh())
-        cells: dict[str, Cell] = {}
-        if suite.grid is not None:
-            _grid_clips(suite, Path(), suite.pairs[0].test, device)
         for town in (suite.grid.towns or ()) if suite.grid is not None else ():
             if town not in {pair.test for pair in suite.pairs}:
                 raise ConfigError(f"suite {suite.name}: grid: no pair is tested in {town}")
-        for pair, view, detector in product(suite.pairs, VIEWS, weights):
-            if view == GRID and not _seen_around(suite, pair):
-                continue
-            for row in [{"attack": None}, *rows] if rows or not suite.lights else []:
-                for cell in self._cells(suite, pair, view, detector, row, weights, device):
-                    cells.setdefault(cell.key, cell)
-        cells |= {cell.key: cell for cell in light_cells(self, suite, weights, device)}
+        suite.recordings(Path(), device)
+        about = suite.target, suite.place, suite.size, suite.floor, suite.replicates, device
+        cells: dict[str, Cell] = {}
+        for row in rows_of(suite):
+            detector, source = row.fields["detector"], row.spec.get("light", row.spec).get("source", "")
+            grid = suite.grid.model_dump_json() if suite.grid and row.fields["view"] == GRID else ""
+            inputs = *about, grid, weights[detector], weights.get(source, "")
+            cell = self.make_cell(row.title, detector, suite.seed, row.fields, row.spec, *inputs)
+            cells.setdefault(cell.key, cell)
         return Plan(self, suite, device, tuple(cells.values()), {"weights": weights}, {}, None)
-
-    def _cells(  # noqa: PLR0917
-        self,
-        suite: PhysicalSuite,
-        pair: Pair,
-        view: str,
-        detector: str,
-        row: Mapping[str, Any],
-        weights: Mapping[str, str],
-        device: str,
-    ) -> list[Cell]:
-        """The cells of an attack on a detector in a pair of towns."""
-        attack = row["attack"]
-        trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
-        moved = trained and ((suite.transfer and row["of"] is None) or detector in suite.judges)
-        sources = [row["source"]] if "file" in row else suite.detectors if moved else [detector]
-        seeds = range(suite.seeds) if attack in ("random", "noise", "shuffled") else (0,)
-        found = []
-        for source in sources:
-            for seed in seeds:
-                spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
-                spec["source"] = source if trained else ""
-                fields = {
-                    "test": pair.test, "train": pair.train, "view": view, "detector": detector,
-                    "carrier": carrier_title(row),
-                    "attack": _title(row),
-                    "source": source if trained else "", "number": seed,
-                }  # fmt: skip
-                title = "/".join(
-                    str(one) for one in [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
-                )
-                if view == GRID:
-                    title += f"/{GRID}"
-                grid = suite.grid.model_dump_json() if suite.grid and view == GRID else ""
-                inputs = suite.target, suite.place, suite.size, suite.floor, suite.replicates, grid, device
-                found.append(
-                    self.make_cell(
-                        title, detector, suite.seed, fields, spec, *inputs, weights[detector], weights.get(source, "")
-                    )
-                )
-        return found
 
     def order(self, cell: Cell) -> float:
         """From behind before from all around; clean first, then controls, then what is trained."""
@@ -139,36 +99,14 @@ class Physical(Kind):
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """Records the pictures, and renders once what they see of each carrier."""
         suite: PhysicalSuite = plan.suite
-        images: dict[str, int] = {}
-        for pair in suite.pairs:
-            for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
-                images[town] = max(images.get(town, 0), count)
-        target = target_of(suite)
-        mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
-        recordings = [
-            Clips(
-                folder / "data" / town, ((town, count),), (), mode, suite.size, target, suite.behind, seed=suite.seed,
-                device=plan.device, distances=tuple(suite.distances),
-            )
-            for town, count in images.items()
-        ]  # fmt: skip
-        if suite.grid is not None:
-            tests = dict.fromkeys(pair.test for pair in suite.pairs if _seen_around(suite, pair))
-            recordings += [_grid_clips(suite, folder, town, plan.device) for town in tests]
-        further = max((entry.around for entry in suite.attacks), default=0)
-        for town in dict.fromkeys(pair.train for pair in suite.pairs) if further else ():
-            recordings.append(replace(_around(folder, town, suite, plan.device), images=((town, further),)))
+        recordings = suite.recordings(folder, plan.device)
+        work: dict[str, Any] = {"workers": resources.workers, "ray": resources.ray}
         with Live("recording", 1, 0, console=resources.console, unit="parts") as live:
-            record_all(recordings, workers=resources.workers, ray=resources.ray, progress=live.show)
+            record_all(recordings, **work, progress=live.show)
         surfaces = list(dict.fromkeys(TextureSpec.of_row(c.spec).surface for c in plan.cells if c.spec["attack"]))
-        tasks = [
-            (clips.out, part, suite.target, surfaces, plan.device)
-            for clips in recordings if surfaces for part in unseen_parts(clips.out, layers_of(suite.target, surfaces))
-        ]  # fmt: skip
-        if tasks:
-            pool = open_pool(len(tasks), workers=resources.workers, ray=resources.ray, device=plan.device)
-            with Live("rendering what wears textures", len(tasks), 0, console=resources.console, unit="parts") as live:
-                run_all(pool, see_surfaces, tasks, progress=live.show)
+        if surfaces:
+            with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as live:
+                see_all(recordings, suite.target, surfaces, **work, progress=live.show)
         return {
             "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
             "grid": suite.grid.count if suite.grid else 0,
@@ -237,45 +175,7 @@ class Physical(Kind):
         """Pictures of each test town under each texture, of the grid from four sides, and of lights: DIR/pictures."""
         suite: PhysicalSuite = plan.suite
         attacks = attacks_of(Job(folder, plan.device, {"target": suite.target, "seed": suite.seed}))
-        captions, name = {}, suite.detectors[0]
-        lights, path = lights_shown(plan.cells, suite, attacks.lights), folder / "pictures" / "lights.jpg"
-        if lights and not path.is_file() and (folder / "data" / suite.pairs[0].test / "annotations").is_dir():
-            save_picture(path, attacks.light_sheet(name, suite.pairs[0].test, lights))
-        if path.is_file():
-            captions[path.name] = (
-                f"What {name} finds (orange, score at least 0.25) in a picture of {suite.pairs[0].test} under each "
-                "light."
-            )
-        for pair in suite.pairs:
-            chosen = self._chosen(plan, attacks, pair, name)
-            trained = [(title, spec) for title, spec in chosen.items() if spec.source and not spec.of]
-            for view, text, sides, shown in (
-                ("drive", "from behind", (None,), chosen),
-                (GRID, "from the front, the left, the rear and the right", SIDES, dict(trained[-1:])),
-            ):
-                path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
-                clips = TargetClips(folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}", 1)
-                if chosen and not path.is_file() and (clips.folder / "annotations").is_dir():
-                    save_picture(path, attacks.sheet(name, clips, textures=shown, sides=sides, clean=CLEAN))
-                if path.is_file():
-                    captions[path.name] = (
-                        f"What {name} finds (orange, score at least 0.25) in {pair.test}, clean and attacked, {text}."
-                    )
-        if captions:
-            safeio.write_atomic(folder / "pictures" / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
-
-    def _chosen(self, plan: Plan, attacks: TargetAttacks, pair: Pair, detector: str) -> dict[str, TextureSpec]:
-        """The textures of a pair of towns that are there, one of each attack, by title."""
-        found: dict[str, TextureSpec] = {}
-        for cell in plan.cells:
-            spec = cell.spec
-            if spec["attack"] is None or spec["pair"] != pair.model_dump() or spec["number"]:
-                continue
-            if cell.system == detector and spec["source"] in ("", detector):
-                texture = TextureSpec.of_row(spec)
-                if not texture.trained or attacks.textures.kept(texture).is_file():
-                    found.setdefault(f"{cell.fields['attack']} ({cell.fields['carrier']})", texture)
-        return found
+        write_sheets(attacks, suite, [(cell.fields, cell.spec) for cell in plan.cells])
 
 
 def attacks_of(job: Job) -> TargetAttacks:
@@ -289,33 +189,17 @@ def _clean_sightings(pictures: TargetClips | LitPictures, detector: str) -> tupl
     return tuple(sightings(make_detector(detector, device=pictures.device), pictures.clean()))
 
 
-def _grid_clips(suite: PhysicalSuite, folder: Path, town: str, device: str) -> Clips:
-    """The recording of a suite's grid in a town. ConfigError, UnknownNameError: a value that cannot be."""
-    assert suite.grid is not None
-    grid = suite.grid
-    return Clips(
-        folder / "data" / f"{town}-grid", ((town, grid.count),), (), mode="orbit", target=target_of(suite),
-        size=suite.size, seed=suite.seed, device=device, distances=tuple(grid.distances),
-        azimuths=tuple(grid.azimuths), elevations=tuple(grid.elevations), weathers=tuple(grid.weathers),
-    )  # fmt: skip
+def shown_by(folder: Path, name: str) -> tuple[TargetAttacks, Cell]:
+    """A cell of a physical run, and where its textures and lights are.
 
+    Args:
+        folder: Results folder of the run.
+        name: The cell: its key, the start of one, or its name.
 
-def _around(folder: Path, town: str, suite: PhysicalSuite, device: str) -> Clips:
-    """The recording of pictures from all around for trainings in a town."""
-    return Clips(
-        folder / "data" / f"{town}-around", ((town, 1),), (), mode="orbit", target=target_of(suite), size=suite.size,
-        seed=suite.seed, device=device,
-    )  # fmt: skip
-
-
-def _seen_around(suite: PhysicalSuite, pair: Pair) -> bool:
-    """Whether the grid is seen in the test of a pair."""
-    return suite.grid is not None and (suite.grid.towns is None or pair.test in suite.grid.towns)
-
-
-def _title(row: Mapping[str, Any]) -> str:
-    """What tables call the attack of a row: such as "shuffled vanishing, all sides"."""
-    if row["attack"] is None:
-        return CLEAN
-    sides = ", all sides" if row.get("around") else ""
-    return f"shuffled {row['of']}{sides}" if row["of"] else f"{row['attack']}{sides}"
+    Raises:
+        ConfigError: There is no such cell, or the run is of another kind.
+    """
+    plan = read_plan(folder)
+    if plan.kind.name != Physical.name:
+        raise ConfigError(f"{folder}: a run of kind {plan.kind.name} shows neither textures nor lights")
+    return TargetAttacks(folder, plan.suite.target, plan.suite.seed), find_cell(plan.cells, name)
