@@ -283,8 +283,8 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
             light = {"number": 0, **row, "source": source, "pair": pair.model_dump()}
             fields = {
                 "test": pair.test, "train": pair.train, "view": "drive", "detector": detector,
-                "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}), "attack": _light_title(row), "source": source,
-                "number": light["number"],
+                "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}),
+                "attack": _light_title(row), "source": source, "number": light["number"],
             }  # fmt: skip
             words = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
             yield TargetRow("/".join(map(str, words)), fields, {"attack": None, "light": light})

@@ -80,7 +80,6 @@ class Physical(Kind):
         for town in (suite.grid.towns or ()) if suite.grid is not None else ():
             if town not in {pair.test for pair in suite.pairs}:
                 raise ConfigError(f"suite {suite.name}: grid: no pair is tested in {town}")
-        suite.recordings(Path(), device)
         about = suite.target, suite.place, suite.size, suite.floor, suite.replicates, device
         cells: dict[str, Cell] = {}
         for row in rows_of(suite):
@@ -89,6 +88,7 @@ class Physical(Kind):
             inputs = *about, grid, weights[detector], weights.get(source, "")
             cell = self.make_cell(row.title, detector, suite.seed, row.fields, row.spec, *inputs)
             cells.setdefault(cell.key, cell)
+        suite.recordings(Path(), device)
         return Plan(self, suite, device, tuple(cells.values()), {"weights": weights}, {}, None)
 
     def order(self, cell: Cell) -> float:
