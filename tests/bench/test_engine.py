@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import inspect
 import io
 import json
@@ -92,6 +93,18 @@ def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -
 def test_a_bad_cell_costs_only_itself(tmp_path: Path, workers: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(WORKER_MEMORY, str(512 << 20))
     check_bad_cells(tmp_path, workers)
+
+
+def test_what_a_kind_imports_costs_no_cell_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine, good cells ran into their time-out, each the first of a new worker."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "late_dice.py").write_text(
+        "import sys, time\nfrom helpers.own_kind import Dice\n\n\nclass Late(Dice):\n    pass\n\n\n"
+        "time.sleep(2.0 * sys.argv[0].endswith('worker.py'))\n"
+    )
+    plan = importlib.import_module("late_dice").Late().plan(dice(["a"]))
+    (record,) = run(plan, tmp_path / "run", Resources(1, console=Console(file=io.StringIO())))
+    assert (record["status"], record["wall_s"] < 2.0) == ("ok", True)
 
 
 @pytest.mark.slow

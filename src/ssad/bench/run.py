@@ -104,8 +104,7 @@ class _Schedule:
         count = len(self.data) + len(missing)
         place = self.resources
         workers = self.kind.workers(self.plan, place.workers)
-        begins = type(self.kind).start is not Kind.start
-        start = (_start, (self.kind, self.job)) if begins else None
+        start = (_start, (self.kind, self.job))  # of every kind: importing it takes seconds that are no cell's
         total = len(self.plan.cells) + len(self.data)
         done = len(self.plan.cells) - len(missing)
         with (
