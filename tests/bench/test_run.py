@@ -240,7 +240,10 @@ def test_the_pool_is_asked_for_what_the_run_may_use(bench: Bench, monkeypatch: p
         bench.folder = bench.folder.with_name(f"shared-{k}")
         bench.run("a b", "1 2 3", workers=workers)
     (six, plain), (three, own), (shared, _), _ = bench.asked
-    assert (six, plain) == (6, {"workers": 3, "ray": None, "device": "cpu", "start": None})
+    function, argument = plain.pop("start")
+    assert (six, plain) == (6, {"workers": 3, "ray": None, "device": "cpu"})
+    function(argument)
+    assert isinstance(argument[0], Words)
     assert three == 3
     function, argument = own.pop("start")
     assert own == {"workers": None, "ray": None, "device": "cuda"}
