@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ssad.core.detections import Detections, Truth
-from ssad.evaluation.target_scores import Sighting, sighting, target_scores
+from ssad.evaluation.target_scores import Sighting, _precisions, precision, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 
@@ -100,3 +100,22 @@ def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
     low, high = once["intervals"]["AP50"]
     assert low <= once["metrics"]["AP50"] <= high
     assert target_scores(some)["intervals"] == once["intervals"], "the draws come from the seed"
+
+
+def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
+    """Matched once, and drawn as pictures that are matched anew: the same, also where scores are equal."""
+    draws = np.random.default_rng(0)
+    pictures = []
+    for drive in range(6):
+        for _ in range(4):
+            boxes = [(np.array(TARGET) + draws.normal(0.0, 6.0, 4)).tolist() for _ in range(5)]
+            pictures.append(seen(*((b, round(draws.random(), 1)) for b in boxes), real=(TARGET, OTHER)))
+    of = np.repeat(np.arange(6, dtype=np.int32), 4)
+    drawn = [draws.integers(6, size=6) for _ in range(20)]
+    for target_only, least in ((True, 0.0), (False, 0.25)):
+        naive = []
+        for drives in drawn:
+            picked = [pictures[k] for drive in drives for k in np.flatnonzero(of == drive)]
+            naive.append(precision(picked, target_only=target_only, least=least))
+        assert _precisions(pictures, of, drawn, target_only=target_only, least=least) == naive
+        assert len(set(naive)) > 10

@@ -15,7 +15,8 @@ from ssad.core.detections import Detections, Truth
 from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
 from ssad.core.types import F64, I32, Bool
-from ssad.metrics.detection2d import Boxes2D, average_precision
+from ssad.metrics.detection2d import Boxes2D, Matched2D, average_precision, match_2d
+from ssad.metrics.detection_boxes import I64
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
 
 IOU = 0.5
@@ -122,12 +123,10 @@ def target_scores(
     for name, (target_only, least) in PRECISIONS.items():
         value = metrics[name] = precision(sightings, target_only=target_only, least=least)
         if len(drives) >= MIN_CLUSTERS and replicates and value is not None:
-            draws, values = generator("target scores", seed, name), []
-            for _ in range(replicates):
-                drawn = draws.integers(len(drives), size=len(drives))
-                picked = np.concatenate([np.flatnonzero(of == drive) for drive in drawn])
-                values.append(precision([sightings[k] for k in picked], target_only=target_only, least=least))
-            spread = np.asarray(np.var([v for v in values if v is not None], ddof=1))
+            draws = generator("target scores", seed, name)
+            drawn = [draws.integers(len(drives), size=len(drives)) for _ in range(replicates)]
+            values = _precisions(sightings, of, drawn, target_only=target_only, least=least)
+            spread = np.asarray(np.var(values, ddof=1))
             low, high = replicate_limits(np.asarray(value), spread, len(drives), bounded=True)
             intervals[name] = [float(low), float(high)]
     scores = [one.confidences() for one in sightings]
@@ -153,6 +152,46 @@ def target_scores(
 
 def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
     """AP50 of boxes above a score: of the target alone (others count neither way), or of all vehicles of its class."""
+    real, found = _tables(sightings, target_only=target_only, least=least)
+    value = average_precision(real, found, labels=1, threshold=IOU)[0]
+    return None if np.isnan(value) else float(value)
+
+
+def _precisions(
+    sightings: Sequence[Sighting], of: I32, drawn: Iterable[I64], *, target_only: bool, least: float
+) -> list[float]:
+    """`precision` of several draws of drives; what a box hits in its picture does not depend on the draw.
+
+    Args:
+        sightings: All pictures.
+        of: The drive of each [N].
+        drawn: Drives of each draw, some of them several times.
+        target_only: See `precision`.
+        least: See `precision`.
+    """
+    real, found = _tables(sightings, target_only=target_only, least=least)
+    matched = match_2d(real, found, labels=1, threshold=IOU)
+    assert matched.row is not None
+    assert found.score is not None
+    assert real.ignore is not None
+    row, hit = matched.row[~matched.ignored], matched.hit[~matched.ignored]
+    order = np.argsort(found.image[row], kind="stable")  # picture after picture, in each the best box first
+    row, hit = row[order], hit[order]
+    drive = of[found.image[row]]
+    count = np.bincount(of[real.image[~real.ignore]], minlength=int(of.max()) + 1)
+    own = [np.flatnonzero(drive == one) for one in range(len(count))]
+    values = []
+    for drives in drawn:
+        boxes = np.concatenate([own[one] for one in drives])
+        boxes = boxes[np.argsort(-found.score[row[boxes]], kind="stable")]
+        none = np.zeros(len(boxes), np.bool_)
+        ranked = Matched2D(none.astype(np.int32), hit[boxes], none, np.array([count[drives].sum()]))
+        values.append(float(ranked.average_precision()[0]))
+    return [value for value in values if not np.isnan(value)]
+
+
+def _tables(sightings: Sequence[Sighting], *, target_only: bool, least: float) -> tuple[Boxes2D, Boxes2D]:
+    """True and found boxes of pictures, for their AP."""
     crowd = []
     own_boxes = [(one.box[one.score > least], one.score[one.score > least]) for one in sightings]
     for one in sightings:
@@ -161,13 +200,10 @@ def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least:
         if target_only:
             own[1:] = True
         crowd.append(own)
-    value = average_precision(
+    return (
         _boxes([s.real for s in sightings], ignore=crowd),
         _boxes([box for box, _ in own_boxes], score=[score for _, score in own_boxes]),
-        labels=1,
-        threshold=IOU,
-    )[0]
-    return None if np.isnan(value) else float(value)
+    )
 
 
 def _boxes(

@@ -475,6 +475,7 @@ def clip_views(
     device: str = "cpu",
     only: Collection[str] | None = None,
     hour: Callable[[Weather], Weather] = lambda weather: weather,
+    stages: dict[Any, Any] | None = None,
 ) -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
 
@@ -486,6 +487,7 @@ def clip_views(
         device: Where to render.
         only: Names of the files that are wanted; None for all.
         hour: The weather to show instead of the recorded one.
+        stages: Where all scenes are kept for another call; None: they are let go one after the other.
 
     Raises:
         FormatError: No recording of this version.
@@ -494,14 +496,14 @@ def clip_views(
     rows = clip_rows(folder, split)
     try:
         clips = _clips_of(recording_of(folder, split), folder, device)
-        sets: dict[tuple[object, ...], _Set] = {}
+        sets: dict[tuple[object, ...], _Set] = {} if stages is None else stages
         for row, objects in rows:
             if only is not None and row["file_name"] not in only:
                 continue
             key = (clips.seed, clips.mode, row["town"], row["part"], row["attempt"])
             if key not in sets:
-                # one part at a time: its pictures may come from several drives
-                sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
+                if stages is None:  # one part at a time: its pictures may come from several drives
+                    sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
                 sets[key] = _prepare(clips, row["town"], key)
             made = sets[key]
             weather = hour(Weather(**row["light"]))

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import torch
 from torch import Tensor
@@ -106,7 +106,13 @@ def _part(clip: ClipView) -> tuple[slice, slice]:
 
 
 def lit_clips(
-    folder: Path, hour: str, *, device: str = "cpu", count: int | None = None, split: str = "all"
+    folder: Path,
+    hour: str,
+    *,
+    device: str = "cpu",
+    count: int | None = None,
+    split: str = "all",
+    stages: dict[Any, Any] | None = None,
 ) -> Iterator[LitClip]:
     """The pictures of a recording at an hour, in order.
 
@@ -116,6 +122,7 @@ def lit_clips(
         device: Where to render.
         count: How many; None for all.
         split: train, test or all.
+        stages: See `clip_views`.
 
     Raises:
         FormatError: No recording of this version.
@@ -125,7 +132,12 @@ def lit_clips(
     wanted = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
     made: tuple[Scene, Scene] | None = None
     for clip in clip_views(
-        folder, split=split, device=device, only=wanted, hour=lambda weather: at_hour(weather, hour)
+        folder,
+        split=split,
+        device=device,
+        only=wanted,
+        hour=lambda weather: at_hour(weather, hour),
+        stages=stages,
     ):
         if made is None or made[0] is not clip.scene:
             made = clip.scene, Scene(clip.scene.street, [*clip.scene.meshes, BLIND.mesh()], device=device)
@@ -176,4 +188,10 @@ class LitPictures:
 
 @lru_cache(maxsize=4)
 def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ...]:
-    return tuple(lit_clips(folder, hour, count=count, device=device))
+    return tuple(lit_clips(folder, hour, count=count, device=device, stages=_stages(folder, device)))
+
+
+@lru_cache(maxsize=2)
+def _stages(folder: Path, device: str) -> dict[Any, Any]:
+    """The scenes of a recording, which are the same at all hours."""
+    return {}

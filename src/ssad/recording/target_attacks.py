@@ -20,6 +20,7 @@ from ssad.core.detections import Truth
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.detectors import make_detector
+from ssad.evaluation.target_scores import TOGETHER
 from ssad.evaluation.target_sheet import COLUMNS, target_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool, run_all
@@ -62,12 +63,11 @@ class TargetAttacks:
 
     def detector(self, name: str) -> Detector:
         """A detector where it is needed."""
-        made: Detector = make_detector(name, device=self.device)
-        return made
+        return _detector(name, self.device)
 
     def clips(self, recording: str, count: int, detector: str) -> TargetClips:
         """The first pictures of a recording as they are, or with a target that waits for a texture."""
-        return TargetClips(self.folder / "data" / recording, count, tuple(make_detector(detector).classes), self.device)
+        return TargetClips(self.folder / "data" / recording, count, tuple(self.detector(detector).classes), self.device)
 
     def texture(self, spec: TextureSpec) -> Tensor:
         """A texture [3, H, W], sRGB; trained now if it has to be. ConfigError as for `TextureFolder.texture`."""
@@ -84,9 +84,13 @@ class TargetAttacks:
     def worn(self, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
         """Drive, picture and truth of clips under a texture."""
         colour = albedo_of(self.texture(spec)).to(self.device)  # may be trained now, so gradients are on
-        for drive, view in clips.wearing(surface_of(self.target, spec.surface)):
+        left = clips.wearing(surface_of(self.target, spec.surface))
+        while own := list(islice(left, 1 if self.device == "cpu" else TOGETHER)):
+            pictures = [view.picture for _, view in own]
             with torch.no_grad():
-                yield drive, view.picture.together([view.picture], {0: colour[None]}), view.truth
+                images = pictures[0].together(pictures, {0: colour.expand(len(own), *colour.shape)})
+            for (drive, view), image in zip(own, torch.split(images, 1), strict=True):
+                yield drive, image, view.truth
 
     def about(self, spec: TextureSpec) -> dict[str, Any]:
         """What records say of a texture: its picture, and how it was trained."""
@@ -209,6 +213,13 @@ def see_all(
 def layers_of(target: str, surfaces: Sequence[str]) -> list[tuple[Layer | Decal, ...]]:
     """Where textures go, each alone, as `see_clips` takes them."""
     return [(surface_of(target, surface).layer,) for surface in surfaces]
+
+
+@lru_cache(maxsize=4)
+def _detector(name: str, device: str) -> Detector:
+    """A detector, kept: trainings and tests leave it as it is."""
+    made: Detector = make_detector(name, device=device)
+    return made
 
 
 @lru_cache(maxsize=16)

@@ -15,7 +15,7 @@ from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError
 from ssad.detectors import make_detector
 from ssad.evaluation.target_grid import grid_scores
-from ssad.evaluation.target_scores import Sighting, sightings, target_scores
+from ssad.evaluation.target_scores import Sighting, precision, sightings, target_scores
 from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import record_all
@@ -150,10 +150,10 @@ class Physical(Kind):
         clips = attacks.clips(f"{pair['test']}{'-grid' if grid else ''}", count, detector)
         lit = LitPictures.of(clips, light["hour"]) if light else None
         clean = _clean_sightings(lit or clips, detector)
-        before = target_scores(clean, **draws)
         if cell.fields["attack"] == CLEAN:
-            return before | (grid_scores(clips.rows(), clean, None, floor=floor) if grid else {})
-        have = before["metrics"]["AP50"] or 0.0
+            found = target_scores(clean, **draws)
+            return found | (grid_scores(clips.rows(), clean, None, floor=floor) if grid else {})
+        have = round(precision(clean) or 0.0, 6)
         if have < floor:
             when = f" ({light['hour']})" if light else ""
             raise CellError(
