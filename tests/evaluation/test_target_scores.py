@@ -106,7 +106,7 @@ def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
     """Matched once, and drawn as pictures that are matched anew: the same, also where scores are equal."""
     draws = np.random.default_rng(0)
     pictures = []
-    for drive in range(6):
+    for _drive in range(6):
         for _ in range(4):
             boxes = [(np.array(TARGET) + draws.normal(0.0, 6.0, 4)).tolist() for _ in range(5)]
             pictures.append(seen(*((b, round(draws.random(), 1)) for b in boxes), real=(TARGET, OTHER)))
