@@ -139,6 +139,8 @@ def test_lights_are_cells_with_a_clean_one_for_each_hour_and_random_ones_beside(
     other = Physical().plan(suite(attacks=[], lights=[rows[0] | {"options": {"watts": 0.1}}, rows[1]], seeds=2))
     same = {cell.key for cell in plan.cells} & {cell.key for cell in other.cells}
     assert len(same) == len(plan.cells) - 3
+    named = {cell.fields["carrier"] for cell in other.cells if cell.fields["attack"] != "clean"}
+    assert named == {"light, night, watts 0.1", "light, noon"}, "lasers of two powers are two rows"
     assert len(load_suite("physical-lights").lights) >= 4
     with_textures = Physical().plan(suite(lights=rows, seeds=1))
     assert sum(cell.fields["attack"] == "clean" for cell in with_textures.cells) == 3

@@ -51,7 +51,7 @@ def run_json(plan: Plan) -> dict[str, Any]:
         "identity": digest("run", plan.device, *[cell.key for cell in plan.cells])[:16],
         "kind": kind.name,
         "suite": plan.suite.model_dump(mode="json"),
-        "command": command_of(plan.suite),
+        "command": command_of(plan.suite, plan.device),
         "versions": {**versions(plan.device), **plan.versions},
         "code": kind.code,
         "columns": [vars(column) for column in kind.columns],

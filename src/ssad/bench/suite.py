@@ -146,15 +146,20 @@ def _explain(error: ValidationError, document: Document, changed: dict[str, str]
     return document.error(location, text)
 
 
-def command_of(suite: SuiteBase) -> str:
-    """The command that runs a suite again; only what differs from the suite of that name is spelt out."""
+def command_of(suite: SuiteBase, device: str | None = None) -> str:
+    """The command that runs a suite again; only what differs from the suite of that name is spelt out.
+
+    Args:
+        suite: What was run.
+        device: Where it ran; None: left out, and what is there is taken.
+    """
     values = suite.model_dump(mode="json")
     name = str(values.pop("name"))
     try:
         stock = load_suite(name).model_dump(mode="json")
     except ConfigError:  # a suite of the user's own, by its file
         stock = values
-    words = ["ssad", "run", name]
+    words = ["ssad", "run", name] + (["--device", device] if device else [])
     for key, value in values.items():
         if value != stock.get(key):
             words += ["--set", f"{key}={_flow(value)}"]

@@ -171,7 +171,7 @@ def margin_table(run: PhysicalRun) -> Table:
             own = score(run.lines(test, "drive", detector, attack), "AP50")
             controls = {
                 other: score(run.lines(test, "drive", detector, other), "AP50") for other in run.attacks
-                if other[1] == carrier and other[0].split()[0] in CONTROLS
+                if other[1] == carrier and _learns_nothing(other[0], name)
             }  # fmt: skip
             measured = {other: cell for other, cell in controls.items() if not math.isnan(cell.mean)}
             if math.isnan(own.mean) or not measured:
@@ -186,6 +186,12 @@ def margin_table(run: PhysicalRun) -> Table:
     )
     heads = ("Town", "Detector", "Attack", "Best control")
     return Table("margins", "Attacks against controls", heads, ("attack", "control", "margin"), tuple(rows), note)
+
+
+def _learns_nothing(control: str, attack: str) -> bool:
+    """Whether it is a control of an attack; of a light ("random laser") only of its own kind."""
+    first, _, rest = control.partition(" ")
+    return first in CONTROLS and (first != "random" or rest in ("", attack))
 
 
 def lower(cell: Cell) -> float:
