@@ -25,6 +25,7 @@ TARGET = Aim(objects=(0,))  # the first object of each picture's truth
 INERTIA, PULL = 0.7298, 1.4962  # of a swarm that converges (Clerc and Kennedy, IEEE Trans. Evol. Comput. 6, 2002)
 FASTEST = 0.3  # of a particle, sides of the space a round
 STEPS = (0.2, 0.1, 0.05)  # of the greedy search, one after the other
+POWER = ("watts", "lumens")  # settings that say how strong a light is
 AT_ONCE = 16  # pictures that a detector gets in one call
 
 
@@ -143,9 +144,10 @@ def search_light(
 
 
 def random_settings(attack: LightAttack, target: Target, *, key: tuple[object, ...]) -> dict[str, float]:
-    """Settings that no search has seen: each uniform over its range."""
+    """Settings that no search has seen: each uniform over its range, at full power, as a search may have it."""
     draws = generator("random light", attack.name, *key)
-    return {name: float(draws.uniform(low, high)) for name, (low, high) in attack.ranges(target).items()}
+    drawn = {name: float(draws.uniform(low, high)) for name, (low, high) in attack.ranges(target).items()}
+    return {name: attack.ranges(target)[name][1] if name in POWER else value for name, value in drawn.items()}
 
 
 def _loss(detector: Detector, images: Tensor, truth: Truth) -> Tensor:
