@@ -1,7 +1,8 @@
-"""Write docs/physical_results.md from stored runs: python benchmarks/physical_page.py [RUN]
+"""Write docs/physical_results.md from stored runs: python benchmarks/physical_page.py [RUN...]
 
-With RUN (what `ssad run physical` or `ssad run physical-quick` wrote) its tables and run.json without its cells are
-stored first, in benchmarks/results/NAME of the suite.
+With runs (folders that `ssad run physical` or another of `SUITES` wrote) the tables and run.json without its cells are
+stored first, in benchmarks/results/NAME of the suite. Several runs of one suite, such as of one pair of towns each, are
+joined: of a cell that two have, the later counts.
 """
 
 from __future__ import annotations
@@ -9,11 +10,16 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
+from ssad.report.kinds.physical import section
+from ssad.report.load import load_run
+from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -27,16 +33,35 @@ FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 OTHERS = ("margins", "transfer", "grid", "others", "effort")
 
 
-def store(run: Path) -> None:
-    """Keep what the page needs of a run."""
-    about = json.loads((run / "run.json").read_text())
-    folder = RESULTS / about["suite"]["name"]
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in (run / "results.jsonl").read_text().splitlines()]
-    counts = {"cells": len(about.pop("cells")), "cells_done": sum(row["status"] == "ok" for row in rows)}
-    (folder / "run.json").write_text(json.dumps(about | counts, indent=1) + "\n")
-    for table in sorted((run / "tables").glob("*.md")):
-        shutil.copy(table, folder / table.name)
+def store(folders: Sequence[Path]) -> None:
+    """Keep what the page needs of runs of one suite."""
+    runs = [load_run(folder) for folder in folders]
+    name = runs[0].suite["name"]
+    folder = RESULTS / name
+    lines: dict[tuple[Any, ...], Mapping[str, Any]] = {}
+    cells: set[tuple[Any, ...]] = set()
+    for run in runs:
+        if run.suite["name"] != name:
+            raise SystemExit(f"{run.folder} is of the suite {run.suite['name']}, not of {name}")
+        lines |= {_place(line): line for line in run.lines}
+        cells |= {_place(cell) for cell in run.header["cells"]}
+    about = {key: value for key, value in runs[0].header.items() if key != "cells"}
+    about["weights"] = {key: value for run in runs for key, value in run.header["weights"].items()}
+    about["command"] = list(dict.fromkeys(run.command for run in runs))
+    done = sum(line["status"] == "ok" for line in lines.values())
+    joined = replace(runs[0], header=about, lines=tuple(lines.values()), planned=len(cells))
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    (folder / "run.json").write_text(json.dumps(about | {"cells": len(cells), "cells_done": done}, indent=1) + "\n")
+    for table in section(joined)[1]:
+        (folder / f"{table.name}.md").write_text(to_markdown(table))
+
+
+def _place(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What tells a cell from others, whatever run it is of."""
+    number = row["spec"].get("light", row["spec"])["number"] if "spec" in row else row["number"]
+    names = ("train", "test", "view", "detector", "attack", "carrier", "source")
+    return (*(row[name] for name in names), number)
 
 
 def outdated(about: dict[str, Any]) -> list[str]:
@@ -54,10 +79,10 @@ def part(name: str) -> list[str]:
     lines = [f"## `{name}`", "", suite["description"], ""]
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
+    commands = [about["command"]] if isinstance(about["command"], str) else about["command"]
     lines += [
-        f"Command: `{about.get('command') or SUITES[name]}`. Software: torch {about['versions']['torch']}. Weights: "
-        + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items())
-        + ".",
+        f"Command: {', then '.join(f'`{one}`' for one in commands)}. Software: torch {about['versions']['torch']}. "
+        "Weights: " + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items()) + ".",
         "",
     ]
     done, cells = about.get("cells_done"), about.get("cells")
@@ -84,5 +109,5 @@ def page() -> str:
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
-        store(Path(sys.argv[1]))
+        store([Path(one) for one in sys.argv[1:]])
     PAGE.write_text(page())
