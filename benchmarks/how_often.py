@@ -4,7 +4,8 @@
     uv run python -m benchmarks.how_often coverage --lapse 0.04 --repeats 1000 --json FILE
 
 `brute` runs episodes of one scenario of the set lane-traffic until so many have ended in a collision, and saves after
-each batch. `coverage` repeats both accelerated estimates; how many intervals hold, benchmarks/how_often_page.py counts.
+each batch; what FILE has of the same case is added to. `coverage` repeats both accelerated estimates (with other seeds
+in several processes); how many intervals hold, benchmarks/how_often_page.py counts.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from ssad.core.seeding import generator
 from ssad.drivers import make_system
 from ssad.jobs.machine import quiet_warp
+from ssad.metrics.rare_events import weighted_limits
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
@@ -59,23 +61,33 @@ def write(path: Path | None, data: dict[str, Any]) -> None:
 
 def brute(given: argparse.Namespace) -> None:
     """Plain Monte Carlo."""
+    about = {"scenario": SCENARIO, "device": given.device, "batch": given.batch, "noise": vars(noise_of(given))}
+    names = ("events", "episodes", "work", "seconds", "processor_s")
+    old: dict[str, Any] = dict.fromkeys(names, 0)
+    if given.json is not None and given.json.exists():
+        kept = json.loads(given.json.read_text(encoding="utf-8"))
+        old = kept if {name: kept[name] for name in about} == about else old
+    data = about | old
     process = make_process(given.batch, noise_of(given), device=given.device)
-    random = generator("how often", "brute", given.lapse, given.accel, given.choice_time, given.seed)
-    began = time.perf_counter()
-    processor = time.process_time()
-    for found, keys in monte_carlo(process, random, episodes=given.episodes, events=given.crashes):
+    chance = [given.lapse, given.accel, given.choice_time, given.seed, *([old["episodes"]] if old["episodes"] else [])]
+    random = generator("how often", "brute", *chance)
+    began, processor = time.perf_counter(), time.process_time()
+    wanted = None if given.crashes is None else given.crashes - old["events"]
+    for found, keys in monte_carlo(process, random, episodes=given.episodes - old["episodes"], events=wanted):
         spent = time.perf_counter() - began
-        data = {
-            "scenario": SCENARIO, "device": given.device, "batch": given.batch, "noise": vars(noise_of(given)),
-            "seconds": spent, "processor_s": time.process_time() - processor, "steps_per_s": found.work / spent,
-            "crash_keys": [str(key) for key in keys[:8]], **found.as_dict(),
-        }  # fmt: skip
+        now = found.events, found.episodes, found.work, spent, time.process_time() - processor
+        sums = {name: old[name] + value for name, value in zip(names, now, strict=True)}
+        low, high = (float(v) for v in weighted_limits(sums["events"], sums["events"], 1.0, sums["episodes"]))
+        data = about | found.as_dict() | {"probability": sums["events"] / sums["episodes"], "low": low, "high": high}
+        data |= {"effective": float(sums["events"]), "steps_per_s": sums["work"] / sums["seconds"]} | sums
+        data["crash_keys"] = old.get("crash_keys") or [str(key) for key in keys[:8]]
         write(given.json, data)
         if spent > given.seconds:
             break
     print(
-        f"{found.events} crashes in {found.episodes:,} episodes: {found.probability:.4g} ({found.low:.4g} to "
-        f"{found.high:.4g}), {found.work:.3g} agent-steps in {spent:.1f} s ({found.work / spent:,.0f} a second)"
+        f"{data['events']} crashes in {data['episodes']:,} episodes: {data['probability']:.4g} ({data['low']:.4g} to "
+        f"{data['high']:.4g}), {data['work']:.3g} agent-steps in {data['seconds']:.1f} s "
+        f"({data['work'] / data['seconds']:,.0f} a second)"
     )
 
 
@@ -85,21 +97,22 @@ def coverage(given: argparse.Namespace) -> None:
     training: list[float] = []
     branching: list[list[float]] = []
     began = time.perf_counter()
-    process = make_process(1500, noise_of(given), device=given.device)
+    process = make_process(min(given.each, 16384), noise_of(given), device=given.device)
     for number in range(given.repeats):
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
-            pupil = make_process(1000, noise_of(given), device=given.device)
+            pupil = make_process(1000, noise_of(given), device="cpu")  # it branches on the host
             proposal = learn(pupil, random, components=2, rounds=2, episodes=2000)
             training.append(pupil.work())
-        found, _ = importance(process, proposal, random, episodes=1500, training=training[-1])
+        found, _ = importance(process, proposal, random, episodes=given.each, training=training[-1])
         sampling.append([found.probability, found.low, found.high, found.effective, found.work])
         if number % given.share == given.share - 1 and len(branching) < given.splittings:
-            branch = splitting(make_process(3000, noise_of(given), device=given.device), random, repeats=20).estimate()
+            branch = splitting(make_process(3000, noise_of(given), device="cpu"), random, repeats=20).estimate()
             branching.append([branch.probability, branch.low, branch.high, branch.effective, branch.work])
         if number % 20 == 19 or number == given.repeats - 1:
             data = {
                 "scenario": SCENARIO, "noise": vars(noise_of(given)), "repeats": number + 1, "share": given.share,
+                "each": given.each, "device": given.device,
                 "training": training, "seconds": time.perf_counter() - began, "columns": COLUMNS,
                 "importance": rounded(sampling), "splitting": rounded(branching),
             }  # fmt: skip
@@ -129,6 +142,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--repeats", type=int, default=100)
     parser.add_argument("--share", type=int, default=10, help="estimates that share a proposal")
+    parser.add_argument("--each", type=int, default=15_000, help="episodes of an estimate")
     parser.add_argument("--splittings", type=int, default=40)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

@@ -95,12 +95,11 @@ class Loop:
         started = np.full(simulator.batch, scenes is None)
         if scenes is not None:
             started[np.asarray(scenes)] = True
-        running = [simulator.episodes[k] for k in simulator.assigned] if scenes is None else []
         for policy, (who, driver) in enumerate(self.drivers):
             if isinstance(who, int):
                 self._seat(policy, (np.arange(simulator.agents) == who) & started[:, None])
             if (driver.controller == Controller.EXTERNAL or isinstance(driver, Believer)) and scenes is None:
-                driver.reset(running)
+                driver.reset([simulator.episodes[k] for k in simulator.assigned])
 
     def _seat(self, policy: int, mask: npt.NDArray[np.bool_]) -> None:
         driver = self.drivers[policy][1]

@@ -23,7 +23,7 @@ def run(process: Process) -> Bool:
     """Run all rows of a process, which have just been reset, to their ends; [B] which have failed."""
     whole = getattr(process, "run", None)
     if whole is not None:
-        whole()
+        return np.asarray(whole())
     while process.running().any():
         process.step()
     return np.asarray(process.score() >= 1.0)

@@ -107,12 +107,12 @@ class WorldProcess:
         else:
             self.loop.step()
 
-    def run(self) -> None:
-        """Advance all rows, which have just been reset, to their ends; on CUDA with one launch."""
+    def run(self) -> Bool:
+        """Advance all rows, which have just been reset, to their ends (on CUDA with one launch); [B] who has failed."""
         if self.world.device == "cpu" or not self._inside:
             while self.running().any():
                 self.step()
-            return
+            return self.failed()
         if self._recorded:
             self.world.step()
         else:
@@ -122,6 +122,7 @@ class WorldProcess:
             self._recorded = True
         # who leaves before the end is counted on
         self._work += float((self.world.array("step") * self._there()).sum())
+        return self.failed()
 
     def _there(self) -> npt.NDArray[np.int64]:
         kinds = np.array([sum(1 for _ in e.agents) for e in self.world.episodes])
