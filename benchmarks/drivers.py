@@ -178,15 +178,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", default="", help="sets to drive, with commas")
     parser.add_argument("--adversaries", default="", help="sets of natural traffic to put adversaries into")
+    parser.add_argument("--json", type=Path, default=RESULTS, help="where the results are kept")
     parser.add_argument("--page", action="store_true", help="write docs/drivers.md")
     given = parser.parse_args()
-    data: dict[str, Any] = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {}
+    data: dict[str, Any] = json.loads(given.json.read_text()) if given.json.is_file() else {}
     shipped = sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
     for name in filter(None, given.sets.split(",")):
         data.setdefault("drivers", {})[name] = drive(name)
+        given.json.write_text(json.dumps(data, indent=1) + "\n")
     for name in filter(None, given.adversaries.split(",")):
         data.setdefault("adversaries", {})[name] = attack(name, shipped)
-    RESULTS.write_text(json.dumps(data, indent=1) + "\n")
+        given.json.write_text(json.dumps(data, indent=1) + "\n")
     if given.page:
         page(data)
 

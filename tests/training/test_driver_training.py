@@ -70,6 +70,22 @@ def test_a_stopped_training_goes_on(tmp_path: Path) -> None:
         list(run_driver_training(plan(tmp_path, lr=1e-5), say=said.append))
 
 
+def test_a_training_begins_with_the_networks_of_another(tmp_path: Path) -> None:
+    list(run_driver_training(plan(tmp_path / "first"), say=lambda line: None))
+    still = {"steps": 128, "lr": 1e-12, "seed": 1}
+    further = replace(plan(tmp_path / "further", **still), start=tmp_path / "first")
+    list(run_driver_training(further, say=lambda line: None))
+    old, new = (torch.load(tmp_path / name / "last.pt", weights_only=True)["policy"] for name in ("first", "further"))
+    assert all(torch.allclose(old[name], new[name], atol=1e-6) for name in old)
+    assert "--start" in load_card(tmp_path / "further" / "ppo.safetensors")[0].command
+    with pytest.raises(FormatError, match="another recipe or other scenarios"):
+        list(run_driver_training(replace(further, start=None), say=lambda line: None))
+    with pytest.raises(FormatError, match="not those of this training"):
+        list(run_driver_training(replace(further, out=tmp_path / "b", changes=(*further.changes, ("hidden", (8,))))))
+    with pytest.raises(ConfigError, match="start from the folder of a training"):
+        list(run_driver_training(replace(further, out=tmp_path / "c", start=tmp_path / "nothing")))
+
+
 def test_what_is_learned_is_what_is_exported(tmp_path: Path) -> None:
     """The exported policy acts as the model of stable-baselines3 does without its noise."""
     for algorithm in ("ppo", "sac", "td3"):

@@ -35,6 +35,10 @@ ADVERSARIES |= {
         LEARNINGS["sac"], steps=100_000, observation="adversary", action="adversary", reward="adversary", draws=6,
         gamma=0.98, lr=3e-4, batch=256, validate=25_000,
     ),
+    "adv-ddpg": replace(
+        LEARNINGS["td3"], algorithm="ddpg", steps=100_000, observation="adversary", action="adversary",
+        reward="adversary", draws=6, gamma=0.98, batch=256, validate=25_000,
+    ),
 }  # fmt: skip
 """How adversaries are trained."""
 REWARDS = ("adversary", "colliding", "feasible")

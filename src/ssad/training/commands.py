@@ -67,21 +67,27 @@ def train_driver(
     change: Changes = None,
     seconds: Annotated[float | None, typer.Option(min=0.0, help="Time limit, s; repeat the command to resume.")] = None,
     device: Annotated[str, typer.Option(help="Where the networks are trained: cpu or cuda.")] = "cpu",
+    start: Annotated[
+        Path | None, typer.Option(help="Folder of an earlier training, whose networks are trained further.")
+    ] = None,
 ) -> None:
     """Train a driving system by reinforcement learning (needs the extra train). To resume, repeat the command."""
     from ssad.training.detector import parse_changes
     from ssad.training.driver import DriverPlan, run_driver_training
 
     plan = DriverPlan(
-        algorithm, out, _names(scenarios), _names(test), parse_changes(change or []), seconds=seconds, device=device
-    )
+        algorithm, out, _names(scenarios), _names(test), parse_changes(change or []), seconds=seconds, device=device,
+        start=start,
+    )  # fmt: skip
     for line in run_driver_training(plan, say=lambda text: print(text, flush=True)):
         print(line)
 
 
 @train_app.command("adversary")
 def train_adversary(
-    algorithm: Annotated[str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea or adv-sac.")] = "adv-ppo",
+    algorithm: Annotated[
+        str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea, adv-sac or adv-ddpg.")
+    ] = "adv-ppo",
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[
         str, typer.Option(help="Comma-separated sets or files with background traffic to learn in.")

@@ -25,6 +25,7 @@ from ssad.training.recipe import set_words
 from ssad.training.reinforcement import (
     LEARNINGS,
     Say,
+    begin_with,
     find_learning,
     finish,
     learn,
@@ -52,6 +53,7 @@ class DriverPlan:
         changes: Changed values of the recipe.
         seconds: Time limit, s; None: none.
         device: Where the networks are trained.
+        start: Folder of an earlier training with the same algorithm, whose networks are trained further.
     """
 
     algorithm: str
@@ -61,6 +63,7 @@ class DriverPlan:
     changes: tuple[tuple[str, Any], ...] = ()
     seconds: float | None = None
     device: str = "cpu"
+    start: Path | None = None
 
 
 @lru_cache(maxsize=16)
@@ -142,6 +145,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         reward=lambda state: learning.reward_scale * reward(state), policies=make_system,
     )  # fmt: skip
     model = make_model(learning, SB3VecEnv(env), device=plan.device)
+    begun = "" if plan.start is None else begin_with(model, learning, plan.start)
     held = draw_episodes(scenarios, graphs, draws=2, seed=VALIDATION_SEED)[len(scenarios) :]
     held = held[:: max(len(held) // MOST_VALIDATION, 1)]
 
@@ -149,7 +153,8 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         found = measure(PolicyDriver(policy, name="candidate"), held, graphs)
         return found | {"score": found["RC"] - found["CR"] - 2.0 * found["OF"]}
 
-    about = digest("driver training", *(safeio.dump_json([e.key, e.seed]) for e in episodes))[:16]
+    keys = (safeio.dump_json([e.key, e.seed]) for e in episodes)
+    about = digest("driver training", *keys, *([begun] if begun else []))[:16]
     state = learn(
         model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about,
     )  # fmt: skip
@@ -181,4 +186,6 @@ def command_of(plan: DriverPlan) -> str:
         words += ["--scenarios", ",".join(plan.scenarios)]
     if plan.test != ("precrash", "natural"):
         words += ["--test", ",".join(plan.test)]
+    if plan.start is not None:
+        words += ["--start", str(plan.start)]
     return shlex.join([*words, *set_words(plan.changes)])

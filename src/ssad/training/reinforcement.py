@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,7 +34,7 @@ class Learning:
     """How a policy is trained: all that decides the result but the scenarios.
 
     Attributes:
-        algorithm: ppo, sac or td3.
+        algorithm: ppo, sac, td3 or ddpg.
         steps: Steps of the world, over all scenes.
         observation: Sensor that the policy looks at.
         action: What it does, see `ssad.world.policy.to_controls`.
@@ -49,15 +50,15 @@ class Learning:
         epochs: ppo: passes over them.
         gae: ppo: lambda of the advantages.
         entropy: ppo: weight of the entropy.
-        noise: ppo: first standard deviation of the actions; td3: of the noise added to them.
-        buffer: sac, td3: steps that are remembered.
-        first: sac, td3: steps with random actions before the first update.
-        updates: sac, td3: gradient steps after each step of all scenes.
+        noise: ppo: first standard deviation of the actions; td3, ddpg: of the noise added to them.
+        buffer: all but ppo: steps that are remembered.
+        first: all but ppo: steps with random actions before the first update.
+        updates: all but ppo: gradient steps after each step of all scenes.
         validate: Steps from one validation to the next.
         seed: Of all random draws.
     """
 
-    algorithm: Literal["ppo", "sac", "td3"]
+    algorithm: Literal["ppo", "sac", "td3", "ddpg"]
     steps: Whole
     observation: Literal["safebench", "frea", "traffic", "adversary"] = "traffic"
     action: Literal["safebench", "frea", "pedals", "adversary"] = "pedals"
@@ -139,10 +140,39 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
         "buffer_size": learning.buffer, "learning_starts": learning.first, "train_freq": 1,
         "gradient_steps": learning.updates, "policy_kwargs": nets,
     }  # fmt: skip
-    if learning.algorithm == "td3":
+    if learning.algorithm in ("td3", "ddpg"):
         size = env.action_space.shape
         more["action_noise"] = sb3.common.noise.NormalActionNoise(np.zeros(size), np.full(size, learning.noise))
     return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **more, **common)
+
+
+def begin_with(model: Any, learning: Learning, folder: Path) -> str:
+    """Give a fresh model the networks of an earlier training, as its last checkpoint has them.
+
+    Args:
+        model: As `make_model` gives it.
+        learning: Its recipe.
+        folder: Where the earlier training wrote to.
+
+    Returns:
+        A hash of the checkpoint.
+
+    Raises:
+        ConfigError: There is no checkpoint in the folder.
+        FormatError: It is broken, or its networks are of other sizes.
+    """
+    path = folder / LAST
+    state = read_state(path, "key")
+    if state is None:
+        raise ConfigError(f"{path}: not found; start from the folder of a training with {learning.algorithm}")
+    try:
+        model.policy.load_state_dict(state["policy"])
+    except (KeyError, RuntimeError, TypeError):
+        raise FormatError(
+            f"{path}: its networks are not those of this training; use the algorithm, hidden, observation and action "
+            "that it was made with"
+        ) from None
+    return sha256(path.read_bytes()).hexdigest()
 
 
 def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:

@@ -65,5 +65,17 @@ class AdvPPO:
         """Nothing to learn: the policy was trained before."""
 
 
+class Frea(AdvPPO):
+    """FREA: as Adv.PPO, but the policy was rewarded only for what the ego could still avoid."""
+
+    name = "frea"
+
+
+class AdvSAC(AdvPPO):
+    """As Adv.PPO, trained by soft actor-critic instead."""
+
+    name = "adv-sac"
+
+
 def _can_be(controller: Controller) -> bool:
     return controller in (Controller.AUTOPILOT, Controller.FOLLOW, Controller.SCRIPT, Controller.EXTERNAL)
