@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.crossing_traffic import crossings
 from ssad.core.errors import RouteError
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.safeio import write_atomic
 from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
 from ssad.roads import load_town
@@ -35,6 +35,8 @@ PRECRASH_TOWN = "ProvingGround"
 NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 30, "Crossgate": 45}
 """Town -> number of junction routes."""
 NATURAL, CROSSING = 150, 2  # scenarios of the set `natural`, as many as FREA has, and the least that cross in each
+SIGN_TOWNS: Mapping[str, int] = {"Oldmarket": 12, "Larkhill": 12}
+"""Town -> number of ways past a stop sign; no detector of ours has learned from pictures of these towns."""
 UNSELECTED = 2  # draws of traffic on each route in the set `natural-unselected`
 TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
 """Learned drivers are trained here, on none of the towns that the other sets are in."""
@@ -249,6 +251,25 @@ def junction_routes(graph: LaneGraph, routes: int) -> tuple[Stretch, ...]:
     return tuple(chosen)
 
 
+def past_stop_signs(towns: Mapping[str, int]) -> list[Scenario]:
+    """Ways through junctions that begin before a stop sign, turns in rotation, with traffic as it comes."""
+    found = []
+    for town, routes in towns.items():
+        graph = load_town(town)
+        signed = graph.rule_lane[graph.sign_kind[graph.rule_sign] == SignKind.STOP]
+        pool = [p for p in passages(graph, 32.0, 30.0) if np.isin(_approach(graph, p), signed)]
+        for i, stretch in enumerate(_spread(pool, lambda p: p.turn, routes, lambda _: True)):
+            name, points = f"stop-signs/{town}_{i:02d}", stretch.points
+            found.append(Scenario(name, "NaturalJunction", town, points, seed=i, group=town))
+    return found
+
+
+def _approach(graph: LaneGraph, passage: Stretch) -> int:
+    """The last lane before a junction."""
+    inside = next(k for k, lane in enumerate(passage.lanes) if graph.junction[lane] >= 0)
+    return passage.lanes[inside - 1]
+
+
 def natural(graph: LaneGraph, routes: int, repetitions: int) -> list[Scenario]:
     """Junction routes, each with `repetitions` draws of traffic."""
     return [
@@ -311,6 +332,7 @@ def make() -> dict[str, str]:
         "precrash.yaml": scenario_text(precrash(load_town(PRECRASH_TOWN))),
         "natural.yaml": scenario_text(with_crossing_traffic(NATURAL_TOWNS, NATURAL)),
         "natural-unselected.yaml": scenario_text(unselected(NATURAL_TOWNS)),
+        "stop-signs.yaml": scenario_text(past_stop_signs(SIGN_TOWNS)),
     }
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from ssad.core.driving import Belief, Observation
 from ssad.core.lane_graph import SignKind
 from ssad.core.seeding import generator
 from ssad.core.types import (
     ENDS,
+    F32,
     Controller,
     Episode,
     EpisodeAgent,
@@ -96,6 +100,38 @@ def test_a_lit_signal_stands_above_a_stop_sign() -> None:
     assert trace.end == "complete"
     assert trace.stop_sign.sum() == 0
     assert trace.speed[20:, 0].min() > 1.0
+
+
+class Reader:
+    """The Autopilot that knows the truth, and of stop signs what it is told."""
+
+    name = "reader"
+    controller = Controller.AUTOPILOT
+    sensors = ("truth",)
+
+    def __init__(self, known: int) -> None:
+        self.known = known
+
+    def reset(self, episodes: list[Episode]) -> None: ...
+
+    def act(self, view: Observation) -> F32:
+        raise AssertionError
+
+    def believe(self, view: Observation) -> Belief:
+        known = np.full(len(view.scene), self.known, np.uint8)
+        return replace(view.readings["truth"], stop_sign=known)
+
+
+def test_who_does_not_know_of_a_stop_sign_drives_on() -> None:
+    graph = load_town("Larkhill")
+    episodes = [alone(graph, past(graph, lane)) for lane in stop_lanes(graph)[:3]]
+    privileged = rollout(World(episodes, {"Larkhill": graph}), Drives(Controller.AUTOPILOT))
+    told = rollout(World(episodes, {"Larkhill": graph}), Reader(1))
+    untold = rollout(World(episodes, {"Larkhill": graph}), Reader(0))
+    for one, same, other in zip(privileged, told, untold, strict=True):
+        assert np.array_equal(one.x, same.x)
+        assert np.array_equal(one.speed, same.speed)
+        assert other.stop_sign.sum() >= 1
 
 
 def test_background_traffic_stops_too_each_time_it_comes_by() -> None:

@@ -215,6 +215,8 @@ class Belief:
             it; NaN: not known.
         signal: [B, S] `ssad.core.types.SignalState` of the signals of the scene's town, -1: as it is. None: all as
             they are.
+        stop_sign: [B] 1 if it knows of the stop sign that it comes to next, 0 if it does not and drives on. Where the
+            map has none, nothing makes it stop. None: it knows all signs of the map.
     """
 
     pose: F32
@@ -229,6 +231,7 @@ class Belief:
     change: I32 | None = None
     height: F32 | None = None
     signal: npt.NDArray[np.int8] | None = None
+    stop_sign: U8 | None = None
 
     def keep(self, mask: Bool) -> Self:
         """Forget objects.

@@ -15,6 +15,7 @@ from ssad.core.types import F64, AgentKind, Bool, EpisodeTrace
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.driver import Known, Sighting
 from ssad.drivers.perceiving.objects import I64, Objects
+from ssad.drivers.perceiving.signs import SAME
 from ssad.drivers.perceiving.tracker import Tracks
 from ssad.metrics.detection import match
 from ssad.metrics.detection_boxes import BoxTable
@@ -25,6 +26,7 @@ NEAR: Final = (
 ROUGH: Final = 5.0  # m within which something was found, but in the wrong place
 BANDS: Final = ((0.0, 15.0), (15.0, 30.0), (30.0, 60.0))  # m
 REACH: Final = 60.0  # m
+NEAREST_SIGN, FARTHEST_SIGN = 5.0, 40.0  # m ahead within which a stop sign should be read
 BEFORE: Final = 3.0  # s before a collision that are looked at
 CAUSES: Final[Mapping[str, str]] = {
     "hidden": "out of the cameras' view or hidden",
@@ -44,11 +46,13 @@ class Perceived:
         looks: For each look its time, s, and what was found; None where there was no picture.
         known: For each step its time, s, and the confirmed tracks.
         cameras: Through which it looked.
+        signs: For each look its time, s, and where the stop signs stand that were read [M, 2].
     """
 
     looks: Sequence[tuple[float, Objects | None]]
     known: Sequence[tuple[float, Tracks]]
     cameras: Mapping[str, Camera]
+    signs: Sequence[tuple[float, F64]] = ()
 
 
 class Watcher:
@@ -65,11 +69,14 @@ class Watcher:
         self.looks: list[list[Any]] = [[] for _ in range(scenes)]
         self.known: list[list[Any]] = [[] for _ in range(scenes)]
         self.shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
+        self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
 
     def __call__(self, told: Sighting | Known) -> None:
         """See `Perceiving`."""
         if isinstance(told, Sighting):
             self.looks[told.scene].append((told.time, told.found))
+            if told.signs is not None:
+                self.signs[told.scene].append((told.time, told.signs))
             for picture in list(told.pictures.values())[:1]:
                 self.shots[told.scene].append((told.time, np.ascontiguousarray(np.moveaxis(picture, 0, -1))))
             return
@@ -78,7 +85,7 @@ class Watcher:
 
     def perceived(self, scene: int) -> Perceived:
         """What was perceived in a scene."""
-        return Perceived(self.looks[scene], self.known[scene], self.cameras)
+        return Perceived(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
 
 
 def in_view(trace: EpisodeTrace, step: int, cameras: Mapping[str, Camera]) -> Bool:
@@ -163,6 +170,36 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     for low, high in BANDS:
         metrics[f"target_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
     return metrics | _belief_metrics(trace, seen, target)
+
+
+def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, float | None]:
+    """How well stop signs were read on the frames of a drive; None where none stood before the ego.
+
+    Args:
+        trace: The drive.
+        seen: What was perceived in it.
+        signs: Where the stop signs stand that the route comes by, x, y [N, 2].
+
+    Returns:
+        sign_recall: share of the looks with such a sign 5 to 40 m ahead in which it was read. sign_read_at: m from the
+        sign at which one was first read.
+    """
+    looks, read = 0, []
+    for time, places in seen.signs:
+        step = min(round(time / trace.dt), len(trace.x) - 1)
+        ego = np.array([trace.x[step, 0], trace.y[step, 0]], np.float64)
+        yaw = float(trace.yaw[step, 0])
+        away = signs - ego
+        ahead = away @ (np.cos(yaw), np.sin(yaw))
+        aside = np.abs(away @ (-np.sin(yaw), np.cos(yaw)))
+        near = np.flatnonzero((ahead > NEAREST_SIGN) & (ahead < FARTHEST_SIGN) & (aside < 0.5 * ahead))
+        if len(near):
+            looks += 1
+            sign = near[ahead[near].argmin()]
+            reach = SAME * float(np.linalg.norm(away[sign])) + 1.0
+            if len(places) and float(np.linalg.norm(places - signs[sign], axis=1).min()) < reach:
+                read.append(float(np.linalg.norm(away[sign])))
+    return {"sign_recall": len(read) / looks if looks else None, "sign_read_at": max(read, default=None)}
 
 
 def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> float | None:

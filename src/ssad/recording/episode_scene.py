@@ -18,12 +18,12 @@ from ssad.assets.bodies import draw_paint, make_body
 from ssad.assets.mesh import Material, Mesh, merge, prism
 from ssad.assets.street import cached_street
 from ssad.camera.scene import Scene, Thing
-from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32, U8, Bool, Episode, EpisodeTrace, SignalState
 from ssad.recording.scene_objects import PHASES, STRIDE, Clear
-from ssad.recording.street_signs import REACH, street_signs
+from ssad.recording.street_signs import KINDS, REACH, street_signs
 from ssad.world.models import MODELS
 from ssad.world.rollout import route_signals
 
@@ -150,6 +150,7 @@ class EpisodeScene:
         street = self.street = cached_street(graph)
         at = graph.sign_xy.astype(np.float64).reshape(-1, 2)
         found = list(street_signs(graph, at, Clear(street), key=(graph.name,), many=False, detail=1))
+        self.stop_signs = frozenset(n for n, sign in enumerate(found) if sign.kind == KINDS[SignKind.STOP])
         self._sign_poses = [upright_pose(*sign.pose) for sign in found]
         self._fixed = [merge([sign.plate, sign.post]) for sign in found] + [_lens(state) for state in LENSES]
         self._bodies: dict[object, int] = {}

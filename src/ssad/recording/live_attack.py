@@ -1,33 +1,37 @@
-"""A physical attack on an agent of the closed loop: what it wears and what shines on it, before any camera looks."""
+"""A physical attack in the closed loop, on an agent or on stop signs: what they wear and what shines on them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 from ssad.assets.mesh import Mesh
 from ssad.camera.scene import Thing
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.types import AgentKind
-from ssad.recording.target import TargetCar
+from ssad.recording.target import TargetCar, TargetSign
 from ssad.world.models import MODELS
+
+SIGN: Final = "stop_sign"
+FIRST_SIGN: Final = 1 << 16  # tag of a town's sign 0: no scene has so many agents
 
 
 @dataclass(frozen=True)
 class LiveAttack:
-    """An attack on an agent, for `ssad.recording.loop_sensors.Onboard`.
+    """An attack on an agent or on all stop signs, for `ssad.recording.loop_sensors.Onboard`.
 
     Attributes:
         edit: What changes around a target, given its body.
-        target: The car that the attack is made for: it plays the agent, in the size that the agent has in the world.
-        agent: Who is attacked; 0 is the ego.
+        target: What the attack is made for: a car plays the agent, in the size that the agent has in the world; a sign
+            stands in place of every stop sign.
+        agent: Who is attacked; 0 is the ego. Of no account where the target is a sign.
     """
 
     edit: Callable[[Mesh], SceneEdit]
-    target: TargetCar
+    target: TargetCar | TargetSign
     agent: int = 1
 
     @cached_property
@@ -35,21 +39,28 @@ class LiveAttack:
         return {}
 
     def body(self, model: str) -> tuple[Mesh, SceneEdit]:
-        """The body that plays an agent of a model, and the edit for it; made once.
+        """The body that plays an agent of a model, or a sign, and the edit for it; made once.
 
         Raises:
             ConfigError: The model is no car, or the attack does not fit on it.
         """
         if model not in self._bodies:
-            one = MODELS[model]
-            if one.kind != AgentKind.CAR:
-                raise ConfigError(f"agent {self.agent} is a {model}; the attack is made for a car: name another agent")
-            mesh = replace(self.target, size=(one.length, one.width, one.height)).mesh()
+            if isinstance(self.target, TargetSign):
+                mesh = self.target.mesh()
+            else:
+                one = MODELS[model]
+                if one.kind != AgentKind.CAR:
+                    raise ConfigError(
+                        f"agent {self.agent} is a {model}; the attack is made for a car: name another agent"
+                    )
+                mesh = replace(self.target, size=(one.length, one.width, one.height)).mesh()
             self._bodies[model] = mesh, self.edit(mesh)
         return self._bodies[model]
 
     def attacked(self, models: tuple[str, ...], key: str) -> str:
-        """The model of the agent that is attacked in an episode. ConfigError: it has no such agent."""
+        """The model of the agent that is attacked in an episode, or `SIGN`. ConfigError: it has no such agent."""
+        if isinstance(self.target, TargetSign):
+            return SIGN
         if not 0 <= self.agent < len(models):
             raise ConfigError(f"{key}: has agents 0 to {len(models) - 1}; agent {self.agent} cannot be attacked")
         return models[self.agent]
@@ -60,8 +71,27 @@ class LiveAttack:
         found: dict[Any, Mesh] = {("attacked", self.target, model): mesh}
         return found | {("attacked card", self.target, model, k): card for k, card in enumerate(edit.meshes())}
 
-    def dressed(self, things: tuple[Thing, ...], mesh: int) -> tuple[Thing, ...]:
-        """The things of a view with the target's body for the agent, which is number `mesh` of the scene."""
+    def dressed(self, things: tuple[Thing, ...], mesh: int, signs: Iterable[int] = ()) -> tuple[Thing, ...]:
+        """The things of a view with the target's body in place of what is attacked.
+
+        Args:
+            things: Of the view.
+            mesh: Number of the target's body in the scene.
+            signs: Meshes of the stop signs there.
+        """
+        if isinstance(self.target, TargetSign):
+            return tuple(
+                replace(one, mesh=mesh, paint=self.target.colour, tag=FIRST_SIGN + one.mesh)
+                if one.tag == 0 and one.mesh in signs
+                else one
+                for one in things
+            )
         return tuple(
             replace(one, mesh=mesh, paint=self.target.colour) if one.tag == self.agent + 1 else one for one in things
         )
+
+    def tags(self, things: Iterable[Thing]) -> list[int]:
+        """Tags of what is attacked among the things of a view."""
+        if isinstance(self.target, TargetSign):
+            return [one.tag for one in things if one.tag >= FIRST_SIGN]
+        return [self.agent + 1]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
 
+import numpy as np
 import torch
 
 from ssad.assets.mesh import Mesh
@@ -13,11 +14,13 @@ from ssad.camera.scene_edit import SceneEdit
 from ssad.core.driving import Perturbation, Sensor
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.frames import Camera
-from ssad.core.types import AgentKind, Episode
+from ssad.core.lane_graph import LaneGraph, SignKind
+from ssad.core.types import F32, F64, AgentKind, Episode
+from ssad.recording.live_attack import SIGN
 from ssad.recording.live_attack import LiveAttack as PhysicalAttack
 from ssad.recording.loop_sensors import Onboard
 from ssad.recording.loop_shifts import LOOP_SHIFTS, ShiftedCamera
-from ssad.recording.target import parse_target
+from ssad.recording.target import class_of_target, parse_target
 from ssad.recording.texture_export import Print
 from ssad.scenarios.static.digital import ATTACKS, make_attack, needs
 from ssad.scenarios.static.digital.budget import Budget, px
@@ -30,9 +33,11 @@ from ssad.world.models import MODELS
 
 NONE: Final = "none"
 GREY: Final = "grey"
+GREY_SIGN: Final = "grey-sign"
 TEXTURE: Final = "texture"
 WEAR: Final = "wear-"
 TARGET: Final = "sedan"
+BESIDE: Final = 12.0  # m from a way within which its signs stand
 SHARES: Final = (1.0, 0.9, 0.8, 0.7, 0.6)  # sizes of a patch that are tried, of the one that was trained
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that attacks may move a pixel by, by severity
 STEPS: Final = 2  # gradient steps a picture; an attacker in the loop has no time for more
@@ -44,7 +49,7 @@ def perturbation_names() -> dict[str, str]:
     return {
         NONE: "none", **dict.fromkeys(FAULTS, "fault"), **dict.fromkeys(LOOP_SHIFTS, "shift"),
         **dict.fromkeys((f"attack-{name}" for name in attacks), "attack"),
-        **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, *shipped_textures())), TEXTURE),
+        **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
     }  # fmt: skip
 
 
@@ -60,17 +65,52 @@ def first_car(episode: Episode) -> int | None:
     return cars[0] if cars else None
 
 
+def who_wears(name: str) -> str:
+    """Whom a texture is made for: car or stop_sign.
+
+    Args:
+        name: Of the perturbation.
+    """
+    name = name.removeprefix(WEAR)
+    if name in (GREY, GREY_SIGN):
+        return SIGN if name == GREY_SIGN else "car"
+    return class_of_target(parse_target(load_texture(name)[1].target))
+
+
+def wearer(kind: str, episode: Episode, graph: LaneGraph) -> int | None:
+    """Number of the agent who wears a texture, 0 where stop signs do; None: nobody in this episode can.
+
+    Args:
+        kind: See `who_wears`.
+        episode: The episode.
+        graph: Its town.
+    """
+    if kind == SIGN:
+        route = episode.agents[0].route
+        return 0 if route is not None and len(signs_of_route(graph, route.xy)) else None
+    return first_car(episode)
+
+
+def signs_of_route(graph: LaneGraph, route: F32) -> F64:
+    """Where the stop signs stand that a way [N, 2] comes by, x, y [M, 2]."""
+    stop = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
+    ruled = [bool(np.hypot(*(route - at).T).min() < BESIDE) for at in stop]
+    return stop[np.array(ruled, bool)]
+
+
 def worn(name: str, agent: int) -> PhysicalAttack:
     """What makes an agent wear the texture of a perturbation, for `ssad.recording.loop_sensors.Onboard`.
 
     Args:
-        name: Of the perturbation: a shipped texture; grey: a car painted grey all over, the control.
-        agent: Who wears it.
+        name: Of the perturbation: a shipped texture; grey, grey-sign: a car, or the plate of a sign, painted grey all
+            over, the control.
+        agent: Who wears it; of no account where signs do.
     """
     name = name.removeprefix(WEAR)
-    if name == GREY:
-        surface = make_carrier("camouflage", {}).on(parse_target(TARGET).mesh())
-        return Print(torch.full((3, *surface.size), 0.5), "camouflage", {}, TARGET).live(agent)
+    if name in (GREY, GREY_SIGN):
+        target = SIGN if name == GREY_SIGN else TARGET
+        surface = make_carrier("camouflage", {}).on(parse_target(target).mesh())
+        return Print(torch.full((3, *surface.size), 0.5), "camouflage", {}, target).live(agent)
     texture, card = load_texture(name)
     whole = Print(texture, card.carrier, card.options, card.target)
 
@@ -91,7 +131,7 @@ def worn(name: str, agent: int) -> PhysicalAttack:
 def texture_version(name: str) -> str:
     """Hash of the texture of a perturbation; "" of the control."""
     name = name.removeprefix(WEAR)
-    return "" if name == GREY else load_texture(name)[1].hash
+    return "" if name in (GREY, GREY_SIGN) else load_texture(name)[1].hash
 
 
 def perturbed(

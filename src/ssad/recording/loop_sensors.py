@@ -97,7 +97,7 @@ class Onboard:
         weather: Of all episodes, or a function from an episode's key to its weather.
         response: What stands between lens and picture; as the recorder's.
         device: Where it is rendered: cpu or cuda:0.
-        attack: A physical attack on one of the agents, in what cameras and LiDARs see.
+        attack: A physical attack on one of the agents, or on stop signs, in what cameras and LiDARs see.
     """
 
     def __init__(
@@ -183,8 +183,8 @@ class Onboard:
         found = sight.town.things(sight.looks, sight.moment, without=sight.agent)
         if self.attack is None:
             return found
-        (own, *_) = self.attack.meshes(sight.looks.models[self.attack.agent])
-        return self.attack.dressed(found, sight.town.index(own))
+        (own, *_) = self.attack.meshes(self._attacked(sight))
+        return self.attack.dressed(found, sight.town.index(own), sight.town.stop_signs)
 
     def render(self, sights: Sequence[Sight], camera: Camera) -> Picture:
         """What sights in one town show, all of one edit (see `edit`), with its arrays left where they are."""
@@ -197,7 +197,11 @@ class Onboard:
 
     def edit(self, sight: Sight) -> SceneEdit | None:
         """What the attack changes in an episode, the same for all episodes whose attacked agent is of one model."""
-        return None if self.attack is None else self.attack.body(sight.looks.models[self.attack.agent])[1]
+        return None if self.attack is None else self.attack.body(self._attacked(sight))[1]
+
+    def _attacked(self, sight: Sight) -> str:
+        assert self.attack is not None
+        return self.attack.attacked(sight.looks.models, sight.looks.key)
 
     def sights(self, simulator: Simulator, agents: I32) -> list[Sight]:
         """What agents [N, 2] (scene, agent) could see now; without those whose episode has ended."""
@@ -256,8 +260,10 @@ class Onboard:
         edit = self.edit(sight)
         if edit is None or self.attack is None:
             return view
-        _, *cards = self.attack.meshes(looks.models[self.attack.agent])
-        return edit.on(view, self.attack.agent + 1, cards=[sight.town.index(key) for key in cards])
+        _, *cards = self.attack.meshes(self._attacked(sight))
+        for tag in self.attack.tags(things):
+            view = edit.on(view, tag, cards=[sight.town.index(key) for key in cards])
+        return view
 
 
 @dataclass(frozen=True, slots=True)

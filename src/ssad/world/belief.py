@@ -52,10 +52,11 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
         if value is None:
             continue
         value = np.asarray(value)
-        expected = (batch, signals) if field.name == "signal" else (*kind.shape, *tails.get(field.name, ()))
+        of_scene = {"signal": (batch, signals), "stop_sign": (batch,)}
+        expected = of_scene.get(field.name) or (*kind.shape, *tails.get(field.name, ()))
         if value.shape != expected:
             raise ConfigError(f"belief: {field.name} has shape {value.shape}; expected {expected}")
-        if field.name not in ("signal", "height") and not np.isfinite(value[used]).all():
+        if field.name not in (*of_scene, "height") and not np.isfinite(value[used]).all():
             raise ConfigError(f"belief: {field.name} holds a number that is not finite")
     if not (np.asarray(belief.size)[used] > 0).all():
         raise ConfigError("belief: size must be above 0 m")

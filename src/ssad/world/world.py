@@ -32,7 +32,7 @@ from ssad.world.noise import NAMES, Keys, Noise, episode_keys, noise_state
 VERSION = "6"  # part of every cell's key: raise it when the same episode no longer gives the same bits
 
 _STATE, _SEEN, _EGO = array_types(State), array_types(Seen), array_types(Ego)
-_OF_SCENES = ("believes", "told", "light")  # arrays of `Seen` that have no rows of objects
+_OF_SCENES = ("believes", "told", "light", "sign")  # arrays of `Seen` that have no rows of objects
 
 
 @dataclass(frozen=True)
@@ -403,6 +403,8 @@ class World:
             told = np.full(light.shape, -1) if belief.signal is None else np.asarray(belief.signal)
             self.put("seen.told", np.where(which, step, self.array("seen.told")).astype(np.int32))
             self.put("seen.light", np.where(which[:, None], told, light).astype(np.int32))
+            known = np.ones(self.batch) if belief.stop_sign is None else np.asarray(belief.stop_sign)
+            self.put("seen.sign", np.where(which, known, self.array("seen.sign")).astype(np.int32))
         self.put("seen.believes", believes.astype(np.int32))
 
     def _put_rows(self, name: str, value: npt.NDArray[Any], scenes: Bool) -> None:

@@ -29,6 +29,7 @@ from ssad.core.types import Episode, EpisodeTrace
 from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
 from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.signs import SignReading
 from ssad.drivers.perceiving.tracker import Tracking
 from ssad.evaluation.drive_perception import (
     BANDS,
@@ -38,6 +39,7 @@ from ssad.evaluation.drive_perception import (
     hard_braking,
     impact_speed,
     phantom_stop,
+    sign_metrics,
 )
 from ssad.evaluation.drive_sheet import Seen, drive_film, drive_sheet
 from ssad.jobs.machine import quiet_warp
@@ -56,10 +58,12 @@ from ssad.recording.loop_perturbations import (
     NONE,
     TEXTURE,
     check_perturbation,
-    first_car,
     perturbation_names,
     perturbed,
+    signs_of_route,
     texture_version,
+    wearer,
+    who_wears,
     worn,
 )
 
@@ -82,6 +86,8 @@ class System(BaseModel):
         confirm: hits from which an object is believed (H).
         reserve: looks without a hit that it stays believed for (R).
         high, low: scores of the tracker's two stages.
+        reads_signs: whether it knows of stop signs only what its detector reads; else those of the map.
+        sign_memory: s that a sign is remembered after it was last read; none: until it has been passed.
         missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
     """
 
@@ -99,6 +105,8 @@ class System(BaseModel):
     reserve: int = Field(default=6, ge=0)
     high: float = Field(default=0.3, ge=0, le=1)
     low: float = Field(default=0.1, ge=0, le=1)
+    reads_signs: bool = False
+    sign_memory: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     missed: float = Share
     burst: float = Field(default=3.0, ge=1, allow_inf_nan=False)
     noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
@@ -122,8 +130,10 @@ class System(BaseModel):
         else:
             eyes = CameraEyes(_detector(self.detector, self.weights, self.input_width), cameras, threshold=self.low)
         tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
+        memory = float("inf") if self.sign_memory is None else self.sign_memory
+        signs = SignReading(confirm=self.confirm, memory=memory, score=self.high) if self.reads_signs else None
         return Perceiving(
-            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair
+            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
         )  # fmt: skip
 
 
@@ -184,6 +194,9 @@ class Gap(Kind):
         Column("impact_speed", "impact speed", "m/s", "lower"),
         Column("route_completion", "RC", "", "higher"),
         Column("min_ttc", "least time to collision", "s", "higher"),
+        Column("stop_signs", "stop signs run", "", "lower"),
+        Column("sign_recall", "share of the looks in which the stop sign ahead was read", "", "higher"),
+        Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher"),
         Column("hard_braking", "times of braking above 4 m/s^2", "", "lower"),
         Column("phantom_stop_s", "time stood before a phantom", "s", "lower"),
     )
@@ -203,23 +216,33 @@ class Gap(Kind):
         scenarios = suite_scenarios(suite)  # type: ignore[arg-type]  # the same attributes
         towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
         conditions = _conditions(suite)
-        wearers: dict[str, int | None] = {}
-        if check or any(_family(condition) == TEXTURE for condition in conditions):
+        wearers: dict[tuple[str, str], int | None] = {}
+        kinds = {name: who_wears(name) for name in suite.perturbations if perturbation_names()[name] == TEXTURE}
+        if check or kinds:
             for scenario in scenarios:
-                clean = self._cell(suite, scenario, conditions[0], 0, versions, towns)
-                wearers[scenario.name] = first_car(episode_of(clean))
+                episode = episode_of(self._cell(suite, scenario, conditions[0], 0, versions, towns))
+                for name, kind in kinds.items():
+                    wearers[name, scenario.name] = wearer(kind, episode, town(scenario.town))
         cells = [
-            self._cell(suite, scenario, condition, repetition, versions, towns, wearer=wearers.get(scenario.name))
+            self._cell(
+                suite,
+                scenario,
+                condition,
+                repetition,
+                versions,
+                towns,
+                worn_by=wearers.get((condition[1], scenario.name)),
+            )
             for condition in conditions
             for scenario in scenarios
             for repetition in range(suite.repetitions)
-            if _family(condition) != TEXTURE or wearers[scenario.name] is not None
+            if _family(condition) != TEXTURE or wearers[condition[1], scenario.name] is not None
         ]
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
 
     def _cell(  # noqa: PLR0917  # plain values
         self, suite: GapSuite, scenario: Any, condition: tuple[Any, str, int], repetition: int,
-        versions: Mapping[str, str], towns: Mapping[str, str], *, wearer: int | None = None,
+        versions: Mapping[str, str], towns: Mapping[str, str], *, worn_by: int | None = None,
     ) -> Cell:  # fmt: skip
         """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
         system, perturbation, severity = condition
@@ -236,7 +259,7 @@ class Gap(Kind):
         }  # fmt: skip
         texture = ""
         if _family(condition) == TEXTURE:
-            spec["wearer"], texture = wearer, texture_version(perturbation)
+            spec["wearer"], texture = worn_by, texture_version(perturbation)
         fields = {
             "system": name, "perturbation": perturbation, "severity": severity,
             "family": perturbation_names()[perturbation], "group": scenario.group or scenario.type,
@@ -278,6 +301,7 @@ class Gap(Kind):
             if seen is not None:
                 own = System.model_validate(cell.spec["settings"])
                 metrics |= component_metrics(trace, seen.perceived(k), sure=own.high)
+                metrics |= sign_metrics(trace, seen.perceived(k), signs_of_route(town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, seen.perceived(k))
                 about["cause"] = cause_of_collision(trace, seen.perceived(k))
                 if job.settings["sheets"] and seen.shots[k]:

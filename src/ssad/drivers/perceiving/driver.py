@@ -2,8 +2,9 @@
 
     cameras -> detector -> world -> tracker -> belief -> the Autopilot's planner and controller
 
-Route, lane map and its own pose are given, signals and signs are those of the map; other road users are told by
-detected objects and nothing else. All else is the Autopilot, so that what it drives worse is what it sees worse.
+Route, lane map and its own pose are given, signals are those of the map, and so are stop signs unless it reads them
+itself; other road users are told by detected objects and nothing else. All else is the Autopilot, so that what it
+drives worse is what it sees worse.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ssad.drivers.perceiving.eyes import Eyes
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import I64, Objects, no_objects
 from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.signs import SignMemory, SignReading, read_signs
 from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks, believed
 
 LATE = 1e-4  # s, less than a step: times are 32-bit numbers
@@ -37,12 +39,16 @@ class Sighting:
         time: s when the pictures were taken.
         found: What was found in them, in the world; None: no camera had a picture.
         pictures: What the cameras showed, uint8 [3, H, W] by name, where eyes look at pictures.
+        signs: Where the stop signs stand that were read, if the driver reads them: x, y in the world [M, 2], m.
+        eye: From where: x, y [2].
     """
 
     scene: int
     time: float
     found: Objects | None
     pictures: Mapping[str, U8] = field(default_factory=dict)
+    signs: F64 | None = None
+    eye: F64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +78,7 @@ class Perceiving:
             misplaced, but unknown for so long.
         watch: Told of each look, and at each step of what is believed.
         repair: Repairs one error of what is found, to see what it alone does.
+        signs: How it reads stop signs; None: it knows those of the map.
 
     Raises:
         ConfigError: A value is out of its range.
@@ -90,6 +97,7 @@ class Perceiving:
         latency: float = 0.1,
         watch: Callable[[Sighting | Known], None] | None = None,
         repair: Repair | None = None,
+        signs: SignReading | None = None,
     ) -> None:
         if not 0.0 < rate <= 1000.0 or not 0.0 <= latency <= 10.0:
             raise ConfigError(f"perceiving needs a rate above 0 and a latency of 0 to 10 s, not {rate} and {latency}")
@@ -97,6 +105,7 @@ class Perceiving:
         self.rate, self.latency, self.watch = rate, latency, watch
         self.repair = repair
         self.sensors: tuple[str, ...] = tuple(dict.fromkeys((*eyes.sensors, *(("truth",) if repair else ()))))
+        self._signs = None if signs is None else SignMemory(signs)
         self._tracker = Tracker(self.tracking, 0)
         self._looks = np.zeros(0, np.int64)
         self._waiting: list[Sighting] = []
@@ -122,18 +131,23 @@ class Perceiving:
         self._tracker = Tracker(self.tracking, len(episodes))
         self._looks = np.full(len(episodes), -1)
         self._waiting = []
+        if self._signs is not None:
+            self._signs.reset(len(episodes))
         self.eyes.reset(episodes)
 
     def snapshot(self) -> Any:
         """All that changes; with a snapshot of the simulator, `restore` goes on from there to the bit."""
-        return self._tracker.snapshot(), self._looks.copy(), list(self._waiting), self.eyes.snapshot()
+        signs = None if self._signs is None else self._signs.snapshot()
+        return self._tracker.snapshot(), self._looks.copy(), list(self._waiting), self.eyes.snapshot(), signs
 
     def restore(self, snapshot: Any) -> None:
         """Go on from an earlier moment of the same batch."""
-        tracks, looks, waiting, eyes = snapshot
+        tracks, looks, waiting, eyes, signs = snapshot
         self._tracker.restore(tracks)
         self._looks, self._waiting = looks.copy(), list(waiting)
         self.eyes.restore(eyes)
+        if self._signs is not None:
+            self._signs.restore(signs)
 
     def act(self, view: Observation) -> F32:
         """Never called: the planner runs inside the world."""
@@ -151,25 +165,32 @@ class Perceiving:
         tracks = self._tracker.confirmed(view.scene, now)
         if self.watch is not None:
             self.watch(Known(view.scene, now, tracks))
-        return believed(tracks, view.scene)
+        belief = believed(tracks, view.scene)
+        if self._signs is None:
+            return belief
+        return replace(belief, stop_sign=self._signs.known(view.scene, now, view.pose))
 
     def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
         """What is seen now in some rows."""
         looked = self.eyes.look(view, rows)
         sightings = []
         for k, row in enumerate(rows.tolist()):
-            scene, parts = int(view.scene[row]), []
+            scene, parts, signs = int(view.scene[row]), [], [np.zeros((0, 2))]
             ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
             for name, camera in self.eyes.cameras.items():
                 one = looked[name][k]
                 if one is not None:
                     found = lift(one, camera, ego @ camera.to_ego, self.eyes.classes, settings=self.lifting)
                     parts.append(replace(found, scene=np.full(len(found), scene)))
+                    if self._signs is not None:
+                        score, at = self._signs.settings.score, ego @ camera.to_ego
+                        signs.append(read_signs(one, camera, at, self.eyes.classes, score=score))
             all_ = merged(Objects.joined(parts), self.lifting.merge) if parts else None
             if self.repair is not None:
                 all_ = self.repair(view, row, all_ or no_objects(), self.eyes.cameras, self.lifting)
             shown = {} if self.watch is None else self._pictures(view, row)
-            sightings.append(Sighting(scene, float(now[row]), all_, shown))
+            read = None if self._signs is None else np.concatenate(signs)
+            sightings.append(Sighting(scene, float(now[row]), all_, shown, read, ego[:2, 3]))
             if self.watch is not None:
                 self.watch(sightings[-1])
         return sightings
@@ -193,3 +214,6 @@ class Perceiving:
                 times = np.array([s.time for s in batch])
                 found = Objects.joined([no_objects(), *(s.found for s in batch if s.found is not None)])
                 self._tracker.update(scenes, times, found)
+                for one in batch:
+                    if self._signs is not None and one.signs is not None and one.eye is not None:
+                        self._signs.update(one.scene, one.time, one.eye, one.signs)

@@ -14,8 +14,8 @@ from ssad.scenarios.dynamic.yamlio import read_scenarios
 
 DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
-UNSELECTED = ("natural-unselected", "lane-traffic")
-"""Traffic as it comes, for rates; its scenarios belong to no class's own."""
+UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs")
+"""Traffic as it comes, for rates and past stop signs; its scenarios belong to no class's own."""
 TRAINING = ("training",)
 """What learned drivers are trained on, in towns that no other set uses; its scenarios belong to no class's own."""
 IMPORTED = ("safebench", "frea")

@@ -160,6 +160,7 @@ class Seen:
     believes: wp.array(dtype=wp.int32)  # [B] 1: the ego plans over the rows from A on, not over the truth
     told: wp.array(dtype=wp.int32)  # [B] step at which the ego was last told what to believe
     light: wp.array2d(dtype=wp.int32)  # [B, S] SignalState that such an ego believes, -1: as it is
+    sign: wp.array(dtype=wp.int32)  # [B] 1: such an ego knows of the stop sign that it comes to next
 
 
 @wp.struct

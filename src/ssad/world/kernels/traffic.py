@@ -347,7 +347,8 @@ def look_around(
     lit = int(SignalState.OFF)
     if index >= 0 and rule[1] - part < SIGHT + 40.0:
         lit = light(bank, roads, state, seen, b, i, e, index, dt)
-    if lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
+    obeys = i > 0 or seen.believes[b] == 0 or seen.sign[b] == 1  # who does not know of a sign does not stop
+    if obeys and lit == SignalState.OFF and state.halted[b, i] != sign_line(roads, route[0], at):
         ahead = roads.ahead[first][0] - part - own[0]
         if ahead > -0.5 and ahead < SIGHT + 20.0:
             react = idm_gap(v, 0.0, ahead + 1.0)
