@@ -14,6 +14,7 @@ from ssad.assets.mesh import Mesh
 from ssad.camera.lamps import Lamp
 from ssad.camera.lidar import Lidar
 from ssad.camera.render import Weather, render
+from ssad.camera.rig import rig_camera
 from ssad.camera.scene_edit import Card, SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
@@ -22,6 +23,7 @@ from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits
 from ssad.recording import loop_sensors
 from ssad.recording.episode_scene import LENSES, Moment, moments_of
 from ssad.recording.live_attack import LiveAttack
+from ssad.recording.loop_perturbations import worn
 from ssad.recording.loop_sensors import Onboard
 from ssad.recording.scene_objects import PHASES
 from ssad.recording.target import TargetCar
@@ -335,3 +337,17 @@ def test_an_attack_that_does_not_fit_ends_in_one_line() -> None:
         onboard = Onboard(attack=LiveAttack(patched, TargetCar(), agent=agent))
         with pytest.raises(ConfigError, match=message):
             rollout(world(0), Watcher("front"), sensors={"front": onboard.camera(FRONT)})
+
+
+def test_signs_wear_a_texture_in_the_loop() -> None:
+    """All stop signs of a way, and nothing else, look otherwise."""
+    graph = load_town("Larkhill")
+    (scenario, *_) = [s for s in load_scenarios("stop-signs") if s.town == "Larkhill"]
+    simulator = World([build_episode(scenario, graph, seed=1)], {"Larkhill": graph})
+    camera = rig_camera("CAM_FRONT", 320)
+    onboards = [Onboard(), Onboard(attack=worn("wear-grey-sign", 0))]
+    plain, grey = (o.camera(camera)(simulator, np.array([[0, 0]], np.int32))[0] for o in onboards)
+    changed = (plain != grey).any(0)
+    assert 0 < changed.sum() < 0.02 * changed.size
+    red = (plain[0].astype(int) - plain[1] > 40) & changed
+    assert red.sum() > 0.2 * changed.sum(), "what changes was red"

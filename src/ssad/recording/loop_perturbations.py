@@ -95,7 +95,8 @@ def signs_of_route(graph: LaneGraph, route: F32) -> F64:
     """Where the stop signs stand that a way [N, 2] comes by, x, y [M, 2]."""
     stop = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
     ruled = [bool(np.hypot(*(route - at).T).min() < BESIDE) for at in stop]
-    return stop[np.array(ruled, bool)]
+    beside: F64 = stop[np.array(ruled, bool)]
+    return beside
 
 
 def worn(name: str, agent: int) -> PhysicalAttack:
