@@ -16,7 +16,7 @@ PICTURE = ROOT / "docs" / "architecture.svg"
 WIDTH, TOP, PITCH, HEIGHT = 1200, 78, 50, 34  # pixels: picture, first row, from row to row, a box
 GREY = "#7d8590"
 COLOURS = {  # fill and border, by what a package is for
-    "#d7e7fb": ("#3b76c4", ("cli", "doctor", "listing", "bench", "report")),
+    "#d7e7fb": ("#3b76c4", ("cli", "doctor", "listing", "results", "bench", "report")),
     "#ddf0dc": ("#4a9150", ("recording", "toolbox", "training", "interchange", "envs", "evaluation")),
     "#fdebd0": ("#c98a2b", ("scenarios", "drivers", "detectors", "datasets")),
     "#e6def5": ("#7d5fb5", ("world", "camera", "assets", "roads")),

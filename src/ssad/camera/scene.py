@@ -15,6 +15,7 @@ from ssad.camera.kernels import matter
 from ssad.camera.kernels import shade as kernels
 from ssad.core.errors import ConfigError
 from ssad.core.types import F32, F64, I32, Bool
+from ssad.jobs.machine import quiet_warp
 
 # pattern of a material by its name; others are plain
 PATTERNS = {
@@ -176,6 +177,7 @@ class Scene:
     """Triangles of a street (or none) and of meshes, on a device."""
 
     def __init__(self, street: Street | None, meshes: Sequence[Mesh], *, device: str = "cpu") -> None:
+        quiet_warp()
         self.street, self.device = street, device
         if street is not None:
             x, y = np.meshgrid(np.arange(street.nx), np.arange(street.ny))

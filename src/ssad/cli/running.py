@@ -42,28 +42,22 @@ def run(
     from rich.console import Console
 
     from ssad.bench.kind import Resources
-    from ssad.bench.run import run as run_plan
-    from ssad.bench.suite import kind_of, load_suite
-    from ssad.jobs.machine import pick_device
     from ssad.report.terminal import summary
+    from ssad.results import make_plan, run_plan
 
-    chosen = load_suite(suite, settings or [])
-    folder = out or Path("runs") / chosen.name
-    where = pick_device(device)
-    kind = kind_of(chosen.kind)
-    plan = kind.plan(chosen, device=where)
-    names = {cell.key: cell.name for cell in plan.cells}
+    plan = make_plan(suite, settings or [], device=device)
+    folder = out or Path("runs") / plan.suite.name
     try:
-        records = run_plan(plan, folder, Resources(workers, ray, where), retry=retry)
-        kind.finish(plan, folder)
+        results = run_plan(plan, folder, Resources(workers, ray, plan.device), retry=retry)
     except KeyboardInterrupt:
         print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
         raise typer.Exit(130) from None
     console = Console()
     console.print(summary(folder))
-    failed = [r for r in records if r["status"] != "ok"]
-    for record in failed[:5]:
-        console.print(f"{record['status']}: {names[record['key']]}: {record['reason']}", markup=False, soft_wrap=True)
+    failed = results.failures
+    for row in failed[:5]:
+        name = results.names[row["key"]]
+        console.print(f"{row['status']}: {name}: {row['reason']}", markup=False, soft_wrap=True)
     if len(failed) > 5:
         console.print(f"... and {len(failed) - 5} more: see {folder / 'results.jsonl'}", markup=False)
     if failed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 from ssad.core.errors import ConfigError
@@ -20,8 +21,9 @@ def cuda_driver() -> bool:
     return True
 
 
+@cache
 def quiet_warp() -> None:
-    """Start Warp and keep its banner and its notes about the kernel cache off the terminal."""
+    """Start Warp, once a process, and keep its banner and its notes about the kernel cache off the terminal."""
     import warp
 
     warp.config.log_level = warp.LOG_ERROR

@@ -34,17 +34,12 @@ class ComparedRun:
     run: Run
 
     @cached_property
-    def names(self) -> Mapping[str, str]:
-        """Key of a cell -> its name."""
-        return {cell["key"]: str(cell.get("name", cell["key"])) for cell in self.run.header.get("cells", [])}
-
-    @cached_property
     def lines(self) -> Mapping[tuple[str, str], Mapping[str, Any]]:
         """(subject, cell without its subject) -> its line; the subject is the system or detector that is tested."""
         found = {}
         for line in self.run.lines:
             subject = next((str(line[name]) for name in _SUBJECTS if line.get(name)), "")
-            name = self.names.get(line["key"], line["key"])
+            name = self.run.names.get(line["key"], line["key"])
             found[subject, name.removeprefix(f"{subject}/")] = line
         return found
 

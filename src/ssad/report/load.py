@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,11 @@ class Run:
     def command(self) -> str:
         """The command that repeats the run."""
         return str(self.header.get("command") or f"ssad run {self.suite.get('name', 'quick')}")
+
+    @cached_property
+    def names(self) -> Mapping[str, str]:
+        """Key of a cell -> its name, such as "blind/StraightObstacle/00"."""
+        return {cell["key"]: str(cell.get("name", cell["key"])) for cell in self.header.get("cells", [])}
 
     @property
     def failures(self) -> list[Mapping[str, Any]]:

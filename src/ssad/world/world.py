@@ -16,6 +16,7 @@ from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
+from ssad.jobs.machine import quiet_warp
 from ssad.world.belief import Lanes, check, complete, lanes_of, rested
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import see
@@ -70,7 +71,7 @@ class World:
     ) -> None:
         if dt <= 0.0 or substeps < 1:
             raise ConfigError(f"a world needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
-        wp.init()
+        quiet_warp()
         self.episodes = tuple(episodes)
         self.graphs: Mapping[str, LaneGraph] = dict(graphs)
         self.dt = dt

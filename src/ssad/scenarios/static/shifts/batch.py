@@ -13,9 +13,8 @@ import warp as wp
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Frame
 from ssad.core.types import U8
+from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts.spec import ShiftSpec
-
-wp.config.log_level = wp.LOG_ERROR
 
 
 @dataclass(slots=True)
@@ -86,6 +85,7 @@ def to_batch(images: Any, device: str | None = None) -> Batch:
     """
     if isinstance(images, Batch):
         return images
+    quiet_warp()
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(images, torch.Tensor):
         values = images.detach()
