@@ -248,6 +248,8 @@ def cases(values: dict[str, list[Any]], column: int | None = None) -> dict[str, 
     found = {}
     for name, row in values.items():
         kept = [v if column is None else v[column] for v in row if v is not None]
+        if not kept:
+            continue
         base = "/".join(name.split("/")[:-1]) if "-ego-" in name else name
         found[name] = CaseValue(float(np.mean(kept)), base, name)
     return found

@@ -16,7 +16,9 @@ BEFORE = 6.0  # s of the motion that is shown
 MARGIN = 14.0  # m
 
 
-def found_view(trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *, size: int = 420) -> U8:
+def found_view(
+    trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *, size: int = 420, last: int | None = None
+) -> U8:
     """A square picture: paths of the last seconds, bodies each second faint, and at the end in full.
 
     Args:
@@ -24,12 +26,14 @@ def found_view(trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *,
         graph: Its town.
         adversaries: Agents drawn as such.
         size: Of the picture, pixels.
+        last: Step that is shown; None: the first contact, or the end.
 
     Returns:
         [size, size, 3] RGB.
     """
     hits = np.flatnonzero(trace.contact)
-    last = int(hits[0]) if len(hits) else len(trace.x) - 1
+    if last is None:
+        last = int(hits[0]) if len(hits) else len(trace.x) - 1
     first = max(0, last - round(BEFORE / trace.dt))
     path = np.stack([trace.x[first : last + 1], trace.y[first : last + 1]], -1).astype(np.float64)
     shown = path[:, [0, *adversaries]].reshape(-1, 2)
@@ -42,11 +46,15 @@ def found_view(trace: EpisodeTrace, graph: LaneGraph, adversaries: list[int], *,
         return np.asarray(np.round(pixels * 16), np.int32)  # in sixteenths of a pixel
 
     picture = np.full((size, size, 3), GROUND, np.uint8)
-    for strip in strips(graph):
-        if np.abs(strip.ring - centre).max(1).min() < half + 20:
-            cv2.fillPoly(picture, [at(strip.ring)], ROAD if strip.layer >= 2 else SIDE, cv2.LINE_AA, 4)
-    for strip in strips(graph):
-        if strip.layer == 3 and not strip.junction and np.abs(strip.ring - centre).max(1).min() < half + 20:
+    near = [  # a straight strip may have no corner in the picture
+        strip
+        for strip in strips(graph)
+        if (strip.ring.min(0) < centre + half).all() and (strip.ring.max(0) > centre - half).all()
+    ]
+    for strip in near:
+        cv2.fillPoly(picture, [at(strip.ring)], ROAD if strip.layer >= 2 else SIDE, cv2.LINE_AA, 4)
+    for strip in near:
+        if strip.layer == 3 and not strip.junction:
             for edge in (strip.left, strip.right):
                 cv2.polylines(picture, [at(edge)], False, MARK, 1, cv2.LINE_AA, 4)
     colours = {0: EGO, **dict.fromkeys(adversaries, ADVERSARY)}
