@@ -376,7 +376,7 @@ def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path, monkeyp
         module.task = "3d"  # type: ignore[assignment]
         return module
 
-    monkeypatch.setattr(detection, "detector_of", detector)
+    monkeypatch.setattr("ssad.recording.scored_data.detector_of", detector)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/nobody")
     given = ["fcos3d-light", "fcos3d-light@fresh=random", "fcos3d-light@a=own.pth", "fcos3d-light@b=~/own.pth"]

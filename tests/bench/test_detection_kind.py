@@ -15,9 +15,10 @@ from rich.console import Console
 
 from ssad.bench.kind import Job, Plan, Resources
 from ssad.bench.kinds import detection
-from ssad.bench.kinds.detection import Detection, DetectionSuite, Recorded, recording_of
+from ssad.bench.kinds.detection import Detection, DetectionSuite
 from ssad.core.errors import ConfigError, FormatError
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path
+from ssad.recording.scored_data import Recorded, recording_of
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 GOOD: dict[str, Any] = {

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from ssad.bench.kind import Job, Plan, Resources
-from ssad.bench.kinds import detection, digital
+from ssad.bench.kinds import digital
 from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
 from ssad.bench.suite import command_of, load_suite
@@ -29,6 +29,7 @@ from ssad.evaluation.attack_sheet import magnified
 from ssad.evaluation.attack_tally import sum_notes
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
 from ssad.evaluation.scene_boxes import Examination, Watched, boxes_path, detector_of, find_boxes, read_boxes
+from ssad.recording import scored_data
 from ssad.report import write_report
 from ssad.report.kinds.digital import attempts_of, effort_table, load_digital_run, lost_table, main_table, short_of
 from ssad.report.kinds.digital import summary as kind_summary
@@ -105,8 +106,8 @@ def test_cells_are_the_clean_data_noise_of_each_size_the_table_and_the_curves(ro
 
 def test_a_plan_builds_each_detector_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
-    real = detection.detector_of
-    for module in (detection, digital):
+    real = scored_data.detector_of
+    for module in (scored_data, digital):
         monkeypatch.setattr(module, "detector_of", lambda *given: built.append(given[0]) or real(*given), raising=False)
     plan = Digital().plan(suite_of(root))
     assert built == [LINEAR, BLIND]

@@ -277,7 +277,7 @@ def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest
     short = replace(episodes()[0], limits=Limits(max_steps=2))
     monkeypatch.setattr(driving, "episode_of", lambda cell: short)
     monkeypatch.setattr(driving, "system_of", lambda name: watcher)
-    cell = SimpleNamespace(system="watcher", spec={"scenario": {"type": short.scenario.type}})
+    cell = SimpleNamespace(key="a", system="watcher", spec={"scenario": {"type": short.scenario.type}})
     _, (trace,) = driving.drive([cell], device="cpu")
     camera = Onboard().rig()["CAM_BACK"]
     assert np.array_equal(watcher.shown["CAM_BACK", 0, 0, 1], camera.of_trace(trace, town(), steps=[1])[0])

@@ -7,27 +7,27 @@ have. Everything else is the engine's: processes, time-outs, resume, retry, prog
 from __future__ import annotations
 
 import difflib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from abc import ABC
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
-from ssad.core import safeio
+from ssad.core import safeio, schema
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import digest
 from ssad.core.source import source_version
 from ssad.core.types import U8, EpisodeTrace
 
-Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
+Names = schema.Names
 
 
-class SuiteBase(BaseModel):
+class SuiteBase(schema.Schema):
     """What suites of every kind say.
 
     Attributes:
@@ -36,10 +36,9 @@ class SuiteBase(BaseModel):
         title, description: what people read.
         seed: root of all random numbers.
         timeout_s: seconds that one cell may take.
+        chunk: cells that run as one batch, where they can (results do not depend on it).
         reference: the published table that the report shows beside this one.
     """
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     kind: str
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
@@ -47,6 +46,7 @@ class SuiteBase(BaseModel):
     description: str = ""
     seed: int = Field(default=0, ge=0)
     timeout_s: float = Field(default=3600.0, gt=0, allow_inf_nan=False)
+    chunk: int = Field(default=1, ge=1, le=4096)
     reference: str | None = None
 
     def beside(self, path: Path) -> Self:
@@ -172,9 +172,8 @@ class Kind(ABC):
     factors: ClassVar[tuple[str, ...]]
     patience: ClassVar[int | None] = None
 
-    @abstractmethod
     def plan(self, suite: Any, *, device: str = "cpu", check: bool = True) -> Plan:
-        """Resolve a suite.
+        """Resolve a suite: by default, what `cells` says of it.
 
         Args:
             suite: The suite.
@@ -185,16 +184,27 @@ class Kind(ABC):
             ConfigError: The input is wrong.
             FormatError: The input is wrong.
         """
+        return Plan(self, suite, device, tuple(self.cells(suite)), {})
 
-    @abstractmethod
+    def cells(self, suite: Any) -> Iterable[Cell]:
+        """The cells of a suite; a kind brings this or `plan`."""
+        raise NotImplementedError
+
     def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
-        """In a worker: results of some cells by key.
+        """In a worker: results of some cells by key; by default of one after another. What goes wrong raises.
+
+        Alone, a cell then fails with that reason; of several, each is run again alone.
+        """
+        return {cell.key: self.result(cell, job) for cell in cells}
+
+    def result(self, cell: Cell, job: Job) -> Mapping[str, Any]:
+        """In a worker: the result of a cell; a kind brings this or `execute`.
 
         A result is plain data: metrics (name -> number, None where it was not measured); n; artefacts (name -> path in
         the folder, or list of them; on disk when this returns); case and cluster (see docs/metrics.md); episode (a
-        line for episodes.jsonl); and whatever else the record shall have. What goes wrong raises: alone, a cell then
-        fails with that reason; of several, each is run again alone.
+        line for episodes.jsonl); and whatever else the record shall have.
         """
+        raise NotImplementedError
 
     def start(self, job: Job) -> None:  # noqa: B027  nothing to do by default
         """In a worker, once: what no cell's time-out shall pay for."""
@@ -226,8 +236,12 @@ class Kind(ABC):
         return asked
 
     def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
-        """Cells in groups that `execute` is given at once; they share a system."""
-        return [[cell] for cell in cells]
+        """Cells in groups that `execute` is given at once: alike, of one system, and fewer where workers would idle."""
+        return grouped(cells, plan.suite.chunk, workers=workers, by=self.alike)
+
+    def alike(self, cell: Cell) -> Hashable:
+        """Cells for which this is equal can run as one batch; they share a system."""
+        return cell.system
 
     def order(self, cell: Cell) -> float:
         """Cells of a lower number run earlier."""
@@ -282,6 +296,12 @@ class Kind(ABC):
         described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
         key = digest("cell", self.name, self.code, safeio.dump_json(described), system, seed, *inputs)
         return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
+
+
+def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
+    """ConfigError: a name appears twice under a key of a suite."""
+    if len(set(names)) != len(names):
+        raise ConfigError(f"suite {suite.name}: {key}: a name appears twice")
 
 
 def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.schema import Schema
 from ssad.evaluation.attacked_scenes import AttackSpec, takes
 from ssad.scenarios.static.digital import default_loss, make_objective
 from ssad.scenarios.static.digital.budget import Norm
@@ -25,7 +26,7 @@ ENSEMBLE = "ensemble"
 DRAWS = 4  # of a random defence that an attack knows, if the suite does not say it
 
 
-class Method(BaseModel):
+class Method(Schema):
     """An attack as a suite names it.
 
     Attributes:
@@ -36,12 +37,10 @@ class Method(BaseModel):
         precision: of the gradients, where it is not the suite's.
     """
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
     name: str = Field(min_length=1)
     loss: str | None = None
     norm: Literal["linf", "l2"] = "linf"
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default={})
     precision: Precision | None = None
 
 
@@ -59,13 +58,11 @@ class Row(Method):
     scenes: Scenes | None = None
 
 
-class Guard(BaseModel):
+class Guard(Schema):
     """A defence before the detector: its name (jpeg, bits, blur, resize) and further settings."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
     name: str = Field(min_length=1)
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default={})
 
 
 class Entry(Row):
@@ -86,10 +83,10 @@ class Entry(Row):
     defence: Guard | None = None
     aware: bool | None = None
     draws: Steps | None = None
-    classes: list[str] = []
-    becomes: dict[str, str] = {}
+    classes: list[str] = Field(default=[])
+    becomes: dict[str, str] = Field(default={})
     object: Annotated[str, Field(min_length=1)] | None = None
-    members: list[Row] = []
+    members: list[Row] = Field(default=[])
 
     @field_validator("defence", "members", mode="before")
     @classmethod
@@ -101,8 +98,8 @@ class Entry(Row):
 class Sweep(Method):
     """A curve: an attack over radii at the suite's steps, and over steps at the suite's radius; scenes as in `Row`."""
 
-    radii: list[Radius] = []
-    steps: list[Steps] = []
+    radii: list[Radius] = Field(default=[])
+    steps: list[Steps] = Field(default=[])
     scenes: Scenes | None = None
 
 
@@ -111,7 +108,7 @@ def named(value: Any) -> Any:
     return [{"name": one} if isinstance(one, str) else one for one in value] if isinstance(value, list) else value
 
 
-class AttackTable(BaseModel):
+class AttackTable(Schema):
     """Digital attacks, beside the clean data and random noise of the same size.
 
     Attributes:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import lru_cache
 from importlib.metadata import version
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ssad.core import safeio
-from ssad.core.driving import Driver, Sensor, Simulator
+from ssad.core.driving import Driver, Perturbation, Sensor, Simulator
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.nuscenes_names import CAMERAS, LIDAR
@@ -152,14 +153,31 @@ def episode_of(order: Order) -> Episode:
     )
 
 
-def drive(orders: Sequence[Order], *, device: str) -> tuple[list[Episode], list[EpisodeTrace]]:
-    """Episodes and traces of orders that share a system and a simulator, run as one batch."""
+def drive(
+    orders: Sequence[Order],
+    *,
+    device: str,
+    driver: Driver | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    perturbation: Mapping[str, Perturbation] | None = None,
+    key: Callable[[Order], str] = attrgetter("key"),
+) -> tuple[list[Episode], list[EpisodeTrace]]:
+    """Episodes and traces of orders that share a system and a simulator, run as one batch.
+
+    Args:
+        orders: What is to be driven.
+        device: Where the world computes.
+        driver: Who drives; None: the system that the orders name.
+        sensors: What drivers may ask for; None: `onboard_sensors`.
+        perturbation: What changes the pictures that drivers get; see `ssad.world.rollout.rollout`.
+        key: Of the episodes, on which the noise of sensors depends; traces have those of their orders.
+    """
     from ssad.drivers import make_system
     from ssad.interchange.highway_env import HighwayEnv
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
-    episodes = [episode_of(order) for order in orders]
+    episodes = [replace(episode_of(order), key=key(order)) for order in orders]
     graphs = {episode.town: town(episode.town) for episode in episodes}
     away = orders[0].spec.get("simulator")
     simulator: Simulator
@@ -169,16 +187,18 @@ def drive(orders: Sequence[Order], *, device: str) -> tuple[list[Episode], list[
         simulator = Carla(episodes, graphs, server=Server.of(away))
     else:
         simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
-    system = system_of(orders[0].system)
+    system = driver or system_of(orders[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
-    for driver in (system, *policies.values()):
-        if callable(getattr(driver, "to", None)):
-            driver.to(device)  # type: ignore[attr-defined]
-    sensors = onboard_sensors([system, *policies.values()], device)
+    for one in (system, *policies.values()):
+        if callable(getattr(one, "to", None)):
+            one.to(device)  # type: ignore[attr-defined]
+    if sensors is None:
+        sensors = onboard_sensors([system, *policies.values()], device)
     try:
-        return episodes, rollout(simulator, system, sensors=sensors, policies=policies.__getitem__)
+        traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
     finally:
         getattr(simulator, "close", lambda: None)()
+    return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)]
 
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from ssad.camera.render import Weather
 from ssad.core.errors import ConfigError
+from ssad.core.schema import Names, Schema
 from ssad.evaluation.digital_points import named
 from ssad.recording.clips import AZIMUTHS, ELEVATIONS, Clips
 from ssad.recording.lit_clips import at_hour
@@ -26,13 +27,10 @@ from ssad.scenarios.static.physical.shipped import load_texture
 CLEAN, RANDOM = "clean", "random"
 GRID = "grid"
 VIEWS = ("drive", GRID)
-_STRICT = ConfigDict(strict=True, extra="forbid", frozen=True)
 
 
-class Pair(BaseModel):
+class Pair(Schema):
     """Where textures are trained and where they are tested: towns, and numbers of pictures."""
-
-    model_config = _STRICT
 
     train: str
     test: str
@@ -40,7 +38,7 @@ class Pair(BaseModel):
     test_images: int = Field(default=400, ge=1)
 
 
-class Grid(BaseModel):
+class Grid(Schema):
     """Views from all around the target: each combination once in each town of a test.
 
     Attributes:
@@ -50,8 +48,6 @@ class Grid(BaseModel):
         weathers: kinds (`ssad.recording.nuscenes_recorder.WEATHERS`).
         towns: Of the tests that are seen from all around; None: all.
     """
-
-    model_config = _STRICT
 
     distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0, 30.0], min_length=1)
     azimuths: list[float] = Field(default=list(AZIMUTHS), min_length=1)
@@ -65,7 +61,7 @@ class Grid(BaseModel):
         return len(self.distances) * len(self.azimuths) * len(self.elevations) * len(self.weathers)
 
 
-class Entry(BaseModel):
+class Entry(Schema):
     """A row of the table.
 
     Attributes:
@@ -80,18 +76,16 @@ class Entry(BaseModel):
             and the detector that it was trained against are those of the card.
     """
 
-    model_config = _STRICT
-
     name: str = Field(min_length=1)
     carrier: Literal["patch", "camouflage", "road"] | None = None
-    options: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default={})
+    settings: dict[str, Any] = Field(default={})
     around: int = Field(default=0, ge=0)
     of: str | None = None
     texture: str | None = None
 
 
-class LightEntry(BaseModel):
+class LightEntry(Schema):
     """Rows of the table for one light: searched, and with settings drawn at random.
 
     Attributes:
@@ -101,15 +95,13 @@ class LightEntry(BaseModel):
         settings: of its search (`Budget`); of a projector, of `TextureAttack`.
     """
 
-    model_config = _STRICT
-
     name: str = Field(min_length=1)
     hour: str = "night"
-    options: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default={})
+    settings: dict[str, Any] = Field(default={})
 
 
-class TargetTable(BaseModel):
+class TargetTable(Schema):
     """Textures on a target and lights on it, trained on drives in one town and tested in another.
 
     Attributes:
@@ -135,7 +127,7 @@ class TargetTable(BaseModel):
 
     name: str
     seed: int
-    detectors: list[Annotated[str, Field(min_length=1)]] = Field(default=["yolov5n", "yolov3-tiny"], min_length=1)
+    detectors: Names = Field(default=["yolov5n", "yolov3-tiny"], min_length=1)
     judges: list[str] = Field(default=[])
     transfer: bool = False
     target: str = "sedan:silver:0"

@@ -4,39 +4,31 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Hashable, Sequence
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-import numpy as np
 from pydantic import Field
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase, grouped
-from ssad.bench.kinds.driving import DrivingSuite, keep_towns, suite_scenarios
+from ssad.bench.kind import Cell, Column, Job, Names, Plan, Resources, check_distinct
+from ssad.bench.kinds.driving import ScenarioKind, ScenarioSuite, described
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.core.safeio import plain
-from ssad.core.seeding import seed32
 from ssad.core.source import source_version
 from ssad.core.traces import motion_hash, save_trace
-from ssad.core.types import Episode, Scenario
-from ssad.evaluation.search_scores import MOVING, distinct, likeness, reference, summary
-from ssad.recording.closed_loop import grade_of, load_world, scenario_json, system_version, town, town_version
-
-AVOIDERS = {
-    "cc": "CC", "reg157": "Reg157", "rss": "RSS", "fsm": "FSM", "limit": "a manoeuvre",
-}  # fmt: skip
-"""Short name in a grade -> who avoids a collision: the careful drivers, and the kinematic limit."""
+from ssad.evaluation.found_collisions import AVOIDERS, collides, grades, refusal, saved_collisions, transfer
+from ssad.evaluation.search_scores import likeness, reference, summary
+from ssad.recording.closed_loop import grade_of, system_version, town
 
 
-class AdversarialSuite(SuiteBase):
+class AdversarialSuite(ScenarioSuite):
     """One table: generators x scenarios x systems.
 
     Attributes:
         systems: driving systems under test.
-        scenarios: base scenarios, as in a driving suite.
         generators: names, or module:object.
         budget: rollouts that a generator may spend on a base.
         batch: how many of them it is asked for at once.
@@ -49,7 +41,6 @@ class AdversarialSuite(SuiteBase):
 
     kind: Literal["adversarial"] = "adversarial"
     systems: Names
-    scenarios: Names
     generators: Names
     budget: int = Field(default=64, ge=1, le=100_000)
     batch: int = Field(default=8, ge=1, le=1024)
@@ -59,16 +50,8 @@ class AdversarialSuite(SuiteBase):
     transfer: list[str] = Field(default_factory=list)
     chunk: int = Field(default=32, ge=1, le=1024)
 
-    def beside(self, path: Path) -> Self:
-        """Scenario files are looked for in the working folder, then beside the suite."""
-        found = self._driving().beside(path).scenarios
-        return self.model_copy(update={"scenarios": found})
 
-    def _driving(self) -> DrivingSuite:
-        return DrivingSuite(name=self.name, systems=self.systems, scenarios=self.scenarios)
-
-
-class Adversarial(Kind):
+class Adversarial(ScenarioKind):
     """See the module."""
 
     name = "adversarial"
@@ -107,63 +90,41 @@ class Adversarial(Kind):
         from ssad.scenarios.dynamic import build_episode
         from ssad.scenarios.dynamic.generate import generator_factory
 
-        for key in ("systems", "generators"):
-            if len(set(getattr(suite, key))) != len(getattr(suite, key)):
-                raise ConfigError(f"suite {suite.name}: {key}: a name appears twice")
-        systems = {
-            name: system_version(name) for name in {**dict.fromkeys(suite.systems), **dict.fromkeys(suite.transfer)}
-        }
+        check_distinct(suite, "systems", suite.systems)
+        check_distinct(suite, "generators", suite.generators)
+        systems = {name: system_version(name) for name in dict.fromkeys([*suite.systems, *suite.transfer])}
         factories = {name: generator_factory(name) for name in suite.generators}
-        generators = {name: source_version(f.__module__) for name, f in factories.items()}
-        scenarios = suite_scenarios(suite._driving())
-        towns = {name: town_version(town(name)) for name in sorted({s.town for s in scenarios})}
+        generators = {name: source_version(factory.__module__) for name, factory in factories.items()}
+        scenarios, towns = described(suite)
         if check:
-            episodes = [build_episode(scenario, town(scenario.town), seed=0) for scenario in scenarios]
+            episodes = [build_episode(one.scenario, town(one.scenario.town), seed=0) for one in scenarios]
             for name, factory in factories.items():
                 refused = [refusal(factory, episode) for episode in episodes]
                 if all(refused):
                     raise ConfigError(f"generator {name}: {refused[0]}")
-        cells = []
-        for generator in suite.generators:
-            for system in suite.systems:
-                for scenario in scenarios:
-                    data = scenario_json(scenario)
-                    for repetition in range(suite.repetitions):
-                        # all generators and systems meet the same bases with the same seeds
-                        seed = seed32("adversarial", suite.seed, safeio.dump_json(data), repetition)
-                        mark = f"#{repetition}" if repetition else ""
-                        fields = {
-                            "generator": generator, "system": system, "group": scenario.group or scenario.type,
-                            "cluster": scenario.name,
-                        }  # fmt: skip
-                        spec = {
-                            "scenario": data, "generator": generator, "system": system, "repetition": repetition,
-                            "budget": suite.budget, "batch": suite.batch, "keep": suite.keep,
-                        }  # fmt: skip
-                        if suite.transfer:
-                            spec["transfer"] = list(suite.transfer)
-                        if not suite.grade:
-                            spec["grade"] = False
-                        others = [systems[name] for name in suite.transfer]
-                        versions = systems[system], generators[generator], towns[scenario.town], *others
-                        name = f"{generator}/{system}/{scenario.name}{mark}"
-                        cells.append(self.make_cell(name, system, seed, fields, spec, *versions))
-        inputs = {"towns": towns, "systems": systems, "generators": generators}
-        return Plan(self, suite, device, tuple(cells), inputs)
+        others = [systems[name] for name in suite.transfer]
+        # all generators and systems meet the same bases with the same seeds
+        cells = tuple(
+            self.scenario_cell(
+                suite, one, systems[system], generators[generator], *others, system=system,
+                title=f"{generator}/{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+                chance=("adversarial", repetition), fields={"generator": generator}, generator=generator,
+                repetition=repetition, budget=suite.budget, batch=suite.batch, keep=suite.keep, grade=suite.grade,
+                transfer=list(suite.transfer),
+            )
+            for generator, system, one, repetition
+            in product(suite.generators, suite.systems, scenarios, range(suite.repetitions))
+        )  # fmt: skip
+        return Plan(self, suite, device, cells, {"towns": towns, "systems": systems, "generators": generators})
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
-        """Copies of the towns lie beside the results, so that a report can be made where they are not imported."""
-        keep_towns(plan.inputs["towns"], folder)
+        """See `ScenarioKind`; makes room for what is found."""
         safeio.make_folder(folder / "found")
-        return {}
+        return super().prepare(plan, folder, resources)
 
-    def batches(self, plan: Plan, cells: Sequence[Cell], workers: int) -> list[list[Cell]]:
+    def alike(self, cell: Cell) -> Hashable:
         """Cells of one generator and one system, whose bases it works on side by side."""
-        return grouped(cells, plan.suite.chunk, workers=workers, by=lambda c: (c.fields["generator"], c.system))
-
-    def start(self, job: Job) -> None:
-        """Loads the world's kernels, which are compiled on first use."""
-        load_world(job.device)
+        return cell.fields["generator"], cell.system
 
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Runs one generator on the bases that the system survives."""
@@ -181,13 +142,13 @@ class Adversarial(Kind):
         alive: list[Cell] = []
         results: dict[str, dict[str, Any]] = {}
         for cell in cells:
-            refused = refusal(factory, bases[cell.key].episode)
-            survived = bases[cell.key].trace.end != "collision"
+            base = bases[cell.key]
+            refused, survived = refusal(factory, base.episode), not collides(base)
             if survived and not refused:
                 alive.append(cell)
                 continue
             metrics: dict[str, Any] = {"applies": not refused, "survived": survived}
-            results[cell.key] = {"metrics": metrics, "case": motion_hash(bases[cell.key].trace), "refused": refused}
+            results[cell.key] = {"metrics": metrics, "case": motion_hash(base.trace), "refused": refused}
         if not alive:
             return results
         began = time.process_time()
@@ -201,13 +162,8 @@ class Adversarial(Kind):
         usual = reference(job.folder, job.device)
         for cell, base, row in zip(alive, chosen, outcomes, strict=True):
             about = self._save(cell, base, row, trials, job.folder)
-            metrics = {
-                "applies": True,
-                "survived": True,
-                **summary(row),
-                **about.pop("metrics"),
-                **likeness(row, base.graph, usual),
-            }
+            metrics = {"applies": True, "survived": True, **summary(row), **about.pop("metrics")}
+            metrics |= likeness(row, base.graph, usual)
             metrics["seconds"] = max(clock.values()) / len(alive)
             spent = [s for asked, s in clock.items() if metrics["CR"] and asked >= metrics["rollouts"]]
             metrics["seconds_first"] = min(spent, default=math.nan) / len(alive)
@@ -216,86 +172,24 @@ class Adversarial(Kind):
 
     def _save(self, cell: Cell, base: Base, row: Sequence[Outcome], trials: Any, folder: Path) -> dict[str, Any]:
         """Writes the most distinct collisions as scenarios, drives each again, and keeps the trace of the first."""
-        from ssad.scenarios.dynamic import save_scenarios
-        from ssad.scenarios.dynamic.generate import scenario_of
-
-        found = distinct([outcome for outcome in row if outcome.valid])[: cell.spec["keep"]]
+        mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
+        stem = f"{base.scenario.name}/{cell.spec['generator']}{mark}"
+        artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
+        found, made = saved_collisions(
+            folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem
+        )  # fmt: skip
         if not found:
             return {"metrics": {"replayed": None}}
-        mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
-        made = [
-            scenario_of(o, base, name=f"{base.scenario.name}/{cell.spec['generator']}{mark}-{n}")
-            for n, o in enumerate(found)
-        ]
+        assert found[0].trace is not None
+        save_trace(folder / artefacts["trace"], found[0].trace)
         # with another seed: what is saved must not depend on one
         seed = cell.seed + 1
         again = [trials.base(scenario, base.graph, seed=seed) for scenario in made]
-        hits = [one.trace.end == "collision" for one in again]
-        artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
-        save_scenarios(folder / artefacts["scenarios"], made)
-        assert found[0].trace is not None
-        save_trace(folder / artefacts["trace"], found[0].trace)
+        metrics = {"replayed": sum(map(collides, again)) / len(again)}
+        if cell.spec["grade"]:
+            hits = [one for one in again if collides(one)]
+            metrics |= grades([grade_of(one.episode, one.trace, trials.device).metrics() for one in hits], hits)
         return {
-            "artefacts": artefacts, "adversaries": list(found[0].adversaries),
-            "metrics": {"replayed": float(np.mean(hits))}
-            | (grades([one for one, hit in zip(again, hits, strict=True) if hit], trials.device)
-               if cell.spec.get("grade", True) else {}),
-            "transfer": transfer(cell.spec.get("transfer", []), base, made, trials.device, seed=seed),
+            "artefacts": artefacts, "adversaries": list(found[0].adversaries), "metrics": metrics,
+            "transfer": transfer(cell.spec["transfer"], base, made, trials.device, seed=seed),
         }  # fmt: skip
-
-
-def grades(collisions: Sequence[Base], device: str) -> dict[str, float]:
-    """Shares of collisions that each careful driver, any of them, and the kinematic limit avoid; {} without any."""
-    if not collisions:
-        return {}
-    rows = [grade_of(base.episode, base.trace, device).metrics() for base in collisions]
-    careful = [any(row[f"avoided_by_{name}"] for name in AVOIDERS if name != "limit") for row in rows]
-    moving = [fine for fine, base in zip(careful, collisions, strict=True) if _moves(base)]
-    shares = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    shares["attributable"] = float(np.mean(careful))
-    return shares | ({"attributable_moving": float(np.mean(moving))} if moving else {})
-
-
-def _moves(base: Base) -> bool:
-    """Whether the ego moves when it is hit."""
-    return abs(float(base.trace.speed[int(np.flatnonzero(base.trace.contact)[0]), 0])) > MOVING
-
-
-def transfer(
-    systems: Sequence[str], base: Base, made: Sequence[Scenario], device: str, *, seed: int
-) -> dict[str, dict[str, float]]:
-    """How other systems fare in what was found against one.
-
-    Args:
-        systems: The others.
-        base: What was searched.
-        made: What was found.
-        device: Where the world computes.
-        seed: Of the episodes.
-
-    Returns:
-        Name of a system -> `base`, whether it collides in the base, and `found`, the share of `made` in which it does.
-    """
-    from ssad.drivers import make_system
-    from ssad.scenarios.dynamic.generate import Trials
-
-    rows = {}
-    for name in systems:
-        trials = Trials(partial(make_system, name), make_system, device=device)
-        hits = [
-            float(trials.base(scenario, base.graph, seed=seed).trace.end == "collision")
-            for scenario in (base.scenario, *made)
-        ]
-        rows[name] = {"base": hits[0], "found": float(np.mean(hits[1:]))}
-    return rows
-
-
-def refusal(factory: Any, episode: Episode) -> str:
-    """Why a generator has nothing to change in an episode; "": it has."""
-    check = getattr(factory, "check", None)
-    try:
-        if check is not None:
-            check(episode)
-    except ConfigError as error:
-        return str(error)
-    return ""

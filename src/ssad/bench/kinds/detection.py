@@ -5,7 +5,6 @@ It also has what other kinds that score 3D detectors under conditions need.
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -13,21 +12,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
 from ssad.bench.run import hash_artefacts
 from ssad.core import safeio
-from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import save_picture
-from ssad.core.nuscenes_names import MMDET3D_CLASSES
-from ssad.core.source import source_version
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import SceneData
-from ssad.detectors import DETECTORS, SHIPPED
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.pictures import STRONG, detection_sheet
 from ssad.evaluation.scene_boxes import (
@@ -35,58 +30,28 @@ from ssad.evaluation.scene_boxes import (
     Examination,
     ShiftedScene,
     boxes_path,
-    detector_of,
     find_boxes,
     forget_failures,
     score_scenes,
 )
 from ssad.jobs.machine import default_workers
 from ssad.jobs.progress import Live
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.recording.nuscenes_recorder import record_nuscenes
+from ssad.recording.scored_data import RECORDED, DetectorTable, data_of, detectors_of, recording_of
 from ssad.scenarios.static.digital.defences import make_defence
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
-RECORDED = "recorded"
 
 
-class Recorded(BaseModel):
-    """The validation set that is recorded where none is given: drives in towns that the shipped detectors never saw.
-
-    Attributes:
-        towns: names.
-        scenes: of each town.
-        seconds: of a scene, two samples each.
-        width: of the pictures.
-        seed: of the drives.
-    """
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-    towns: Names = ["Oldmarket", "Larkhill"]
-    scenes: int = Field(default=12, ge=1)
-    seconds: float = Field(default=8.0, ge=0.5, allow_inf_nan=False)
-    width: int = Field(default=800, ge=64)
-    seed: int = Field(default=0, ge=0)
-
-
-class DetectorSuite(SuiteBase):
+class DetectorSuite(SuiteBase, DetectorTable):
     """What suites say that score 3D detectors.
 
     Attributes:
-        detectors: names, with weights of your own as NAME=FILE, or module:object.
-        data: "recorded", or the root of a data set in the nuScenes schema, with version (default: the one that is
-            there) and split.
-        recorded: what is recorded.
         replicates: of the bootstrap over scenes.
         timeout_s: seconds that one scene under one condition, or one score, may take.
     """
 
-    detectors: Names = Field(default=["fcos3d-light", "pgd-det-light"], min_length=1)
-    data: str = Field(default=RECORDED, min_length=1)
-    version: str | None = None
-    split: str = "val"
-    recorded: Recorded = Recorded()
     replicates: int = Field(default=100, ge=0, le=10_000)
 
 
@@ -312,78 +277,6 @@ class Detection(DetectorKind):
             f"and under each shift at severity {severity}."
         )
         return lambda: detection_sheet(examination, suite.split, shifts, severity), caption
-
-
-def detectors_of(
-    suite: DetectorSuite, names: Sequence[str] | None = None, *, flat: bool = False
-) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
-    """By name of the detectors: versions of weights and own source; files of weights ("": shipped); tasks (2d, 3d).
-
-    Args:
-        suite: Which names them.
-        names: Those that are meant, as a suite writes them; None: `suite.detectors`.
-        flat: Whether 2D detectors with a class of nuScenes are welcome too.
-
-    Raises:
-        ConfigError: A detector appears twice, has no weights, or is not of the kind that is welcome.
-    """
-    weights: dict[str, str] = {}
-    files: dict[str, str] = {}
-    tasks: dict[str, str] = {}
-    for text in suite.detectors if names is None else names:
-        name, _, file = text.partition("=")
-        if name in files:
-            raise ConfigError(
-                f"suite {suite.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
-                f"{name}@mine=FILE"
-            )
-        path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
-        kind = name.partition("@")[0]
-        if not path and kind in DETECTORS and not (SHIPPED / f"{kind}.json").is_file():
-            raise ConfigError(
-                f"suite {suite.name}: no weights of {kind} are shipped; give a file, {kind}=FILE "
-                f"(docs/detectors.md: ssad train detector {kind}, or official ones)"
-            )
-        detector = detector_of(name, path, "cpu")
-        tasks[name] = str(getattr(detector, "task", ""))
-        if tasks[name] != "3d":
-            if not flat:
-                raise ConfigError(f"suite {suite.name}: {name} finds 2D boxes; this suite takes 3D detectors")
-            if not set(detector.classes) & set(MMDET3D_CLASSES):
-                raise ConfigError(f"suite {suite.name}: {name} knows none of the ten classes of nuScenes")
-        own = f" {source_version(kind.partition(':')[0])}" if ":" in kind else ""
-        weights[name], files[name] = state_hash(detector) + own, path
-    return weights, files, tasks
-
-
-def data_of(suite: DetectorSuite) -> dict[str, Any]:
-    """What the results depend on of the data set, which is checked.
-
-    Raises:
-        ConfigError: There is no such version, split or scene.
-        FormatError: The data set is broken.
-    """
-    if suite.data == RECORDED:
-        if suite.split not in ("val", "all"):
-            raise ConfigError(f"suite {suite.name}: recorded data have the splits val and all, not '{suite.split}'")
-        return {**recording_of(suite, Path(RECORDED)).identity(), "split": suite.split}
-    root = Path(suite.data).expanduser()
-    if not root.is_dir():
-        raise ConfigError(f"suite {suite.name}: data: {root} is no folder; give the root of a data set, or {RECORDED}")
-    with NuScenes(root, suite.version) as data:
-        version, scenes = data.version, scenes_of(data, suite.split)
-    about: dict[str, Any] = {"version": version, "split": suite.split, "scenes": list(scenes)}
-    for name in ("sample", "sample_annotation", "sample_data", "calibrated_sensor"):
-        table = safeio.read_bytes(root / version / f"{name}.json", limit=1 << 34)
-        about[name] = hashlib.sha256(table).hexdigest()[:16]
-    return about
-
-
-def recording_of(suite: DetectorSuite, out: Path) -> Recording:
-    """On the CPU, on any machine: it decides bits."""
-    own = suite.recorded
-    towns = tuple(own.towns)
-    return Recording(out, towns, towns, scenes=own.scenes, seconds=own.seconds, width=own.width, seed=own.seed)
 
 
 def _examination(job: Job) -> Examination:

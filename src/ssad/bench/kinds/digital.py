@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from ssad.bench.kind import Cell, Column, Job, Plan, Resources
-from ssad.bench.kinds.detection import DetectorKind, DetectorSuite, data_of, detectors_of
+from ssad.bench.kinds.detection import DetectorKind, DetectorSuite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.types import U8
@@ -28,6 +28,7 @@ from ssad.evaluation.digital_points import (
     transfers_of,
 )
 from ssad.evaluation.scene_boxes import Condition, Examination, ShiftedScene, boxes_path
+from ssad.recording.scored_data import data_of, detectors_of
 from ssad.scenarios.static.digital.universal import UniversalFit
 
 

@@ -11,18 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Resources, SuiteBase
 from ssad.bench.suite import kind_of, load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.jsonl import read_lines
+from ssad.core.schema import Schema
 
 TROUBLE = "trouble.txt"
 
 
-class Part(BaseModel):
+class Part(Schema):
     """A suite of a tour.
 
     Attributes:
@@ -32,8 +33,6 @@ class Part(BaseModel):
         question: what it tests, in one sentence.
         limits: what it does not show.
     """
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     suite: str

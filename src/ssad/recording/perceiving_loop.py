@@ -1,0 +1,165 @@
+"""Perceiving systems in the closed loop, as plain data: made, and driven with perturbed cameras under observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ssad.core.checkpoints import state_hash
+from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.schema import Schema
+from ssad.core.seeding import digest
+from ssad.core.types import Episode, EpisodeTrace
+from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.signs import SignReading
+from ssad.drivers.perceiving.tracker import Tracking
+from ssad.evaluation.drive_perception import Watcher
+from ssad.metrics import episode_metrics
+from ssad.recording.closed_loop import Order, drive
+from ssad.recording.loop_perturbations import perturbed, worn
+from ssad.recording.loop_sensors import Onboard
+
+Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
+
+
+class PerceivingSystem(Schema):
+    """A perceiving system of a suite.
+
+    Attributes:
+        name: what tables call it.
+        detector: `ssad list detectors`; truth: a perfect detector, which is told the truth.
+        weights: a file of weights; none: the shipped ones.
+        cameras: of the nuScenes rig.
+        width: of their pictures, pixels.
+        input_width: width to which a 3D detector resizes them; none: its own.
+        rate: looks a second.
+        latency: s from a picture to its detections.
+        confirm: hits from which an object is believed (H).
+        reserve: looks without a hit that it stays believed for (R).
+        high, low: scores of the tracker's two stages.
+        reads_signs: whether it knows of stop signs only what its detector reads; else those of the map.
+        sign_memory: s that a sign is remembered after it was last read; none: until it has been passed.
+        missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+    """
+
+    name: str = Field(min_length=1)
+    detector: str = "fcos3d-light"
+    weights: str | None = None
+    cameras: list[Literal[CAMERAS]] = Field(default=["CAM_FRONT"], min_length=1)  # type: ignore[valid-type]
+    width: int = Field(default=640, ge=64, le=1600)
+    input_width: int | None = Field(default=None, ge=64, le=3200)
+    rate: float = Field(default=5.0, gt=0, le=100, allow_inf_nan=False)
+    latency: float = Field(default=0.1, ge=0, le=10, allow_inf_nan=False)
+    confirm: int = Field(default=2, ge=1)
+    reserve: int = Field(default=6, ge=0)
+    high: float = Field(default=0.3, ge=0, le=1)
+    low: float = Field(default=0.1, ge=0, le=1)
+    reads_signs: bool = False
+    sign_memory: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    missed: float = Share
+    burst: float = Field(default=3.0, ge=1, allow_inf_nan=False)
+    noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    phantoms: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+    @property
+    def version(self) -> str:
+        """Hash of the weights of its detector; "" without one."""
+        return "" if self.perfect else state_hash(_detector(self.detector, self.weights, self.input_width))
+
+    @property
+    def perfect(self) -> bool:
+        """Whether it is told the truth."""
+        return self.detector == "truth"
+
+    def make(
+        self, watch: Callable[[Sighting | Known], None] | None = None, *, repair: Repair | None = None
+    ) -> Perceiving:
+        """The driver; `watch` is told what it sees, `repair` mends one error of it."""
+        cameras = front(self.width, self.cameras)
+        eyes: CameraEyes | PerfectEyes
+        if self.perfect:
+            eyes = PerfectEyes(
+                cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
+            )  # fmt: skip
+        else:
+            eyes = CameraEyes(_detector(self.detector, self.weights, self.input_width), cameras, threshold=self.low)
+        tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
+        memory = float("inf") if self.sign_memory is None else self.sign_memory
+        signs = SignReading(confirm=self.confirm, memory=memory, score=self.high) if self.reads_signs else None
+        return Perceiving(
+            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
+        )  # fmt: skip
+
+
+def drive_perceiving(
+    orders: Sequence[Order], *, device: str, seed: int, repair: Repair | None = None
+) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
+    """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
+
+    Args:
+        orders: What is to be driven; their specs say settings (of a `PerceivingSystem`; None: another driver),
+            perturbation, severity, and for a texture its wearer.
+        device: Where the world and the cameras compute.
+        seed: Of the perturbations.
+        repair: What mends one error of the driver.
+    """
+    spec = orders[0].spec
+    if spec["settings"] is None:
+        return *drive(orders, device=device, key=_paired), None
+    own = PerceivingSystem.model_validate(spec["settings"])
+    watcher = Watcher(front(own.width, own.cameras), len(orders))
+    driver = own.make(watcher, repair=repair)
+    driver.to(device)
+    onboard = Onboard(device=device, attack=worn(spec["perturbation"], spec["wearer"]) if "wearer" in spec else None)
+    sensors, changes = perturbed(
+        onboard, driver.cameras, spec["perturbation"], spec["severity"], detector=driver.detector, seed=seed
+    )
+    found = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
+    return *found, watcher
+
+
+def drive_repaired(
+    orders: Sequence[Order], traces: Sequence[EpisodeTrace], *, device: str, seed: int
+) -> dict[int, dict[str, Any]]:
+    """Drives that ended in a collision driven again with whom they hit found where it is: does that one error decide?
+
+    Args:
+        orders: What was driven.
+        traces: What happened.
+        device: See `drive_perceiving`.
+        seed: See `drive_perceiving`.
+
+    Returns:
+        By the drive's number: whether there is a collision now, and whether with the same agent.
+    """
+    first = {k: np.flatnonzero(trace.contact_agent > 0) for k, trace in enumerate(traces)}
+    hit = {k: int(traces[k].contact_agent[steps[0]]) for k, steps in first.items() if len(steps)}
+    if not hit:
+        return {}
+    repair = Repair(dict(enumerate(hit.values())))
+    _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair)
+    return {
+        k: {"collision": bool(episode_metrics(one, stop_signs=False).collision),
+            "same": bool((one.contact_agent == agent).any())}
+        for (k, agent), one in zip(hit.items(), again, strict=True)
+    }  # fmt: skip
+
+
+def _paired(order: Order) -> str:
+    """Pictures are keyed by the episode: conditions of one drive must share their noise and weather."""
+    return digest("gap", order.spec["scenario"]["name"], order.seed)[:16]
+
+
+@lru_cache(maxsize=4)
+def _detector(name: str, weights: str | None, width: int | None) -> Any:
+    """A detector, made once a process."""
+    from ssad.detectors import make_detector
+
+    options: dict[str, Any] = {} if width is None else {"input_width": width}
+    return make_detector(name, weights=weights, **options)
