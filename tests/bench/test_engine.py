@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import own_kind
+from helpers import other_dice, own_kind
 from helpers.own_kind import DiceSuite
 from rich.console import Console
 
@@ -37,8 +37,16 @@ def dice(numbers: list[str], **changes: Any) -> DiceSuite:
     return DiceSuite(**{"name": "dice", "systems": ["fair"], "numbers": numbers, "timeout_s": 60.0, **changes})
 
 
-def go(suite: DiceSuite, folder: Path, workers: int | None = 1, *, ray: str | None = None, retry: bool = False) -> Any:
-    plan = own_kind.Dice().plan(suite)
+def go(
+    suite: DiceSuite,
+    folder: Path,
+    workers: int | None = 1,
+    *,
+    ray: str | None = None,
+    retry: bool = False,
+    kind: type[own_kind.Dice] = own_kind.Dice,
+) -> Any:
+    plan = kind().plan(suite)
     return run(plan, folder, Resources(workers, ray, console=Console(file=io.StringIO())), retry=retry)
 
 
@@ -59,7 +67,7 @@ def test_all_cells_run_once_and_in_plan_order(tmp_path: Path) -> None:
 
 def test_result_does_not_depend_on_workers_or_batches(tmp_path: Path) -> None:
     for workers, batch in ((0, 2), (1, 9), (2, 4)):
-        go(dice([f"n-{i}" for i in range(9)], batch=batch), tmp_path / f"{workers}-{batch}", workers)
+        go(dice([f"n-{i}" for i in range(9)], chunk=batch), tmp_path / f"{workers}-{batch}", workers)
     tables = [[(r["key"], r["metrics"]) for r in table(folder)] for folder in sorted(tmp_path.iterdir())]
     assert tables[0] == tables[1] == tables[2]
     assert len(tables[0]) == 9
@@ -78,8 +86,9 @@ def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -
     """Only what hangs has little time: all else must have enough on a machine that is busy."""
     good = ["a", "b", "c", "d"]
     for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 1.5)):
-        suite = dice([*good[:2], *deeds, *good[2:]], batch=batch, timeout_s=timeout_s)
-        found = {r["number"]: r for r in go(suite, folder / name, workers, ray=ray)}
+        suite = dice([*good[:2], *deeds, *good[2:]], chunk=batch, timeout_s=timeout_s)
+        records = go(suite, folder / name, workers, ray=ray, kind=other_dice.LyingDice)
+        found = {r["number"]: r for r in records}
         assert [found[number]["status"] for number in good] == ["ok"] * 4
         for deed, (status, reason) in deeds.items():
             assert found[deed]["status"] == status, found[deed]
@@ -122,7 +131,7 @@ def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, w
     """Seven numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
     numbers = [f"n-{i}" for i in range(7)]
     suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=1.5)
-    plan = own_kind.SharedDice().plan(suite)
+    plan = other_dice.SharedDice().plan(suite)
     records = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())))
     status = {name: {r["status"] for r in records if r["system"] == name} for name in suite.systems}
     assert status == {"fair": {"ok"}, "die": {"crashed"}, "hang": {"timeout"}, "raise": {"failed"}, "loaded": {"ok"}}
@@ -142,7 +151,7 @@ def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, w
 def test_a_lost_node_of_a_cluster_changes_nothing(tmp_path: Path) -> None:
     from ray.cluster_utils import Cluster
 
-    suite = dice([f"slow-{i}" for i in range(120)], batch=2)
+    suite = dice([f"slow-{i}" for i in range(120)], chunk=2)
     go(suite, tmp_path / "here", workers=2)
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     second = cluster.add_node(num_cpus=1)
@@ -197,9 +206,8 @@ def test_artefacts_are_hashed(tmp_path: Path) -> None:
 
 
 def test_a_kind_of_ones_own_gets_a_report_for_nothing(tmp_path: Path) -> None:
-    """The kind, without what makes it misbehave, has under 60 lines."""
-    lines = [x for x in inspect.getsource(own_kind).split("class SharedDice")[0].splitlines() if x.strip()]
-    assert len(lines) < 60
+    """The whole file of the kind has under 60 lines, blank ones and imports included."""
+    assert len(inspect.getsource(own_kind).splitlines()) < 60
     path = tmp_path / "dice.yaml"
     path.write_text("name: mine\nkind: helpers.own_kind:Dice\nsystems: [fair]\nnumbers: [a, b, c, raise]\n")
     suite = load_suite(str(path), ["repetitions=2"])
@@ -223,7 +231,7 @@ def start(folder: Path, count: int) -> subprocess.Popen[bytes]:
         "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from helpers.own_kind import Dice, DiceSuite\nfrom ssad.bench.kind import Resources\n"
         "from ssad.bench.run import run\nnumbers = [f'slow-{i}' for i in range(int(sys.argv[2]))]\n"
-        "suite = DiceSuite(name='dice', systems=['fair'], numbers=numbers, timeout_s=60.0, batch=3)\n"
+        "suite = DiceSuite(name='dice', systems=['fair'], numbers=numbers, timeout_s=60.0, chunk=3)\n"
         "run(Dice().plan(suite), sys.argv[1], Resources(2))"
     )
     command = [sys.executable, "-c", code, str(folder), str(count)]
@@ -255,7 +263,7 @@ def kill_and_resume(folder: Path, count: int, kills: int, seed: int) -> int:
 
 def check_killed_run(tmp_path: Path, count: int, kills: int) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    go(dice([f"slow-{i}" for i in range(count)], batch=3), whole, 0)
+    go(dice([f"slow-{i}" for i in range(count)], chunk=3), whole, 0)
     assert kill_and_resume(killed, count, kills, seed=1) >= kills // 2
     assert table(killed) == table(whole)
     assert len(table(killed)) == count
