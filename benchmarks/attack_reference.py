@@ -4,13 +4,13 @@
     python benchmarks/attack_reference.py art CLIPS [--images 8] [--steps 10] [--json FILE]
     python benchmarks/attack_reference.py torchattacks [--steps 10] [--json FILE]
     python benchmarks/attack_reference.py overhead CLIPS [--images 2] [--repeats 9] [--json FILE]
-    python benchmarks/attack_reference.py precision CLIPS [--images 8] [--steps 10] [--device cuda] [--json FILE]
+    python benchmarks/attack_reference.py precision DRIVES [--images 24] [--repeats 3] [--device cuda] [--json FILE]
 
 art: PGD of adversarial-robustness-toolbox on YOLOv5n, wrapped as its estimator of object detectors, and ours, on the
 same pictures, loss, budget and number of steps. torchattacks: its APGD and ours on a small network trained on the
-handwritten digits of scikit-learn. precision: PGD with gradients in float32 and in bfloat16.
-CLIPS: a folder that `ssad record --clips` wrote. FILE, such as benchmarks/results/attacks.json, keeps the figures of
-the four side by side; benchmarks/page.py shows them.
+handwritten digits of scikit-learn. precision: PGD with gradients in float32 and in bfloat16, on the light 3D detectors.
+CLIPS: a folder that `ssad record --clips` wrote; DRIVES: one that `ssad record` wrote. FILE, such as
+benchmarks/results/attacks.json, keeps the figures of the four side by side; benchmarks/page.py shows them.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ import argparse
 import json
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Sequence
 from importlib import metadata
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +37,8 @@ from ssad.evaluation.detection import score_2d
 from ssad.jobs.machine import keep_memory
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.victim import Victim, steady
-from ssad.training.batches import PictureSet
+from ssad.training.batches import PictureSet, move
+from ssad.training.data import nuscenes_items
 from ssad.training.detector import coco_items
 
 RADIUS = 5
@@ -242,27 +245,35 @@ def overhead(folder: Path, count: int, repeats: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def precisions(folder: Path, count: int, steps: int, device: str) -> dict[str, Any]:
-    """What PGD leaves with gradients in float32 and in bfloat16, and how long it takes, in turn."""
-    images, truth = pictures(folder, count)
-    detector = make_detector("yolov5n", device=device)
+def precisions(folder: Path, count: int, steps: int, device: str, repeats: int) -> dict[str, Any]:
+    """How long PGD takes with gradients in float32 and in bfloat16, in turn, and which loss it reaches."""
+    items = [item for item in nuscenes_items(folder, None, "val") if len(item.truth.label) >= 4]
+    items = items[:: max(1, len(items) // count)][:count]
+    images = torch.stack([torch.from_numpy(np.ascontiguousarray(item.read())) for item in items]).to(device)
+    images = images.permute(0, 3, 1, 2).float() / 255
+    truth = move([item.truth for item in items], torch.device(device))
+    lens = torch.stack([one.intrinsic for one in truth if one.intrinsic is not None])
     rows: list[dict[str, Any]] = []
-    for loss in ("full", "margin"):
-        for precision in ("float32", "bfloat16"):
+    for name, loss in product(("fcos3d-light", "pgd-det-light"), ("full", "margin")):
+        detector = make_detector(name, device=device)
+        reached, seconds = {}, defaultdict(list)
+        for number, precision in product(range(repeats + 1), ("float32", "bfloat16")):
             began = time.perf_counter()
             found = run_attack(
-                make_attack("pgd", steps=steps), detector, images.to(device), truth, Budget(px(RADIUS)), objective=loss,
-                precision=precision, check=False,
+                make_attack("pgd", steps=steps), detector, images, truth, Budget(px(RADIUS)), objective=loss,
+                intrinsic=lens, precision=precision, check=False,
             )  # fmt: skip
-            value, used = float(found.after.mean()), time.perf_counter() - began
-            left = score(detector, found.images.cpu(), truth)
-            before = float(found.before.mean())
-            rows.append(
-                {"loss": loss, "precision": precision, "before": before, "after": value, "AP50": left, "s": used}
-            )
+            reached[precision] = [float(found.before.mean()), float(found.after.mean())]
+            if number:  # the first warms up
+                seconds[precision].append(time.perf_counter() - began)
+        rows += [
+            {"detector": name, "loss": loss, "precision": precision, "before": reached[precision][0],
+             "after": reached[precision][1], "s": statistics.median(seconds[precision])}
+            for precision in seconds
+        ]  # fmt: skip
     return {
-        "images": len(images), "radius_px": RADIUS, "steps": steps, "device": device,
-        "clean": score(detector, images, truth), "rows": rows,
+        "images": len(images), "radius_px": RADIUS, "steps": steps, "repeats": repeats, "rows": rows,
+        "device": torch.cuda.get_device_name() if device == "cuda" else device, "versions": _versions(),
     }  # fmt: skip
 
 
@@ -296,7 +307,7 @@ def main() -> None:
     elif chosen.what == "art":
         found = beside_art(chosen.clips, chosen.images, chosen.steps)
     elif chosen.what == "precision":
-        found = precisions(chosen.clips, chosen.images, chosen.steps, chosen.device)
+        found = precisions(chosen.clips, chosen.images, chosen.steps, chosen.device, chosen.repeats)
     else:
         found = overhead(chosen.clips, chosen.images, chosen.repeats)
     print(json.dumps(found, indent=1))

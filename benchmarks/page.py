@@ -233,14 +233,15 @@ def attacks() -> list[str]:
     if mixed := data.get("precision"):
         lines += [
             "",
-            f"PGD with {mixed['steps']} steps, with gradients in float32 and in bfloat16, on {mixed['images']}",
-            f"of these images (clean AP50 {100 * mixed['clean']:.1f} %):",
+            f"PGD with {mixed['steps']} steps on {mixed['images']} images at once, with gradients in float32 and in",
+            f"bfloat16 ({mixed['device']}; median of {mixed['repeats']} runs in turn):",
             "",
-            "| loss ascended | gradients | loss | AP50 |",
-            "|---|---|---:|---:|",
+            "| detector | loss ascended | gradients | loss before | loss after | s |",
+            "|---|---|---|---:|---:|---:|",
         ]
         for row in mixed["rows"]:
-            lines.append(f"| {row['loss']} | {row['precision']} | {row['after']:.4g} | {100 * row['AP50']:.1f} % |")
+            head = f"{row['detector']} | {row['loss']} | {row['precision']}"
+            lines.append(f"| {head} | {row['before']:.4g} | {row['after']:.4g} | {row['s']:.2f} |")
     return [
         *lines,
         "",

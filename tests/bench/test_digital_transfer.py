@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ from ssad.bench.kinds.digital import Digital, DigitalSuite
 from ssad.bench.run import run
 from ssad.core.errors import SSADError
 from ssad.report import write_report
-from ssad.report.digital_tables import distance_table, transfer_table
+from ssad.report.digital_tables import black_box_table, distance_table, hardened_table, transfer_table
 from ssad.report.kinds.digital import load_digital_run, main_table
 from ssad.report.load import load_run
 
 THREE, OTHER, TWO = (f"helpers.linear3d:{name}" for name in ("build", "build_other", "build_flat"))
+HARD = f"{THREE}@hard"
 OVER = ("others", "drive")
 
 
@@ -40,7 +42,7 @@ def folder(tiny_set: Path, shared: Shared) -> Path:
 def suite_of(root: Path, **changes: Any) -> DigitalSuite:
     base: dict[str, Any] = {
         "kind": "digital", "name": "t", "detectors": [THREE], "transfer_detectors": [TWO, OTHER], "data": str(root),
-        "split": "all", "replicates": 3, "transfer": ["fgsm"],
+        "split": "all", "replicates": 3, "transfer": ["fgsm"], "hardened": [HARD],
         "attacks": ["fgsm", *({"name": "universal", "steps": 3, "options": {"frames": 4, "over": o}} for o in OVER)],
     }  # fmt: skip
     return DigitalSuite.model_validate(base | changes)
@@ -79,15 +81,35 @@ def test_who_takes_part_in_the_transfer_alone_stands_in_no_other_table(folder: P
     own = load_digital_run(load_run(folder))
     assert main_table(own).columns == (f"{THREE} mAP", f"{THREE} NDS")
     assert {row.head[0] for row in distance_table(own).rows} == {THREE}
-    assert not [key for key in records(folder) if key[0] != THREE and key[1] in ("noise", "universal")]
+    assert not [key for key in records(folder) if key[0] in (TWO, OTHER) and key[1] in ("noise", "universal")]
     assert TWO in (folder / "report.html").read_text()
+
+
+def test_hardened_weights_stand_beside_ordinary_ones_in_a_table_of_their_own(folder: Path) -> None:
+    kept = {key[1:] for key in records(folder) if key[0] == HARD}
+    assert kept == {("", ""), ("noise", ""), ("fgsm", "")}, "neither transfer nor what is not of the table"
+    own = load_digital_run(load_run(folder))
+    table = hardened_table(own)
+    assert [row.head[:2] for row in table.rows] == [(HARD, "clean"), (HARD, "noise"), (HARD, "FGSM, full loss")]
+    for row in table.rows:
+        ordinary, hard, gain = (cell.mean for cell in row.cells)
+        assert gain == pytest.approx(hard - ordinary)
+    assert 100 * records(folder)[HARD, "fgsm", ""]["metrics"]["mAP"] == pytest.approx(table.rows[2].cells[1].mean)
+    assert HARD not in " ".join([*main_table(own).columns, *transfer_table(own).columns])
+
+
+def test_what_asks_for_no_gradient_stands_beside_noise(folder: Path) -> None:
+    table = black_box_table(load_digital_run(load_run(folder)))
+    assert {row.head[0] for row in table.rows} == {THREE}
+    assert [row.head[1] for row in table.rows] == ["universal, full loss"] * 2
+    assert all(math.isfinite(cell.mean) for row in table.rows for cell in row.cells)
 
 
 def test_2d_detectors_may_have_the_whole_table(tiny_set: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("LINEAR_DATA", str(tiny_set))
     members = [{"name": "fgsm"}, {"name": "fgsm", "radius": 5.0, "loss": "vanish"}]
     suite = suite_of(
-        tiny_set, detectors=[TWO], transfer_detectors=[], transfer=[], replicates=0,
+        tiny_set, detectors=[TWO], transfer_detectors=[], transfer=[], hardened=[], replicates=0,
         attacks=[*members, {"name": "ensemble", "members": members}, {"name": "fgsm", "classes": ["car"],
                  "loss": "vanish", "defence": "bits"}],
     )  # fmt: skip

@@ -114,6 +114,14 @@ def test_what_may_be_weaker_than_a_single_step_on_another_loss() -> None:
         assert audit([replace(FGSM, **paired), sound]).faults == ()
 
 
+def test_an_attack_is_judged_beside_another_loss_by_its_most_steps() -> None:
+    slow, done = replace(BASE, loss="margin", steps=5, score=0.1), replace(BASE, loss="margin", score=0.02)
+    assert rules(audit([FGSM, slow])) == ["losses"]
+    assert audit([FGSM, slow, done]).faults == ()
+    assert rules(audit([FGSM, slow, replace(done, score=0.1)])) == ["losses"]
+    assert rules(audit([FGSM, slow, replace(done, attack="apgd")])) == ["losses"], "another attack answers for itself"
+
+
 def test_a_budget_may_be_too_small_for_an_attack_and_for_noise() -> None:
     small = replace(BASE, radius=1.0, change=1.0, score=CLEAN)
     noise = replace(NOISE, radius=1.0, change=1.0, score=CLEAN)

@@ -9,6 +9,7 @@ from ssad.core.registry import names, resolve
 
 DETECTORS: dict[str, str] = {
     "fcos3d-light": "ssad.detectors.builders:fcos3d_light",
+    "fcos3d-light-robust": "ssad.detectors.builders:fcos3d_light",
     "pgd-det-light": "ssad.detectors.builders:pgd_det_light",
     "fcos3d": "ssad.detectors.fcos3d:fcos3d",
     "pgd-det": "ssad.detectors.pgd_det:pgd_det",

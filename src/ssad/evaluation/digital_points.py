@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
@@ -271,18 +272,22 @@ def points_of(suite: AttackTable) -> list[Point]:
     Raises:
         ConfigError: An attack does not exist or refuses a setting, or an attack appears twice.
     """
-    rows, curves, moved = rows_of(suite), _swept(suite), transfers_of(suite)
+    rows, curves, moved = rows_of(suite), _swept(suite, suite.sweeps), transfers_of(suite)
     bare = [
         replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)
         for one in rows if one.defence
     ]  # fmt: skip
-    curves = [*curves, *bare]
+    return _with_controls([*rows, *curves, *bare, *moved])
+
+
+def _with_controls(points: Sequence[Point]) -> list[Point]:
+    """Clean data and noise that points are compared with, and then these, each once."""
     noise = [
         replace(one, specs=(AttackSpec("noise", default_loss("noise"), one.specs[0].norm, one.specs[0].radius),))
-        for one in [*rows, *curves, *moved] if one.defence is None
+        for one in points if one.defence is None
     ]  # fmt: skip
-    clean = [Point(scenes=one.scenes, defence=one.defence) for one in [*rows, *curves, *moved]]
-    return list(dict.fromkeys([Point(row=True), *clean, *noise, *rows, *curves, *moved]))
+    clean = [Point(scenes=one.scenes, defence=one.defence) for one in points]
+    return list(dict.fromkeys([Point(row=True), *clean, *noise, *points]))
 
 
 def bystander_points(suite: AttackTable) -> list[Point]:
@@ -293,6 +298,16 @@ def bystander_points(suite: AttackTable) -> list[Point]:
     """
     moved = transfers_of(suite)
     return list(dict.fromkeys([*(Point(scenes=one.scenes) for one in moved), *moved]))
+
+
+def hardened_points(suite: AttackTable) -> list[Point]:
+    """The conditions of adversarially trained weights: clean data, noise, the main table, and the curves over radii.
+
+    Raises:
+        ConfigError: An attack does not exist or refuses a setting.
+    """
+    over_radii = [one.model_copy(update={"steps": []}) for one in suite.sweeps if one.radii]
+    return _with_controls([*(one for one in rows_of(suite) if one.row), *_swept(suite, over_radii)])
 
 
 def transfers_of(suite: AttackTable) -> list[Point]:
@@ -329,10 +344,10 @@ def _spec(suite: AttackTable, method: Method, radius: float | None, steps: int |
     return replace(spec, precision=method.precision or suite.precision) if graded else spec
 
 
-def _swept(suite: AttackTable) -> list[Point]:
+def _swept(suite: AttackTable, sweeps: Sequence[Sweep]) -> list[Point]:
     """The points of the curves; a radius of 0 is the clean data. ConfigError."""
     found = []
-    for one in suite.sweeps:
+    for one in sweeps:
         if not one.radii and not one.steps:
             raise ConfigError(f"suite {suite.name}: sweeps: {one.name} has neither radii nor steps")
         specs = [_spec(suite, one, radius, None) for radius in one.radii if radius > 0]

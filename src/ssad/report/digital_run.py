@@ -77,6 +77,13 @@ class DigitalRun:
         return [text.partition("=")[0] for text in self.suite["detectors"]]
 
     @property
+    def hardened(self) -> list[tuple[str, str]]:
+        """Detectors of adversarially trained weights, and of each the one that its name begins with ("": none)."""
+        names = [text.partition("=")[0] for text in self.suite.get("hardened", [])]
+        ordinary = sorted(self.detectors, key=len, reverse=True)
+        return [(name, next((one for one in ordinary if name.startswith(one)), "")) for name in names]
+
+    @property
     def everyone(self) -> list[str]:
         """Those, and the detectors that take part in the transfer alone."""
         others = [text.partition("=")[0] for text in self.suite.get("transfer_detectors", [])]
@@ -196,3 +203,13 @@ def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> 
     shares = [1.0 - after / before for before, after in pairs if before > 0]
     value = 1.0 - own["metrics"][metric] / clean["metrics"][metric]
     return score_cell(Resampling(int(own.get("scenes", 0))), value, shares, own["n"], bounded=False)
+
+
+def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
+    """How much higher the first of two detectors scores, in points; the interval from paired replicates."""
+    one, other = (run.record(name, setting) for name in detectors)
+    if one is None or other is None or one["metrics"].get(metric) is None or other["metrics"].get(metric) is None:
+        return Cell(math.nan)
+    pairs = zip(replicates_of(one, metric), replicates_of(other, metric), strict=True)
+    value = one["metrics"][metric] - other["metrics"][metric]
+    return score_cell(Resampling(int(one.get("scenes", 0))), value, [a - b for a, b in pairs], one["n"], bounded=False)

@@ -10,6 +10,7 @@ from ssad.report.digital_run import (
     DigitalRun,
     Setting,
     defence_of,
+    gained_cell,
     metric_cell,
     scenes_of,
     size_of,
@@ -17,6 +18,7 @@ from ssad.report.digital_run import (
 )
 from ssad.report.tables import Cell, Row, Table
 
+FURTHEST = 32.0  # radius up to which curves are shown: what lies beyond is for the audit
 BANDS = {"0-20": "0 to 20 m", "20-40": "20 to 40 m", "40+": "beyond 40 m"}
 
 
@@ -66,6 +68,45 @@ def defence_table(run: DigitalRun) -> Table:
 
 def _without_draws(options: str) -> str:
     return " ".join(word for word in options.split() if not word.startswith("draws="))
+
+
+def hardened_table(run: DigitalRun) -> Table:
+    """Adversarially trained weights beside ordinary ones, on the same pictures: what they cost, and what they buy."""
+    rows = []
+    for name, ordinary in run.hardened:
+        for setting in (s for s in run.settings if s.radius <= FURTHEST and run.record(name, s)):
+            pair = [metric_cell(run.record(one, setting), "mAP") for one in (ordinary, name)]
+            head = (name, title_of(setting), size_of(setting), scenes_of(setting))
+            rows.append(Row(head, (*pair, gained_cell(run, (name, ordinary), setting, "mAP"))))
+    note = (
+        "mAP in percent, difference in points. Each is attacked by itself, white-box, on the same pictures. The clean "
+        "rows say what adversarial training costs, the others what it buys."
+    )
+    heads = ("Detector", "Attack", "Budget", "Scenes")
+    columns = ("ordinary weights", "adversarially trained", "difference")
+    return Table("hardened", "Adversarial training", heads, columns, tuple(rows), note)
+
+
+def black_box_table(run: DigitalRun) -> Table:
+    """What attacks do that follow no gradient of the pictures that they change, beside noise of the same size."""
+    rows = []
+    for (detector, setting), record in run.records.items():
+        if not setting.plain or setting.attack in ("", "noise") or record["status"] != "ok":
+            continue
+        if record["access"] == "white-box":
+            continue
+        noise = Setting("noise", norm=setting.norm, radius=setting.radius, subset=setting.subset)
+        records = (run.clean(detector, setting), run.record(detector, noise), record)
+        queries = Cell(float(record["queries"] or 0), digits=0)
+        head = (detector, title_of(setting), size_of(setting), scenes_of(setting))
+        rows.append(Row(head, (queries, *(metric_cell(one, "mAP") for one in records))))
+    note = (
+        "mAP in percent. Square and NES ask for losses; a universal change was fitted to other pictures (over=others) "
+        "or to those of its own drive (over=drive), and asks nothing when it is added."
+    )
+    heads = ("Detector", "Attack", "Budget", "Scenes")
+    columns = ("queries an image", "clean", "noise", "attacked")
+    return Table("blackbox", "Without gradients", heads, columns, tuple(rows), note)
 
 
 def target_table(run: DigitalRun) -> Table:

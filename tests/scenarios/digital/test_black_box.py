@@ -105,6 +105,18 @@ def test_the_estimate_is_the_gradient_on_average() -> None:
         assert 0.7 < wrong / (len(gradient) / 600) ** 0.5 < 1.3
 
 
+def test_directions_are_constant_over_tiles_and_find_the_mean_slope_of_each() -> None:
+    detector, (images, truth) = ToyDetector(), toy_scene(1, size=(16, 12), objects=2)
+    victim = Victim(detector, images, truth, TrueLogits())
+    tiles = [(slice(top, top + 8), slice(left, left + 8)) for top in (0, 8) for left in (0, 8)]  # the last is cut off
+    slopes = torch.stack([victim.gradient(images)[1][0, :, y, x].sum((1, 2)) for y, x in tiles]).flatten()
+    estimate = NES(samples=400, tile=8).estimate(victim, images)[0]
+    for y, x in tiles:
+        assert bool((estimate[:, y, x] == estimate[:, y, x][:, :1, :1]).all())
+    found = torch.stack([estimate[:, y, x][:, 0, 0] for y, x in tiles]).flatten()
+    assert float(torch.corrcoef(torch.stack([slopes, found]))[0, 1]) > 0.9
+
+
 def test_squares_shrink_by_the_schedule_of_the_source() -> None:
     attack = Square(share=0.8)
     sides = [attack.side(done / 10_000, 32, 32) for done in (0, 10, 11, 51, 201, 501, 1001, 2001, 4001, 6001, 8001)]
@@ -144,6 +156,7 @@ def test_they_beat_noise_on_a_shipped_detector(name: str, norm: str) -> None:
         ("nes", {"samples": 0}, "nes: steps and samples must be 1 or more"),
         ("nes", {"sigma": 0.0}, "sigma above 0"),
         ("nes", {"step": -1.0}, "step must be above 0"),
+        ("nes", {"tile": 0}, "tile must be 1 or more"),
         ("nes", {"directions": "all"}, "choose gaussian or signs"),
         ("spsa", {"steps": 0}, "spsa: steps"),
     ],

@@ -22,6 +22,7 @@ from ssad.evaluation.digital_points import (
     AttackTable,
     bystander_points,
     guard_of,
+    hardened_points,
     points_of,
     rows_of,
     system_name,
@@ -39,10 +40,13 @@ class DigitalSuite(DetectorSuite, AttackTable):
 
     Attributes:
         transfer_detectors: detectors that take part in the transfer alone, as `detectors` names them.
+        hardened: detectors of adversarially trained weights, named likewise: they are shown the table's attacks and the
+            curves over radii alone, beside the detector that their name begins with.
     """
 
     kind: Literal["digital"]
     transfer_detectors: list[str] = Field(default=[])
+    hardened: list[str] = Field(default=[])
 
 
 class Digital(DetectorKind):
@@ -59,16 +63,18 @@ class Digital(DetectorKind):
     def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Attacks, defences and detectors are built once, the data set is looked at."""
         points = points_of(suite)
-        weights, detectors, tasks = detectors_of(suite, [*suite.detectors, *suite.transfer_detectors], flat=True)
+        named = [*suite.detectors, *suite.hardened, *suite.transfer_detectors]
+        weights, detectors, tasks = detectors_of(suite, named, flat=True)
         if suite.transfer_detectors and not suite.transfer:
             raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
-        main = [text.partition("=")[0] for text in suite.detectors]
+        main, hard = ([text.partition("=")[0] for text in own] for own in (suite.detectors, suite.hardened))
         data = data_of(suite)
         cells = []
         for detector in detectors:
-            others = [other for other in detectors if other != detector]
+            others = [other for other in detectors if other not in (detector, *hard)]
             moved = [replace(one, source=other) for one in transfers_of(suite) for other in others]
-            for point in [*(points if detector in main else bystander_points(suite)), *moved]:
+            own = [*(points if detector in main else bystander_points(suite)), *moved]
+            for point in hardened_points(suite) if detector in hard else own:
                 system = system_name(detector, point.defence)
                 source = point.source or (system if point.aware or not point.defence else detector)
                 title = f"{system}/{point.attack}{f'@{source}' if point.specs and source != system else ''}"

@@ -22,7 +22,16 @@ from ssad.report.digital_run import (
     size_of,
     title_of,
 )
-from ssad.report.digital_tables import defence_table, distance_table, halving_table, target_table, transfer_table
+from ssad.report.digital_tables import (
+    FURTHEST,
+    black_box_table,
+    defence_table,
+    distance_table,
+    halving_table,
+    hardened_table,
+    target_table,
+    transfer_table,
+)
 from ssad.report.kinds.detection import CLASSES, interval_note, replicates_of
 from ssad.report.load import Run
 from ssad.report.pages import render
@@ -33,7 +42,6 @@ from ssad.report.tables import Cell, Row, Table
 SOURCE = "published by the paper: nuScenes val, L-infinity attacks, epsilon 5 and ten steps"
 PAPER = {("fgsm", "full"): "FGSM", ("pgd", "full"): "PGD", ("cw", "margin"): "C&W", ("", ""): ""}
 EPSILON = 5.0
-FURTHEST = 32.0  # radius up to which curves are drawn: what lies beyond is for the audit
 
 
 def published_row(run: DigitalRun, setting: Setting) -> tuple[tuple[str, str], list[tuple[float, ...]]] | None:
@@ -297,7 +305,8 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     verdict = audit(attempts_of(run))
     main, lost, effort = main_table(run), lost_table(run), effort_table(run)
     every, classes, checked = every_table(run), class_table(run), audit_table(verdict)
-    others = [t for t in (transfer_table(run), defence_table(run), target_table(run), halving_table(run)) if t.rows]
+    makers = (transfer_table, defence_table, hardened_table, black_box_table, target_table, halving_table)
+    others = [table for make in makers if (table := make(run)).rows]
     distances = distance_table(run)
     page = render(
         "digital.html", found, others=others, distances=distances,

@@ -12,7 +12,7 @@ from ssad.core.errors import ConfigError
 from ssad.scenarios.static.digital.attack import Access, keep_best
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.pgd import PGD
-from ssad.scenarios.static.digital.victim import Victim
+from ssad.scenarios.static.digital.victim import Victim, draw
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +26,8 @@ class NES:
         step: length of the first step as a share of the radius; None: the rule of `PGD`; steps shrink as there.
         decay: of the sum of the estimates of earlier steps: it is what averages their noise.
         directions: "gaussian" (NES), or "signs": every value by `sigma` up or down (SPSA).
+        tile: side of the squares over which a direction is constant. A picture has a million values, and a few dozen
+            probes say next to nothing about so many; neighbours have similar slopes, so squares lose little.
 
     The ascent starts at the clean image; the best image met is kept. Queries: (2 samples + 1) for each step, and one.
 
@@ -33,8 +35,8 @@ class NES:
         ConfigError: No step or sample, a sigma or step of 0 or less, a decay below 0.
 
     Source: Ilyas et al., Black-box Adversarial Attacks with Limited Queries and Information (ICML 2018), with its
-    antithetic draws and momentum. SPSA: Uesato et al., Adversarial Risk and the Dangers of Evaluating Against Weak
-    Attacks (ICML 2018).
+    antithetic draws and momentum. Tiles: Ilyas et al., Prior Convictions (ICLR 2019), section 3.1. SPSA: Uesato et al.,
+    Adversarial Risk and the Dangers of Evaluating Against Weak Attacks (ICML 2018).
     """
 
     steps: int = 20
@@ -43,6 +45,7 @@ class NES:
     step: float | None = None
     decay: float = 0.9
     directions: Literal["gaussian", "signs"] = "gaussian"
+    tile: int = 1
     name: str = "nes"
     access: Access = "black-box"
 
@@ -51,6 +54,8 @@ class NES:
             raise ConfigError(f"{self.name}: steps and samples must be 1 or more, sigma above 0, decay 0 or more")
         if self.step is not None and self.step <= 0:
             raise ConfigError(f"{self.name}: step must be above 0")
+        if self.tile < 1:
+            raise ConfigError(f"{self.name}: tile must be 1 or more")
         if self.directions not in ("gaussian", "signs"):
             raise ConfigError(f"{self.name}: directions '{self.directions}'; choose gaussian or signs")
 
@@ -76,13 +81,19 @@ class NES:
         """
         total = torch.zeros_like(images)
         for j in range(self.samples):
-            direction = victim.draw("gaussian", self.name, use, j)
+            direction = self._direction(victim, use, j)
             if self.directions == "signs":
                 direction = torch.where(direction < 0, -1.0, 1.0).to(images)
             rise = victim.loss((images + self.sigma * direction).clamp(0.0, 1.0))
             rise = rise - victim.loss((images - self.sigma * direction).clamp(0.0, 1.0))
             total += rise.to(images)[:, None, None, None] * direction
         return total / (2 * self.sigma * self.samples)
+
+    def _direction(self, victim: Victim, *use: object) -> Tensor:
+        """A normal direction [B, 3, H, W], constant over tiles."""
+        few = draw(victim.clean[:, :, :: self.tile, :: self.tile], victim.keys, "gaussian", self.name, *use)
+        height, width = victim.clean.shape[2:]
+        return few.repeat_interleave(self.tile, 2).repeat_interleave(self.tile, 3)[:, :, :height, :width]
 
 
 def spsa(
