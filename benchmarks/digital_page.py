@@ -1,11 +1,14 @@
-"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py
+"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py [FOLDER]
 
-benchmarks/results/digital holds what that run wrote: DIR/tables/*.md, and run.json without its cells.
+benchmarks/results/digital holds what a run wrote: tables/*.md of its folder, and run.json without its cells. With
+FOLDER they are copied from there first.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,21 @@ from ssad.evaluation.scene_boxes import detector_of
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "digital"
 PAGE = ROOT / "docs" / "digital.md"
-TABLES = ("digital", "lost", "halving", "transfer", "defences", "targets", "distances", "classes", "audit")
+TABLES = (
+    "digital", "lost", "halving", "transfer", "defences", "hardened", "blackbox", "targets", "distances", "classes",
+    "audit",
+)  # fmt: skip
+
+
+def keep(folder: Path) -> None:
+    """Copy what the page needs from the folder of a run that is complete."""
+    told = json.loads((folder / "run.json").read_text())
+    told.pop("cells", None)
+    for name in TABLES:
+        (RESULTS / f"{name}.md").unlink(missing_ok=True)
+        if (folder / "tables" / f"{name}.md").is_file():
+            shutil.copy(folder / "tables" / f"{name}.md", RESULTS)
+    (RESULTS / "run.json").write_text(json.dumps(told, indent=1) + "\n")
 
 
 def outdated() -> list[str]:
@@ -33,7 +50,9 @@ def grown(stored: dict[str, Any]) -> list[str]:
     names = dict.fromkeys(f"`{' '.join(str(one[k]) for k in about if k in one)}`" for one in fresh if one not in known)
     missing = [f"the attack{'s' if len(names) > 1 else ''} {', '.join(names)}"]
     others = [f"`{one}`" for one in suite["transfer_detectors"] if one not in stored.get("transfer_detectors", [])]
-    return (missing if names else []) + ([f"transfer to and from {' and '.join(others)}"] if others else [])
+    hard = [f"`{one}`" for one in suite["hardened"] if one not in stored.get("hardened", [])]
+    found = [*(missing if names else []), *([f"transfer to and from {' and '.join(others)}"] if others else [])]
+    return found + ([f"the adversarially trained {' and '.join(hard)}"] if hard else [])
 
 
 def _said(told: Any) -> Any:
@@ -67,10 +86,12 @@ def page() -> str:
     ]
     if new := grown(about["suite"]):
         lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
-    for name in TABLES:
+    for name in (name for name in TABLES if (RESULTS / f"{name}.md").is_file()):
         lines += [(RESULTS / f"{name}.md").read_text().strip(), ""]
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
+    if sys.argv[1:]:
+        keep(Path(sys.argv[1]))
     PAGE.write_text(page())
