@@ -95,6 +95,27 @@ def part(name: str) -> list[str]:
     return lines
 
 
+def speed() -> list[str]:
+    """What an attack step costs, where it was measured."""
+    lines = [
+        "## What a step costs", "",
+        "`python benchmarks/physical_speed.py [--device cuda] --out FILE`: showing a car at 20 m with a camouflage "
+        "(print, light, lens, sensor, JPEG; forward and backward) and asking YOLOv5n, for a picture; and what the "
+        "paper's budget of 600 pictures x 200 epochs takes then.", "",
+        "| On | Shown | Pictures a step | Rendering, ms | Detector, ms | Share of rendering | Paper's budget, min |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for path in sorted(RESULTS.glob("physical_speed*.json")):
+        found = json.loads(path.read_text())
+        for name, row in found["rows"].items():
+            shown = "whole picture, 640 px" if name == "whole" else f"window, {found['window']} px"
+            lines.append(
+                f"| {found['device']} | {shown} | {found['batch']} | {row['render_ms']:.1f} | {row['detector_ms']:.1f} "
+                f"| {100 * row['share']:.0f} % | {row['paper_minutes']:.0f} |"
+            )
+    return [*lines, ""]
+
+
 def page() -> str:
     """The page."""
     lines = [
@@ -104,7 +125,7 @@ def page() -> str:
     ]  # fmt: skip
     for name in SUITES:
         lines += part(name)
-    return "\n".join(lines)
+    return "\n".join(lines + speed())
 
 
 if __name__ == "__main__":
