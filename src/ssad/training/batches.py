@@ -205,16 +205,18 @@ def draw_change(
     """A random change of a picture of `size` (height, width).
 
     With an intrinsic `lens` [3, 3] the zoom is about the principal point, as a lens zooms: where the ground meets an
-    object keeps telling its distance. Without one the crop lies anywhere.
+    object keeps telling its distance; then all moves up or down by at most `recipe.rise` rows, as on a shifted sensor.
+    Without one the crop lies anywhere.
     """
     zoom = float(np.exp(rng.uniform(np.log(recipe.zoom[0]), np.log(recipe.zoom[1]))))
     free = [length * (1.0 - zoom) for length in (size[1], size[0])]
     mirror = bool(rng.random() < recipe.flip)
     share = [rng.random(), rng.random()]
+    rise = float(rng.uniform(-recipe.rise, recipe.rise)) if recipe.rise else 0.0
     if lens is not None:
         share = [float(lens[0, 2]) / size[1], float(lens[1, 2]) / size[0]]
         share[0] = 1.0 - share[0] if mirror else share[0]
-    return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1]))
+    return Change(mirror, zoom, (share[0] * free[0], share[1] * free[1] + rise))
 
 
 def change_truths(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,10 +30,10 @@ LAST = "last.pt"
 class Step(nn.Module):
     """From a batch to its losses, as one module, so that gradients can be shared between devices."""
 
-    def __init__(self, detector: Any, *, amp: bool) -> None:
+    def __init__(self, detector: Any, *, amp: bool, doubt: float = 0.0) -> None:
         super().__init__()
         self.detector = detector
-        self.amp = amp
+        self.amp, self.doubt = amp, doubt
 
     def forward(self, images: Tensor, truth: list[Truth]) -> dict[str, Tensor]:
         """Losses by name."""
@@ -43,6 +43,8 @@ class Step(nn.Module):
                 lens = torch.stack([t.intrinsic for t in truth if t.intrinsic is not None])
             dense = self.detector.dense(images, lens)
         assignment = self.detector.assign(dense, truth)
+        if self.doubt:
+            assignment = self.detector.doubted(dense, assignment, doubt=self.doubt)
         return dict(self.detector.losses(dense, assignment))
 
 
@@ -99,7 +101,7 @@ def train(
     for part in detector.modules():
         if hasattr(part, "compiled"):
             part.compiled = recipe.compile
-    step_of = Step(detector, amp=recipe.amp)
+    step_of = Step(detector, amp=recipe.amp, doubt=recipe.doubt)
     shared: Any = step_of
     if share.world > 1:
         ids = [where.index or 0] if where.type == "cuda" else None
@@ -128,7 +130,7 @@ def train(
             if recipe.radius:
                 images = harden(step_of, images, truth, recipe, key=key)
             losses = shared(images, truth)
-            loss = torch.stack(list(losses.values())).sum()
+            loss = weighed(losses, recipe.weigh)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             if recipe.clip:
@@ -160,6 +162,22 @@ def train(
             break
     best = average if average is not None else detector
     return best.requires_grad_(False).eval()
+
+
+def weighed(losses: Mapping[str, Tensor], factors: Mapping[str, float]) -> Tensor:
+    """The sum of losses times their factors, 1 where there is none.
+
+    Args:
+        losses: By name.
+        factors: By name.
+
+    Raises:
+        ConfigError: There is a factor of a loss that the detector does not have.
+    """
+    for name in factors:
+        if name not in losses:
+            raise ConfigError(f"weigh: there is no loss '{name}'; there are {', '.join(losses)}")
+    return torch.stack([value * factors.get(name, 1.0) for name, value in losses.items()]).sum()
 
 
 def harden(step: Step, images: Tensor, truth: list[Truth], recipe: Recipe, *, key: tuple[int, ...]) -> Tensor:

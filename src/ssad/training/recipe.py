@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, field, fields, replace
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, ValidationError, model_validator
@@ -45,6 +45,11 @@ class Recipe:
         norm_eval: Whether BatchNorm keeps its statistics.
         flip: Probability of a mirror image.
         zoom: Range of the scale of a random crop.
+        rise: Most rows by which a picture is moved up or down, 3D only, its lens with it: cameras that look level show
+            the horizon at one height, and without this nothing is learned about any other.
+        doubt: Error of the predicted depth (m) at which the centreness to be learned falls to 1/e, 3D only, so that
+            boxes are ranked by how well they lie; 0: it does not fall.
+        weigh: Factors of losses by name; 1 where there is none.
         jitter: Of brightness, contrast, saturation and gamma.
         noise: Largest standard deviation of added noise.
         keep: Least visible share of a box after a crop, 2D only (a 3D box stays while its middle is in sight).
@@ -76,6 +81,9 @@ class Recipe:
     norm_eval: bool = False
     flip: Part = 0.5
     zoom: tuple[Above, Above] = (1.0, 1.0)
+    rise: Least = 0.0
+    doubt: Least = 0.0
+    weigh: dict[str, Least] = field(default_factory=dict)
     jitter: Part = 0.3
     noise: Part = 0.02
     keep: Part = 0.0
@@ -91,6 +99,9 @@ class Recipe:
             raise ValueError("zoom: needs low <= high")
         if self.keep and self.three:
             raise ValueError("keep: is for 2D detectors; a 3D box stays while its middle is in sight")
+        for name in ("rise", "doubt"):
+            if getattr(self, name) and not self.three:
+                raise ValueError(f"{name}: is for 3D detectors")
         return self
 
     @property

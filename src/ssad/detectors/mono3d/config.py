@@ -40,6 +40,12 @@ class Mono3DConfig:
         nms: IoU on the ground above which the worse of two boxes of a class is dropped.
         image_nms: IoU in the image above which the worse of two boxes of a class is dropped as well: two guesses of one
             object's depth do not overlap on the ground. None: not used, as in the source.
+        vote: IoU in the image from which a box that is dropped has a say in the place, size and velocity of the one of
+            its class that stays, by its score: places beside each other guess one object's distance, and their mean
+            errs less (Gidaris and Komodakis, ICCV 2015). None: not used, as in the source.
+        fade: How scores fall with depth, 1/m: by exp(-fade depth). Far boxes are less often in their place, and without
+            it score as high as near ones. 0: not used, as in the source.
+        sure: Power of PGD's confidence of depth in the score; 1 as in the source.
         before: Places kept of each level before suppression.
         most: Maximum number of detections in an image.
         input_width: Width to which pictures are resized inside; None: they are not.
@@ -71,6 +77,9 @@ class Mono3DConfig:
     threshold: float = 0.05
     nms: float = 0.8
     image_nms: float | None = None
+    vote: float | None = None
+    fade: float = 0.0
+    sure: float = 1.0
     before: int = 1000
     most: int = 200
     input_width: int | None = None
@@ -111,8 +120,9 @@ FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
     deformable=False, input_width=800, trained_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
     start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.6,
+    threshold=0.02, vote=0.6, fade=0.02,
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
-    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None,
+    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, vote=0.6, fade=0.02,
     code_weights=(*_LIGHT_WEIGHTS, *_PGD_WEIGHTS[9:]),
 )  # fmt: skip

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torchvision.ops import batched_nms
+from torchvision.ops import batched_nms, box_iou
 
 from ssad.core.detections import Assignment, Dense, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
@@ -127,35 +128,67 @@ class Mono3D(nn.Module):
         with _exact(dense.logit):
             flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
             places = places_of(dense.maps["cls_scores"], self.config.strides)
-            share = self._shares(flat)
+            share = self._shares(flat, lens)
             kept = self._leading(dense, share.amax(-1))
             share = share.gather(1, kept[..., None].expand(-1, -1, share.shape[2]))
             image, place, label = (share > threshold).nonzero(as_tuple=True)
             rows, score = kept[image, place], share[image, place, label]
-            centre, size, yaw = self._solids(pick(flat, image, rows), places.xy[rows], lens, image)
+            picked, xy = pick(flat, image, rows), places.xy[rows]
+            solids = centre, size, yaw = self._solids(picked, xy, lens, image)
             ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1).cpu()
             ends = torch.searchsorted(image, torch.arange(len(lens) + 1, device=image.device)).tolist()
-            shown = None
-            if self.config.image_nms is not None:
-                solids = centre, size, yaw
-                picked = pick(flat, image, rows)
-                shown = self._boxes(picked, places.xy[rows], solids, lens=lens[image], size=dense.size).cpu()
-            stay = self._suppressed(ground, shown, score.cpu(), label.cpu(), ends, best_first=best_first)
+            shown = self._boxes(picked, xy, solids, lens=lens[image], size=dense.size)
+            kinds = score.cpu(), label.cpu()
+            stay = self._suppressed(ground, shown.cpu(), *kinds, ends, best_first=best_first)
             of = torch.cat(stay).to(image.device)
-            image, rows, score, label = image[of], rows[of], score[of], label[of]
-            centre, size, yaw = centre[of], size[of], yaw[of]
-            picked, xy = pick(flat, image, rows), places.xy[rows]
-            box = self._boxes(picked, xy, (centre, size, yaw), lens=lens[image], size=dense.size)
-            columns = (score, label, box, centre, size, yaw, picked.reg[:, 7:9], picked.attribute.argmax(-1))
+            place3d = torch.cat([centre, size, picked.reg[:, 7:9]], 1)
+            if self.config.vote is not None:
+                place3d = self._voted(place3d.cpu(), shown.cpu(), *kinds, ends, stay).to(place3d)
+            else:
+                place3d = place3d[of]
+            centre, size, velocity = place3d.split([3, 3, 2], 1)
+            columns = score[of], label[of], shown[of], centre, size, yaw[of], velocity, picked.attribute[of].argmax(-1)
             parts = zip(*(torch.split(column, [len(s) for s in stay]) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
 
-    def _shares(self, flat: Flat) -> Tensor:
-        """Scores [B, P, 10]: class times centreness, for PGD-Det times how sure it is of the depth."""
+    def _shares(self, flat: Flat, lens: Tensor) -> Tensor:
+        """Scores [B, P, 10]: class times centreness, for PGD-Det times how sure it is of the depth; see also `fade`."""
         share = flat.logit.sigmoid() * flat.centreness.sigmoid()[..., None]
         if flat.bins is not None:
-            share = share * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True)
+            share = share * flat.bins.softmax(-1).topk(2, -1)[0].mean(-1, keepdim=True) ** self.config.sure
+        if self.config.fade:
+            share = share * torch.exp(-self.config.fade * self._depth(flat, lens[:, None]).clamp_min(0.0))[..., None]
         return share
+
+    def _depth(self, flat: Flat, lens: Tensor) -> Tensor:
+        """Depth [..., P] of places, m; lens [..., 3, 3], one a place or broadcast."""
+        depth = flat.reg[..., 2]
+        return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(lens))
+
+    def _voted(  # noqa: PLR0917
+        self, values: Tensor, shown: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], stay: Sequence[Tensor]
+    ) -> Tensor:
+        """Means of values of all candidates, by their scores, over those that show what a box that stays shows.
+
+        Args:
+            values: Of all candidates [N, K].
+            shown: Their boxes in the image [N, 4].
+            score: Their scores [N].
+            label: Their classes [N].
+            ends: Where each image's candidates begin, and where the last ones end.
+            stay: Rows of those that stay, by image.
+
+        Returns:
+            One row for each that stays, image by image.
+        """
+        means = [values[:0]]
+        for (start, end), rows in zip(pairwise(ends), stay, strict=True):
+            same = box_iou(shown[rows], shown[start:end]) >= self.config.vote
+            same &= label[rows][:, None] == label[start:end]
+            same[torch.arange(len(rows)), rows - start] = True  # a box without area as well
+            weight = same * score[start:end]
+            means.append(weight @ values[start:end] / weight.sum(1, keepdim=True))
+        return torch.cat(means)
 
     def _leading(self, dense: Dense, best: Tensor) -> Tensor:
         """Places [B, R] of the best of each level, by their best scores [B, P]."""
@@ -172,14 +205,14 @@ class Mono3D(nn.Module):
         return torch.cat(rows, 1)
 
     def _suppressed(
-        self, ground: Tensor, shown: Tensor | None, score: Tensor, label: Tensor, ends: Sequence[int], *,
+        self, ground: Tensor, shown: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], *,
         best_first: bool,
     ) -> list[Tensor]:  # fmt: skip
         """Rows of each image's candidates that survive suppression; all on the host.
 
         Args:
             ground: Rectangles of all candidates on the ground.
-            shown: Their boxes in the image; None: these do not count.
+            shown: Their boxes in the image.
             score: Their scores.
             label: Their classes.
             ends: Where each image's candidates begin, and where the last ones end.
@@ -189,7 +222,7 @@ class Mono3D(nn.Module):
         for start, end in pairwise(ends):
             own = score[start:end]
             rows = rotated_nms(ground[start:end], own, label[start:end], threshold=self.config.nms)
-            if shown is not None and self.config.image_nms is not None:
+            if self.config.image_nms is not None:
                 columns = shown[start:end][rows], own[rows], label[start:end][rows]
                 rows = rows[batched_nms(*columns, self.config.image_nms).sort()[0]]
             if len(rows) > self.config.most or best_first:
@@ -213,6 +246,25 @@ class Mono3D(nn.Module):
                 self.config, places, truth, lens, self._scale(dense.size, lens), above=self._above(dense.size)
             )
 
+    @torch.no_grad()
+    def doubted(self, dense: Dense, assignment: Assignment, *, doubt: float) -> Assignment:
+        """The assignment with centreness that falls with the error of the depth that a place predicts now.
+
+        What is learned from it ranks boxes by how well they lie, as IoU-Net does it (Jiang et al., ECCV 2018).
+
+        Args:
+            dense: Raw outputs.
+            assignment: Of these pictures.
+            doubt: Error of the depth at which centreness falls to 1/e, m.
+        """
+        image, place = (assignment.label >= 0).nonzero(as_tuple=True)
+        with _exact(dense.logit):
+            depth = self._depth(pick(flatten(_head_maps(dense)), image, place), dense.maps["intrinsic"][0][image])
+        wrong = (depth - assignment.extra["reg"][image, place, 2]).abs()
+        centreness = assignment.extra["centreness"].clone()
+        centreness[image, place] *= torch.exp(-wrong / doubt)
+        return replace(assignment, extra={**assignment.extra, "centreness": centreness})
+
     def losses(
         self, dense: Dense, assignment: Assignment, *, reduction: Literal["batch", "image"] = "batch"
     ) -> dict[str, Tensor]:
@@ -235,10 +287,9 @@ class Mono3D(nn.Module):
         self, flat: Flat, xy: Tensor, lens: Tensor, image: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Centre, size, yaw [..., P, ...] of places; lens [..., 3, 3] (broadcast), or one an image and image [P]."""
-        centre2d, depth = xy - flat.reg[..., :2], flat.reg[..., 2]
+        centre2d = xy - flat.reg[..., :2]
         own = lens if image is None else lens[image]
-        if flat.bins is not None:
-            depth = self.bbox_head.fuse(depth, flat.bins, self._factor(own))
+        depth = self._depth(flat, own)
         centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens, image)
         direction = flat.direction.argmax(-1)
         yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], own, offset=self.config.dir_offset)

@@ -1,0 +1,108 @@
+"""How the light 3D detectors turn maps into boxes best: thresholds of suppression, votes, and how scores fade.
+
+    python benchmarks/detector_settings.py DETECTOR DRIVES --out FILE [--weights FILE] [--device cuda] [--workers 8]
+
+DRIVES: a folder that `ssad record` wrote of TRAINING towns that this detector was not trained on (another seed); the
+towns that are reported on must not decide. The maps of all its pictures are computed once; then one setting after the
+other is changed, and the value with the largest sum of mAP and NDS is kept, until nothing gets better. FILE gets all
+that was tried, the best last.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ssad.core.images import read_image
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.truth import read_truth
+from ssad.detectors import make_detector
+from ssad.detectors.mono3d.multi_camera import merge_cameras
+from ssad.evaluation.camera_truth import scenes_of
+from ssad.evaluation.detection import SampleBoxes, match_boxes, numbers, to_images
+
+SETTINGS: Mapping[str, tuple[float | None, ...]] = {
+    "fade": (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04),
+    "vote": (None, 0.4, 0.5, 0.6, 0.7),
+    "image_nms": (0.3, 0.4, 0.5, 0.6, 0.7),
+    "sure": (0.0, 0.5, 1.0),
+    "nms": (0.05, 0.1, 0.2, 0.3, 0.5),
+}
+SEEN: list[Any] = []  # of each sample: token, poses, maps; the workers are forks and share it
+
+
+def look(detector: Any, root: Path, split: str, device: str) -> tuple[str, tuple[str, ...]]:
+    """Fill SEEN with the maps of all samples; version and scenes."""
+    with NuScenes(root) as data, torch.no_grad():
+        scenes = scenes_of(data, split)
+        for name in scenes:
+            scene = data.scene(name)
+            frames = [f for f in scene.frames if f.modality == "camera" and f.key_frame]
+            for sample in scene.samples:
+                own = [f for f in frames if f.sample_token == sample.token]
+                lens = torch.from_numpy(np.stack([np.asarray(f.intrinsic, np.float32) for f in own])).to(device)
+                dense = detector.dense(to_images([read_image(root / f.filename) for f in own], device), lens)
+                maps = {key: [m.cpu().clone() for m in value] for key, value in dense.maps.items()}
+                small = replace(dense, maps=maps, features=(), logit=dense.logit[:, :1].cpu(), box=dense.box[:, :1].cpu())
+                SEEN.append((sample.token, [(f.sensor_to_ego, f.ego_to_world) for f in own], small))
+        return data.version, scenes
+
+
+def boxes_of(task: tuple[Any, int, int]) -> list[SampleBoxes]:
+    """Every n-th sample's boxes."""
+    detector, first, step = task
+    torch.set_num_threads(1)
+    found = []
+    for token, poses, dense in SEEN[first::step]:
+        chosen = detector.select(dense, detector.config.threshold)
+        found.append(SampleBoxes(token, merge_cameras(chosen, [a for a, _ in poses], [b for _, b in poses])))
+    return found
+
+
+def main() -> None:
+    """Search, and write what was tried."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("detector")
+    parser.add_argument("drives", type=Path)
+    parser.add_argument("--split", default="train")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    detector = make_detector(given.detector, weights=given.weights, device=given.device)
+    version, scenes = look(detector, given.drives, given.split, given.device)
+    detector.to("cpu")
+    truth = read_truth(given.drives, version, scenes=frozenset(scenes))
+    usual = detector.config
+    tried: dict[tuple[float | None, ...], dict[str, float]] = {}
+    best = tuple(getattr(usual, name) for name in SETTINGS)
+    with multiprocessing.get_context("fork").Pool(given.workers) as pool:
+
+        def score(values: tuple[float | None, ...]) -> float:
+            if values not in tried:
+                detector.config = replace(usual, **dict(zip(SETTINGS, values, strict=True)))  # type: ignore[arg-type]
+                parts = pool.map(boxes_of, [(detector, k, given.workers) for k in range(given.workers)], chunksize=1)
+                tried[values] = numbers(match_boxes([one for part in parts for one in part], truth).scores())
+            return tried[values]["mAP"] + tried[values]["NDS"]
+
+        before = None
+        while best != before:
+            before = best
+            for k, choices in enumerate(SETTINGS.values()):
+                best = max([best, *(best[:k] + (value,) + best[k + 1 :] for value in choices)], key=score)
+    rows = [dict(zip(SETTINGS, values, strict=True)) | found for values, found in tried.items() if values != best]
+    rows.append(dict(zip(SETTINGS, best, strict=True)) | tried[best])
+    given.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
