@@ -30,13 +30,14 @@ from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.detection import SampleBoxes, match_boxes, numbers, to_images
 
 SETTINGS: Mapping[str, tuple[float | None, ...]] = {
-    "fade": (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04),
-    "vote": (None, 0.4, 0.5, 0.6, 0.7),
-    "image_nms": (0.3, 0.4, 0.5, 0.6, 0.7),
+    "fade": (0.0, 0.01, 0.02, 0.03, 0.04),
+    "vote": (None, 0.5, 0.6, 0.7, 0.8),
+    "image_nms": (0.4, 0.5, 0.6, 0.7),
     "sure": (0.0, 0.5, 1.0),
-    "nms": (0.05, 0.1, 0.2, 0.3, 0.5),
+    "nms": (0.1, 0.2, 0.3),
 }
-SEEN: list[Any] = []  # of each sample: token, poses, maps; the workers are forks and share it
+SEEN: list[Any] = []  # of each sample: token, poses, maps; the workers are forks and share it and the detector
+DETECTOR: list[Any] = []
 
 
 def look(detector: Any, root: Path, split: str, device: str) -> tuple[str, tuple[str, ...]]:
@@ -51,14 +52,16 @@ def look(detector: Any, root: Path, split: str, device: str) -> tuple[str, tuple
                 lens = torch.from_numpy(np.stack([np.asarray(f.intrinsic, np.float32) for f in own])).to(device)
                 dense = detector.dense(to_images([read_image(root / f.filename) for f in own], device), lens)
                 maps = {key: [m.cpu().clone() for m in value] for key, value in dense.maps.items()}
-                small = replace(dense, maps=maps, features=(), logit=dense.logit[:, :1].cpu(), box=dense.box[:, :1].cpu())
+                small = replace(dense, maps=maps, features=(), logit=dense.logit[:, :1].cpu())
                 SEEN.append((sample.token, [(f.sensor_to_ego, f.ego_to_world) for f in own], small))
         return data.version, scenes
 
 
 def boxes_of(task: tuple[Any, int, int]) -> list[SampleBoxes]:
-    """Every n-th sample's boxes."""
-    detector, first, step = task
+    """Boxes of every n-th sample with a configuration."""
+    config, first, step = task
+    detector = DETECTOR[0]
+    detector.config = config
     torch.set_num_threads(1)
     found = []
     for token, poses, dense in SEEN[first::step]:
@@ -80,7 +83,7 @@ def main() -> None:
     given = parser.parse_args()
     detector = make_detector(given.detector, weights=given.weights, device=given.device)
     version, scenes = look(detector, given.drives, given.split, given.device)
-    detector.to("cpu")
+    DETECTOR.append(detector.to("cpu"))
     truth = read_truth(given.drives, version, scenes=frozenset(scenes))
     usual = detector.config
     tried: dict[tuple[float | None, ...], dict[str, float]] = {}
@@ -89,16 +92,18 @@ def main() -> None:
 
         def score(values: tuple[float | None, ...]) -> float:
             if values not in tried:
-                detector.config = replace(usual, **dict(zip(SETTINGS, values, strict=True)))  # type: ignore[arg-type]
-                parts = pool.map(boxes_of, [(detector, k, given.workers) for k in range(given.workers)], chunksize=1)
+                config = replace(usual, **dict(zip(SETTINGS, values, strict=True)))
+                parts = pool.map(boxes_of, [(config, k, given.workers) for k in range(given.workers)], chunksize=1)
                 tried[values] = numbers(match_boxes([one for part in parts for one in part], truth).scores())
             return tried[values]["mAP"] + tried[values]["NDS"]
 
         before = None
         while best != before:
             before = best
-            for k, choices in enumerate(SETTINGS.values()):
-                best = max([best, *(best[:k] + (value,) + best[k + 1 :] for value in choices)], key=score)
+            for k, (name, choices) in enumerate(SETTINGS.items()):
+                if name == "sure" and not usual.pgd:
+                    continue
+                best = max([best, *((*best[:k], value, *best[k + 1 :]) for value in choices)], key=score)
     rows = [dict(zip(SETTINGS, values, strict=True)) | found for values, found in tried.items() if values != best]
     rows.append(dict(zip(SETTINGS, best, strict=True)) | tried[best])
     given.out.write_text(json.dumps(rows, indent=1) + "\n")
