@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers.mono3d import TINY, TINY_PGD, lens, lively, some_truth, truth_of
@@ -19,6 +20,7 @@ from ssad.detectors import make_detector
 from ssad.detectors.fcos3d import fcos3d
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
+from ssad.detectors.mono3d.decode import flatten, places_of
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.mono3d.head import group_norm_relu
 from ssad.detectors.pgd_det import pgd_det
@@ -469,3 +471,58 @@ def test_boxes_of_one_object_in_the_image_are_suppressed(config: Mono3DConfig) -
                 keep.append(k)
         assert 1 < len(keep) < len(before.score)
         torch.testing.assert_close(after.box, before.box[keep])
+
+
+@BOTH
+def test_dropped_boxes_vote_on_where_the_one_that_stays_is(config: Mono3DConfig) -> None:
+    free = lively(replace(config, nms=2.0))  # an overlap that there is not: nothing is dropped
+    voted = lively(replace(config, nms=2.0, image_nms=0.3, vote=0.5))
+    images, cameras = pictures(1, 3, 64, 96), lens(100.0, (64, 96))[None].float()
+    for detector in (free, voted):
+        detector.config = replace(detector.config, most=100_000)
+    (every,), (found,) = (d.predict(images, cameras, threshold=0.0) for d in (free, voted))
+    assert every.solid is not None and found.solid is not None
+    assert 1 < len(found.score) < len(every.score)
+    for k in range(0, len(found.score), 7):
+        same = every.label == found.label[k]
+        same &= box_iou(found.box[k : k + 1], every.box)[0] >= 0.5
+        if not same.any():
+            continue  # without area
+        weight = every.score[same] / every.score[same].sum()
+        for name in ("centre", "size_lhw", "velocity"):
+            expected = weight @ getattr(every.solid, name)[same]
+            torch.testing.assert_close(getattr(found.solid, name)[k], expected, rtol=1e-4, atol=1e-4)
+
+
+@BOTH
+def test_scores_fade_with_depth_and_the_confidence_of_depth_has_a_power(config: Mono3DConfig) -> None:
+    images, cameras = pictures(1, 3, 64, 96), lens(100.0, (64, 96))[None].float()
+    scores = []
+    for changes in ({}, {"fade": 0.05}, {"sure": 0.0}):
+        (found,) = lively(replace(config, nms=2.0, most=100_000, **changes)).predict(images, cameras, threshold=0.0)
+        assert found.solid is not None
+        depth, label = found.solid.centre[:, 2], found.label
+        rank = np.lexsort((label.numpy(), depth.numpy(), found.solid.centre[:, 0].numpy()))
+        scores.append(found.score[rank])
+        depths = depth[rank]
+    usual, faded, unsure = scores
+    torch.testing.assert_close(faded, usual * torch.exp(-0.05 * depths.clamp_min(0.0)))
+    assert (unsure > usual).all() if config.pgd else torch.equal(unsure, usual)
+
+
+@BOTH
+def test_doubt_lowers_the_centreness_of_places_that_err_about_depth(config: Mono3DConfig) -> None:
+    detector, truth = lively(config), some_truth(4)
+    dense = detector.dense(pictures(1, 3, *SIZE), K[None])
+    assignment = detector.assign(dense, [truth])
+    doubted = detector.doubted(dense, assignment, doubt=3.0)
+    own = assignment.label[0] >= 0
+    assert own.any()
+    flat = flatten({name: maps for name, maps in dense.maps.items() if name != "intrinsic"})
+    places = places_of(dense.maps["cls_scores"], config.strides)
+    depth = detector._solids(flat, places.xy, dense.maps["intrinsic"][0][:, None])[0][0, own, 2]
+    wrong = (depth - assignment.extra["reg"][0, own, 2]).abs()
+    expected = assignment.extra["centreness"][0, own] * torch.exp(-wrong / 3.0)
+    torch.testing.assert_close(doubted.extra["centreness"][0, own], expected, rtol=1e-4, atol=1e-6)
+    assert torch.equal(doubted.extra["centreness"][0, ~own], assignment.extra["centreness"][0, ~own])
+    assert doubted.extra["reg"] is assignment.extra["reg"]

@@ -34,7 +34,7 @@ from ssad.training.batches import (
     order,
     repeats,
 )
-from ssad.training.loop import LAST, LOG, train
+from ssad.training.loop import LAST, LOG, train, weighed
 from ssad.training.recipe import RECIPES, Recipe, find_recipe
 
 
@@ -252,6 +252,29 @@ def test_a_zoom_is_about_the_principal_point() -> None:
         across = 80.0 - 30.0 if change.mirror else 30.0
         np.testing.assert_allclose(truth.intrinsic[:2, 2].numpy(), [across, 15.0], atol=1e-4)
         np.testing.assert_allclose(truth.intrinsic[0, 0], 500.0 * change.zoom, rtol=1e-6)
+
+
+def test_a_picture_that_rises_takes_its_lens_along() -> None:
+    truth = some_truth(3, size=(40, 80), focal=60.0)
+    recipe = replace(find_recipe("fcos3d-light"), zoom=(1.0, 1.0), flip=0.0, rise=6.0)
+    rng = np.random.default_rng(5)
+    moved = [draw_change(recipe, (40, 80), rng, lens=truth.intrinsic).shift for _ in range(50)]
+    assert {across for across, _ in moved} == {0.0}
+    assert -6 <= min(down for _, down in moved) < -3 < 3 < max(down for _, down in moved) <= 6
+    after = change_truth(truth, Change(False, 1.0, moved[0]), (40, 80), keep=0)
+    assert after.solid is not None and after.intrinsic is not None and truth.solid is not None
+    before = project(truth.solid.centre, lens(60.0, (40, 80)))
+    now = project(after.solid.centre, after.intrinsic)
+    np.testing.assert_allclose(now[:, 0], before[: len(now), 0], atol=1e-4)
+    np.testing.assert_allclose(now[:, 1], before[: len(now), 1] + moved[0][1], atol=1e-4)
+
+
+def test_losses_are_weighed_by_name() -> None:
+    losses = {"one": torch.tensor(2.0), "two": torch.tensor(3.0)}
+    assert float(weighed(losses, {})) == 5.0
+    assert float(weighed(losses, {"two": 0.5})) == 3.5
+    with pytest.raises(ConfigError, match="there is no loss 'three'; there are one, two"):
+        weighed(losses, {"three": 1.0})
 
 
 def test_a_batch_is_decided_by_its_key() -> None:
