@@ -104,8 +104,7 @@ def main() -> None:
                 if name == "sure" and not usual.pgd:
                     continue
                 best = max([best, *((*best[:k], value, *best[k + 1 :]) for value in choices)], key=score)
-    rows = [dict(zip(SETTINGS, values, strict=True)) | found for values, found in tried.items() if values != best]
-    rows.append(dict(zip(SETTINGS, best, strict=True)) | tried[best])
+    rows = [{**dict(zip(SETTINGS, v, strict=True)), **tried[v]} for v in (*(v for v in tried if v != best), best)]
     given.out.write_text(json.dumps(rows, indent=1) + "\n")
 
 

@@ -497,9 +497,9 @@ def test_dropped_boxes_vote_on_where_the_one_that_stays_is(config: Mono3DConfig)
 @BOTH
 def test_scores_fade_with_depth_and_the_confidence_of_depth_has_a_power(config: Mono3DConfig) -> None:
     images, cameras = pictures(1, 3, 64, 96), lens(100.0, (64, 96))[None].float()
-    scores = []
-    for changes in ({}, {"fade": 0.05}, {"sure": 0.0}):
-        (found,) = lively(replace(config, nms=2.0, most=100_000, **changes)).predict(images, cameras, threshold=0.0)
+    config, scores = replace(config, nms=2.0, most=100_000), []
+    for changed in (config, replace(config, fade=0.05), replace(config, sure=0.0)):
+        (found,) = lively(changed).predict(images, cameras, threshold=0.0)
         assert found.solid is not None
         depth, label = found.solid.centre[:, 2], found.label
         rank = np.lexsort((label.numpy(), depth.numpy(), found.solid.centre[:, 0].numpy()))

@@ -146,7 +146,7 @@ class Mono3D(nn.Module):
                 place3d = self._voted(place3d.cpu(), shown.cpu(), *kinds, ends, stay).to(place3d)
             else:
                 place3d = place3d[of]
-            centre, size, velocity = place3d.split([3, 3, 2], 1)
+            centre, size, velocity = torch.split(place3d, [3, 3, 2], 1)
             columns = score[of], label[of], shown[of], centre, size, yaw[of], velocity, picked.attribute[of].argmax(-1)
             parts = zip(*(torch.split(column, [len(s) for s in stay]) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
