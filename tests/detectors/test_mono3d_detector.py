@@ -481,7 +481,8 @@ def test_dropped_boxes_vote_on_where_the_one_that_stays_is(config: Mono3DConfig)
     for detector in (free, voted):
         detector.config = replace(detector.config, most=100_000)
     (every,), (found,) = (d.predict(images, cameras, threshold=0.0) for d in (free, voted))
-    assert every.solid is not None and found.solid is not None
+    assert every.solid is not None
+    assert found.solid is not None
     assert 1 < len(found.score) < len(every.score)
     for k in range(0, len(found.score), 7):
         same = every.label == found.label[k]

@@ -262,7 +262,9 @@ def test_a_picture_that_rises_takes_its_lens_along() -> None:
     assert {across for across, _ in moved} == {0.0}
     assert -6 <= min(down for _, down in moved) < -3 < 3 < max(down for _, down in moved) <= 6
     after = change_truth(truth, Change(False, 1.0, moved[0]), (40, 80), keep=0)
-    assert after.solid is not None and after.intrinsic is not None and truth.solid is not None
+    assert after.solid is not None
+    assert after.intrinsic is not None
+    assert truth.solid is not None
     before = project(truth.solid.centre, lens(60.0, (40, 80)))
     now = project(after.solid.centre, after.intrinsic)
     np.testing.assert_allclose(now[:, 0], before[: len(now), 0], atol=1e-4)
