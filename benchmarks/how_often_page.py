@@ -1,8 +1,12 @@
-"""Write docs/how_often.md from what was measured: python -m benchmarks.how_often_page"""
+"""Write docs/how_often.md from what was measured: python -m benchmarks.how_often_page
+
+It reads benchmarks/results/how-often-*.json: brute force, and the estimates of one or several processes.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -74,18 +78,33 @@ def brute_row(data: dict[str, Any]) -> str:
     )
 
 
+def estimates() -> list[dict[str, Any]]:
+    """What `coverage` measured, by the share of lapses, the largest first; several processes' estimates in one."""
+    found: dict[float, dict[str, Any]] = {}
+    for path in sorted(RESULTS.glob("how-often-coverage*.json")):
+        data = json.loads(path.read_text(encoding="utf-8"))
+        known = found.setdefault(data["noise"]["lapse"], data)
+        if known is not data:
+            if any(known[key] != data[key] for key in ("noise", "share", "each", "scenario")):
+                raise ValueError(f"{path}: of another case, or of estimates of another size, than those beside it")
+            for key in ("training", "importance", "splitting", "repeats", "seconds"):
+                known[key] += data[key]
+    return [found[lapse] for lapse in sorted(found, reverse=True)]
+
+
 def main() -> None:
     """Write the page."""
-    lines = [TEXT + "## A case measured"]
-    covered = read("how-often-coverage")
-    brutes = [data for data in (read("how-often-brute"), read("how-often-4"), read("how-often-6")) if data]
-    noise = (covered or brutes[0])["noise"]
-    (scenario,) = load_scenarios((covered or brutes[0])["scenario"])
+    lines = [TEXT + "## Cases measured"]
+    covered = estimates()
+    brutes = [data for data in (read("how-often-4"), read("how-often-6")) if data]
+    noise = (covered or brutes)[0]["noise"]
+    (scenario,) = load_scenarios((covered or brutes)[0]["scenario"])
     lines += [
         f"`{scenario.name}`: on a straight road of {scenario.town}, the Autopilot follows two vehicles at "
         f"{scenario.parameters['ego_speed']:g} m/s for {0.1 * scenario.limits.max_steps:g} s. They accelerate and "
         f"brake with a standard deviation of {noise['accel']:g} m/s^2; its lapses forget in {noise['choice_time']:g} s."
-        " Brute force (`python -m benchmarks.how_often brute --lapse 0.04`):",
+        " How rare a collision is hangs on the share of lapses. Brute force (`python -m benchmarks.how_often brute "
+        "--lapse 0.04 --crashes 10000` and `--lapse 0.004`):",
         "",
         "| share of lapses | device | episodes | collisions | probability | 95 % limits | agent-steps | a second |",
         "|---:|---|---:|---:|---:|---|---:|---:|",
@@ -94,8 +113,8 @@ def main() -> None:
         "The last column counts processor time of one core on CPU, and time by the clock on a GPU.",
         "",
     ]
-    if covered:
-        lines += coverage(covered, brutes)
+    for data in covered:
+        lines += coverage(data, brutes)
     path = ROOT / "docs" / "how_often.md"
     path.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
 
@@ -110,12 +129,14 @@ def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
     if best is not None and best["events"] >= 5000:
         truth, named = best["probability"], "brute force"
     steps = best["work"] / best["episodes"] if best else float("nan")
+    beside = f"; brute force: {best['probability']:.4g} ({best['low']:.3g} to {best['high']:.3g})" if best else ""
     lines = [
-        f"`python -m benchmarks.how_often coverage --repeats {data['repeats']} --share {data['share']}`: every "
-        f"estimate has its own episodes; {data['share']} of importance sampling share a proposal, of which each counts "
-        f"the whole training. An interval holds if it contains {named} ({truth:.4g}). What brute force would "
-        "need is 1.96^2 (1 - p) / (p h^2) episodes for the half-width h, relative to p, that the estimates have in the "
-        "mean.",
+        f"### Lapses {data['noise']['lapse']:.1%} of the time: near {10 ** round(math.log10(pooled)):.0e}",
+        f"`python -m benchmarks.how_often coverage --lapse {data['noise']['lapse']:g} --repeats {data['repeats']} "
+        f"--share {data['share']} --each {data['each']}`: every estimate has its own {data['each']:,} episodes; "
+        f"{data['share']} of importance sampling share a proposal, of which each counts the whole training. An "
+        f"interval holds if it contains {named} ({truth:.4g}{beside}). What brute force would need is "
+        "1.96^2 (1 - p) / (p h^2) episodes for the half-width h, relative to p, that the estimates have in the mean.",
         "",
         "| method | estimates | mean probability | intervals that hold | relative half-width | agent-steps each | of "
         "these learning | fewer than brute force |",
