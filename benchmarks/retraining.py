@@ -127,8 +127,8 @@ def search_all(
     system: str, generator: str, scenarios: Sequence[Any], graphs: Any, *, seed: int, budget: int
 ) -> tuple[list[Any], list[Any]]:
     """Bases that a system survives and a generator can change, and the outcomes of each."""
-    from ssad.evaluation.found_collisions import refusal
     from ssad.drivers import make_system
+    from ssad.evaluation.found_collisions import refusal
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
 
     trials = Trials(lambda: make_system(system), make_system)
