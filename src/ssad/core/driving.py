@@ -508,16 +508,17 @@ Sensor = Callable[[Any, I32], Any]
 One that also has a method `follow`, which takes the simulator, is told of every step, also where nobody looks."""
 
 
+Frames = npt.NDArray[Any]
+"""Pictures [N, C, H, W]."""
+
+Generators = Sequence[np.random.Generator]
+"""Random numbers, a generator for each picture."""
+
+
 class Perturbation(Protocol):
     """What changes the pictures that a driver gets, the same open loop and closed loop."""
 
-    def apply(
-        self,
-        frames: npt.NDArray[Any],
-        victim: Any,
-        truth: Any,
-        generators: Sequence[np.random.Generator],
-    ) -> npt.NDArray[Any]:
+    def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
         """Change pictures.
 
         Args:

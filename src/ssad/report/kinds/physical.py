@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -264,43 +264,38 @@ def effort_table(run: PhysicalRun) -> Table:
 
 def maps(run: PhysicalRun) -> list[tuple[str, str]]:
     """For each town and detector: a title, and heat maps of the clean car beside the attacked one as SVG text."""
-    found = []
-    for _, test in run.pairs:
-        for detector in run.detectors:
-            drawn = []
-            for attack in run.attacks:
-                lines = run.lines(test, "grid", detector, attack)
-                if lines:
-                    drawn.append(_map(lines[0], title_of(attack), clean=attack[0] == "clean"))
-            if drawn:
-                label = f"AP50 by distance and azimuth, {detector} in {test}"
-                found.append((f"{detector}, {test}", heat_maps(drawn, label=label)))
-    return found
+    return _drawn(run, _map, "AP50 by distance and azimuth")
 
 
 def weather_maps(run: PhysicalRun) -> list[tuple[str, str]]:
     """The same by elevation and weather: shares of the views in which the target is found above 0.25."""
+    return _drawn(run, _weather_map, "share of views in which the target is found, by elevation and weather")
+
+
+def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[tuple[str, str]]:
+    """For each town and detector: a title, and the maps of the attacks that were seen on the grid."""
     found = []
     for _, test in run.pairs:
         for detector in run.detectors:
-            drawn = []
-            for attack in run.attacks:
-                lines = run.lines(test, "grid", detector, attack)
-                if not lines:
-                    continue
-                sums: dict[tuple[str, str], list[bool]] = {}
-                for _, _, elevation, weather, before, after in lines[0]["views"]:
-                    score_ = before if attack[0] == "clean" else after
-                    sums.setdefault((f"{elevation:g}°", weather), []).append(score_ > 0.25)
-                rows, columns = (list(dict.fromkeys(place[k] for place in sums)) for k in (0, 1))
-                values = {place: sum(own) / len(own) for place, own in sums.items()}
-                tips = {place: f"{title_of(attack)}: {sum(own)} of {len(own)} views" for place, own in sums.items()}
-                rows.sort(key=lambda text: float(text[:-1]))
-                drawn.append(HeatMap(title_of(attack), rows, sorted(columns), values, None, tips))
+            seen = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
+            drawn = [
+                draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in seen if lines
+            ]  # fmt: skip
             if drawn:
-                label = f"share of views in which {detector} finds the target, by elevation and weather, {test}"
-                found.append((f"{detector}, {test}", heat_maps(drawn, label=label)))
+                found.append((f"{detector}, {test}", heat_maps(drawn, label=f"{label}, {detector} in {test}")))
     return found
+
+
+def _weather_map(line: Line, title: str, *, clean: bool) -> HeatMap:
+    """The map of a record by elevation and weather."""
+    sums: dict[tuple[str, str], list[bool]] = {}
+    for _, _, elevation, weather, before, after in line["views"]:
+        sums.setdefault((f"{elevation:g}°", weather), []).append((before if clean else after) > 0.25)
+    rows, columns = (list(dict.fromkeys(place[k] for place in sums)) for k in (0, 1))
+    values = {place: sum(own) / len(own) for place, own in sums.items()}
+    tips = {place: f"{title}: {sum(own)} of {len(own)} views" for place, own in sums.items()}
+    rows.sort(key=lambda text: float(text[:-1]))
+    return HeatMap(title, rows, sorted(columns), values, None, tips)
 
 
 def _map(line: Line, title: str, *, clean: bool) -> HeatMap:

@@ -6,13 +6,12 @@ camera of one batch of drives, which begin together; a drive's draws all come fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Final
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from ssad.core.driving import Frames, Generators
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.types import F32, U8
 
@@ -50,13 +49,7 @@ class CameraFault:
         self.name, self.severity = name, severity
         self._rows: list[_Row] = []
 
-    def apply(
-        self,
-        frames: npt.NDArray[Any],
-        victim: Any,
-        truth: Any,
-        generators: Sequence[np.random.Generator],
-    ) -> npt.NDArray[Any]:
+    def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
         """See `ssad.core.driving.Perturbation`.
 
         Args:

@@ -192,6 +192,28 @@ def trigger_place(graph: LaneGraph, scenario: Scenario, route: Route) -> Place:
     return route_place(graph, scenario, route, trigger_index(scenario, route))
 
 
+def ahead_and_left(
+    graph: LaneGraph, scenario: Scenario, route: Route, *, distance: float, gap: float
+) -> tuple[Place, Place]:
+    """Places ahead of the trigger: in the ego's lane, and further on in the lane to its left.
+
+    Args:
+        graph: The town.
+        scenario: What is built.
+        route: Of the ego.
+        distance: To the first place, m.
+        gap: From there to the second, m.
+
+    Raises:
+        RouteError: There is no such lane.
+    """
+    reference = trigger_place(graph, scenario, route)
+    left = beside(graph, ahead(graph, reference, distance + gap), "left")
+    if left is None:
+        raise RouteError(f"scenario {scenario.name}: {scenario.type} needs a lane to the left of the ego's")
+    return ahead(graph, reference, distance), left
+
+
 def junction_span(graph: LaneGraph, scenario: Scenario, route: Route) -> tuple[int, int]:
     """Route points where the first junction after the trigger begins and where it has ended.
 

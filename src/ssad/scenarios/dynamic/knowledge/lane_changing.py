@@ -9,18 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.errors import RouteError
 from ssad.core.types import Condition, EpisodeAgent, Phase, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import (
-    ahead,
-    bending_route,
-    beside,
-    go,
-    pose_at,
-    scripted,
-    trigger_place,
-)
+from ssad.scenarios.dynamic.knowledge._placing import ahead_and_left, bending_route, go, pose_at, scripted
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -29,11 +20,7 @@ if TYPE_CHECKING:
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Leader (actor 0) in the ego's lane, neighbour (actor 1) to its left. RouteError without that lane."""
     value = SCENARIO.values(scenario.parameters)
-    reference = trigger_place(graph, scenario, route)
-    front = ahead(graph, reference, value["distance"])
-    side = beside(graph, ahead(graph, reference, value["distance"] + value["gap"]), "left")
-    if side is None:
-        raise RouteError(f"scenario {scenario.name}: LaneChanging needs a lane to the left of the ego's")
+    front, side = ahead_and_left(graph, scenario, route, distance=value["distance"], gap=value["gap"])
     start = go(value["leader_speed"], value["trigger_distance"])
     brake = Phase(value["brake_speed"], Condition("travelled", value["brake_after"]))
     return [

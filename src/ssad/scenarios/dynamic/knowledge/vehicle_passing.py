@@ -9,19 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssad.core.errors import RouteError
 from ssad.core.types import EpisodeAgent, Route, Scenario
 from ssad.scenarios.dynamic.knowledge._kind import Parameter, ScenarioType
-from ssad.scenarios.dynamic.knowledge._placing import (
-    ahead,
-    bending_route,
-    beside,
-    go,
-    pose_at,
-    scripted,
-    standing,
-    trigger_place,
-)
+from ssad.scenarios.dynamic.knowledge._placing import ahead_and_left, bending_route, go, pose_at, scripted, standing
 
 if TYPE_CHECKING:
     from ssad.core.lane_graph import LaneGraph
@@ -30,11 +20,7 @@ if TYPE_CHECKING:
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Parked car (actor 0) in the ego's lane, oncoming car (actor 1) in the lane to the left."""
     value = SCENARIO.values(scenario.parameters)
-    reference = trigger_place(graph, scenario, route)
-    parked = ahead(graph, reference, value["distance"])
-    side = beside(graph, ahead(graph, reference, value["distance"] + value["gap"]), "left")
-    if side is None:
-        raise RouteError(f"scenario {scenario.name}: VehiclePassing needs a lane to the left of the ego's")
+    parked, side = ahead_and_left(graph, scenario, route, distance=value["distance"], gap=value["gap"])
     return [
         standing("parked car", "compact", pose_at(graph, parked)),
         scripted(

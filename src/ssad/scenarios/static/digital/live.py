@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
 from ssad.core.detections import Detections, Truth
+from ssad.core.driving import Frames, Generators
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
 from ssad.scenarios.static.digital.attack import Attack, run_attack
@@ -82,13 +82,7 @@ class LiveAttack:
         if isinstance(self.objective, str):
             make_objective(self.objective)
 
-    def apply(
-        self,
-        frames: npt.NDArray[Any],
-        victim: Any,
-        truth: Any,
-        generators: Sequence[np.random.Generator],
-    ) -> npt.NDArray[Any]:
+    def apply(self, frames: Frames, victim: Any, truth: Any, generators: Generators) -> Frames:
         """Attack pictures; black ones, of episodes that have ended, are left alone.
 
         Args:
@@ -119,8 +113,8 @@ class LiveAttack:
         return found
 
     def _some(
-        self, frames: npt.NDArray[Any], victim: Any, truth: Sequence[Truth] | None, keys: Sequence[tuple[object, ...]]
-    ) -> npt.NDArray[Any]:
+        self, frames: Frames, victim: Any, truth: Sequence[Truth] | None, keys: Sequence[tuple[object, ...]]
+    ) -> Frames:
         """Some pictures at once."""
         if isinstance(self.attack, Universal | RandomNoise):
             images = torch.from_numpy(frames).float() / LEVELS

@@ -268,6 +268,21 @@ def paint(
                 left = right
 
 
+@wp.func
+def on_line(first: int, slope: float, low: int, step: int, flat: wp.bool) -> wp.vec2i:
+    """Pixel (x, y) of a step on a line that begins at `first` across and `low` along the longer side of a streak."""
+    side = first + int(wp.floor(slope * float(step) + 0.5))
+    if flat:
+        return wp.vec2i(low + step, side)
+    return wp.vec2i(side, low + step)
+
+
+@wp.func
+def inside(pixel: wp.vec2i, width: int, height: int) -> wp.bool:
+    """Whether a pixel lies in the picture."""
+    return pixel[0] >= 0 and pixel[0] < width and pixel[1] >= 0 and pixel[1] < height
+
+
 @wp.kernel
 def smear(
     image: wp.array(dtype=wp.uint8),
@@ -325,15 +340,10 @@ def smear(
         # the pixel that enters the window, half a streak ahead
         ahead = s + half
         if ahead < steps:
-            side = first + int(wp.floor(slope * float(ahead) + 0.5))
-            x = side
-            y = low + ahead
-            if flat:
-                x = low + ahead
-                y = side
-            if x >= 0 and x < width and y >= 0 and y < height:
-                i = start + (y * width + x) * 3
-                rank = int(owner[b, y, x])
+            pixel = on_line(first, slope, low, ahead, flat)
+            if inside(pixel, width, height):
+                i = start + (pixel[1] * width + pixel[0]) * 3
+                rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
                     total = total + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
                     weight += 1
@@ -341,22 +351,17 @@ def smear(
                     beside = beside + wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
                     count += 1
         if s >= 0 and s < steps and weight > 0:
-            side = first + int(wp.floor(slope * float(s) + 0.5))
-            x = side
-            y = low + s
-            if flat:
-                x = low + s
-                y = side
-            if x >= 0 and x < width and y >= 0 and y < height:
-                rank = int(owner[b, y, x])
+            pixel = on_line(first, slope, low, s, flat)
+            if inside(pixel, width, height):
+                rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
-                    i = start + (y * width + x) * 3
+                    i = start + (pixel[1] * width + pixel[0]) * 3
                     scale = 1.0 / float(weight + count)
                     out[i] = wp.uint8(float(total[0] + beside[0]) * scale + 0.5)
                     out[i + 1] = wp.uint8(float(total[1] + beside[1]) * scale + 0.5)
                     out[i + 2] = wp.uint8(float(total[2] + beside[2]) * scale + 0.5)
                 elif rank < item.rank:
-                    i = start + (y * width + x) * 3
+                    i = start + (pixel[1] * width + pixel[0]) * 3
                     alpha = float(weight) / window
                     scale = alpha / float(weight)
                     out[i] = wp.uint8(float(out[i]) * (1.0 - alpha) + float(total[0]) * scale + 0.5)
@@ -364,15 +369,10 @@ def smear(
                     out[i + 2] = wp.uint8(float(out[i + 2]) * (1.0 - alpha) + float(total[2]) * scale + 0.5)
         behind = s - half
         if behind >= 0 and behind < steps:
-            side = first + int(wp.floor(slope * float(behind) + 0.5))
-            x = side
-            y = low + behind
-            if flat:
-                x = low + behind
-                y = side
-            if x >= 0 and x < width and y >= 0 and y < height:
-                i = start + (y * width + x) * 3
-                rank = int(owner[b, y, x])
+            pixel = on_line(first, slope, low, behind, flat)
+            if inside(pixel, width, height):
+                i = start + (pixel[1] * width + pixel[0]) * 3
+                rank = int(owner[b, pixel[1], pixel[0]])
                 if rank == item.rank:
                     total = total - wp.vec3i(int(image[i]), int(image[i + 1]), int(image[i + 2]))
                     weight -= 1
