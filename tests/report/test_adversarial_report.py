@@ -11,7 +11,7 @@ import pytest
 from helpers.metric_traces import make_trace
 
 from ssad.bench.kinds.adversarial import Adversarial
-from ssad.report.found_view import ADVERSARY, EGO, found_view
+from ssad.report.found_view import ADVERSARY, EGO, ROAD, found_view
 from ssad.report.kinds.adversarial import (
     against_table,
     budget_table,
@@ -103,6 +103,14 @@ def test_a_view_shows_ego_and_adversary_where_they_met() -> None:
     assert blue.sum() > 100
     assert red.sum() > 100
     assert np.nonzero(blue)[1].mean() < np.nonzero(red)[1].mean()  # east is to the right
+
+
+def test_a_view_has_the_road_also_where_none_of_its_corners_is() -> None:
+    graph = load_town("Longreach")
+    lane = max(range(graph.lanes), key=lambda n: float(graph.length[n]))
+    x, y, yaw, _ = graph.at(lane, 0.5 * float(graph.length[lane]))
+    picture = found_view(make_trace(31, [np.tile([x, y, yaw, 0.0], (31, 1)).T]), graph, [], size=100)
+    assert (picture == ROAD).all(-1).mean() > 0.05
 
 
 def test_grades_and_other_systems_have_tables_of_their_own(found: Run) -> None:
