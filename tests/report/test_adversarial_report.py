@@ -19,6 +19,7 @@ from ssad.report.kinds.adversarial import (
     group_table,
     main_table,
     summary,
+    traffic_table,
     transfer_table,
 )
 from ssad.report.load import Run
@@ -90,6 +91,21 @@ def test_groups_have_their_own_rates_and_failures_count(found: Run) -> None:
     assert cell(table, 0, "A").mean == 1.0
     assert cell(table, 0, "B").failed == 1
     assert not math.isnan(cell(table, 1, "A").mean)
+
+
+def test_natural_and_adversarial_traffic_stand_side_by_side(found: Run) -> None:
+    assert traffic_table(found) is None
+    spec = {"repetition": 0, "scenario": {"type": "NaturalJunction", "town": "Twinford"}}
+    lines = [line("adv-ppo", k, 1, spec=spec, survived=k > 1) for k in range(8)]
+    for one in lines[2:]:
+        one["metrics"]["CR_any"] = one["cluster"] != "base 7"
+    table = traffic_table(run([*lines, line("adv-ppo", 9, 1)]))
+    assert table is not None
+    ours = [row for row in table.rows if not row.published]
+    assert [row.head for row in ours] == [("autopilot", "natural", "Twinford"), ("autopilot", "Adv.PPO", "Twinford")]
+    assert [row.cells[0].mean for row in ours] == [2 / 8, 7 / 8]
+    assert ours[1].cells[1].mean == 5 / 8
+    assert ("PPO", "Adv. PPO", "Town02") in [row.head for row in table.rows if row.published]
 
 
 def test_a_view_shows_ego_and_adversary_where_they_met() -> None:

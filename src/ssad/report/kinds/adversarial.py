@@ -19,9 +19,10 @@ from ssad.report.default import result_table
 from ssad.report.found_view import found_view
 from ssad.report.load import Run
 from ssad.report.pages import render
+from ssad.report.paper import NATURAL, SOURCE
 from ssad.report.tables import METHODS, Cell, Row, Table
 
-RANDOM = "random"
+RANDOM, ADVERSARIES = "random", "adv-ppo"
 SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving", "attributable")
 GRADES = {
     "moving": "ego moves", "avoided_by_cc": "CC avoids", "avoided_by_reg157": "Reg157 avoids",
@@ -36,7 +37,7 @@ Line = Mapping[str, Any]
 
 def section(run: Run) -> tuple[str, Sequence[Table]]:
     """The page of a run and its tables."""
-    makers = main_table, careful_table, budget_table, against_table, group_table, transfer_table
+    makers = main_table, careful_table, budget_table, against_table, group_table, traffic_table, transfer_table
     tables = [table for table in (make(run) for make in makers) if table]
     failed = [
         ([str(line.get(name, "")) for name in ("generator", "system", "cluster")], line["status"], line["reason"])
@@ -159,6 +160,46 @@ def group_table(run: Run) -> Table:
         ]
         rows.append(Row(head, tuple(cells)))
     return Table("groups", "CR by group", ("Generator", "System"), tuple(groups), tuple(rows), METHODS)
+
+
+def traffic_table(run: Run) -> Table | None:
+    """Systems in natural traffic and among Adv.PPO's adversaries by town, the paper's rows below."""
+    rows = []
+    for (generator, system), lines in _searches(run).items():
+        natural = [line for line in lines if line["spec"].get("scenario", {}).get("type") == "NaturalJunction"]
+        if generator != ADVERSARIES:
+            continue
+        for town in dict.fromkeys(str(line["spec"]["scenario"]["town"]) for line in natural):
+            here = [line for line in natural if line["spec"]["scenario"]["town"] == town]
+            without = {str(line["key"]): _case(line, 1.0 - _metric(line, "survived")) for line in here}
+            among = {str(line["key"]): _case(line, max(1.0 - _metric(line, "survived"), _found(line))) for line in here}
+            more = paired_difference(among, without, kind="share")
+            for traffic, cases, difference in (("natural", without, None), ("Adv.PPO", among, more)):
+                cells = (
+                    Cell.of(estimate(cases.values(), "share")),
+                    Cell.of(difference) if difference else Cell(math.nan),
+                )
+                rows.append(Row((system, traffic, town), cells))
+    if not rows:
+        return None
+    for (system, traffic), by_town in NATURAL.items():
+        for town, (rate, _, _) in by_town.items():
+            known = "natural" if traffic == "Autopilot" else traffic
+            rows.append(Row((system, known, town), (Cell(rate), Cell(math.nan)), published=True))
+    note = (
+        "Any collision with an adversary counts, wherever the adversary is. Where a system collides in natural traffic "
+        f"no adversary was tried; it counts as colliding among them, too. Shaded rows: {SOURCE}. {METHODS}"
+    )
+    heads = ("System", "Traffic", "Town")
+    columns = ("CR", "more than in natural traffic")
+    return Table("traffic", "Natural and adversarial traffic", heads, columns, tuple(rows), note, SOURCE)
+
+
+def _found(line: Line) -> float:
+    """Whether any collision with an adversary was found; 0 where none was tried, NaN where the cell failed."""
+    if line["status"] != "ok":
+        return math.nan
+    return float(bool((line["metrics"] or {}).get("CR_any")))
 
 
 def views(run: Run) -> list[dict[str, str]]:
