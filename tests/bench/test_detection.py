@@ -26,6 +26,7 @@ from typer.testing import CliRunner
 from ssad.bench.kind import Plan, Resources
 from ssad.bench.kinds import detection
 from ssad.bench.kinds.detection import Detection, DetectionSuite
+from ssad.bench.replay import difference
 from ssad.bench.run import run, run_json
 from ssad.bench.suite import load_suite
 from ssad.cli import app
@@ -153,7 +154,7 @@ def test_replay_finds_the_boxes_of_a_cell_again_and_says_what_differs(folder: Pa
     assert (tmp_path / "out" / f"{record['key']}.jpg").stat().st_size > 10_000
     assert not (again / "detections").exists(), "nothing is written to the run"
     changed = {**record, "metrics": record["metrics"] | {"mAP": 0.25}}
-    assert detection._difference(changed, record) == f"metrics: mAP is {record['metrics']['mAP']}, was 0.25"
+    assert difference(changed, record) == f"metrics: mAP is {record['metrics']['mAP']}, was 0.25"
 
 
 def test_cells_are_scored_as_soon_as_their_boxes_are_there(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +17,6 @@ from ssad.bench.kinds import driving
 from ssad.bench.kinds.driving import (
     Driving,
     DrivingSuite,
-    make_pictures,
     suite_scenarios,
 )
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
@@ -245,60 +242,3 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     assert (tmp_path / path).read_text() == "collision"
     found = Driving().execute(cells, Job(tmp_path, "cpu", {"witness": False}))
     assert "witness" not in found[cells[0].key]
-
-
-def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    made = []
-
-    def sheets(street: Path, path: Path) -> None:
-        made.append(street.name)
-        path.write_text("")
-        path.with_name("shifts-severities.jpg").write_text("")
-
-    def recording(out: Path, towns: tuple[str, ...], *, scenes: int, seconds: float, width: int) -> Path:
-        assert len(towns) == scenes == 1
-        assert seconds >= 0.5, "shifts of motion need more than one frame"
-        assert width % 16 == 0
-        return out
-
-    def record(street: Path, *, workers: int) -> Path:
-        assert workers == 0, "in this process: a run has its own already"
-        return street
-
-    def save(path: Path, picture: str) -> None:
-        made.append(picture)
-        path.write_text("")
-
-    def told() -> Any:
-        return json.loads((tmp_path / "pictures" / "pictures.json").read_text())
-
-    trace = tmp_path / "traces" / "ab12.npz"
-    fakes: dict[str, dict[str, Any]] = {
-        "ssad.recording.nuscenes_recorder": {"Recording": recording, "record_nuscenes": record},
-        "ssad.toolbox.contact_sheet": {"write_sheets": sheets},
-        "ssad.recording.camera_sheets": {"write_gallery": lambda folder: {"camera-rig.jpg": f"In {folder.name}."}},
-        "ssad.recording.onboard": {
-            "pick_trace": lambda folder: trace, "onboard_sheet": lambda trace, graph: f"{trace.town} {graph}",
-        },
-    }  # fmt: skip
-    for name, contents in fakes.items():
-        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**contents))  # type: ignore[arg-type]
-    monkeypatch.setattr(driving, "save_picture", save)
-    monkeypatch.setattr(driving, "load_trace", lambda path: {trace: trace_of("route")}[path])
-    monkeypatch.setattr(driving, "load_graph", lambda path: path.relative_to(tmp_path).as_posix())
-    make_pictures([], tmp_path)
-    assert not list(tmp_path.iterdir()), "none are asked for"
-    for _ in range(2):
-        make_pictures(["shifts", "camera"], tmp_path)
-    assert made == ["street", "Nowhere towns/Nowhere.npz"]
-    captions = told()
-    assert set(captions) == {"shifts.jpg", "shifts-severities.jpg", "camera-rig.jpg", "camera.jpg"}
-    assert captions["camera-rig.jpg"] == "In pictures."
-    assert "(ab12)" in captions["camera.jpg"]
-    (tmp_path / "pictures" / "shifts-severities.jpg").unlink()
-    make_pictures(["shifts"], tmp_path)
-    assert made[2:] == ["street"], "what is gone is made again"
-    assert set(told()) == {"shifts.jpg", "shifts-severities.jpg"}
-    trace = None  # type: ignore[assignment]
-    make_pictures(["camera"], tmp_path)
-    assert set(told()) == {"camera-rig.jpg"}

@@ -10,13 +10,13 @@ import pytest
 
 from ssad.assets.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
 from ssad.assets.bodies import BODIES
-from ssad.bench.kinds.driving import make_pictures
 from ssad.camera.rig import RIG, rig_camera
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CLASSES as NUSCENES
 from ssad.recording.camera_sheets import SHOWN, class_sheet
 from ssad.recording.episode_scene import EpisodeScene, body_of, moments_of
 from ssad.recording.onboard import above, moments, onboard_sheet, pick_trace
+from ssad.recording.run_pictures import write_pictures
 from ssad.roads import load_town
 from ssad.world.models import MODELS
 from ssad.world.rollout import rollout
@@ -78,13 +78,13 @@ def test_an_episode_is_shown_from_the_ego_and_from_above() -> None:
 def test_a_run_without_recordings_has_no_such_picture(tmp_path: Path) -> None:
     (tmp_path / "results.jsonl").write_text("")
     assert pick_trace(tmp_path) is None
-    make_pictures([], tmp_path)
+    write_pictures([], tmp_path)
     assert not (tmp_path / "pictures").exists()
 
 
 @pytest.mark.slow
 def test_the_shifts_are_shown_on_a_recorded_street(tmp_path: Path) -> None:
-    make_pictures(["shifts"], tmp_path)
+    write_pictures(["shifts"], tmp_path)
     sheet = read_image(tmp_path / "pictures" / "shifts.jpg")
     tall, wide = sheet.shape[0] // 4, sheet.shape[1] // 3
     clean, *shifted = (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ssad.bench.kind import Replay, find_cell
 from ssad.bench.run import read_plan
@@ -28,3 +30,16 @@ def replay(folder: str | Path, name: str) -> Replay:
             f"{folder}: cell {cell.key} ({cell.name}) left no trace: {record['status']}, {record['reason']}"
         )
     return plan.kind.replay(plan, cell, record, Path(folder))
+
+
+def difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
+    """Where a result differs from the record, in words; None: nowhere."""
+    for part, value in result.items():
+        if isinstance(value, dict):
+            old = recorded.get(part, {})
+            for name in value:
+                if value[name] != old.get(name):
+                    return f"{part}: {name} is {value[name]}, was {old.get(name)}"
+        elif value != recorded.get(part):
+            return f"{part} is {value}, was {recorded.get(part)}"
+    return None

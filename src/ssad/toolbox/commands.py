@@ -14,8 +14,8 @@ from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
+from ssad.evaluation.contact_sheet import parse_box, write_sheets
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
-from ssad.toolbox.contact_sheet import parse_box, write_sheets
 from ssad.toolbox.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
 from ssad.toolbox.options import Options, Strength
 from ssad.toolbox.write import materialise

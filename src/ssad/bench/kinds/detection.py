@@ -16,6 +16,7 @@ from pydantic import Field
 from rich.console import Console
 
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase
+from ssad.bench.replay import difference
 from ssad.bench.run import hash_artefacts
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
@@ -194,7 +195,7 @@ class DetectorKind(Kind):
         examination = replace(examination, detectors=((system, dict(examination.detectors)[system]),))
         shown, _ = self.sheet(examination, plan.suite, cell)
         return Replay(
-            cell, _difference(record, result), picture=shown,
+            cell, difference(record, result), picture=shown,
             compared=f"{len(result['metrics'])} metrics, {same} of {len(files)} files of boxes the same to the bit",
         )  # fmt: skip
 
@@ -289,16 +290,3 @@ def _examination(job: Job) -> Examination:
         job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["seed"], job.device,
         own["threads"], own.get("calibration", "physical"), defended,
     )  # fmt: skip
-
-
-def _difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
-    """Where a result differs from the record, in words; None: nowhere."""
-    for part, value in result.items():
-        if isinstance(value, dict):
-            old = recorded.get(part, {})
-            for name in value:
-                if value[name] != old.get(name):
-                    return f"{part}: {name} is {value[name]}, was {old.get(name)}"
-        elif value != recorded.get(part):
-            return f"{part} is {value}, was {recorded.get(part)}"
-    return None

@@ -5,7 +5,6 @@ It also has what other kinds that drive scenarios need.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +16,7 @@ from pydantic import Field
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Replay, Resources, SuiteBase, check_distinct
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
-from ssad.core.images import save_picture
-from ssad.core.lane_graph import SignKind, load_graph, save_graph, town_file
+from ssad.core.lane_graph import SignKind, save_graph, town_file
 from ssad.core.safeio import plain
 from ssad.core.seeding import seed32
 from ssad.core.traces import first_difference, load_trace, motion_hash, save_trace, trace_hash
@@ -231,7 +229,9 @@ class Driving(ScenarioKind):
 
     def finish(self, plan: Plan, folder: Path) -> None:
         """The pictures that the suite asks for, made once beside its results."""
-        make_pictures(plan.suite.pictures, folder)
+        from ssad.recording.run_pictures import write_pictures
+
+        write_pictures(plan.suite.pictures, folder)
 
 
 def drive_record(cell: Cell, episode: Episode, trace: EpisodeTrace, folder: Path) -> dict[str, Any]:
@@ -286,36 +286,3 @@ def _check(cell: Cell) -> None:
     except SSADError as error:
         name = f"scenario {cell.spec['scenario']['name']}"
         raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None
-
-
-def make_pictures(names: Sequence[str], folder: Path) -> None:
-    """Make what is missing of DIR/pictures; pictures.json says what each shows.
-
-    Raises:
-        StoreError: A file cannot be written.
-    """
-    target, captions = folder / "pictures", {}
-    if "shifts" in names:
-        captions["shifts.jpg"] = "The 11 natural distribution shifts at severity 3, on a street of Larkhill."
-        captions["shifts-severities.jpg"] = "Each shift at severities 1 to 5."
-        if not all((target / name).is_file() for name in captions):
-            from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
-            from ssad.toolbox.contact_sheet import write_sheets
-
-            with tempfile.TemporaryDirectory() as temporary:
-                street = Recording(Path(temporary) / "street", ("Larkhill",), scenes=1, seconds=0.5, width=960)
-                write_sheets(record_nuscenes(street, workers=0), safeio.make_folder(target) / "shifts.jpg")
-    if "camera" in names:
-        from ssad.recording.camera_sheets import write_gallery
-        from ssad.recording.onboard import onboard_sheet, pick_trace
-
-        captions |= write_gallery(safeio.make_folder(target))
-        chosen = pick_trace(folder)
-        if chosen is not None:
-            captions["camera.jpg"] = f"An episode of this run ({chosen.stem}) from the ego's camera and from above."
-            if not (target / "camera.jpg").is_file():
-                trace = load_trace(chosen)
-                graph = load_graph(folder / "towns" / town_file(trace.town))
-                save_picture(target / "camera.jpg", onboard_sheet(trace, graph))
-    if captions:
-        safeio.write_atomic(target / "pictures.json", safeio.dump_json(captions, indent=1) + "\n")
