@@ -20,6 +20,7 @@ from rich.console import Console
 from ssad.core import safeio, schema
 from ssad.core.errors import ConfigError, SSADError
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.registry import label_of
 from ssad.core.seeding import digest
 from ssad.core.source import source_version
 from ssad.core.types import U8, EpisodeTrace
@@ -292,16 +293,29 @@ class Kind(ABC):
     def make_cell(
         self, name: str, system: str, seed: int, fields: Mapping[str, Any], spec: Mapping[str, Any], *inputs: object
     ) -> Cell:
-        """A cell with its key. inputs: versions of what it depends on besides the source and its own description."""
+        """A cell with its key. inputs: versions of what it depends on besides the source and its own description.
+
+        A system with a label (`ssad.core.registry.Reference`) is called by it in the cell's name and fields.
+        """
+        label = label_of(system)
+        if label != system:
+            name = name.replace(system, label, 1)
+            fields = {key: label if value == system else value for key, value in fields.items()}
         described = safeio.parse_json(safeio.dump_json({"fields": dict(fields), "spec": dict(spec)}))
         key = digest("cell", self.name, self.code, safeio.dump_json(described), system, seed, *inputs)
         return Cell(key[:16], name, system, seed, described["fields"], described["spec"])
 
 
 def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
-    """ConfigError: a name appears twice under a key of a suite."""
-    if len(set(names)) != len(names):
-        raise ConfigError(f"suite {suite.name}: {key}: a name appears twice")
+    """ConfigError: a name, or the label of two, appears twice under a key of a suite."""
+    called = [label_of(name) if isinstance(name, str) else name for name in names]
+    twice = next((name for name in called if called.count(name) > 1), None)
+    if twice is None:
+        return
+    told = f"'{twice}' appears twice" if isinstance(twice, str) else "a name appears twice"
+    if key == "systems":
+        told += f"; tell two of a name apart by a label, {twice}@first"
+    raise ConfigError(f"suite {suite.name}: {key}: {told}")
 
 
 def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
+from errno import ENOSPC
 from typing import Annotated, Any
 
 import typer
 
-from ssad.cli import data, exchange, running
+from ssad.cli import data, exchange, looking, running
 from ssad.core.errors import SSADError, unknown_name
 from ssad.core.version import __version__
 from ssad.interchange.commands import ExportGroup, register
@@ -51,7 +54,10 @@ def about(
     """SSAD: how safe and robust is an autonomous-driving system in safety-critical scenarios?"""
 
 
-for command in (running.run, running.report, running.compare, running.replay, data.shift, data.score, data.record):
+for command in (
+    running.run, running.report, running.compare, running.replay, looking.detect, looking.show, data.shift, data.score,
+    data.record,
+):  # fmt: skip
     app.command()(command)
 app.add_typer(train_app, name="train")
 
@@ -89,12 +95,29 @@ def doctor() -> None:
     raise typer.Exit(1 if broken else 0)
 
 
+def give_up_output() -> None:
+    """Let what is still to be printed go nowhere, so that the end of the process raises nothing."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def main() -> None:
     """Entry point: an error that the user can fix becomes one line and exit code 2."""
     # click's UsageError, which typer does not export
     usage_error: Any = typer.BadParameter.__mro__[1]
     try:
         code = app(standalone_mode=False)
+        sys.stdout.flush()
+    except (BrokenPipeError, SystemExit) as end:  # `ssad ... | head`: who reads has read enough
+        if isinstance(end, SystemExit) and type(sys.stdout).__name__ != "PacifyFlushWrapper":  # typer's, after EPIPE
+            raise
+        give_up_output()
+        sys.exit(141)  # as a program that the signal ends
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else "standard output: " if error.errno == ENOSPC else ""
+        give_up_output()
+        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
     except SSADError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -158,9 +158,9 @@ def record(
 ) -> None:
     """Record drives with the nuScenes sensors as a dataset in the nuScenes schema. To resume, repeat the command."""
     from rich.console import Console
-    from rich.progress import Progress
 
     from ssad.jobs.machine import pick_device
+    from ssad.jobs.progress import Live
     from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
 
     def names(text: str) -> tuple[str, ...]:
@@ -171,13 +171,8 @@ def record(
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             raise ConfigError(f"--{name} {'cannot be used' if clips is not None else 'can only be used'} with --clips")
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("record", total=None)
-
-        def progress(done: int, of: int) -> None:
-            bar.update(task, completed=done, total=of)
-
+    unit = "parts" if clips is not None else "scenes"
+    with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as live:
         if clips is not None:
             from ssad.recording.clip_recorder import record_clips
             from ssad.recording.clips import Clips, pair_images
@@ -188,13 +183,13 @@ def record(
                 out, pairs, names(held_out), clips, target=parse_target(target) if target else None, seed=seed,  # type: ignore[arg-type]
                 device=pick_device(device), streets=streets,
             )  # fmt: skip
-            record_clips(todo, workers=workers, ray=ray, progress=progress)
+            record_clips(todo, workers=workers, ray=ray, progress=live.show)
             text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"
         else:
             drives = Recording(
                 out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
                 seed=seed, device=pick_device(device), streets=streets,
             )  # fmt: skip
-            record_nuscenes(drives, workers=workers, ray=ray, progress=progress)
+            record_nuscenes(drives, workers=workers, ray=ray, progress=live.show)
             text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
     print(text)

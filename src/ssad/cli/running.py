@@ -34,6 +34,15 @@ def run(
     workers: Workers = None,
     ray: Ray = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed cells again.")] = False,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the resolved suite as YAML, and run nothing.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check all input, say what would run and how long it takes; run nothing.")
+    ] = False,
+    sample: Annotated[
+        int, typer.Option(min=0, help="With --dry-run: run so many cells of each system to measure time and disk.")
+    ] = 0,
 ) -> None:
     """Run a suite and write its report. To resume a stopped run, repeat the command.
 
@@ -45,8 +54,22 @@ def run(
     from ssad.report.terminal import summary
     from ssad.results import make_plan, run_plan
 
+    if sample and not dry_run:
+        raise ConfigError("--sample can only be used with --dry-run")
+    if print_config:
+        from ssad.bench.suite import load_suite
+        from ssad.core.safeio import dump_yaml
+
+        print(dump_yaml(load_suite(suite, settings or []).model_dump(mode="json")), end="")
+        return
     plan = make_plan(suite, settings or [], device=device)
     folder = out or Path("runs") / plan.suite.name
+    if dry_run:
+        from ssad.bench.forecast import forecast
+
+        for line in forecast(plan, folder, Resources(workers, ray, plan.device), sample=sample):
+            print(line)
+        return
     try:
         results = run_plan(plan, folder, Resources(workers, ray, plan.device), retry=retry)
     except KeyboardInterrupt:

@@ -1,21 +1,123 @@
 """Names to objects: a built-in table, entry points of other packages, or "module:object" typed by the user.
 
 A package offers objects of a kind through the entry-point group `ssad.<kind>s`, such as `ssad.systems`. Built-in names
-cannot be taken by a package.
+cannot be taken by a package. Where a system or a detector is named, arguments and a label may follow (`Reference`).
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
+import inspect
 import sys
 import traceback
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from ssad.core.errors import ConfigError, unknown_name
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a suite or a command says of a system or a detector: NAME, NAME?KEY=VALUE&KEY=VALUE, NAME@LABEL, or both.
+
+    Attributes:
+        name: A name that `resolve` understands; for some systems with a file behind a colon.
+        options: Arguments that it is called with.
+        label: What tables call it; "" if nothing was said.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    label: str
+
+    @staticmethod
+    def of(text: str) -> Reference:
+        """Read a reference.
+
+        Args:
+            text: Such as "mine:Mine?checkpoint=a.pt&reach=20@a": values are numbers, true, false or texts.
+
+        Raises:
+            ConfigError: An argument is not KEY=VALUE, or the label is empty.
+        """
+        whole, at, label = text.rpartition("@")
+        if not at or "/" in label:
+            whole, label = text, ""
+        elif not label or not whole:
+            raise ConfigError(f"'{text}': expected NAME@LABEL, such as mine:Mine@first")
+        name, _, told = whole.partition("?")
+        options: dict[str, Any] = {}
+        for part in told.split("&") if told else []:
+            key, equals, value = part.partition("=")
+            if not equals or not key.isidentifier() or key in options:
+                raise ConfigError(
+                    f"'{text}': expected arguments as in mine:Mine?checkpoint=a.pt&reach=20, not '{part}'"
+                )
+            options[key] = _value(value)
+        return Reference(name, options, label)
+
+
+def _value(text: str) -> Any:
+    """An argument's value: true, false, a number, or the text."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def label_of(text: str) -> str:
+    """What tables call a system: its label, or all that was said.
+
+    Args:
+        text: As `Reference.of` reads it.
+
+    Raises:
+        ConfigError: See there.
+    """
+    return Reference.of(text).label or text
+
+
+def split_weights(text: str) -> tuple[str, str]:
+    """A detector as a suite writes it, without its weights, and these.
+
+    Args:
+        text: NAME or NAME=FILE; what follows a ? are arguments, and no weights.
+
+    Returns:
+        Name with arguments and label; file, "" for none.
+    """
+    name, equals, file = text.partition("=")
+    return (name, file) if equals and "?" not in name else (text, "")
+
+
+def check_arguments(kind: str, text: str, found: Any) -> None:
+    """Check that what a reference names takes its arguments, without calling it.
+
+    Args:
+        kind: Singular noun for messages.
+        text: The reference.
+        found: What `resolve` found for it.
+
+    Raises:
+        ConfigError: It takes no such arguments.
+    """
+    options = Reference.of(text).options
+    if not options:
+        return
+    if not callable(found):
+        raise ConfigError(f"{kind} '{text}': it is an object, which takes no arguments; name its class instead")
+    try:
+        inspect.signature(found).bind(**options)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{kind} '{text}': {error}") from None
 
 
 def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:

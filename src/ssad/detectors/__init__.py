@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ssad.core.registry import names, resolve
+from ssad.core.registry import Reference, check_arguments, names, resolve
 
 DETECTORS: dict[str, str] = {
     "fcos3d-light": "ssad.detectors.builders:fcos3d_light",
@@ -32,7 +32,7 @@ def make_detector(
     """A detector by name, frozen and in eval mode on a device.
 
     Args:
-        name: Name of the detector.
+        name: Name of the detector; arguments for its builder may follow, as in "mine:make?checkpoint=a.pt".
         weights: None: the shipped ones if there are any, else fresh ones; "random": fresh ones from `seed`; else a file
             (see `ssad.core.checkpoints.load_weights`; darknet's .weights for YOLOv3).
         device: Where it is put.
@@ -44,7 +44,10 @@ def make_detector(
         ConfigError: The builder refuses an option.
         FormatError: The weights cannot be read, or do not fit.
     """
-    build = resolve("detector", DETECTORS, name)
+    reference = Reference.of(name)
+    build = resolve("detector", DETECTORS, reference.name)
+    check_arguments("detector", name, build)
+    name, options = reference.name, {**reference.options, **options}
     if name not in DETECTORS:
         made = build(**options) if callable(build) else build
         return made.to(device) if hasattr(made, "to") else made

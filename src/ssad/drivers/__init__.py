@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, cast
 
 from ssad.core.driving import Believer, Driver
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
+from ssad.core.registry import Reference, check_arguments, label_of, resolve
+from ssad.core.safeio import read_bytes
+from ssad.core.seeding import digest
 from ssad.core.types import Controller
 
 SYSTEMS: dict[str, str] = {
@@ -29,17 +34,19 @@ SYSTEMS: dict[str, str] = {
 LEARNED = ("ppo", "sac", "td3")
 """Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""
 
+LARGEST = 8 << 30
+"""Bytes of a file that an argument may name."""
+
 LEADERBOARD = "leaderboard"
 """leaderboard:FILE.py is an agent of the CARLA leaderboard."""
 
 
 def find_system(name: str) -> Any:
-    """The class or object behind a system's name, entry point or "module:object".
+    """The class or object behind a system's name, entry point or "module:object"; arguments and label are left out.
 
     Raises UnknownNameError; ConfigError if it does not import; FormatError for weights that cannot be used.
     """
-    from ssad.core.registry import resolve
-
+    text, name = name, Reference.of(name).name
     kind, _, weights = name.partition(":")
     if kind in LEARNED and weights:
         return resolve("system", SYSTEMS, kind)(weights)
@@ -47,30 +54,38 @@ def find_system(name: str) -> Any:
         from ssad.drivers.leaderboard import Leaderboard
 
         return Leaderboard(weights)
-    return resolve("system", SYSTEMS, name)
+    found = resolve("system", SYSTEMS, name)
+    check_arguments("system", text, found)
+    return found
 
 
 def weights_version(name: str) -> str:
-    """The hash of a learned system's weights, or of a leaderboard agent's file; "" for a system without any.
+    """The hash of a learned system's weights, of a leaderboard agent's file, or of the files that arguments name.
 
-    Raises FormatError for weights that cannot be used.
+    "" for a system without any. Raises FormatError for weights that cannot be used.
     """
+    reference = Reference.of(name)
+    files = [Path(value) for value in reference.options.values() if isinstance(value, str) and Path(value).is_file()]
+    if files:
+        return digest("files", *[hashlib.blake2b(read_bytes(file, limit=LARGEST)).hexdigest() for file in files])
+    name = reference.name
     return str(make_system(name).version) if name.partition(":")[0] in (*LEARNED, LEADERBOARD) else ""  # type: ignore[attr-defined]
 
 
 def make_system(name: str) -> Driver:
-    """A driving system by name, entry point or "module:object"; a class is called without arguments.
+    """A driving system by name, entry point or "module:object"; a class is called, with the arguments after a ?.
 
+    "mine:Mine?checkpoint=a.pt@first" is `Mine(checkpoint="a.pt")` of mine.py, and tables call it "first".
     Raises UnknownNameError, or ConfigError if the object is not a Driver.
     """
-    found = find_system(name)
-    system = found() if isinstance(found, type) else found
+    found, options = find_system(name), Reference.of(name).options
+    system = found(**options) if isinstance(found, type) or options else found
     controller = getattr(system, "controller", Controller.EXTERNAL)
     if not callable(getattr(system, "act", None)) or not callable(getattr(system, "reset", None)):
         raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(view); see README")
     if not isinstance(controller, Controller):
         raise ConfigError(f"system '{name}': controller must be a ssad.core.types.Controller, not {controller!r}")
-    return _Named(name, controller, cast(Driver, system))
+    return _Named(label_of(name), controller, cast(Driver, system))
 
 
 class _Named:

@@ -87,11 +87,11 @@ def tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, 
     canvas = cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA)
     intrinsic = np.asarray(frame.intrinsic, np.float64)
     if found.solid is None:
-        _draw_flat(canvas, truth.box, scale, colour=TRUE, width=1)
-        _draw_flat(canvas, found.box, scale, colour=FOUND, width=2)
+        draw_flat(canvas, truth.box, scale, colour=TRUE, width=1)
+        draw_flat(canvas, found.box, scale, colour=FOUND, width=2)
     else:
-        _draw(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
-        _draw(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
+        draw_solids(canvas, truth.solid, intrinsic, scale, colour=TRUE, width=1)
+        draw_solids(canvas, found.solid, intrinsic, scale, colour=FOUND, width=2)
     text = f"{title.replace('_', ' ')} ({KNOWN[title][0]})" if title in KNOWN else title
     title_on(canvas, text)
     return np.asarray(canvas)
@@ -103,13 +103,13 @@ def title_on(canvas: U8, text: str) -> None:
     cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
 
 
-def _draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[int, int, int], width: int) -> None:
+def draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[int, int, int], width: int) -> None:
     """2D boxes."""
     for box in np.rint(boxes.cpu().double().numpy() * scale * 8).astype(int).tolist():
         cv2.rectangle(canvas, tuple(box[:2]), tuple(box[2:]), colour, width, cv2.LINE_AA, 3)
 
 
-def _draw(
+def draw_solids(
     canvas: U8, solid: Solids | None, intrinsic: F64, scale: float, *, colour: tuple[int, int, int], width: int
 ) -> None:
     """Edges of boxes that lie before the camera."""

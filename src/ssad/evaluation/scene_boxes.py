@@ -150,7 +150,7 @@ class ShiftedScene:
 
 def detector_of(name: str, weights: str, device: str) -> Any:
     """A detector by name (what follows an @ is a label of the suite's own) and weights."""
-    return make_detector(name.partition("@")[0], weights=weights or None, device=device)
+    return make_detector(name, weights=weights or None, device=device)
 
 
 def boxes_path(folder: Path, detector: str, scene: Condition) -> Path:

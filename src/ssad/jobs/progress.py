@@ -52,7 +52,7 @@ class Live:
     def tick(self) -> None:
         """Show where things are."""
         if self.bar:
-            self.bar.update(self.task, completed=self.done, note=self.note())
+            self.bar.update(self.task, completed=self.done, total=self.total, note=self.note())
         elif time.monotonic() - self.said >= EVERY_S:
             self.said = time.monotonic()
             self.line()

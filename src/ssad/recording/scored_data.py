@@ -13,6 +13,7 @@ from ssad.core import safeio
 from ssad.core.checkpoints import state_hash
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.registry import Reference, split_weights
 from ssad.core.schema import Names, Schema
 from ssad.core.source import source_version
 from ssad.datasets.nuscenes.reader import NuScenes
@@ -74,18 +75,18 @@ def detectors_of(
     Raises:
         ConfigError: A detector appears twice, has no weights, or is not of the kind that is welcome.
     """
-    weights: dict[str, str] = Field(default={})
-    files: dict[str, str] = Field(default={})
-    tasks: dict[str, str] = Field(default={})
+    weights: dict[str, str] = {}
+    files: dict[str, str] = {}
+    tasks: dict[str, str] = {}
     for text in table.detectors if names is None else names:
-        name, _, file = text.partition("=")
+        name, file = split_weights(text)
         if name in files:
             raise ConfigError(
                 f"suite {table.name}: detectors: {name} appears twice; tell two of a kind apart by a label, "
                 f"{name}@mine=FILE"
             )
         path = str(Path(file).expanduser().resolve()) if file and file != "random" else file
-        kind = name.partition("@")[0]
+        kind = Reference.of(name).name
         if not path and kind in DETECTORS and not (SHIPPED / f"{kind}.json").is_file():
             raise ConfigError(
                 f"suite {table.name}: no weights of {kind} are shipped; give a file, {kind}=FILE "

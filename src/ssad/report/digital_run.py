@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from ssad.core.registry import split_weights
 from ssad.report.kinds.detection import cell_of, replicates_of, score_cell
 from ssad.report.load import Run
 from ssad.report.tables import Cell
@@ -74,19 +75,19 @@ class DigitalRun:
     @property
     def detectors(self) -> list[str]:
         """In the order of the suite."""
-        return [text.partition("=")[0] for text in self.suite["detectors"]]
+        return [split_weights(text)[0] for text in self.suite["detectors"]]
 
     @property
     def hardened(self) -> list[tuple[str, str]]:
         """Detectors of adversarially trained weights, and of each the one that its name begins with ("": none)."""
-        names = [text.partition("=")[0] for text in self.suite.get("hardened", [])]
+        names = [split_weights(text)[0] for text in self.suite.get("hardened", [])]
         ordinary = sorted(self.detectors, key=len, reverse=True)
         return [(name, next((one for one in ordinary if name.startswith(one)), "")) for name in names]
 
     @property
     def everyone(self) -> list[str]:
         """Those, and the detectors that take part in the transfer alone."""
-        others = [text.partition("=")[0] for text in self.suite.get("transfer_detectors", [])]
+        others = [split_weights(text)[0] for text in self.suite.get("transfer_detectors", [])]
         return [*self.detectors, *others]
 
     def flat(self, detector: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import rich.table
@@ -30,6 +31,9 @@ def summary(folder: Path | str) -> rich.table.Table:
     )  # fmt: skip
     for name in table.heads:
         result.add_column(name.lower(), no_wrap=True)
+    every = {head for row in table.rows for head in row.head}
+    bare = Counter(MODULE.sub("", head) for head in every)
+    shown = {head: short if bare[short := MODULE.sub("", head)] == 1 else head for head in ("", *every)}
     first, *others = table.columns
     for name in ("n", first, "", *others):
         result.add_column(name, justify="right", min_width=4)
@@ -41,7 +45,7 @@ def summary(folder: Path | str) -> rich.table.Table:
         average = row.head[0].startswith("Avg.")
         values = [str(one.n or ""), one.text, one.interval, *(cell.text for cell in rest)]
         result.add_row(
-            *(MODULE.sub("", head) for head in heads), *(escape(value) for value in values),
+            *(shown[head] for head in heads), *(escape(value) for value in values),
             style="bold" if average else None,
             end_section=after is not None and after.head[0].startswith("Avg.") and not average,
         )  # fmt: skip

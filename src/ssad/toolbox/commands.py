@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.splits import scenes_of_split
 from ssad.datasets.nuscenes.truth import GroundTruth
 from ssad.evaluation.contact_sheet import parse_box, write_sheets
+from ssad.jobs.progress import Live
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 from ssad.toolbox.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
 from ssad.toolbox.options import Options, Strength
@@ -98,18 +98,12 @@ def shift_folder(
                     f"{source}: version {version} has no scene of the split '{split}'; choose another --split"
                 )
     options = Options(source, out, version, shift_names(shifts), severities(severity), scenes=chosen, **settings)
-    columns = (TextColumn("shift"), BarColumn(), MofNCompleteColumn(), TextColumn("scenes"), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("shift", total=None)
-        try:
-            written = materialise(
-                options, workers=workers, ray=ray, progress=lambda n, of: bar.update(task, completed=n, total=of)
-            )
-        except KeyboardInterrupt:
-            bar.stop()
-            print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
-            return 130
+    try:
+        with Live("shift", 1, 0, console=Console(stderr=True), unit="scenes") as live:
+            written = materialise(options, workers=workers, ray=ray, progress=live.show)
+    except KeyboardInterrupt:
+        print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
+        return 130
     failed = 0
     for root in written:
         failed += root.failed

@@ -13,6 +13,7 @@ from ssad.bench.kind import Cell, Column, Job, Plan, Resources
 from ssad.bench.kinds.detection import DetectorKind, DetectorSuite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
+from ssad.core.registry import split_weights
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.scene import SceneData
 from ssad.evaluation.attack_record import attack_record
@@ -67,7 +68,7 @@ class Digital(DetectorKind):
         weights, detectors, tasks = detectors_of(suite, named, flat=True)
         if suite.transfer_detectors and not suite.transfer:
             raise ConfigError(f"suite {suite.name}: transfer_detectors take part in the transfer, and it is empty")
-        main, hard = ([text.partition("=")[0] for text in own] for own in (suite.detectors, suite.hardened))
+        main, hard = ([split_weights(text)[0] for text in own] for own in (suite.detectors, suite.hardened))
         data = data_of(suite)
         cells = []
         for detector in detectors:
@@ -142,7 +143,7 @@ class Digital(DetectorKind):
         """See `DetectorKind`."""
         defended = {
             system_name(detector, guard): [detector, guard.name, dict(guard.options)]
-            for detector in (text.partition("=")[0] for text in suite.detectors)
+            for detector in (split_weights(text)[0] for text in suite.detectors)
             for guard in dict.fromkeys(guard_of(suite, one) for one in suite.attacks if one.defence) if guard
         }  # fmt: skip
         return {"batch": suite.batch, "defended": defended}

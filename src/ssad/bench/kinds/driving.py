@@ -134,7 +134,7 @@ class DrivingSuite(ScenarioSuite):
     """One table: systems x scenarios x repetitions.
 
     Attributes:
-        systems: names, or module:object.
+        systems: names, or module:object; arguments and a label may follow, as in mine:Mine?checkpoint=a.pt@first.
         simulator: embedded, SSAD's own world; or carla://HOST:PORT, a CARLA server (docs/carla.md).
         repetitions: episodes of each pair; the first is the nominal case.
         spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:

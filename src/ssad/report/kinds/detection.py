@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ssad.core.errors import ConfigError
+from ssad.core.registry import split_weights
 from ssad.metrics import replicate_estimate
 from ssad.metrics.intervals import MIN_CLUSTERS
 from ssad.metrics.robustness import corruption_error, mean_resilience_rate, resilience_rate
@@ -49,7 +50,7 @@ class DetectionRun:
     @property
     def detectors(self) -> list[str]:
         """In the order of the suite."""
-        return [text.partition("=")[0] for text in self.suite["detectors"]]
+        return [split_weights(text)[0] for text in self.suite["detectors"]]
 
     @property
     def shifts(self) -> list[str]:

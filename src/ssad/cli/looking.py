@@ -1,0 +1,102 @@
+"""Commands to look at data with: detect and show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ssad.cli.options import Device
+from ssad.core.errors import ConfigError
+
+
+def detect(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="PICTURE...|DATAROOT", help="Image files, or one nuScenes folder."),
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Output folder.")],
+    detector: Annotated[
+        str | None,
+        typer.Option(
+            help="Name, or module:object (see: ssad list detectors).  [default: yolov5n; of a folder fcos3d-light]"
+        ),
+    ] = None,
+    weights: Annotated[Path | None, typer.Option(help="File of weights.  [default: the shipped ones]")] = None,
+    threshold: Annotated[float, typer.Option(min=0.0, max=1.0, help="Least score of a box that is drawn.")] = 0.3,
+    focal: Annotated[
+        float | None, typer.Option(min=1.0, help="3D detectors: focal length of PICTURE, pixels.  [default: assumed]")
+    ] = None,
+    version: Annotated[str | None, typer.Option(help="DATAROOT: version.  [default: the only one]")] = None,
+    split: Annotated[str | None, typer.Option(help="DATAROOT: only the scenes of this split.  [default: all]")] = None,
+    device: Device = "auto",
+) -> None:
+    """Find objects: boxes drawn into OUT/PICTURE.jpg, listed in OUT/detections.json; of a folder: OUT/results.json.
+
+    OUT/results.json is the results file of the official nuScenes detection task, which `ssad score` reads too.
+    """
+    from rich.console import Console
+
+    from ssad.detectors import make_detector
+    from ssad.evaluation.found import detect_dataset, detect_pictures, is_dataset
+    from ssad.jobs.machine import pick_device
+    from ssad.jobs.progress import Live
+
+    folders = [source for source in sources if is_dataset(source)]
+    if folders and len(sources) > 1:
+        raise ConfigError(f"{folders[0]}: give one nuScenes folder, or pictures, not both")
+    directory = next((source for source in sources if source.is_dir()), None)
+    if directory is not None and not folders:
+        raise ConfigError(
+            f"{directory}: no nuScenes folder (no VERSION/sample_data.json in it); name its pictures instead"
+        )
+    idle = {"--focal": focal} if folders else {"--version": version, "--split": split}
+    for name, value in idle.items():
+        if value is not None:
+            raise ConfigError(f"{name} cannot be used with {'a nuScenes folder' if folders else 'pictures'}")
+    where = pick_device(device)
+    made = make_detector(detector or ("fcos3d-light" if folders else "yolov5n"), weights=weights, device=where)
+    if not folders:
+        for one in detect_pictures(made, sources, out, threshold=threshold, focal=focal, device=where):
+            print(f"{one.path}: {one.count} boxes{''.join(f'; {note}' for note in one.notes)}")
+        print(f"boxes: {out / 'detections.json'}")
+        return
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.toolbox.manifest import manifest_digest, read_manifest
+
+    root = folders[0]
+    manifest = "clean" if read_manifest(root) is None else manifest_digest(root)
+    with (
+        NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as live
+    ):  # fmt: skip
+        path, samples, boxes = detect_dataset(
+            made, data, out, split=split, manifest=manifest, device=where, progress=live.show
+        )
+        version = data.version
+    print(f"{path}: {boxes} boxes in {samples} samples")
+    print(f"to score it: ssad score {path} --dataroot {root} --version {version} --split {split or 'SPLIT'}")
+
+
+def show(
+    root: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes or nuScenes-N folder.")],
+    out: Annotated[Path, typer.Argument(metavar="[OUT]", help="Folder for index.html and its pictures.")] = Path(
+        "show"
+    ),
+    version: Annotated[str | None, typer.Option(help="Version.  [default: the only one in DATAROOT]")] = None,
+    scenes: Annotated[str, typer.Option(help="Only these scenes, comma-separated.  [default: the first ten]")] = "",
+    samples: Annotated[int, typer.Option(min=1, help="Moments of each scene, spread over it.")] = 3,
+) -> None:
+    """Write a page to look at a data set: pictures with their boxes, and the LiDAR from above."""
+    from rich.console import Console
+
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.jobs.progress import Live
+    from ssad.toolbox.browse import check_scenes, write_page
+
+    names = [name.strip() for name in scenes.split(",") if name.strip()]
+    with NuScenes(root, version) as data:
+        check_scenes(data, names)
+        with Live("show", 1, 0, console=Console(stderr=True), unit="scenes") as live:
+            page = write_page(data, out, scenes=names, moments=samples, progress=live.show)
+    print(f"page: {page}")

@@ -1,0 +1,197 @@
+"""`ssad detect`, `ssad show`, `--print-config`, `--dry-run`, arguments and labels, and output that ends early."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.command import ssad
+from helpers.run_folder import driving_lines, write_run
+
+from ssad.core.detections import Detections, Solids
+from ssad.core.errors import ConfigError
+from ssad.core.images import read_image, save_picture
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.registry import Reference, label_of, split_weights
+
+MINE = """
+import numpy as np
+
+class Mine:
+    def __init__(self, *, checkpoint="", gain=1.0): self.gain = gain
+    def reset(self, episodes): ...
+    def act(self, view): return np.zeros((len(view.speed), 3), np.float32)
+
+class Finder:
+    name, task, classes = "finder", "2d", ("car",)
+    def __init__(self, *, side=20.0): self.side = side
+    def predict(self, images, intrinsic=None, *, threshold=None):
+        import torch
+        from ssad.core.detections import Detections
+        box = torch.tensor([[10.0, 10.0, 10.0 + self.side, 10.0 + self.side]])
+        return [Detections(torch.tensor([0.5]), torch.tensor([0]), box)] * len(images)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with systems and a detector of the user's, in a module of its own name."""
+    name = f"mine_{abs(hash(str(tmp_path)))}"
+    (tmp_path / f"{name}.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path / name
+
+
+def test_a_reference_has_a_name_arguments_and_a_label() -> None:
+    found = Reference.of("mine:Mine?checkpoint=runs/a.pt&reach=20&gain=1e-3&loud=true@first")
+    assert found.name == "mine:Mine"
+    assert found.options == {"checkpoint": "runs/a.pt", "reach": 20, "gain": 1e-3, "loud": True}
+    assert found.label == "first"
+    assert Reference.of("ppo:/home/a@b/x.safetensors").name == "ppo:/home/a@b/x.safetensors"
+    assert label_of("blind") == "blind"
+    assert split_weights("fcos3d@a=file=1.pth") == ("fcos3d@a", "file=1.pth")
+    assert split_weights("mine:make?checkpoint=a.pt") == ("mine:make?checkpoint=a.pt", "")
+    for wrong in ("mine:Mine?checkpoint", "mine:Mine?a=1&a=2", "mine:Mine@", "mine:Mine?1=2"):
+        with pytest.raises(ConfigError, match="expected"):
+            Reference.of(wrong)
+
+
+def test_arguments_make_another_system_and_the_content_of_their_files_counts(mine: Path) -> None:
+    from ssad.drivers import make_system
+    from ssad.recording.closed_loop import system_version
+
+    assert make_system(f"{mine.name}:Mine?gain=3@third").name == "third"
+    with pytest.raises(ConfigError, match="unexpected keyword argument 'gian'"):
+        make_system(f"{mine.name}:Mine?gian=3")
+    (mine.parent / "a.pt").write_text("one")
+    name = f"{mine.name}:Mine?checkpoint=a.pt"
+    before = system_version(name)
+    (mine.parent / "a.pt").write_text("two")
+    assert system_version(name) != before
+
+
+def test_print_config_is_a_suite_that_says_the_same(tmp_path: Path) -> None:
+    first = ssad("run", "precrash", "--set", "repetitions=2", "--print-config")
+    (tmp_path / "again.yaml").write_text(first.stdout)
+    assert "repetitions: 2" in first.stdout
+    assert ssad("run", tmp_path / "again.yaml", "--print-config").stdout == first.stdout
+
+
+def test_a_dry_run_counts_cells_by_label_and_takes_rates_from_runs_beside_it(mine: Path) -> None:
+    systems = f"systems=[{mine.name}:Mine?gain=1@one,{mine.name}:Mine?gain=2@two]"
+    words = ("run", "precrash", "--set", systems, "--set", "scenarios=[RightTurn]", "--dry-run")
+    done = ssad(*words)
+    assert "cells: 8, of which 0 are there already and 8 would run" in done.stdout
+    assert "  one: 4\n  two: 4\n" in done.stdout
+    assert "time: unknown" in done.stdout
+    assert "disk: unknown" in done.stdout
+    lines = [line | {"wall_s": 30.0} for line in driving_lines()]
+    header = {"suite": {"name": "s"}, "kind": "driving", "versions": {"device": "cpu"}}
+    write_run(mine.parent / "runs" / "old", header, lines)
+    told = ssad(*words, "--device", "cpu", "--workers", "2").stdout
+    assert "time: about 2 min with 2 workers (4 min of work), from earlier runs (old)" in told
+    assert "no such cell was measured for one, two: as the mean of the others" in told
+    assert sorted(os.listdir("runs")) == ["old"], "a dry run writes nothing"
+
+
+def test_two_systems_of_one_name_need_labels(mine: Path) -> None:
+    twice = ssad("run", "precrash", "--set", f"systems=[{mine.name}:Mine@a,{mine.name}:Mine?gain=2@a]", "--dry-run")
+    assert twice.returncode == 2
+    assert "tell two of a name apart by a label" in twice.stderr
+
+
+def test_detect_draws_boxes_and_lists_them(mine: Path) -> None:
+    street = np.full((120, 200, 3), 90, np.uint8)
+    save_picture(Path("street.png"), street)
+    done = ssad("detect", "street.png", "out", "--detector", f"{mine.name}:Finder?side=40", "--device", "cpu")
+    assert done.stdout == "out/street.jpg: 1 boxes\nboxes: out/detections.json\n"
+    assert json.loads(Path("out/detections.json").read_text()) == {
+        "street.png": [{"box": [10.0, 10.0, 50.0, 50.0], "class": "car", "score": 0.5}]
+    }
+    changed = np.abs(read_image("out/street.jpg").astype(int) - 90).max(-1) > 60
+    assert changed[48:53, 20:45].any(0).all(), "the lower edge of the box"
+    assert not changed[60:, 60:].any()
+    wrong = ssad("detect", "street.png", "out", "--split", "val")
+    assert (wrong.returncode, wrong.stderr) == (2, "error: --split cannot be used with pictures\n")
+    assert "no such file" in ssad("detect", "nowhere.png", "out").stderr
+
+
+class Ahead:
+    """Finds a parked car 10 m in front of each camera."""
+
+    name, task, classes = "ahead", "3d", MMDET3D_CLASSES
+
+    def predict(
+        self, images: torch.Tensor, intrinsic: torch.Tensor | None = None, *, threshold: float | None = None
+    ) -> list[Detections]:
+        place, size = torch.tensor([[0.0, 1.0, 10.0]]), torch.tensor([[4.0, 1.5, 1.8]])
+        solid = Solids(place, size, torch.zeros(1), torch.zeros(1, 2), torch.tensor([0]))
+        label = torch.tensor([self.classes.index("car")])
+        return [Detections(torch.tensor([0.5]), label, torch.zeros(1, 4), solid)] * len(images)
+
+
+def test_the_results_of_a_data_set_hold_what_was_found_at_its_place(tiny_set: Path, tmp_path: Path) -> None:
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.datasets.nuscenes.results import read_results
+    from ssad.evaluation.found import detect_dataset
+
+    with NuScenes(tiny_set) as data:
+        path, _, boxes = detect_dataset(Ahead(), data, tmp_path)  # type: ignore[arg-type]
+        scene = data.scene(data.scenes()[0].name)
+    found = read_results(path).boxes
+    front = next(f for f in scene.frames if f.channel == "CAM_FRONT" and f.key_frame)
+    there = front.ego_to_world @ front.sensor_to_ego @ np.array([0.0, 1.0, 10.0, 1.0])
+    assert boxes == len(found.label) > 0
+    assert np.abs(found.centre - there[:3]).sum(1).min() < 0.1
+
+
+@pytest.mark.slow
+def test_detect_on_a_data_set_writes_what_score_reads(tiny_set: Path, tmp_path: Path) -> None:
+    from ssad.datasets.nuscenes.reader import NuScenes
+    from ssad.datasets.nuscenes.results import read_results
+    from ssad.detectors import make_detector
+    from ssad.evaluation.found import detect_dataset
+
+    with NuScenes(tiny_set) as data:
+        path, samples, boxes = detect_dataset(make_detector("fcos3d-light"), data, tmp_path)
+        tokens = [sample.token for scene in data.scenes() for sample in data.scene(scene.name).samples]
+    found = read_results(path, tokens)
+    assert (samples, boxes) == (len(tokens), len(found.boxes.label))
+    assert found.meta["ssad_manifest"] == "clean"
+    flat = ssad("detect", tiny_set, tmp_path / "flat", "--detector", "yolov5n")
+    assert flat.returncode == 2
+    assert "take a 3D detector such as fcos3d-light" in flat.stderr
+
+
+def test_show_has_every_camera_and_the_lidar_of_each_moment(tiny_set: Path, tmp_path: Path) -> None:
+    done = ssad("show", tiny_set, tmp_path / "page", "--samples", "1")
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "page" / "index.html").read_text()
+    named = re.findall(r'src="(pictures/[^"]+)"', page)
+    assert len(named) == len(set(named)) == 2 * (page.count("<figcaption>CAM_") // 2 + 1)
+    assert all((tmp_path / "page" / name).is_file() for name in named)
+    above = read_image(next((tmp_path / "page").glob("pictures/*above.jpg")))
+    assert above.std() > 5, "points and boxes are drawn"
+    assert "no scene 'x'" in ssad("show", tiny_set, tmp_path / "other", "--scenes", "x").stderr
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_disk_and_a_reader_who_leaves_cost_no_traceback() -> None:
+    listing = [sys.executable, "-m", "ssad", "list", "shifts"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(listing, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, "error: standard output: No space left on device\n")
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as gone:
+        done = subprocess.run(listing, stdout=gone, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (141, "")
