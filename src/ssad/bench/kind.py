@@ -312,10 +312,8 @@ def check_distinct(suite: SuiteBase, key: str, names: Sequence[object]) -> None:
     twice = next((name for name in called if called.count(name) > 1), None)
     if twice is None:
         return
-    told = f"'{twice}' appears twice" if isinstance(twice, str) else "a name appears twice"
-    if key == "systems":
-        told += f"; tell two of a name apart by a label, {twice}@first"
-    raise ConfigError(f"suite {suite.name}: {key}: {told}")
+    hint = f" ('{twice}'); tell two of a name apart by a label, {twice}@first" if key == "systems" else ""
+    raise ConfigError(f"suite {suite.name}: {key}: a name appears twice{hint}")
 
 
 def grouped(cells: Sequence[Cell], chunk: int, *, workers: int, by: Callable[[Cell], Hashable]) -> list[list[Cell]]:
