@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.quick import others_slow
-from world.worlds import GRAPHS, ego, episode, line_route
+from world.worlds import GRAPHS, ego, episode, line_route, straight_graph
 
-from benchmarks.traffic import LENGTH, ROUTES, measure, town_routes, traffic, upper_limit
+from benchmarks.traffic import LENGTH, ROUTES, between_lanes, measure, town_routes, traffic, upper_limit
 from ssad.core.types import ENDS, Controller
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -113,3 +115,11 @@ def test_the_autopilot_gets_through_every_pre_crash_scenario() -> None:
     while not world.ended().all():
         world.step()
     assert [ENDS[end] for end in world.ended()] == ["complete"] * len(episodes)
+
+
+def test_a_gap_between_two_lanes_is_not_beside_the_road() -> None:
+    graph = straight_graph()
+    graph = replace(graph, width=graph.width - np.float32(0.02) * (graph.width > 3.0))
+    assert between_lanes(graph, {"x": 100.0, "y": 1.75, "yaw": 0.1})
+    assert not between_lanes(graph, {"x": 100.0, "y": 5.3, "yaw": 0.1})
+    assert not between_lanes(graph, {"x": 100.0, "y": 5.3, "yaw": 1.6})
