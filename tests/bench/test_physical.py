@@ -163,7 +163,7 @@ def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
     assert laser["loss_after"] >= laser["loss_before"]
     assert by_name["shadow", "light, noon"]["lumens"] is None
     assert by_name["random laser", "light, night"]["queries"] == 0
-    assert by_name["projector", "light, night"]["lumens"] <= 50.0
+    assert by_name["projector", "light, night, lumens 50.0"]["lumens"] <= 50.0
     assert "ASR_25" not in by_name["clean", "light, night"]["metrics"]
     kept = {path.name: path.read_bytes() for path in (tmp_path / "lights").glob("*.json")}
     plan.kind.finish(plan, tmp_path)
