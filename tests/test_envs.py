@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
+import cv2
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ssad.core.errors import UnknownNameError
+from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.envs import episodes_of, make_sb3
 
 ID = "ssad.envs:SSAD/Driving-v0"
@@ -48,6 +52,73 @@ def test_episodes_of_a_set_are_built_once() -> None:
     assert again[0] is first[1]
     assert graphs["ProvingGround"] is same["ProvingGround"]
     assert episodes_of("RightTurn", seed=1)[0][0] is not first[0]
+
+
+def test_a_picture_from_above_follows_the_ego() -> None:
+    from ssad.core.top_view import CRASH, EGO
+
+    env = gymnasium.make(ID, scenarios="StraightObstacle/00", render_mode="rgb_array", action="controls")
+    env.reset(seed=0)
+    first = env.render()
+    assert isinstance(first, np.ndarray)
+    assert (first.shape, first.dtype) == ((540, 960, 3), np.uint8)
+    assert (first[270, 480] == EGO).all(), "the ego is in the middle"
+    ended = False
+    while not ended:
+        *_, terminated, truncated, info = env.step(np.array([0.6, 0.0, 0.0], np.float32))
+        ended = terminated or truncated
+    last = env.render()
+    assert isinstance(last, np.ndarray)
+    assert (last != first).any(-1).mean() > 0.01
+    assert info["end"] == "collision"
+    assert (last == CRASH).all(-1).sum() > 50, "a collision is marked"
+    envs = gymnasium.make_vec(ID, num_envs=3, scenarios=["RightTurn/00", "LaneChanging"], render_mode="rgb_array")
+    envs.reset(seed=0)
+    pictures = envs.render()
+    assert pictures is not None
+    assert len(pictures) == 3
+    assert gymnasium.make(ID, scenarios="RightTurn/00").unwrapped.render() is None
+    with pytest.raises(ConfigError, match="unknown render_mode 'ascii'; known: rgb_array, human"):
+        gymnasium.make(ID, scenarios="RightTurn/00", disable_env_checker=True).unwrapped.__class__(
+            *episodes_of("RightTurn/00"), render_mode="ascii"
+        )
+
+
+def test_a_window_names_the_extra_that_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(ConfigError, match=r"needs pygame; .*--extra window"):
+        gymnasium.make(ID, scenarios="RightTurn/00", render_mode="human")
+
+
+@pytest.mark.slow
+def test_a_window_shows_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame = pytest.importorskip("pygame", reason="needs the extra window")
+    env = gymnasium.make(ID, scenarios="RightTurn/00", render_mode="human")
+    env.reset(seed=0)
+    env.step(np.zeros(2, np.float32))
+    assert pygame.display.get_surface().get_size() == (960, 540)
+    env.close()
+    assert not pygame.display.get_init()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_gymnasium_records_a_video(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="gymnasium writes videos with moviepy")
+    from gymnasium.wrappers import RecordVideo
+
+    made = gymnasium.make(ID, scenarios="RightTurn/00", render_mode="rgb_array", action="controls")
+    env = RecordVideo(made, str(tmp_path), name_prefix="drive")
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(np.array([0.5, 0.0, 0.0], np.float32))
+    env.close()
+    reader = cv2.VideoCapture(str(tmp_path / "drive-episode-0.mp4"))
+    found, picture = reader.read()
+    assert found
+    assert picture.shape == (540, 960, 3)
+    assert reader.get(cv2.CAP_PROP_FPS) == 10
 
 
 def test_stable_baselines3_trains_on_the_scenes_of_one_batch() -> None:

@@ -18,6 +18,7 @@ import pytest
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
+from ssad.core.lane_strips import thin
 from ssad.core.safeio import plain
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
@@ -26,7 +27,6 @@ from ssad.report import write_report, write_video
 from ssad.report.driving_tables import precrash_table
 from ssad.report.embed import SCALE, episode_data, origin, pack
 from ssad.report.episodes import load_episodes
-from ssad.report.lanes import thin
 from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
 from ssad.report.tables import tex, to_csv, to_latex, to_markdown

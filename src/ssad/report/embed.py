@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_strips import LAYERS, junction_areas, strips, thin
 from ssad.core.types import EpisodeTrace, LaneType
-from ssad.report.lanes import LAYERS, junction_areas, strips, thin
 
 SCALE = 0.03  # m
 SPEED = 0.01  # m/s

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_strips import strips
 from ssad.core.types import F64, U8, EpisodeTrace
-from ssad.report.lanes import strips
 
 GROUND, ROAD, SIDE, MARK = (236, 240, 238), (196, 199, 203), (221, 222, 224), (255, 255, 255)
 EGO, ADVERSARY, OTHER, DARK = (39, 106, 201), (205, 55, 47), (120, 126, 134), (40, 44, 48)

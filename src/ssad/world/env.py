@@ -17,6 +17,7 @@ from ssad.core.types import ENDS, Controller, End, Episode
 from ssad.world.policy import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import REWARDS, Reward
 from ssad.world.rollout import Drivers, Loop
+from ssad.world.scene_view import SceneViews, Window
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 
@@ -63,7 +64,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     Terminated by collision or completion, truncated by the episode's limits. `info["end"]` names why.
     """
 
-    metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+    metadata = {  # noqa: RUF012
+        "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 10,
+    }  # fmt: skip
 
     def __init__(
         self,
@@ -78,8 +81,12 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         policies: Policies | None = None,
         device: str = "cpu",
         restart: bool = True,
+        render_mode: str | None = None,
     ) -> None:
         super().__init__()
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"unknown render_mode '{render_mode}'; known: {', '.join(self.metadata['render_modes'])}")
+        self.render_mode = render_mode
         if num_envs < 1:
             raise ConfigError(f"num_envs must be at least 1, not {num_envs}")
         self.num_envs = num_envs
@@ -101,6 +108,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._loop = Loop(self.world, drivers or {}, policies=policies)
         self._egos = np.stack([np.arange(num_envs), np.zeros(num_envs)], 1).astype(np.int32)
         self._controls = np.zeros((num_envs, self.world.agents, 3), np.float32)
+        self.views = SceneViews(self.world)
+
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
+        """Each scene from above, RGB uint8 [540, 960, 3], with `render_mode="rgb_array"`."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.views.draw(b) for b in range(self.num_envs))
 
     def _observe(self) -> npt.NDArray[np.float32]:
         rows: npt.NDArray[np.float32] = self._sensor(self.world, self._egos)
@@ -157,11 +171,26 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 class SingleEnv(gym.Env[Any, Any]):
-    """One scene of the same world; reset draws the episode from its seeded generator. Options as `VectorEnv`."""
+    """One scene of the same world; reset draws the episode from its seeded generator. Options as `VectorEnv`.
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    With `render_mode` "rgb_array" `render` returns the scene from above, [540, 960, 3]; with "human" each step shows it
+    in a window, which needs the extra `window`.
+    """
 
-    def __init__(self, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], **options: Any) -> None:
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        graphs: Mapping[str, LaneGraph],
+        *,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"unknown render_mode '{render_mode}'; known: {', '.join(self.metadata['render_modes'])}")
+        self.render_mode = render_mode
+        self._window = Window(self.metadata["render_fps"]) if render_mode == "human" else None
         self._many = VectorEnv(episodes, graphs, 1, restart=False, **options)
         self.world = self._many.world
         self.observation_space = self._many.single_observation_space
@@ -175,6 +204,7 @@ class SingleEnv(gym.Env[Any, Any]):
         chosen = (options or {}).get("episode")
         k = int(self.np_random.integers(len(self.world.episodes))) if chosen is None else int(chosen)
         observation, _ = self._many.reset(options={"episodes": [k]})
+        self._show()
         return observation[0], {"episode": k}
 
     def step(
@@ -183,4 +213,18 @@ class SingleEnv(gym.Env[Any, Any]):
         """One step of 0.1 s."""
         observation, reward, terminated, truncated, info = self._many.step(np.asarray(action)[None])
         about = {"end": info["end"][0]} if "end" in info else {}
+        self._show()
         return observation[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), about
+
+    def _show(self) -> None:
+        if self._window is not None:
+            self._window.show(self._many.views.draw(0))
+
+    def render(self) -> Any:
+        """The scene from above, RGB uint8 [540, 960, 3]; None where a window shows it, or nothing was asked for."""
+        return self._many.views.draw(0) if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()

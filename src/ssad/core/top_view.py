@@ -1,0 +1,151 @@
+"""An episode from above, step by step: what videos, environments and windows show, in the colours of the replay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.geometry import corners
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.lane_strips import LAYERS, junction_areas, strips
+from ssad.core.types import AgentKind, Bool, LaneType
+
+Frame = npt.NDArray[np.uint8]
+GROUND, ROAD, WALK, EDGE = (231, 236, 226), (82, 86, 96), (196, 198, 194), (236, 236, 236)
+EGO, CRASH, ROUTE = (37, 99, 235), (220, 38, 38), (96, 165, 250)
+BODY = {
+    AgentKind.WALKER: (219, 39, 119),
+    AgentKind.BICYCLE: (5, 150, 105),
+    AgentKind.MOTORCYCLE: (5, 150, 105),
+    AgentKind.PROP: (120, 113, 108),
+}
+OTHER = (234, 138, 30)
+LAMP = {1: (220, 38, 38), 2: (234, 179, 8), 3: (34, 197, 94)}
+_SHIFT = 4  # OpenCV draws at 1/16 pixel
+
+
+class _Canvas:
+    """World metres to pixels around a moving centre; colours are RGB."""
+
+    def __init__(self, size: tuple[int, int], scale: float, centre: tuple[float, float]) -> None:
+        self.image: Frame = np.full((size[1], size[0], 3), GROUND, np.uint8)
+        self.size, self.scale, self.centre = size, scale, centre
+
+    def points(self, xy: npt.ArrayLike) -> npt.NDArray[np.int32]:
+        p = (np.asarray(xy, np.float64) - self.centre) * (self.scale, -self.scale)
+        p += (self.size[0] / 2, self.size[1] / 2)
+        return np.round(p * (1 << _SHIFT)).astype(np.int32)
+
+    def fill(self, xy: npt.ArrayLike, colour: tuple[int, int, int]) -> None:
+        cv2.fillPoly(self.image, [self.points(xy)], colour, cv2.LINE_AA, _SHIFT)
+
+    def line(self, xy: npt.ArrayLike, colour: tuple[int, int, int], width: int, closed: bool = False) -> None:
+        cv2.polylines(self.image, [self.points(xy)], closed, colour, width, cv2.LINE_AA, _SHIFT)
+
+    def disc(self, x: float, y: float, radius: float, colour: tuple[int, int, int], width: int = -1) -> None:
+        px, py = self.points([[x, y]])[0]
+        cv2.circle(
+            self.image,
+            (int(px), int(py)),
+            round(radius * self.scale * (1 << _SHIFT)),
+            colour,
+            width,
+            cv2.LINE_AA,
+            _SHIFT,
+        )
+
+    def text(self, place: tuple[int, int], words: str, size: float = 0.5) -> None:
+        for colour, width in (((255, 255, 255), 4), ((30, 41, 59), 1)):
+            cv2.putText(self.image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What there is to draw at one time; agent 0 is the ego.
+
+    Attributes:
+        pose: [A, 3] x, y (m) and yaw (rad) of the middle of the bodies.
+        size: [A, 2] length and width, m.
+        kind: [A] `ssad.core.types.AgentKind`.
+        active: [A] whether somebody is there.
+        route: The ego's route [N, 2], m.
+        past: Where the ego was lately [N, 2], m.
+        lamps: x, y (m) and `ssad.core.types.SignalState` of traffic lights.
+        hit: Steps since the ego's first contact; None: there was none.
+        words: Lines in the upper left corner.
+    """
+
+    pose: npt.NDArray[np.floating]
+    size: npt.NDArray[np.floating]
+    kind: npt.NDArray[np.integer]
+    active: Bool
+    route: npt.NDArray[np.floating]
+    past: npt.NDArray[np.floating]
+    lamps: Sequence[tuple[float, float, int]] = ()
+    hit: int | None = None
+    words: Sequence[str] = ()
+
+
+class TopView:
+    """Draws moments on a town; the roads are prepared once.
+
+    Args:
+        graph: The town.
+        size: Width and height of a frame, pixels.
+        across: Width of what a frame shows, m.
+    """
+
+    def __init__(self, graph: LaneGraph, *, size: tuple[int, int] = (960, 540), across: float = 90.0) -> None:
+        self.lanes = strips(graph)
+        self.areas = junction_areas(graph, self.lanes)
+        self.size, self.scale = size, size[0] / across
+
+    def draw(self, moment: Moment) -> Frame:
+        """RGB [H, W, 3] around the ego, north up."""
+        centre = (float(moment.pose[0, 0]), float(moment.pose[0, 1]))
+        canvas = _Canvas(self.size, self.scale, centre)
+        reach = 0.6 * max(self.size) / self.scale
+        for area in self.areas:
+            canvas.fill(area, ROAD)
+        for lane in self.lanes:
+            ring = lane.ring
+            low, high = ring.min(axis=0), ring.max(axis=0)
+            if (low > np.add(centre, reach)).any() or (high < np.subtract(centre, reach)).any():
+                continue
+            canvas.fill(ring, WALK if lane.layer == 0 else ROAD)
+            if lane.layer == LAYERS[LaneType.DRIVING] and not lane.junction:
+                canvas.line(lane.left, EDGE, 1)
+                canvas.line(lane.right, EDGE, 1)
+        if len(moment.route) > 1:
+            canvas.line(moment.route, ROUTE, 2)
+        for x, y, state in moment.lamps:
+            if state in LAMP:
+                canvas.disc(x, y, 0.9, (30, 30, 30))
+                canvas.disc(x, y, 0.65, LAMP[state])
+        for agent in reversed(range(len(moment.kind))):
+            if moment.active[agent]:
+                _agent(canvas, moment, agent)
+        if moment.hit is not None:
+            canvas.disc(*centre, 4.0 + 0.3 * min(moment.hit, 6), CRASH, 3)
+        for line, words in enumerate(moment.words):
+            canvas.text((14, 28 + 28 * line), words, 0.6)
+        return canvas.image
+
+
+def _agent(canvas: _Canvas, moment: Moment, agent: int) -> None:
+    kind = AgentKind(int(moment.kind[agent]))
+    x, y, yaw = (float(v) for v in moment.pose[agent])
+    length, width = (float(v) for v in moment.size[agent])
+    if agent == 0 and len(moment.past) > 1:
+        canvas.line(moment.past, EGO, 3)
+    body = corners(x, y, yaw, length, width)
+    canvas.fill(body, EGO if agent == 0 else BODY.get(kind, OTHER))
+    canvas.line(body, (255, 255, 255), 1, closed=True)
+    if kind not in (AgentKind.WALKER, AgentKind.PROP):
+        ahead = 0.28 * length
+        tip = corners(x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), yaw, 0.12 * length, 0.8 * width)
+        canvas.fill(tip, (226, 232, 240))

@@ -1,0 +1,75 @@
+"""Scenes of a world as pictures from above, and a window that shows them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ssad.core.errors import ConfigError, install_extra
+from ssad.core.top_view import Moment, TopView
+from ssad.core.types import U8
+from ssad.world.world import World
+
+NEAR = 80.0  # m around the ego in which traffic lights are drawn
+
+
+class SceneViews:
+    """Draws scenes of a world as they are now; a town's roads are prepared when it is first drawn."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self._towns: dict[str, TopView] = {}
+
+    def draw(self, scene: int) -> U8:
+        """A scene from above, RGB [540, 960, 3]."""
+        state = self.world.state()
+        episode = self.world.episodes[int(self.world.assigned[scene])]
+        graph = self.world.graphs[episode.town]
+        if episode.town not in self._towns:
+            self._towns[episode.town] = TopView(graph)
+        pose = np.asarray(state.pose[scene], np.float64)
+        first, count = (int(v) for v in state.route[scene, 0])
+        states = state.signal[scene]
+        close = np.flatnonzero(np.hypot(*(graph.signal_xy - pose[0, :2]).T) < NEAR) if len(graph.signal_xy) else []
+        lamps = [(*map(float, graph.signal_xy[s]), int(states[s])) for s in close]
+        time, share = float(state.time[scene]), float(state.route_complete[scene])
+        return self._towns[episode.town].draw(
+            Moment(
+                pose, state.size[scene], state.kind[scene], state.active[scene],
+                state.roads.path[first : first + count, :2], np.zeros((0, 2)), lamps,  # type: ignore[arg-type]
+                hit=6 if state.contact[scene] else None,
+                words=[f"{time:5.1f} s   {float(state.speed[scene, 0]):5.1f} m/s   route {share:3.0f} %"],
+            )
+        )  # fmt: skip
+
+
+class Window:
+    """A window of pygame (the extra `window`), opened with the first picture."""
+
+    def __init__(self, rate: float) -> None:
+        try:
+            import pygame
+        except ImportError:
+            raise ConfigError(f'render_mode="human" needs pygame; {install_extra("window")}') from None
+        self._pygame: Any = pygame
+        self._surface: Any = None
+        self._rate = rate
+
+    def show(self, picture: U8) -> None:
+        """Show a picture, RGB [H, W, 3], no sooner than the rate allows."""
+        if self._surface is None:
+            self._pygame.init()
+            self._surface = self._pygame.display.set_mode(picture.shape[1::-1])
+            self._pygame.display.set_caption("SSAD")
+            self._clock = self._pygame.time.Clock()
+        self._pygame.event.pump()
+        self._surface.blit(self._pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
+        self._pygame.display.flip()
+        self._clock.tick(self._rate)
+
+    def close(self) -> None:
+        """Close it."""
+        if self._surface is not None:
+            self._pygame.display.quit()
+            self._surface = None
