@@ -31,7 +31,7 @@ class SceneViews:
         pose = np.asarray(state.pose[scene], np.float64)
         first, count = (int(v) for v in state.route[scene, 0])
         states = state.signal[scene]
-        close = np.flatnonzero(np.hypot(*(graph.signal_xy - pose[0, :2]).T) < NEAR) if len(graph.signal_xy) else []
+        close = np.flatnonzero(np.linalg.norm(graph.signal_xy.reshape(-1, 2) - pose[0, :2], axis=1) < NEAR)
         lamps = [(*map(float, graph.signal_xy[s]), int(states[s])) for s in close]
         time, share = float(state.time[scene]), float(state.route_complete[scene])
         return self._towns[episode.town].draw(
