@@ -65,7 +65,7 @@ def run(
     plan = make_plan(suite, settings or [], device=device)
     folder = out or Path("runs") / plan.suite.name
     if dry_run:
-        from ssad.bench.forecast import forecast
+        from ssad.cli.forecast import forecast
 
         for line in forecast(plan, folder, Resources(workers, ray, plan.device), sample=sample):
             print(line)

@@ -142,16 +142,13 @@ class DetectorKind(Kind):
         """Boxes of one scene under one condition."""
         find_boxes(_examination(job), self.condition(data), systems)
 
-    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+    def result(self, cell: Cell, job: Job) -> dict[str, Any]:
         """Scores of a cell; boxes that could not be found together with others are looked for alone."""
-        examination, results = _examination(job), {}
-        for cell in cells:
-            scenes = self.scenes(cell, job)
-            for one in scenes:
-                find_boxes(examination, one, [cell.system])
-            folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
-            results[cell.key] = self.score(examination, cell, scenes, job) | {"artefacts": {"detections": folders}}
-        return results
+        examination, scenes = _examination(job), self.scenes(cell, job)
+        for one in scenes:
+            find_boxes(examination, one, [cell.system])
+        folders = sorted({str(boxes_path(Path(), cell.system, one).parent) for one in scenes})
+        return self.score(examination, cell, scenes, job) | {"artefacts": {"detections": folders}}
 
     def score(self, examination: Examination, cell: Cell, scenes: Sequence[Condition], job: Job) -> dict[str, Any]:
         """The record of a cell whose boxes are there."""
@@ -186,7 +183,7 @@ class DetectorKind(Kind):
         with tempfile.TemporaryDirectory() as temporary:
             job = Job(Path(temporary), plan.device, settings)
             self.start(job)
-            result = safeio.parse_json(safeio.dump_json(dict(self.execute([cell], job)[cell.key])))
+            result = safeio.parse_json(safeio.dump_json(self.result(cell, job)))
             files = hash_artefacts(job.folder, result["artefacts"]["detections"])
         # last digits of boxes were seen to differ (the number of threads may be why); those of metrics are rounded
         same = sum(record["hashes"].get(name) == value for name, value in files.items())

@@ -136,12 +136,8 @@ class Physical(Kind):
         else:
             attacks_of(job).texture(TextureSpec.of_row(data))
 
-    def execute(self, cells: Sequence[Cell], job: Job) -> Mapping[str, Mapping[str, Any]]:
-        """Scores in the town of the test."""
-        return {cell.key: self._score(cell, job) for cell in cells}
-
-    def _score(self, cell: Cell, job: Job) -> dict[str, Any]:
-        """Scores of a cell. CellError: the detector does not find the clean car."""
+    def result(self, cell: Cell, job: Job) -> dict[str, Any]:
+        """Scores in the town of the test. CellError: the detector does not find the clean car."""
         attacks, settings, detector = attacks_of(job), job.settings, cell.system
         light, grid, floor = cell.spec.get("light"), cell.fields["view"] == GRID, settings["floor"]
         draws = {"replicates": settings["replicates"], "seed": settings["seed"]}

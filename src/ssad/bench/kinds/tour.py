@@ -98,9 +98,9 @@ class Tour(Kind):
                 safeio.write_atomic(place / TROUBLE, str(error))
         return {}
 
-    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
-        """Counts what the parts have done."""
-        return {cell.key: counted(job.folder, cell.system) for cell in cells}
+    def result(self, cell: Cell, job: Job) -> dict[str, Any]:
+        """Counts what the part has done."""
+        return counted(job.folder, cell.system)
 
 
 def counted(folder: Path, name: str) -> dict[str, Any]:
