@@ -116,6 +116,62 @@ def speed() -> list[str]:
     return [*lines, ""]
 
 
+def patch() -> list[str]:
+    """What limits an adversarial patch."""
+    rows = json.loads((RESULTS / "physical_patch.json").read_text())
+    lines = [
+        "## What limits a patch", "",
+        "`python benchmarks/physical_patch.py`: Adv. Patch on the rear against YOLOv5n, trained on "
+        f"{rows[0]['pictures']} pictures of Twinford for {rows[0]['epochs']} epochs, with one thing after the other "
+        "made easier for it. Own: in the pictures of its training, the most that it can reach; test: in as many of "
+        "Oldmarket, both printed exactly. AP50 and mean score of the target, and the share of its box that "
+        "the patch covers, in percent.", "",
+        "| Adv. Patch | Covers | Own AP50 | Own score | Test AP50 | Test score | Random patch, score |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    columns = [
+        ("own", "AP50"),
+        ("own", "confidence"),
+        ("test", "AP50"),
+        ("test", "confidence"),
+        ("random", "confidence"),
+    ]
+    for row in rows:
+        values = [row["covers"], *(row.get(group, {}).get(metric) for group, metric in columns)]
+        lines.append(f"| {' | '.join([row['about'], *map(percent, values)])} |")
+    return [*lines, ""]
+
+
+def light() -> list[str]:
+    """What light attacks have to work with."""
+    found = json.loads((RESULTS / "physical_lights.json").read_text())
+    rows = found["rows"]
+    lines = [
+        "## What lights have to work with", "",
+        f"`python benchmarks/physical_lights.py`: {rows[0]['pictures']} pictures of {rows[0]['drives']} drives in "
+        "Oldmarket. Sunlit: pictures in which the sun gives a fifth of the light on the target's rear or more, in the "
+        "others a shadow there cannot be seen; no sun: all of it kept off the whole target, which no card can do; "
+        "flooded: a white lamp of 3000 lm, 4 m behind, on the whole rear. AP50 and mean score of YOLOv5n in percent.",
+        "",
+        "| Hour | Sunlit | Light on the rear, lux | Clean AP50 | Clean score | No sun, AP50 | No sun, score "
+        "| Flooded, AP50 | Flooded, score |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for row in rows:
+        values = [row.get(group, {}).get(metric) for group in ("clean", "no_sun", "flooded")
+                  for metric in ("AP50", "confidence")]  # fmt: skip
+        lines.append(
+            f"| {row['hour']} | {percent(row['sunlit'])} | {row['lux']:.0f} | {' | '.join(map(percent, values))} |"
+        )
+    spans = " and ".join(f"a {name} {low:.0f} to {high:.0f}" for name, (low, high) in found["lux"].items())
+    return [*lines, "", f"At full power {spans} lux on what it lights, by how far it is spread.", ""]
+
+
+def percent(value: float | None) -> str:
+    """A share in percent, or n/a."""
+    return "n/a" if value is None else f"{100 * value:.1f}"
+
+
 def page() -> str:
     """The page."""
     lines = [
@@ -125,7 +181,7 @@ def page() -> str:
     ]  # fmt: skip
     for name in SUITES:
         lines += part(name)
-    return "\n".join(lines + speed())
+    return "\n".join(lines + patch() + light() + speed())
 
 
 if __name__ == "__main__":

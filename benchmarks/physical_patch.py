@@ -4,8 +4,8 @@ Adv. Patch is trained against YOLOv5n on pictures of Twinford and shown in Oldma
 is, with one thing after the other made easier for the attack (no changes of print and place, no regularisers, colours
 that nothing can have, more epochs, other rates, whole pictures, one picture alone), and on more of the rear. `own` is
 the score in the pictures that it was trained on, printed exactly: the most that a variant can reach. A row is added to
-benchmarks/results/physical_patch.json and the table in docs/physical_patch.md is made of all rows; --page makes the
-table alone. Pictures are recorded once, in the folder --home.
+benchmarks/results/physical_patch.json, of which benchmarks/physical_page.py makes a table; --join adds the rows of
+other files. Pictures are recorded once, in the folder --home.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ from ssad.scenarios.static.physical.inks import printable_colours
 from ssad.scenarios.static.physical.printing import NOMINAL
 
 RESULTS = Path(__file__).parent / "results" / "physical_patch.json"
-PAGE = Path(__file__).parents[1] / "docs" / "physical_patch.md"
 WINDOW, EPOCHS, BATCH = 192, 30, 16
 FREE = {"expectation": NOMINAL, "smooth": 0.0, "printed": 0.0}  # nothing but the detector's loss
 METRICS = ("AP50", "found_25", "confidence")
@@ -95,6 +94,7 @@ VARIANTS = {
     "rear-any-colour": Variant("the whole rear, any albedo, exact", 1.9, 0.86, settings=FREE, shown=any_light),
     "rear-slower": Variant("the whole rear, rate 0.01, four times the epochs", 1.9, 0.86, {"rate": 0.01}, longer=4),
 }  # fmt: skip
+ORDER = {name: number for number, name in enumerate(VARIANTS)}
 
 
 def clips(home: Path, town: str, count: int, classes: tuple[str, ...], device: str) -> TargetClips:
@@ -135,7 +135,8 @@ def measure(name: str, *, count: int, epochs: int, home: Path, device: str) -> d
         own = [train([view]) for _, view in views]
     else:
         own = [train([view for _, view in views])] * len(views)
-    pixels = [len(torch.unique(view.picture.taps[0].pixel)) for _, view in views]
+    worn: list[Any] = [view.picture for _, view in views]
+    pixels = [len(torch.unique(picture.taps[0].pixel)) for picture in worn]
     boxes = [view.truth.box[0] for _, view in views]
     area = [float((box[2] - box[0]) * (box[3] - box[1])) for box in boxes]
     found: dict[str, Any] = {
@@ -156,35 +157,8 @@ def measure(name: str, *, count: int, epochs: int, home: Path, device: str) -> d
     return found
 
 
-def page(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of all rows."""
-    order = {name: k for k, name in enumerate(VARIANTS)}
-    first = rows[0]
-    lines = [
-        "# What limits a patch", "",
-        "`benchmarks/physical_patch.py` makes this page: Adv. Patch on the rear against YOLOv5n, trained on "
-        f"{first['pictures']} pictures in Twinford for {first['epochs']} epochs, and one thing after the other made "
-        "easier for it. *Own*: in the pictures of its training, printed exactly; *test*: in as many of Oldmarket. "
-        "*Covers*: its share of the target's box. AP50 and mean score of the target in percent.", "",
-        "| Adv. Patch | Covers | Own AP50 | Own score | Test AP50 | Test score | Random patch, score |",
-        "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
-
-    def cell(row: dict[str, Any], group: str, metric: str) -> str:
-        value = row.get(group, {}).get(metric)
-        return "n/a" if value is None else f"{100 * value:.1f}"
-
-    for row in sorted(rows, key=lambda one: order.get(one["name"], len(order))):
-        wanted = (
-            ("own", "AP50"), ("own", "confidence"), ("test", "AP50"), ("test", "confidence"), ("random", "confidence"),
-        )  # fmt: skip
-        covers = f"{100 * row['covers']:.0f} %"
-        lines.append(f"| {' | '.join([row['about'], covers, *(cell(row, *one) for one in wanted)])} |")
-    return "\n".join([*lines, ""])
-
-
 def main() -> None:
-    """Measure, and add the rows."""
+    """Measure, or join, and add the rows."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("names", nargs="*", default=[], metavar="NAME", help=", ".join(VARIANTS))
     parser.add_argument("--count", type=int, default=25, help="pictures of each town")
@@ -192,18 +166,24 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--home", type=Path, default=Path("runs/physical-patch"))
     parser.add_argument("--out", type=Path, default=RESULTS)
-    parser.add_argument("--page", action="store_true")
+    parser.add_argument("--join", type=Path, nargs="*", default=[], metavar="FILE", help="add rows, measure nothing")
     given = parser.parse_args()
+    rows = json.loads(given.out.read_text()) if given.out.is_file() else []
     quiet_warp()
     torch.set_num_threads(1)
-    for name in () if given.page else given.names or VARIANTS:
-        row = measure(name, count=given.count, epochs=given.epochs, home=given.home, device=given.device)
-        rows = json.loads(given.out.read_text()) if given.out.is_file() else []
-        rows = [one for one in rows if one.get("name") != name] + [row]
+
+    def add(row: dict[str, Any]) -> None:
+        rows[:] = sorted(
+            [*(one for one in rows if one["name"] != row["name"]), row], key=lambda one: ORDER[one["name"]]
+        )
         given.out.write_text(json.dumps(rows, indent=1) + "\n")
-        print(json.dumps(row), flush=True)
-    if given.out == RESULTS and RESULTS.is_file():
-        PAGE.write_text(page(json.loads(RESULTS.read_text())))
+
+    for path in given.join:
+        for row in json.loads(path.read_text()):
+            add(row)
+    for name in () if given.join else given.names or VARIANTS:
+        add(measure(name, count=given.count, epochs=given.epochs, home=given.home, device=given.device))
+        print(json.dumps(rows[-1]), flush=True)
 
 
 if __name__ == "__main__":

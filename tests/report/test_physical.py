@@ -83,6 +83,19 @@ def test_a_margin_is_between_the_ends_of_the_intervals(folder: Path) -> None:
     assert rows["DAS"].cells[2].mean == pytest.approx(45.0 - 53.0), "inside the intervals, so below 0"
 
 
+def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -> None:
+    """A random projector hides more than a random laser; a laser need not be better than that."""
+    night = "light, night"
+    lines = [
+        line("laser", night, 0.70, source="yolov5n"), line("random laser", night, 0.90),
+        line("random laser", night, 0.94, number=1), line("random projector", night, 0.40),
+    ]  # fmt: skip
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    (row,) = margin_table(PhysicalRun(load_run(folder))).rows
+    assert row.head[2:] == ("laser, night", "random laser, night")
+    assert row.cells[2].mean == pytest.approx(90.0 - 75.0)
+
+
 def test_transfer_and_the_worst_cell(folder: Path) -> None:
     run = PhysicalRun(load_run(folder))
     (moved,) = transfer_table(run).rows
