@@ -36,7 +36,7 @@ from ssad.scenarios.static.physical.noninvasive import Flashlight, Laser
 from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND
 
 RESULTS = Path(__file__).parent / "results" / "physical_lights.json"
-TOWN, HOURS = "Oldmarket", ("noon", "low_sun", "night")
+TOWN, HOURS = "Oldmarket", ("noon", "low_sun", "sun_behind", "night")
 SUNLIT = 0.2  # share of the sun in the light on the rear, from which on a shadow could be seen
 
 

@@ -35,6 +35,8 @@ def test_an_hour_is_clear_and_has_the_suns_direction() -> None:
         shown = at_hour(rain, hour)
         assert (shown.sun_heading, shown.turn, shown.fog, shown.wet) == (2.2, 3.0, 0.0, 0.0)
     assert at_hour(rain, "night").sun_height < -0.2
+    behind = at_hour(rain, "sun_behind", 0.4).sun_heading
+    assert np.cos(behind - 0.4) < -0.9, "on the rear of a target that heads there"
     with pytest.raises(UnknownNameError, match="noon"):
         at_hour(rain, "non")
 

@@ -474,7 +474,7 @@ def clip_views(
     split: str = "all",
     device: str = "cpu",
     only: Collection[str] | None = None,
-    hour: Callable[[Weather], Weather] = lambda weather: weather,
+    hour: Callable[[Weather, float], Weather] = lambda weather, heading: weather,
     stages: dict[Any, Any] | None = None,
 ) -> Iterator[ClipView]:
     """The pictures of a recording with their scenes, in order.
@@ -486,7 +486,7 @@ def clip_views(
         split: train, test or all.
         device: Where to render.
         only: Names of the files that are wanted; None for all.
-        hour: The weather to show instead of the recorded one.
+        hour: The weather to show instead of the recorded one, from that and the heading of the target, rad.
         stages: Where all scenes are kept for another call; None: they are let go one after the other.
 
     Raises:
@@ -506,8 +506,9 @@ def clip_views(
                     sets = {known: kept for known, kept in sets.items() if known[:-1] == key[:-1]}
                 sets[key] = _prepare(clips, row["town"], key)
             made = sets[key]
-            weather = hour(Weather(**row["light"]))
-            shot = Viewpoint(row["time"], np.array(row["pose"]), np.array(row["target_pose"]), weather, {})
+            target = np.array(row["target_pose"])
+            weather = hour(Weather(**row["light"]), float(np.arctan2(target[1, 0], target[0, 0])))
+            shot = Viewpoint(row["time"], np.array(row["pose"]), target, weather, {})
             around = made.cast.at(shot.time, shot.camera[:2, 3], 150.0)
             view = _view(made, row["slot"], shot, around, _camera(clips.size))
             yield ClipView(row["file_name"], row, made.stage, view, objects)

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,13 +25,19 @@ from ssad.recording.textured_clips import BLOCK, MARGIN, TexturedClip, seen_part
 from ssad.scenarios.static.physical.noninvasive.light import Target
 from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND, LitPicture, lit_picture
 
-HOURS: Final = ("recorded", "noon", "low_sun", "night")
-SUN: Final = {"noon": 1.0, "low_sun": 0.25, "night": -0.3}  # height of the sun, rad
+HOURS: Final = ("recorded", "noon", "low_sun", "sun_behind", "night")
+SUN: Final = {"noon": 1.0, "low_sun": 0.25, "sun_behind": 0.5, "night": -0.3}  # height of the sun, rad
+ASIDE: Final = 0.3  # rad from straight behind the target to a sun that is behind it
 QUALITY: Final = 92  # of JPEG, as it is recorded
 
 
-def at_hour(weather: Weather, hour: str) -> Weather:
+def at_hour(weather: Weather, hour: str, heading: float | None = None) -> Weather:
     """A weather at an hour: clear and dry, with the sun where it was to the side; recorded: as it was.
+
+    Args:
+        weather: As it was.
+        hour: See `HOURS`; sun_behind: the sun shines on the target's rear.
+        heading: Of the target, rad; None: the sun stays where it was to the side.
 
     Raises:
         UnknownNameError: There is no such hour.
@@ -39,7 +46,10 @@ def at_hour(weather: Weather, hour: str) -> Weather:
         raise unknown_name("hour", hour, HOURS)
     if hour == "recorded":
         return weather
-    return Weather(SUN[hour], weather.sun_heading, min(weather.clouds, 0.3), turn=weather.turn)
+    side = weather.sun_heading
+    if hour == "sun_behind" and heading is not None:
+        side = heading + np.pi + ASIDE
+    return Weather(SUN[hour], float(side), min(weather.clouds, 0.3), turn=weather.turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +146,7 @@ def lit_clips(
         split=split,
         device=device,
         only=wanted,
-        hour=lambda weather: at_hour(weather, hour),
+        hour=lambda weather, heading: at_hour(weather, hour, heading),
         stages=stages,
     ):
         if made is None or made[0] is not clip.scene:
