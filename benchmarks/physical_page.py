@@ -119,6 +119,9 @@ def speed() -> list[str]:
 def patch() -> list[str]:
     """What limits an adversarial patch."""
     rows = json.loads((RESULTS / "physical_patch.json").read_text())
+    rows = [row for row in rows if "name" in row]
+    if not rows:
+        return []
     lines = [
         "## What limits a patch", "",
         "`python benchmarks/physical_patch.py`: Adv. Patch on the rear against YOLOv5n, trained on "
