@@ -148,6 +148,7 @@ def test_find_cell(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_command_spells_out_what_differs(write: Callable[[str], str]) -> None:
+    assert command_of(load_suite("quick", ["name=lab"])) == "ssad run quick --set name=lab"
     assert command_of(load_suite("quick")) == "ssad run quick"
     assert command_of(load_suite("quick"), "cuda") == "ssad run quick --device cuda"
     assert command_of(load_suite("quick", ["repetitions=3", "systems=blind"])) == (

@@ -17,8 +17,8 @@ from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.report import check_artefacts, write_report
-from ssad.report.kinds.tour import verdict
 from ssad.report.load import load_run
+from ssad.report.verdict import verdict
 
 SHORT = """
 name: short

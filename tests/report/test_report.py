@@ -8,6 +8,8 @@ import html.parser
 import io
 import json
 import re
+import shutil
+import subprocess
 import zlib
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.run_folder import driving_lines, write_run
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
@@ -271,3 +274,63 @@ def test_report_needs_no_world(run_folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert safeio.read_json(run_folder / "run.json")["suite"]["name"] == "t"
+
+
+def test_the_first_screen_says_what_was_found_when_where_and_with_which_table(tmp_path: Path) -> None:
+    lines = driving_lines()
+    header = {
+        "suite": {"name": "quick", "kind": "driving", "title": "Stock title", "description": "Stock text."},
+        "kind": "driving", "command": "ssad run quick --set 'scenarios=[RightTurn]' --set pictures=[]", "code": "c0de",
+        "started": "2026-01-02T03:04:05+00:00",
+        "machine": {"processor": "Some CPU", "cores": "2", "system": "Linux x86_64"},
+    }  # fmt: skip
+    page = write_report(write_run(tmp_path / "a", header, lines)).read_text()
+    first = page[: page.index("<main>")]
+    hit = sum(bool(line["metrics"].get("collision")) for line in lines if line["system"] == "a")
+    assert "<h1>quick with scenarios=[RightTurn]</h1>" in first
+    assert "Stock text." not in first, "it describes another run"
+    told = (f"a collided in {hit} of ", f"1 of {len(lines)} cells failed", "2026-01-02 03:04 UTC", "Some CPU, 2 cores")
+    for words in (*told, "code c0de"):
+        assert words in first, words
+    found = re.search(r'equal hashes">([0-9a-f]{12})<', first)
+    assert found
+    assert f">{found[1]}<" in write_report(write_run(tmp_path / "b", header, lines)).read_text()
+    lines[0]["metrics"]["distance_to_route"] += 1e-9
+    assert f">{found[1]}<" not in write_report(write_run(tmp_path / "c", header, lines)).read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [360, 400, 1280])
+def test_nothing_is_wider_than_the_window_and_the_seek_bar_can_be_used(
+    width: int, run_folder: Path, tmp_path: Path
+) -> None:
+    """A browser lays the page out; a frame of that width shows it, and a script tells what sticks out."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        pytest.skip("no Chromium here")
+    page = write_report(run_folder).read_text()
+    script = """<script>addEventListener("load", () => setTimeout(() => {
+        const wide = [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll, svg")
+            && e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName + "." + e.className);
+        const seek = document.getElementById("seek").getBoundingClientRect();
+        const told = JSON.stringify({inner: innerWidth, wide, seek: [seek.width, seek.height]});
+        document.documentElement.innerHTML = "<body><pre id=told>" + told + "</pre></body>";
+    }, 300))</script>"""
+    (tmp_path / "inner.html").write_text(page.replace("</body>", script + "</body>"))
+    frame = f'<iframe id=f src=inner.html style="width:{width}px;height:900px;border:0"></iframe>'
+    tell = """<script>setTimeout(() => {
+        document.body.innerHTML = "<pre>" + f.contentDocument.getElementById("told").textContent + "</pre>";
+    }, 2500)</script>"""
+    (tmp_path / "outer.html").write_text(f"<body>{frame}{tell}</body>")
+    words = ("--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--dump-dom")
+    done = subprocess.run(
+        [chromium, *words, "--virtual-time-budget=8000", f"--user-data-dir={tmp_path / 'profile'}",
+         (tmp_path / "outer.html").as_uri()], capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    told = re.search(r"<pre>(\{.*?\})</pre>", done.stdout)
+    assert told, done.stdout[-500:]
+    found = json.loads(told[1])
+    assert found["inner"] == width
+    assert found["wide"] == []
+    assert found["seek"][0] > 150
+    assert found["seek"][1] >= 12

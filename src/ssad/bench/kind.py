@@ -14,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 from rich.console import Console
 
 from ssad.core import safeio, schema
@@ -49,6 +49,7 @@ class SuiteBase(schema.Schema):
     timeout_s: float = Field(default=3600.0, gt=0, allow_inf_nan=False)
     chunk: int = Field(default=1, ge=1, le=4096)
     reference: str | None = None
+    _origin: str = PrivateAttr(default="")  # the name or file that it was loaded from
 
     def beside(self, path: Path) -> Self:
         """The suite with the files that it names found: in the working folder, else beside the suite's own file."""

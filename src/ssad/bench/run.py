@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from ssad.bench.suite import command_of, kind_of
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
-from ssad.jobs.machine import default_workers, versions
+from ssad.jobs.machine import default_workers, machine, versions
 from ssad.jobs.pool import Pool, open_pool
 from ssad.jobs.progress import Live
 from ssad.jobs.store import Store, read_run
@@ -54,6 +55,8 @@ def run_json(plan: Plan) -> dict[str, Any]:
         "command": command_of(plan.suite, plan.device),
         "versions": {**versions(plan.device), **plan.versions},
         "code": kind.code,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
         "columns": [vars(column) for column in kind.columns],
         "factors": list(kind.factors),
         "cells": [{"key": c.key, "name": c.name, "seed": c.seed, **c.fields} for c in plan.cells],

@@ -88,9 +88,11 @@ def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
     for setting in settings:
         changed[_apply(data, setting, schema)] = setting
     try:
-        return schema.model_validate(data).beside(path)
+        found = schema.model_validate(data).beside(path)
     except ValidationError as error:
         raise _explain(error, document, changed, list(schema.model_fields)) from None
+    found._origin = ref
+    return found
 
 
 def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
@@ -147,19 +149,19 @@ def _explain(error: ValidationError, document: Document, changed: dict[str, str]
 
 
 def command_of(suite: SuiteBase, device: str | None = None) -> str:
-    """The command that runs a suite again; only what differs from the suite of that name is spelt out.
+    """The command that runs a suite again; only what differs from the suite of that name or file is spelt out.
 
     Args:
         suite: What was run.
         device: Where it ran; None: left out, and what is there is taken.
     """
     values = suite.model_dump(mode="json")
-    name = str(values.pop("name"))
+    origin = suite._origin or suite.name
     try:
-        stock = load_suite(name).model_dump(mode="json")
-    except ConfigError:  # a suite of the user's own, by its file
+        stock = load_suite(origin).model_dump(mode="json")
+    except ConfigError:  # made without a file, or the file is gone
         stock = values
-    words = ["ssad", "run", name] + (["--device", device] if device else [])
+    words = ["ssad", "run", origin] + (["--device", device] if device else [])
     for key, value in values.items():
         if value != stock.get(key):
             words += ["--set", f"{key}={_flow(value)}"]

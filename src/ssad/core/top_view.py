@@ -59,8 +59,10 @@ class _Canvas:
         )
 
     def text(self, place: tuple[int, int], words: str, size: float = 0.5) -> None:
-        for colour, width in (((255, 255, 255), 4), ((30, 41, 59), 1)):
-            cv2.putText(self.image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, width, cv2.LINE_AA)
+        (width, height), below = cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+        corner, other = (place[0] - 5, place[1] - height - 5), (place[0] + width + 5, place[1] + below + 3)
+        cv2.rectangle(self.image, corner, other, (255, 255, 255), -1)
+        cv2.putText(self.image, words, place, cv2.FONT_HERSHEY_SIMPLEX, size, (30, 41, 59), 1, cv2.LINE_AA)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import platform
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from ssad.core.errors import ConfigError
 from ssad.core.version import __version__
@@ -86,6 +88,16 @@ def versions(device: str) -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def machine() -> dict[str, str]:
+    """What a run was made on: operating system, processor, cores. No name of it or of its user."""
+    name = platform.processor()
+    with contextlib.suppress(OSError):  # Linux says more here
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    found = {"system": f"{platform.system()} {platform.machine()}", "processor": name, "cores": str(default_workers())}
+    return {key: value for key, value in found.items() if value}
 
 
 def visible_gpus() -> list[str]:

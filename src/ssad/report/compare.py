@@ -290,7 +290,9 @@ def _state(line: Mapping[str, Any]) -> str:
 
 def _changes(first: Run, second: Run) -> Iterator[str]:
     """What the headers of two runs say that differs: code, versions, suite, systems, weights, towns."""
-    for name in sorted((set(first.header) | set(second.header)) - {"cells", "columns", "identity", "command"}):
+    for name in sorted(
+        (set(first.header) | set(second.header)) - {"cells", "columns", "identity", "command", "started"}
+    ):
         yield from _differences(name, first.header.get(name), second.header.get(name))
 
 

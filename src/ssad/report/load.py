@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import shlex
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +14,16 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
+
+INCIDENTAL = (
+    "chunk",
+    "description",
+    "name",
+    "pictures",
+    "reference",
+    "timeout_s",
+    "witness",
+)  # keys of suites that change no result
 
 
 @dataclass(frozen=True)
@@ -44,8 +57,18 @@ class Run:
 
     @property
     def title(self) -> str:
-        """What the page is called."""
-        return str(self.suite.get("title") or self.suite.get("name") or "SSAD")
+        """What the page is called: the suite's title, unless the run differs from what that says."""
+        name = str(self.suite.get("name") or "SSAD")
+        if self.changed and not any(one.startswith("title=") for one in self.changed):
+            return textwrap.shorten(f"{name} with {', '.join(self.changed)}", 100, placeholder=" ...")
+        return str(self.suite.get("title") or name)
+
+    @cached_property
+    def changed(self) -> tuple[str, ...]:
+        """What the run does otherwise than the suite of its name, as KEY=VALUE; what changes no result is left out."""
+        words = shlex.split(self.command)
+        told = [word for before, word in itertools.pairwise(words) if before == "--set"]
+        return tuple(one for one in told if one.partition("=")[0] not in INCIDENTAL)
 
     @property
     def command(self) -> str:

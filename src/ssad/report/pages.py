@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import math
 from pathlib import Path
@@ -13,7 +14,9 @@ from ssad.core import safeio
 from ssad.metrics import METRICS
 from ssad.report.artefacts import artefact_problems
 from ssad.report.load import Run, load_run
-from ssad.report.tables import Cell, write_tables
+from ssad.report.tables import Cell, Table, to_csv, write_tables
+
+TABLE_HASH = "hash-of-the-main-table"  # stands on a page until its tables are known
 
 
 def write_report(folder: Path | str) -> Path:
@@ -34,9 +37,15 @@ def write_report(folder: Path | str) -> Path:
     run = load_run(folder)
     page, tables = kind_module(run.kind).section(run)
     write_tables(run.folder, tables)
+    page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
     path = run.folder / "report.html"
     safeio.write_atomic(path, page)
     return path
+
+
+def table_hash(table: Table) -> str:
+    """12 hex digits over every number of a table, to the last digit: equal runs have equal ones."""
+    return hashlib.sha256(to_csv(table).encode()).hexdigest()[:12]
 
 
 def kind_module(kind: str) -> Any:
@@ -57,8 +66,17 @@ def render(name: str, run: Run, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.filters["heat"] = heat
+    verdict = importlib.import_module("ssad.report.verdict").verdict(run)  # it knows pages of kinds, which know this
     return environment.get_template(name).render(
-        run=run, suite=run.suite, versions=run.header.get("versions", {}), problems=artefact_problems(run), **values
+        **{
+            "run": run,
+            "suite": run.suite,
+            "versions": run.header.get("versions", {}),
+            "verdict": verdict,
+            "problems": artefact_problems(run),
+            "table_hash": TABLE_HASH,
+            **values,
+        }
     )
 
 

@@ -39,6 +39,9 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     tables = driving_tables(run)
     named = {table.name: table for table in tables}
     replay = replay_data(run)
+    gallery = _pictures(found)
+    if gallery:
+        safeio.write_atomic(found.folder / "gallery.html", render("gallery.html", found, pictures=gallery))
     page = render(
         "driving.html",
         found,
@@ -56,7 +59,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
         # "</" would end the script element that holds the data
         replay=safeio.dump_json(replay).replace("</", "<\\/"),
         missing=replay["missing"],
-        pictures=_pictures(found),
+        pictures=gallery,
     )
     return page, tables
 
