@@ -99,15 +99,17 @@ def test_records(done: Path) -> None:
 
 
 def test_same_bits_for_any_workers_chunk_order_and_repetitions(done: Path, tmp_path: Path) -> None:
-    go(tmp_path / "a", suite(chunk=1), workers=1)
+    go(tmp_path / "a", suite(chunk=1), workers=0)
     go(tmp_path / "b", suite(scenarios=SCENARIOS[::-1], systems=["blind", "autopilot"], chunk=3), workers=0)
-    go(tmp_path / "c", suite(repetitions=2), workers=0)
+    go(tmp_path / "c", suite(repetitions=2, scenarios=SCENARIOS[:2]), workers=0)
     expected = facts(done)
     for name in "ab":
         assert facts(tmp_path / name) == expected
     more = facts(tmp_path / "c")
-    assert {k: more["results"][k] for k in expected["results"]} == expected["results"]
-    assert len(more["results"]) == 12
+    assert len(more["results"]) == 8
+    nominal = more["results"].keys() & expected["results"].keys()
+    assert len(nominal) == 4
+    assert {k: more["results"][k] for k in nominal} == {k: expected["results"][k] for k in nominal}
     for path in (done / "traces").iterdir():
         assert path.read_bytes() == (tmp_path / "a" / "traces" / path.name).read_bytes()
 

@@ -262,7 +262,10 @@ def make(name: str) -> Any:
     return lively(TINY) if name == "fcos" else make_detector(name)
 
 
-@pytest.mark.parametrize("case", SUBTLE)
+LONG = ("WithTheGradientTurned-fcos", "WithATenthOfTheGradient-yolov3-tiny")
+
+
+@pytest.mark.parametrize("case", others_slow(SUBTLE, [case for case in SUBTLE if case not in LONG]))
 def test_it_names_what_is_wrong(case: str) -> None:
     part, name, kind, promise = SUBTLE[case]
     trial = CheckCase(kind(make(name)), SIZE, None)

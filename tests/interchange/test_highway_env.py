@@ -45,10 +45,11 @@ def make(assign, steps: int = 200) -> HighwayEnv:
 
 
 def test_it_keeps_the_promises_of_a_simulator() -> None:
-    check_simulator(make, episodes=4, steps=15)
+    check_simulator(make, episodes=3, steps=10)
 
 
-@pytest.mark.parametrize("driver", [pytest.param(Autopilot, marks=pytest.mark.slow), Blind])
+@pytest.mark.slow
+@pytest.mark.parametrize("driver", [Autopilot, Blind])
 def test_our_drivers_keep_theirs_in_it(driver) -> None:
     check_driver(driver, make, episodes=3, steps=12)
 

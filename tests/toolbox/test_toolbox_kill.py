@@ -129,6 +129,7 @@ def test_what_a_killed_run_made_is_not_made_again(
     assert tree(out) == unbroken
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_process_that_started_them(
     clean: Path, tmp_path: Path, unbroken: dict[str, str | bytes]
 ) -> None:

@@ -74,6 +74,7 @@ def test_one_of_two_that_stand_nose_to_nose_backs_out() -> None:
     assert not found["contacts"]
 
 
+@pytest.mark.slow
 def test_who_has_no_room_behind_is_made_room_for() -> None:
     """Scenes in which the one of two that should back out stands before a queue: 17, 25 and 32 vehicles were stuck.
 
