@@ -54,6 +54,11 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
+def pytest_sessionfinish() -> None:
+    """What was set apart is let go with the rest, or libraries complain of leaks."""
+    gc.unfreeze()
+
+
 def find_data() -> Path | None:
     """The folder of CARLA maps and routes: $SSAD_DATA, else ../shared/data beside the checkout."""
     folder = ROOT / os.environ.get("SSAD_DATA", "../shared/data")

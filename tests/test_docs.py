@@ -8,6 +8,7 @@ import io
 import re
 import runpy
 import shlex
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -97,12 +98,17 @@ def commands(text: str) -> list[str]:
     return [re.split(r"\s{3,}", line)[0].strip() for line in lines if line.startswith("ssad ")]
 
 
-@page
-def test_commands_and_their_options_exist(page: str) -> None:
+@cache
+def whole_command() -> Any:
     from ssad.cli import app
 
+    return typer.main.get_command(app)
+
+
+@page
+def test_commands_and_their_options_exist(page: str) -> None:
     for line in commands(TEXTS[page]):
-        command: Any = typer.main.get_command(app)
+        command = whole_command()
         words = shlex.split(line)[1:]
         while hasattr(command, "commands") and words:
             names = words.pop(0).split("|")

@@ -86,7 +86,8 @@ def drive(shared: Shared) -> Path:
     return shared("shipped-drive", make)
 
 
-@pytest.mark.parametrize("name", others_slow(THREE, ["fcos3d-light"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", THREE)
 def test_objects_are_found_in_space_in_a_town_never_seen(name: str, drive: Path) -> None:
     scores = score_3d(make_detector(name), drive, "v1.0-ssad", SCENES)
     assert scores["AP_car"] > 0.1, scores  # 0.2 and more

@@ -168,8 +168,8 @@ def test_gpus_are_shared_by_as_many_as_their_memory_takes(
 
 
 HELD = """
-import ctypes, sys
-import torch
+import ctypes
+import numpy as np
 from ssad.jobs.machine import keep_memory
 
 class Mallinfo(ctypes.Structure):  # struct mallinfo2 of <malloc.h>
@@ -181,7 +181,7 @@ library.mallinfo2.restype = Mallinfo
 
 
 def hold():
-    tensor = torch.zeros(10 << 20)  # 40 MiB
+    tensor = np.empty(10 << 20, np.float32)  # 40 MiB, from the allocator that tensors on the CPU are from
     lent = library.mallinfo2().hblkhd
     del tensor
     print(lent, library.mallinfo2().fordblks)

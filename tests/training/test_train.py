@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from helpers.bodies import plain_bodies
 from helpers.sharing import Shared
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.cli import main
 from ssad.core.checkpoints import read_card
@@ -170,7 +170,16 @@ def test_the_command_can_be_given_to_a_shell() -> None:
     )
 
 
-@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_an_error_of_a_process_is_what_it_was() -> None:
+    text = "\n\n-- Process 1 terminated with the following error:\nTraceback (most recent call last):\n  File x\n"
+    with pytest.raises(ConfigError, match=r"^no such thing: here$"), training._one_line():
+        raise ProcessRaisedException(f"{text}ssad.core.errors.ConfigError: no such thing: here\n", 1, 7)
+    with pytest.raises(ProcessRaisedException, match="KeyError: 'x'"), training._one_line():
+        raise ProcessRaisedException(f"{text}KeyError: 'x'\n", 1, 7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [1, 2])
 def test_an_error_in_another_process_is_one_line(count: int, tmp_path: Path) -> None:
     plan = Plan("yolov5n", (tmp_path / "nowhere",), tmp_path / "out", gpus=count)
     with pytest.raises(ConfigError, match=r"nowhere: no annotations/train.json"), training._one_line():
