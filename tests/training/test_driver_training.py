@@ -88,8 +88,9 @@ def test_a_training_begins_with_the_networks_of_another(tmp_path: Path) -> None:
 
 def test_what_is_learned_is_what_is_exported(tmp_path: Path) -> None:
     """The exported policy acts as the model of stable-baselines3 does without its noise."""
-    for algorithm in ("ppo", "sac", "td3"):
-        learning = find_learning(LEARNINGS, algorithm, dict(SMALL))
+    ddpg = {"ddpg": replace(LEARNINGS["td3"], algorithm="ddpg")}
+    for algorithm in ("ppo", "sac", "td3", "ddpg"):
+        learning = find_learning(LEARNINGS | ddpg, algorithm, dict(SMALL))
         from ssad.training.reinforcement import policy_now
 
         model = make_model(learning, environment(learning))
