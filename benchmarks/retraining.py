@@ -1,6 +1,6 @@
 """Does an ego that was trained on generated scenarios collide less? Generated, trained and tested anew, with intervals.
 
-    python -m benchmarks.retraining --out DIR --workers 8        # resumes what DIR has; --tiny tries it at a small size
+    python -m benchmarks.retraining --out DIR --workers 8        # resumes what DIR has; also --small, --tiny
     python -m benchmarks.retraining --page                       # the table of docs/drivers.md from the kept results
 
 1. `before`: PPO on the set `training`, with several seeds.
@@ -49,6 +49,7 @@ class Size:
         generators: What searches.
         budget: Rollouts of each search.
         every: Only each so-many-th scenario of the sets.
+        attack: Whether the egos are also attacked anew.
         changes: Further values of the recipe.
     """
 
@@ -57,9 +58,14 @@ class Size:
     generators: tuple[str, ...] = ("bayesian", "king", "adv-ppo")
     budget: int = 16
     every: int = 1
+    attack: bool = True
     changes: tuple[tuple[str, Any], ...] = ()
 
 
+SMALL = Size(
+    seeds=2, steps=300_000, generators=("bayesian", "adv-ppo"), budget=8, every=2, attack=False,
+    changes=(("validate", 150_000),),
+)  # fmt: skip
 TINY = Size(
     seeds=2, steps=2048, generators=("random", "adv-ppo"), budget=4, every=16,
     changes=(("scenes", 16), ("rollout", 64), ("batch", 256), ("validate", 1024), ("draws", 1)),
@@ -166,7 +172,7 @@ def drive(out: Path, size: Size, arm: str, seed: int) -> None:
                 off = row.off_road / row.driven if row.driven else 0.0
                 rows[episode.scenario.name] = [float(row.collision), row.route_completion, off]
         found["found" if name == "found" else "plain"] |= {name: rows}
-    for generator, (where, every) in ATTACKS.items():
+    for generator, (where, every) in ATTACKS.items() if size.attack else ():
         scenarios, graphs = scenarios_of([where], max(size.every, every))
         bases, outcomes = search_all(system, generator, scenarios, graphs, seed=1000 + seed, budget=size.budget)
         hit = {base.scenario.name: any(o.valid for o in row) for base, row in zip(bases, outcomes, strict=True)}
@@ -311,11 +317,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--steps", type=int, default=1_000_000)
-    parser.add_argument("--tiny", action="store_true")
+    parser.add_argument("--small", action="store_true", help="half an hour of one core")
+    parser.add_argument("--tiny", action="store_true", help="only to try it")
     parser.add_argument("--json", type=Path, default=RESULTS)
     parser.add_argument("--page", action="store_true", help="write docs/drivers.md")
     given = parser.parse_args()
-    size = TINY if given.tiny else Size(seeds=given.seeds, steps=given.steps)
+    size = TINY if given.tiny else SMALL if given.small else Size(seeds=given.seeds, steps=given.steps)
     if given.out is not None:
         (given.out / "found").mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
