@@ -1,15 +1,15 @@
-"""Write docs/physical_results.md from stored runs: python benchmarks/physical_page.py [RUN...]
+"""Write docs/physical_results.md from stored runs: python benchmarks/physical_page.py [--as NAME] [RUN...]
 
 With runs (folders that `ssad run physical` or another of `SUITES` wrote) the tables and run.json without its cells are
-stored first, in benchmarks/results/NAME of the suite. Several runs of one suite, such as of one pair of towns each, are
-joined: of a cell that two have, the later counts.
+stored first, in benchmarks/results/NAME (of the suite, if none is said). Several runs of one suite, such as of one pair
+of towns each, are joined: of a cell that two have, the later counts.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +26,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
     "physical": "ssad run physical --device cuda", "physical-gpu": "ssad run physical-gpu --device cuda",
+    "physical-gpu-larkhill": "ssad run physical-gpu --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
 }  # fmt: skip
@@ -33,16 +34,16 @@ FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 OTHERS = ("margins", "transfer", "grid", "others", "effort")
 
 
-def store(folders: Sequence[Path]) -> None:
+def store(folders: Sequence[Path], name: str | None = None) -> None:
     """Keep what the page needs of runs of one suite."""
     runs = [load_run(folder) for folder in folders]
-    name = runs[0].suite["name"]
-    folder = RESULTS / name
+    suite = runs[0].suite["name"]
+    folder = RESULTS / (name or suite)
     lines: dict[tuple[Any, ...], Mapping[str, Any]] = {}
     cells: set[tuple[Any, ...]] = set()
     for run in runs:
-        if run.suite["name"] != name:
-            raise SystemExit(f"{run.folder} is of the suite {run.suite['name']}, not of {name}")
+        if run.suite["name"] != suite:
+            raise SystemExit(f"{run.folder} is of the suite {run.suite['name']}, not of {suite}")
         lines |= {_place(line): line for line in run.lines}
         cells |= {_place(cell) for cell in run.header["cells"]}
     about = {key: value for key, value in runs[0].header.items() if key != "cells"}
@@ -188,6 +189,10 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        store([Path(one) for one in sys.argv[1:]])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN")
+    parser.add_argument("--as", dest="name", choices=list(SUITES))
+    given = parser.parse_args()
+    if given.runs:
+        store(given.runs, given.name)
     PAGE.write_text(page())

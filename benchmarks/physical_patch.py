@@ -40,6 +40,7 @@ from ssad.scenarios.static.physical.printing import NOMINAL
 
 RESULTS = Path(__file__).parent / "results" / "physical_patch.json"
 WINDOW, EPOCHS, BATCH = 192, 30, 16
+ALONE = 5  # pictures that have a patch of their own
 FREE = {"expectation": NOMINAL, "smooth": 0.0, "printed": 0.0}  # nothing but the detector's loss
 METRICS = ("AP50", "found_25", "confidence")
 
@@ -113,14 +114,14 @@ def shown(
             yield drive, view.picture.together([view.picture], {0: look(colour.to(device))[None]}), view.truth
 
 
-def measure(name: str, *, count: int, epochs: int, home: Path, device: str) -> dict[str, Any]:
+def measure(name: str, *, count: int, epochs: int, batch: int, home: Path, device: str) -> dict[str, Any]:
     """One row."""
     variant = VARIANTS[name]
     detector = make_detector("yolov5n", device=device)
     classes = tuple(detector.classes)
     surface = Patch(width=variant.width, height=variant.height, centre=variant.centre).on(TargetCar().mesh())
     views = list(clips(home, "Twinford", count, classes, device).wearing(surface))
-    settings = {"epochs": variant.longer * epochs, "window": WINDOW, "batch": BATCH} | variant.settings
+    settings = {"epochs": variant.longer * epochs, "window": WINDOW, "batch": batch} | variant.settings
     attack = make_physical("adv-patch", **settings)
     begin = time.perf_counter()
 
@@ -131,7 +132,7 @@ def measure(name: str, *, count: int, epochs: int, home: Path, device: str) -> d
         ).colour  # fmt: skip
 
     if variant.alone:
-        views = views[:: max(1, len(views) // 10)]
+        views = views[:: max(1, len(views) // ALONE)]
         own = [train([view]) for _, view in views]
     else:
         own = [train([view for _, view in views])] * len(views)
@@ -140,7 +141,7 @@ def measure(name: str, *, count: int, epochs: int, home: Path, device: str) -> d
     boxes = [view.truth.box[0] for _, view in views]
     area = [float((box[2] - box[0]) * (box[3] - box[1])) for box in boxes]
     found: dict[str, Any] = {
-        "name": name, "about": variant.about, "pictures": count, "epochs": epochs, "device": device,
+        "name": name, "about": variant.about, "pictures": count, "epochs": epochs, "batch": batch, "device": device,
         "covers": sum(pixels) / sum(area), "seconds": round(time.perf_counter() - begin),
     }  # fmt: skip
 
@@ -163,6 +164,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=[], metavar="NAME", help=", ".join(VARIANTS))
     parser.add_argument("--count", type=int, default=25, help="pictures of each town")
     parser.add_argument("--epochs", type=int, default=EPOCHS)
+    parser.add_argument("--batch", type=int, default=BATCH, help="pictures a step")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--home", type=Path, default=Path("runs/physical-patch"))
     parser.add_argument("--out", type=Path, default=RESULTS)
@@ -182,7 +184,8 @@ def main() -> None:
         for row in json.loads(path.read_text()):
             add(row)
     for name in () if given.join else given.names or VARIANTS:
-        add(measure(name, count=given.count, epochs=given.epochs, home=given.home, device=given.device))
+        budget = {"count": given.count, "epochs": given.epochs, "batch": given.batch}
+        add(measure(name, **budget, home=given.home, device=given.device))
         print(json.dumps(rows[-1]), flush=True)
 
 
