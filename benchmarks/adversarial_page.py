@@ -1,7 +1,7 @@
 """Tables of what generators found, from runs of suite `adversarial`: into docs/generators.md, between their markers.
 
     ssad run adversarial --out RUN ...
-    python -m benchmarks.adversarial_page NAME=RUN ...      # keeps the records' metrics in benchmarks/results
+    python -m benchmarks.adversarial_page NAME=RUN,RUN ...  # keeps the records' metrics in benchmarks/results
     python -m benchmarks.adversarial_page                   # the tables anew from what is kept
 
 Each base scenario is a case; of natural traffic each route is a cluster. In brackets the 95 % interval.
@@ -40,20 +40,23 @@ def cluster(name: str) -> str:
     return re.sub(r"^(natural[\w-]*/\w+)/\d+$", r"\1", name)
 
 
-def keep(name: str, run: Path) -> None:
-    """The metrics of a run's records, without what cannot be shown."""
+def keep(name: str, runs: list[Path]) -> None:
+    """The metrics of the records of runs with the same settings, without what cannot be shown."""
     rows = []
-    for line in (run / "results.jsonl").read_text(encoding="utf-8").splitlines():
+    for line in "".join((run / "results.jsonl").read_text(encoding="utf-8") for run in runs).splitlines():
         record = json.loads(line)
         if record["status"] != "ok":
             rows.append({"failed": record["reason"], "generator": record["generator"], "system": record["system"]})
             continue
         metrics = {k: v for k, v in record["metrics"].items() if k in (*COLUMNS, "applies", "survived")}
         short = {k: round(float(v), 4) for k, v in metrics.items() if v is not None}
-        rows.append({"generator": record["generator"].rpartition(":")[2], "system": record["system"],
+        rows.append({"generator": record["generator"], "system": record["system"],
                      "base": record["cluster"], **short})  # fmt: skip
-    suite = json.loads((run / "run.json").read_text(encoding="utf-8"))["suite"]
-    about = {key: suite[key] for key in ("systems", "scenarios", "budget", "keep")}
+    suites = [json.loads((run / "run.json").read_text(encoding="utf-8"))["suite"] for run in runs]
+    about = {key: suites[0][key] for key in ("scenarios", "budget", "keep")}
+    if any({key: suite[key] for key in about} != about for suite in suites):
+        raise ValueError(f"{name}: runs of unlike settings")
+    about["systems"] = list(dict.fromkeys(name for suite in suites for name in suite["systems"]))
     RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(about | {"rows": rows}, separators=(",", ":")) + "\n", encoding="utf-8")
@@ -88,11 +91,11 @@ def tables(data: dict[str, Any]) -> list[str]:
             own = [row for row in rows if row["generator"] == name and row.get("survived") and row.get("applies")]
             alive[name] = own
             cells = [shown(cases(own, key), key) for key in COLUMNS]
-            lines.append(f"| `{name.lower()}` | {len(own)} | {' | '.join(cells)} |")
+            lines.append(f"| `{name}` | {len(own)} | {' | '.join(cells)} |")
         lines.append("")
-        if {"adv-ppo", "Frea"} <= set(names):
+        if {"adv-ppo", "frea"} <= set(names):
             for key in ("avoided_by_reg157", "attributable"):
-                both = [cases(alive[name], key) for name in ("Frea", "adv-ppo")]
+                both = [cases(alive[name], key) for name in ("frea", "adv-ppo")]
                 mean, low, high = difference(*both)
                 counts = " and ".join(f"{len(group)} collisions" for group in both)
                 lines.append(
@@ -124,8 +127,8 @@ def difference(first: dict[str, CaseValue], second: dict[str, CaseValue]) -> tup
 def main() -> None:
     """Keep what is given, and write all tables that are kept and have a place."""
     for word in sys.argv[1:]:
-        name, _, run = word.partition("=")
-        keep(name, Path(run))
+        name, _, runs = word.partition("=")
+        keep(name, [Path(run) for run in runs.split(",")])
     whole = DOCUMENT.read_text(encoding="utf-8")
     for path in sorted(RESULTS.glob("*.json")):
         begin, end = f"<!-- {path.stem}: begin -->", f"<!-- {path.stem}: end -->"

@@ -56,7 +56,7 @@ def test_a_generator_keeps_its_promises(name: str, bases: list[Base]) -> None:
             )  # fmt: skip
             assert proposal.scenario.target_speed == base.scenario.target_speed
             assert proposal.scenario.route == base.scenario.route
-    if name != "adv-ppo":
+    if name not in ("adv-ppo", "frea", "adv-ddpg"):  # policies, which have one proposal
         assert len({repr(p.scenario) for p in both[0]}) > 5
 
 

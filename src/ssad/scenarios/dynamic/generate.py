@@ -34,6 +34,8 @@ GENERATORS: dict[str, str] = {
     "near-miss": "ssad.scenarios.dynamic.logged.near_miss:NearMisses",
     "king": "ssad.scenarios.dynamic.transition.kinematics:King",
     "adv-ppo": "ssad.scenarios.dynamic.policy.adv_ppo:AdvPPO",
+    "frea": "ssad.scenarios.dynamic.policy.adv_ppo:Frea",
+    "adv-ddpg": "ssad.scenarios.dynamic.policy.adv_ppo:AdvDDPG",
     "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""

@@ -71,10 +71,10 @@ class Frea(AdvPPO):
     name = "frea"
 
 
-class AdvSAC(AdvPPO):
-    """As Adv.PPO, trained by soft actor-critic instead."""
+class AdvDDPG(AdvPPO):
+    """As Adv.PPO, trained by deep deterministic policy gradient instead."""
 
-    name = "adv-sac"
+    name = "adv-ddpg"
 
 
 def _can_be(controller: Controller) -> bool:
