@@ -9,6 +9,7 @@ from typing import Any
 from ssad.metrics import CaseValue, estimate
 from ssad.report.kinds import gap
 from ssad.report.load import Run
+from ssad.report.tables import Cell
 
 Line = Mapping[str, Any]
 
@@ -96,13 +97,19 @@ def _gap(run: Run) -> list[str]:
             sees = "" if math.isnan(part) else f" It found objects with an AP of {part:.2f} on the way."
             found.append(f"{system} collided in {rate:.0%} of {len(lines)} drives.{sees}")
             continue
-        fall, rise = (gap.change(run, (system, perturbation, severity), name).mean for name in ("AP", "collision"))
-        if not math.isnan(fall) and not math.isnan(rise):
+        fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
+        if not math.isnan(fall.mean) and not math.isnan(rise.mean):
             found.append(
-                f"{perturbation} {severity} changes the AP of {system} by {fall:+.2f} and its collision rate by "
-                f"{rise:+.2f}."
+                f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
+                f"{_sure(rise)}, in {rise.n} drives."
             )
     return found
+
+
+def _sure(change: Cell) -> str:
+    """A change with its interval; where there is none, it says so."""
+    known = change.method not in ("range", "none") and change.interval
+    return f"{change.mean:+.2f} ({change.interval if known else 'too few drives for an interval'})"
 
 
 VERDICTS: dict[str, Callable[[Run], list[str]]] = {

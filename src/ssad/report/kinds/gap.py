@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
-from typing import Any
+from typing import Any, Literal
 
 from ssad.core import safeio
 from ssad.metrics import CaseValue, estimate, paired_difference
@@ -237,4 +237,5 @@ def change(run: Run, condition: Condition, name: str) -> Cell:
     """What a condition changes in a metric against the same drives without it."""
     every = conditions(run)
     clean = every.get((condition[0], "none", 0), [])
-    return Cell.of(paired_difference(_values(every[condition], name), _values(clean, name)))
+    kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
+    return Cell.of(paired_difference(_values(every[condition], name), _values(clean, name), kind=kind))
