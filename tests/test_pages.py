@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,3 +49,28 @@ def test_the_page_of_attacks_says_whether_weights_have_changed() -> None:
     told = json.loads((ROOT / "benchmarks" / "results" / "digital" / "run.json").read_text())
     current = told["weights"] == {name: state_hash(detector_of(name, "", "cpu")) for name in told["weights"]}
     assert ("**Measured with earlier weights" in (ROOT / "docs" / "digital.md").read_text()) is not current
+
+
+def test_every_page_has_a_place_on_the_site_and_its_links_lead_somewhere(tmp_path: Path) -> None:
+    site = runpy.run_path(str(ROOT / "benchmarks" / "site.py"))
+    pages = site["write_pages"](tmp_path / "pages")
+    assert sorted(page for part in site["PARTS"].values() for page in part) == pages
+    for page in pages:
+        path = tmp_path / "pages" / f"{page}.md"
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", path.read_text()):
+            assert target.startswith("http") or (path.parent / target).exists(), f"{page}: {target}"
+    api = (tmp_path / "pages" / "api.md").read_text()
+    assert "::: ssad.results.run" in api
+    assert "::: ssad.core.protocols.Detector" in api
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_network(tmp_path: Path) -> None:
+    for tool in ("mkdocs", "mkdocstrings", "material"):
+        pytest.importorskip(tool, reason="needs the group site")
+    words = [sys.executable, str(ROOT / "benchmarks" / "site.py"), str(tmp_path / "site")]
+    blocked = os.environ | {"http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=blocked)
+    assert done.returncode == 0, done.stderr
+    assert "Results" in (tmp_path / "site" / "api.html").read_text()
+    assert "https://fonts" not in (tmp_path / "site" / "index.html").read_text()
