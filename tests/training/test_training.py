@@ -34,8 +34,9 @@ from ssad.training.batches import (
     order,
     repeats,
 )
+from ssad.training.detector import parse_changes
 from ssad.training.loop import LAST, LOG, train, weighed
-from ssad.training.recipe import RECIPES, Recipe, find_recipe
+from ssad.training.recipe import RECIPES, Recipe, find_recipe, set_words
 
 
 def change_truth(truth: Truth, change: Change, size: tuple[int, int], *, keep: float) -> Truth:
@@ -513,3 +514,8 @@ def test_a_recipe_that_is_unknown_or_wrong_is_one_line() -> None:
             find_recipe("yolov5n", **wrong)  # type: ignore[arg-type]
         assert "\n" not in str(error.value)
     assert find_recipe("yolov5n", lr=1, zoom=(1, 2), freeze=("backbone",)).zoom == (1, 2)
+
+
+def test_changed_values_are_read_as_they_are_written() -> None:
+    changes = (("weigh", {"depth": 4.0, "dir": 1.5}), ("zoom", (0.8, 1.3)), ("lr", 1e-4), ("compile", True))
+    assert parse_changes(set_words(changes)[1::2]) == changes

@@ -192,8 +192,16 @@ def changed(usual: T, changes: Mapping[str, Any], *, fixed: str, what: str) -> T
 
 def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:
     """Changed values as words of the command line."""
-    texts = [(key, "[" + ",".join(map(str, v)) + "]" if isinstance(v, tuple) else v) for key, v in changes]
-    return [word for key, text in texts for word in ("--set", f"{key}={text}")]
+    return [word for key, value in changes for word in ("--set", f"{key}={_written(value)}")]
+
+
+def _written(value: Any) -> str:
+    """A value in YAML, as short as it goes."""
+    if isinstance(value, tuple):
+        return "[" + ",".join(map(str, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {one}" for key, one in value.items()) + "}"
+    return str(value)
 
 
 def recipe_data(recipe: Recipe) -> dict[str, Any]:
