@@ -240,7 +240,7 @@ def together(name: str, rows: Sequence[Row]) -> Row:
 
 
 def page(rows: Sequence[dict[str, Any]]) -> None:
-    """Write the table of docs/loop.md."""
+    """Write the table of docs/loop.md; the last two rows hold several towns."""
     lines = [
         "| town | vehicle-hours | contacts | per 100 h | upper 95 % limit | off the road | in a lasting queue |",
         "|---" * 7 + "|",
@@ -251,6 +251,8 @@ def page(rows: Sequence[dict[str, Any]]) -> None:
             f"| {row['town']} | {row['hours']:,.0f} | {len(row['contacts'])} | {mean:.2f} | {most:.2f} | "
             f"{len(row['off_road'])} | {len(row['stuck'])} |"
         )
+    towns = [rate(row)[0] for row in rows[:-2]]
+    lines.append(f"| all, each town alike | | | {sum(towns) / len(towns):.2f} | | | |")
     insert("loop.md", "traffic", lines)
 
 
