@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.run_folder import write_run
 from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
@@ -17,6 +18,8 @@ from ssad.bench.kinds.gap import Gap, GapSuite
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite, suite_files
 from ssad.core.errors import SSADError
+from ssad.core.jsonl import read_lines
+from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace
 from ssad.core.types import AgentKind
 from ssad.recording.loop_perturbations import perturbation_names, texture_version, worn
@@ -123,6 +126,20 @@ def test_the_page_has_tables_a_figure_and_drives(folder: Path) -> None:
     assert (folder / "tables" / "changes.csv").is_file()
     assert summary(folder).rows
     assert scatter(found) == "" or "<svg" in scatter(found)
+
+
+def test_copies_change_no_table(folder: Path, tmp_path: Path) -> None:
+    """Equal drives are one case: a run with each of its lines three times has the same estimates and intervals."""
+    header, lines = read_json(folder / "run.json"), read_lines(folder / "results.jsonl")
+    copies = [line | {"key": f"{line['key']}{k}"} for k in range(2) for line in lines]
+    written = {}
+    for name, told in (("plain", lines), ("copied", [*lines, *copies])):
+        run = write_run(tmp_path / name, header, told)
+        (run / "episodes.jsonl").write_bytes((folder / "episodes.jsonl").read_bytes())
+        write_report(run)
+        written[name] = {path.name: path.read_bytes() for path in (run / "tables").iterdir()}
+    assert written["plain"]
+    assert written["copied"] == written["plain"]
 
 
 def test_a_collision_goes_where_the_object_that_was_hit_is_found(tmp_path: Path) -> None:
