@@ -415,3 +415,55 @@ def test_safebench_actors_stand_where_its_classes_put_them(data_dir: Path, carla
     assert poses("LaneChanging/00") == [(107.5, -5.2, 0.0), (108.5, -1.8, 0.0)]
     assert poses("VehiclePassing/00") == [(122.5, -1.8, 0.0), (152.5, 1.8, 3.14)]
     assert poses("RightTurn/00") == [(-14.5, -5.2, 0.0)]
+
+
+def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> None:
+    flat = make(tmp_path / "flat")
+    inside = tmp_path / "SafeBench" / "safebench" / "scenario"
+    (inside / "config").mkdir(parents=True)
+    (inside / "scenario_data").mkdir()
+    (flat / "scenario_type").rename(inside / "config" / "scenario_type")
+    (flat / "route").rename(inside / "scenario_data" / "route")
+    rows = [(0, 0, None), (5, 3, None), (5, 3, [0.5]), (5, 4, None)]
+    entries = [
+        {"data_id": k, "scenario_id": number, "route_id": route, "parameters": told}
+        for k, (number, route, told) in enumerate(rows)
+    ]  # fmt: skip
+    (inside / "config" / "scenario_type" / "standard.json").write_text(json.dumps(entries))
+    left_out: list[str] = []
+    found = import_routes(tmp_path / "SafeBench", left_out=left_out)
+    assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
+    assert [line.rpartition("/")[2] for line in left_out] == [
+        "standard.json: entry 0: unknown scenario_id 0; known: 1 to 9",
+        "standard.json: entry 2: parameters of an entry are not read; set them to null",
+        "scenario_05_route_04.xml: no such route file; standard.json asks for it",
+    ]
+    with pytest.raises(FormatError, match="unknown scenario_id 0"):
+        import_routes(tmp_path / "SafeBench")
+    (inside / "scenario_data" / "route" / "scenario_05_routes" / "scenario_05_route_03.xml").write_text("<routes/>")
+    with pytest.raises(FormatError, match="none of its routes can be read; the first: "):
+        import_routes(tmp_path / "SafeBench", left_out=[])
+
+
+def test_a_trigger_on_a_curve_is_found_on_the_route_through_its_town(tmp_path: Path) -> None:
+    """The straight line between the ends of a turn passes more than 2 m beside its lane."""
+    from ssad.roads import load_town
+    from ssad.roads.router import route_along
+
+    turn = load_scenarios("RightTurn")[0]
+    ends = (turn.route[0], turn.route[-1])
+    route = route_along(load_town(turn.town), ends)
+    middle = len(route.xy) // 2
+    text = "".join(f'<waypoint x="{p.x}" y="{-p.y}" yaw="{-math.degrees(p.yaw)}"/>' for p in ends)
+    x, y, yaw = float(route.xy[middle, 0]), float(route.xy[middle, 1]), float(route.yaw[middle])
+    trigger = event(transform={"x": x, "y": -y, "yaw": -math.degrees(yaw)})
+    folder = make(tmp_path, events=[trigger], route=f'<routes><route id="0" town="{turn.town}">{text}</route></routes>')
+    table = (folder / TABLE).read_text()
+    (folder / TABLE).write_text(table.replace('"T"', f'"{turn.town}"'))
+    (found,) = import_routes(folder)
+    assert found.trigger is not None
+    assert (found.trigger.x, found.trigger.y) == pytest.approx((x, y))
+    for path in (folder / TABLE, folder / XML):
+        path.write_text(path.read_text().replace(turn.town, "Nowhere"))
+    with pytest.raises(FormatError, match="no trigger of RedlightRunning in Nowhere lies on the route"):
+        import_routes(folder)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from pathlib import Path
 from typing import Annotated
 
@@ -65,10 +67,12 @@ def import_map(
 
 
 def import_routes(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of SafeBench, FREA or leaderboard routes.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Routes of SafeBench, FREA (or a checkout) or leaderboard 1.0.")
+    ],
     name: Annotated[str | None, typer.Option(help="Name of the set.  [default: name of the folder]")] = None,
 ) -> None:
-    """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite."""
+    """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
     from ssad.core.safeio import home
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
@@ -79,11 +83,15 @@ def import_routes(
         raise ConfigError(f"'{label}' cannot name a set; choose a name of letters, digits, _ and - with --name")
     if label in BUILT_IN_SETS:
         raise ConfigError(f"'{label}' is a built-in set; choose another name with --name")
-    scenarios = read(folder)
+    left_out: list[str] = []
+    scenarios = read(folder, left_out=left_out)
     path = home() / "scenarios" / f"{label}.yaml"
     save_scenarios(path, scenarios)
     towns = ", ".join(sorted({s.town for s in scenarios}))
     print(f"set {label}: {len(scenarios)} scenarios on {towns}, written to {path}")
+    counted = Counter(re.sub(r": entry \d+", "", line) for line in left_out)
+    for line, count in counted.items():
+        print(f"left out or not read: {line}{f' ({count} entries)' if count > 1 else ''}")
 
 
 def import_drive(

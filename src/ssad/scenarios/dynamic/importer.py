@@ -3,8 +3,11 @@
 SafeBench and FREA: `scenario_type/*.json` lists episodes (scenario id, route id); routes are in
 `route/scenario_XX_routes/scenario_XX_route_YY.xml`, triggers and actors in
 `route/scenarios/scenario_XX.json`. Leaderboard: XML files of routes beside JSON files of triggers; every
-trigger on a route gives a scenario. CARLA's frame (x forward, y right, yaw clockwise in degrees) becomes
-ours here and nowhere else. The town is not needed. Nothing of CARLA's weather is read.
+trigger on a route gives a scenario. In a whole checkout of SafeBench or FREA the two folders lie deeper
+(`config/scenario_type`, `scenario_data/route`) and are found. CARLA's frame (x forward, y right, yaw clockwise
+in degrees) becomes ours here and nowhere else. The town is not needed, but helps: a trigger is looked for beside
+the straight lines between key points, and if there is none, beside the route through an imported town.
+Nothing of CARLA's weather is read.
 """
 
 from __future__ import annotations
@@ -17,9 +20,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import FormatError
+import numpy as np
+
+from ssad.core.errors import FormatError, SSADError
 from ssad.core.safeio import dotted, read_json, read_xml
 from ssad.core.types import Pose, Scenario
+from ssad.roads import load_town
+from ssad.roads.router import route_along
 from ssad.scenarios.dynamic.catalog import PRECRASH
 from ssad.scenarios.dynamic.schema import problems
 
@@ -70,33 +77,65 @@ class _Road:
     points: tuple[Pose, ...]
 
 
-def import_routes(folder: Path) -> tuple[Scenario, ...]:
+def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[Scenario, ...]:
     """All scenarios of a folder, in its order; of several lists in `scenario_type` the longest is taken.
 
     Args:
-        folder: A SafeBench, FREA or leaderboard folder, or one list in `scenario_type`.
+        folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`.
+        left_out: Gets a line for each entry of a list that is broken, and the rest comes in; None: the first of them is
+            an error.
 
     Raises:
-        FormatError: The message says what is broken and where.
+        FormatError: The message says what is broken and where; or nothing is left.
     """
     folder = Path(folder)
     if folder.is_file() and folder.parent.name == "scenario_type":
-        return _listed(folder.parent.parent, _read_list(folder), folder)
+        return _listed(_routes_of(folder.parent), _read_list(folder, left_out), folder, left_out)
     if not folder.is_dir():
         raise FormatError(f"{folder}: no such folder")
-    lists = sorted((folder / "scenario_type").glob("*.json"))
+    lists = sorted(path for place in _scenario_types(folder) for path in place.glob("*.json"))
     if lists:
-        entries = {path: _read_list(path) for path in lists}
-        longest = max(lists, key=lambda path: len(entries[path]))
-        return _listed(folder, entries[longest], longest)
+        found: dict[Path, tuple[list[tuple[int, int]], list[str]]] = {}
+        for path in lists:
+            missing: list[str] = []
+            found[path] = _read_list(path, None if left_out is None else missing), missing
+        longest = max(lists, key=lambda path: len(found[path][0]))
+        entries, missing = found[longest]
+        if left_out is not None:
+            left_out += missing
+        return _listed(_routes_of(longest.parent), entries, longest, left_out)
     return _leaderboard(folder)
+
+
+def _scenario_types(folder: Path) -> list[Path]:
+    """The folder of lists: in the folder itself, else the nearest below it (a checkout)."""
+    own = folder / "scenario_type"
+    if own.is_dir():
+        return [own]
+    deeper = [path for path in folder.rglob("scenario_type") if path.is_dir() and any(path.glob("*.json"))]
+    return sorted(deeper, key=lambda path: (len(path.parts), path))[:1]
+
+
+def _routes_of(lists: Path) -> Path:
+    """The folder of routes that belongs to a folder of lists: beside it, else the nearest beside one of its parents.
+
+    Raises:
+        FormatError: There is none.
+    """
+    for place in (lists.parent, lists.parent.parent):
+        near = [path for path in (place / "route", *place.glob("*/route")) if (path / "scenarios").is_dir()]
+        if near:
+            return near[0]
+    raise FormatError(
+        f"{lists.parent}: no folder route with a folder scenarios in it, here or in scenario_data beside it"
+    )
 
 
 # ---------------------------------------------------------------- SafeBench, FREA
 
 
-def _read_list(path: Path) -> list[tuple[int, int]]:
-    """(scenario id, route id) of each entry, in the order of data_id."""
+def _read_list(path: Path, left_out: list[str] | None) -> list[tuple[int, int]]:
+    """(scenario id, route id) of each entry, in the order of data_id; what is no scenario of ours is left out."""
     data = read_json(path)
     if not isinstance(data, list):
         raise FormatError(f"{path}: expected a list of episodes")
@@ -112,35 +151,52 @@ def _read_list(path: Path) -> list[tuple[int, int]]:
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
                 raise FormatError(f"{path}: entry {i}: {key} should be a whole number, not {value!r}")
             ids.append(value)
+        trouble = ""
         if ids[1] not in _TYPES:
-            raise FormatError(f"{path}: entry {i}: unknown scenario_id {ids[1]}; known: 1 to {max(_TYPES)}")
-        if entry.get("parameters") is not None:
-            raise FormatError(f"{path}: entry {i}: parameters of an entry are not read; set them to null")
-        rows.append(ids)
+            trouble = f"{path}: entry {i}: unknown scenario_id {ids[1]}; known: 1 to {max(_TYPES)}"
+        elif entry.get("parameters") is not None:
+            trouble = f"{path}: entry {i}: parameters of an entry are not read; set them to null"
+        if trouble and left_out is None:
+            raise FormatError(trouble)
+        if trouble and left_out is not None:
+            left_out.append(trouble)
+        if ids[1] in _TYPES:
+            rows.append(ids)
     rows.sort(key=lambda row: row[0])
     return [(row[1], row[2]) for row in rows]
 
 
-def _listed(folder: Path, entries: Sequence[tuple[int, int]], listing: Path) -> tuple[Scenario, ...]:
+def _listed(
+    routes: Path, entries: Sequence[tuple[int, int]], listing: Path, left_out: list[str] | None
+) -> tuple[Scenario, ...]:
     """The scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
+    if not entries:
+        raise FormatError(f"{listing}: no entry of it can be read")
     suite = "frea" if all(number == NATURAL_ID for number, _ in entries) else "safebench"
     title = {"frea": "FREA", "safebench": "SafeBench"}[suite]
     total = Counter(entries)
     done: Counter[tuple[int, int]] = Counter()
-    cache: dict[tuple[int, int], Scenario] = {}
+    cache: dict[tuple[int, int], Scenario | None] = {}
     events: dict[int, list[_Event]] = {}
     result = []
     for number, route_id in entries:
         key = (number, route_id)
         if key not in cache:
-            if number not in events:
-                events[number] = _read_events(folder / "route" / "scenarios" / f"scenario_{number:02d}.json")
-            name = f"scenario_{number:02d}_route_{route_id:02d}.xml"
-            path = folder / "route" / f"scenario_{number:02d}_routes" / name
-            if not path.is_file():
-                raise FormatError(f"{path}: no such route file; {listing.name} asks for it")
-            cache[key] = _scenario(path, _TYPES[number], events[number])
+            try:
+                if number not in events:
+                    events[number] = _read_events(routes / "scenarios" / f"scenario_{number:02d}.json")
+                path = routes / f"scenario_{number:02d}_routes" / f"scenario_{number:02d}_route_{route_id:02d}.xml"
+                if not path.is_file():
+                    raise FormatError(f"{path}: no such route file; {listing.name} asks for it")
+                cache[key] = _scenario(path, _TYPES[number], events[number])
+            except FormatError as error:
+                if left_out is None:
+                    raise
+                left_out.append(str(error))
+                cache[key] = None
         base, repetition = cache[key], done[key]
+        if base is None:
+            continue
         done[key] += 1
         if number == NATURAL_ID:
             name, group = f"{suite}/{base.town}_{route_id:02d}", base.town
@@ -150,6 +206,9 @@ def _listed(folder: Path, entries: Sequence[tuple[int, int]], listing: Path) -> 
             name += f"/{repetition:02d}"
         source = f"{title} scenario {number} route {route_id:02d}"
         result.append(replace(base, name=name, group=group, seed=repetition, source=source))
+    if not result:
+        assert left_out
+        raise FormatError(f"{listing}: none of its routes can be read; the first: {left_out[0]}")
     return tuple(result)
 
 
@@ -159,9 +218,7 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
     if len(roads) != 1:
         raise FormatError(f"{path}: expected one route, found {len(roads)}")
     road = roads[0]
-    found = sorted(
-        (at, i) for i, e in enumerate(events) if e.town == road.town and (at := _along(road, e.trigger)) is not None
-    )
+    found = _triggers(road, events) or _triggers(_through_town(road), events)
     if not found and kind != "NaturalJunction":
         raise FormatError(f"{path}: no trigger of {kind} in {road.town} lies on the route (2 m, 10 degrees)")
     event = events[found[0][1]] if found else None
@@ -176,6 +233,25 @@ def _scenario(path: Path, kind: str, events: Sequence[_Event]) -> Scenario:
     if kind in _PLACED and not scenario.placements:
         raise FormatError(f"{path}: its trigger names no other actor, which {kind} needs")
     return _checked(scenario, path)
+
+
+def _triggers(road: _Road, events: Sequence[_Event]) -> list[tuple[float, int]]:
+    """How far along a route its triggers are, and their numbers, in order."""
+    rows = ((_along(road, e.trigger), i) for i, e in enumerate(events) if e.town == road.town)
+    return sorted((at, i) for at, i in rows if at is not None)
+
+
+def _through_town(road: _Road) -> _Road:
+    """The route with a point each metre along the lanes of its town, if that is known and has such a route.
+
+    Source: SafeBench (Xu et al. 2022) interpolates a route to a point each metre and matches triggers to these.
+    """
+    try:
+        route = route_along(load_town(road.town), road.points)
+    except SSADError:  # a town that is not imported, or a route that leaves its lanes
+        return road
+    points = tuple(Pose(*map(float, row)) for row in np.column_stack([route.xy, route.yaw]))
+    return replace(road, points=points)
 
 
 def _checked(scenario: Scenario, path: Path) -> Scenario:
@@ -213,11 +289,7 @@ def _leaderboard(folder: Path) -> tuple[Scenario, ...]:
     result: list[Scenario] = []
     for path in routes:
         for road in _read_roads(path):
-            found = sorted(
-                (at, i)
-                for i, e in enumerate(events)
-                if e.town == road.town and (at := _along(road, e.trigger)) is not None
-            )
+            found = _triggers(road, events)
             count: Counter[str] = Counter()
             for _, i in found:
                 event = events[i]
