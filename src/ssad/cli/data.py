@@ -12,7 +12,9 @@ from ssad.core.errors import ConfigError
 
 
 def shift(
-    source: Annotated[Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, or an image file.")],
+    source: Annotated[
+        Path, typer.Argument(metavar="DATAROOT", help="nuScenes folder, folder of pictures, or an image file.")
+    ],
     out: Annotated[
         Path,
         typer.Argument(metavar="OUT", help="Folder for the shifted nuScenes roots, or FILE.png for a contact sheet."),
@@ -54,9 +56,11 @@ def shift(
 ) -> None:
     """Apply distribution shifts to a nuScenes folder (nuScenes-N), or to one image as a contact sheet.
 
+    In any other folder, such as KITTI's or COCO's, each picture is shifted by itself (docs/shifts.md).
+
     To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
     """
-    from ssad.toolbox.commands import shift_folder, verify_folder, write_contact_sheets
+    from ssad.toolbox.commands import shift_folder, shift_picture_folder, verify_folder, write_contact_sheets
 
     if verify:
         raise typer.Exit(verify_folder(out))
@@ -76,6 +80,16 @@ def shift(
             calibration=calibration,
         )
         return
+    if source.is_dir() and not any(source.glob("*/sample_data.json")):
+        for name, value in (("--version", version), ("--split", split), ("--scenes", scenes), ("--ray", ray)):
+            if value:
+                raise ConfigError(f"{name} is for a nuScenes folder; {source} has no VERSION/sample_data.json")
+        raise typer.Exit(
+            shift_picture_folder(
+                source, out, shifts=names, severity=severity,
+                settings={"seed": seed, "calibration": calibration, "quality": quality, "subsampling": subsampling},
+            )
+        )  # fmt: skip
     code = shift_folder(
         source,
         out,

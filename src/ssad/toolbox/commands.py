@@ -17,7 +17,8 @@ from ssad.evaluation.contact_sheet import parse_box, write_sheets
 from ssad.jobs.progress import Live
 from ssad.scenarios.static.shifts import KNOWN, SHIFTS, Calibration
 from ssad.toolbox.manifest import PAGE, check_manifest, manifest_digest, read_manifest, verify
-from ssad.toolbox.options import Options, Strength
+from ssad.toolbox.options import SUBSAMPLING, Options, Strength
+from ssad.toolbox.picture_folder import picture_shifts, shift_pictures
 from ssad.toolbox.write import materialise
 
 
@@ -120,6 +121,49 @@ def shift_folder(
             "fix these files in the dataset and repeat the command"
         )
     return int(failed > 0)
+
+
+def shift_picture_folder(
+    source: Path, out: Path, *, shifts: Sequence[str], severity: str, settings: Mapping[str, Any]
+) -> int:
+    """Shift the pictures of a folder that is no nuScenes root, and print one line for each new folder.
+
+    Args:
+        source: The folder.
+        out: Folder of the new ones.
+        shifts: See `shift_names`.
+        severity: See `severities`.
+        settings: See `shift_pictures`.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        SSADError: See `shift_pictures`.
+    """
+    if settings["calibration"] not in get_args(Calibration):
+        raise unknown_name("calibration", settings["calibration"], get_args(Calibration))
+    if settings["subsampling"] not in SUBSAMPLING:
+        raise unknown_name("subsampling", settings["subsampling"], SUBSAMPLING)
+    chosen, strengths = picture_shifts(shift_names(shifts)), severities(severity)
+    try:
+        with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as live:
+            written = shift_pictures(
+                source, out, shifts=chosen, severities=strengths, settings=settings, progress=live.show
+            )
+    except KeyboardInterrupt:
+        print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
+        return 130
+    left_out = [name for name in shift_names(shifts) if name not in chosen]
+    if left_out:
+        print(f"left out, since they need boxes in space: {', '.join(left_out)}")
+    for one in written:
+        told = f"{one.root}: {one.shifted} pictures shifted, {one.linked} other files linked unchanged, "
+        told += f"{100 * one.applied:.0f} % of the pictures changed"
+        print(told + (f", {len(one.reasons)} failed" if one.reasons else ""))
+        for reason in one.reasons[:3]:
+            print(f"  {reason}")
+    return int(any(one.reasons for one in written))
 
 
 def verify_folder(out: Path) -> int:

@@ -13,6 +13,7 @@ from ssad.scenarios.static.shifts import KNOWN, VERSIONS, Calibration, ShiftSpec
 
 Labels = Literal["original", "transformed"]
 Strength = int | Literal["random"]
+SUBSAMPLING = ("auto", "444", "422", "420")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,7 @@ class Options:
             raise ConfigError("no shift or no severity to apply")
         if self.labels not in ("original", "transformed"):
             raise ConfigError(f"labels '{self.labels}': expected original or transformed")
-        if self.subsampling not in ("auto", "444", "422", "420"):
+        if self.subsampling not in SUBSAMPLING:
             raise ConfigError(f"subsampling '{self.subsampling}': expected auto, 444, 422 or 420")
         if not 1 <= self.quality <= 100:
             raise ConfigError(f"quality {self.quality}: expected 1 to 100")
