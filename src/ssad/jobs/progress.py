@@ -71,5 +71,5 @@ class Live:
     ) -> None:
         if self.bar:
             self.bar.stop()
-        else:
+        elif kind is None or self.done > self.first:  # an error before anything was done is alone
             self.line()
