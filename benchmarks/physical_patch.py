@@ -78,9 +78,9 @@ class Variant:
 VARIANTS = {
     "as-it-is": Variant("as it is"),
     "exact": Variant("printed and placed exactly (no expectation)", settings={"expectation": NOMINAL}),
-    "free": Variant("exact, without total variation and inks", settings=FREE),
-    "any-colour": Variant("the same, with any albedo from 0 to 1", settings=FREE, shown=any_light),
-    "longer": Variant("the same, four times the epochs", settings=FREE, shown=any_light, longer=4),
+    "free": Variant("printed exactly, without total variation and inks", settings=FREE),
+    "any-colour": Variant("printed exactly, no total variation, no inks, any albedo", settings=FREE, shown=any_light),
+    "longer": Variant("the same as the last, four times the epochs", settings=FREE, shown=any_light, longer=4),
     "slower": Variant("as it is, rate 0.01", settings={"rate": 0.01}),
     "faster": Variant("as it is, rate 0.1", settings={"rate": 0.1}),
     "small-steps": Variant("as it is, 4 pictures a step", settings={"batch": 4}),
@@ -182,11 +182,11 @@ def main() -> None:
 
     for path in given.join:
         for row in json.loads(path.read_text()):
-            add(row)
+            add(row | {"about": VARIANTS[row["name"]].about})
     for name in () if given.join else given.names or VARIANTS:
         budget = {"count": given.count, "epochs": given.epochs, "batch": given.batch}
-        add(measure(name, **budget, home=given.home, device=given.device))
-        print(json.dumps(rows[-1]), flush=True)
+        add(row := measure(name, **budget, home=given.home, device=given.device))
+        print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":
