@@ -24,6 +24,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import (
     Controller,
+    End,
     Episode,
     EpisodeAgent,
     LaneType,
@@ -142,7 +143,8 @@ def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, de
         fresh, before = touch & ~before, touch
         if now <= SETTLE:
             continue
-        here = world.array("active") != Presence.ABSENT
+        # where the first vehicle is at the end of its way, the scene has ended and stands still
+        here = (world.array("active") != Presence.ABSENT) & (world.ended() == End.RUNNING)[:, None]
         steps += int(here.sum())
         for scene, agent in np.argwhere(fresh != 0).tolist():
             for other in range(agent + 1, world.agents):
