@@ -12,11 +12,16 @@ from pathlib import Path
 
 import pytest
 from helpers.sharing import Shared
+from hypothesis import HealthCheck, settings
 
 # One thread a process: as many as there are cores in each of several test workers only wait for each other. The
 # libraries read this when they are first imported, and child processes inherit it.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(_name, "1")
+
+# The same cases in every run and on every machine, however slow it is: what is drawn anew cannot hold a release up.
+settings.register_profile("same", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("same")
 
 ROOT = Path(__file__).resolve().parent.parent
 
