@@ -311,7 +311,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     page = render(
         "digital.html", found, others=others, distances=distances,
         main=main, lost=lost, effort=effort, every=every, classes=classes, audit=checked,
-        verdict=verdict, paper=audit(published_attempts()) if run.suite.get("reference") else None, tiles=tiles(run),
+        audited=verdict, paper=audit(published_attempts()) if run.suite.get("reference") else None, tiles=tiles(run),
         plot=curves(run, "radius"), plot_steps=curves(run, "steps"), pictures=pictures(found.folder),
         samples=max(int(r.get("n", 0)) for r in run.records.values()), scenes=run.scenes,
         failures=[
