@@ -24,7 +24,7 @@ from ssad.report.kinds.digital import load_digital_run, main_table
 from ssad.report.load import load_run
 
 THREE, OTHER, TWO = (f"helpers.linear3d:{name}" for name in ("build", "build_other", "build_flat"))
-HARD = f"{THREE}@hard"
+HARD = "hard"  # what records call it
 OVER = ("others", "drive")
 
 
@@ -42,7 +42,7 @@ def folder(tiny_set: Path, shared: Shared) -> Path:
 def suite_of(root: Path, **changes: Any) -> DigitalSuite:
     base: dict[str, Any] = {
         "kind": "digital", "name": "t", "detectors": [THREE], "transfer_detectors": [TWO, OTHER], "data": str(root),
-        "split": "all", "replicates": 3, "transfer": ["fgsm"], "hardened": [HARD],
+        "split": "all", "replicates": 3, "transfer": ["fgsm"], "hardened": [f"{THREE}@{HARD}"],
         "attacks": ["fgsm", *({"name": "universal", "steps": 3, "options": {"frames": 4, "over": o}} for o in OVER)],
     }  # fmt: skip
     return DigitalSuite.model_validate(base | changes)

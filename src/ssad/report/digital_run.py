@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ssad.core.registry import split_weights
+from ssad.core.registry import label_of, split_weights
 from ssad.report.kinds.detection import cell_of, replicates_of, score_cell
 from ssad.report.load import Run
 from ssad.report.tables import Cell
@@ -75,19 +75,20 @@ class DigitalRun:
     @property
     def detectors(self) -> list[str]:
         """In the order of the suite."""
-        return [split_weights(text)[0] for text in self.suite["detectors"]]
+        return [_called(text) for text in self.suite["detectors"]]
 
     @property
     def hardened(self) -> list[tuple[str, str]]:
         """Detectors of adversarially trained weights, and of each the one that its name begins with ("": none)."""
         names = [split_weights(text)[0] for text in self.suite.get("hardened", [])]
-        ordinary = sorted(self.detectors, key=len, reverse=True)
-        return [(name, next((one for one in ordinary if name.startswith(one)), "")) for name in names]
+        ordinary = sorted((split_weights(text)[0] for text in self.suite["detectors"]), key=len, reverse=True)
+        beside = (next((one for one in ordinary if name.startswith(one)), "") for name in names)
+        return [(_called(name), _called(one)) for name, one in zip(names, beside, strict=True)]
 
     @property
     def everyone(self) -> list[str]:
         """Those, and the detectors that take part in the transfer alone."""
-        others = [split_weights(text)[0] for text in self.suite.get("transfer_detectors", [])]
+        others = [_called(text) for text in self.suite.get("transfer_detectors", [])]
         return [*self.detectors, *others]
 
     def flat(self, detector: str) -> bool:
@@ -127,6 +128,11 @@ class DigitalRun:
         return self.record(detector, Setting(defence=defence, subset=subset))
 
 
+def _called(text: str) -> str:
+    """What records call a detector that a suite names."""
+    return label_of(split_weights(text)[0])
+
+
 @dataclass(frozen=True)
 class Resampling:
     """How many scenes were resampled for one record: it may be of fewer than others."""
@@ -136,14 +142,14 @@ class Resampling:
 
 def load_digital_run(run: Run) -> DigitalRun:
     """The records of a run folder."""
-    return DigitalRun(run, {(r["detector"], setting_of(r)): r for r in run.lines})
+    return DigitalRun(run, {(_called(r["detector"]), setting_of(r)): r for r in run.lines})
 
 
 def setting_of(record: Mapping[str, Any]) -> Setting:
     """What tells the attack of a record from others; records of older versions say less."""
     return Setting(
         record["attack"] or "", record["loss"] or "", record["norm"] or "", float(record["radius"]),
-        int(record["steps"]), record["options"], record.get("source", ""), record.get("defence", ""),
+        int(record["steps"]), record["options"], _called(record.get("source", "")), record.get("defence", ""),
         bool(record.get("aware")), record.get("target", ""), int(record.get("subset", 0)),
     )  # fmt: skip
 
