@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
@@ -48,10 +49,12 @@ class FakeWarp:
 
 
 @pytest.fixture
-def warp(monkeypatch: pytest.MonkeyPatch) -> FakeWarp:
+def warp(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeWarp]:
     fake = FakeWarp()
     monkeypatch.setitem(sys.modules, "warp", fake)
-    return fake
+    quiet_warp.cache_clear()  # Warp is started once a process; here another test may have started the real one
+    yield fake
+    quiet_warp.cache_clear()
 
 
 def has_driver(monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
