@@ -94,8 +94,8 @@ def wearer(kind: str, episode: Episode, graph: LaneGraph) -> int | None:
 def signs_of_route(graph: LaneGraph, route: F32) -> F64:
     """Where the stop signs stand that a way [N, 2] comes by, x, y [M, 2]."""
     stop = graph.sign_xy[graph.sign_kind == SignKind.STOP].astype(np.float64).reshape(-1, 2)
-    ruled = [bool(np.hypot(*(route - at).T).min() < BESIDE) for at in stop]
-    beside: F64 = stop[np.array(ruled, bool)]
+    away = np.linalg.norm(stop[:, None] - route[None], axis=-1).min(1)
+    beside: F64 = stop[away < BESIDE]
     return beside
 
 

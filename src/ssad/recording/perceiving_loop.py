@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ssad.core.checkpoints import state_hash
+from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import CAMERAS
 from ssad.core.schema import Schema
 from ssad.core.seeding import digest
@@ -17,7 +18,7 @@ from ssad.core.types import Episode, EpisodeTrace
 from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
 from ssad.drivers.perceiving.repair import Repair
-from ssad.drivers.perceiving.signs import SignReading
+from ssad.drivers.perceiving.signs import SignReading, sign_labels
 from ssad.drivers.perceiving.tracker import Tracking
 from ssad.evaluation.drive_perception import Watcher
 from ssad.metrics import episode_metrics
@@ -76,6 +77,16 @@ class PerceivingSystem(Schema):
     def perfect(self) -> bool:
         """Whether it is told the truth."""
         return self.detector == "truth"
+
+    def check(self) -> None:
+        """ConfigError: its settings of stop signs do not fit together, or its detector knows no stop signs."""
+        if self.sign_memory is not None and not self.reads_signs:
+            raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
+        if self.reads_signs:
+            try:
+                sign_labels(self.make().eyes.classes)
+            except ConfigError as error:
+                raise ConfigError(f"system {self.name}, detector {self.detector}: {error}") from None
 
     def make(
         self, watch: Callable[[Sighting | Known], None] | None = None, *, repair: Repair | None = None

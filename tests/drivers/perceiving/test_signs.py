@@ -11,6 +11,7 @@ from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import upright_pose
 from ssad.drivers.perceiving.signs import FACE, SignMemory, SignReading, read_signs
+from ssad.recording.perceiving_loop import PerceivingSystem
 
 CLASSES = ("car", "stop_sign")
 EGO = (120.0, -35.0, 2.1)
@@ -63,3 +64,15 @@ def test_settings_that_cannot_be() -> None:
     for wrong in ({"confirm": 0}, {"memory": -1.0}, {"score": 2.0}, {"memory": float("nan")}):
         with pytest.raises(ConfigError, match="reading signs"):
             SignReading(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"detector": "truth", "reads_signs": True}, "system a, detector truth: signs are read by a detector with"),
+        ({"detector": "yolov5n", "sign_memory": 1.0}, "system a: sign_memory can only be used with reads_signs: true"),
+    ],
+)
+def test_a_suite_says_before_it_drives_that_signs_cannot_be_read(settings: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        PerceivingSystem(name="a", **settings).check()

@@ -46,6 +46,21 @@ class SignReading:
             )
 
 
+def sign_labels(classes: Sequence[str]) -> list[int]:
+    """Labels of stop signs.
+
+    Args:
+        classes: Names of a detector's labels.
+
+    Raises:
+        ConfigError: It knows no stop signs.
+    """
+    labels = [k for k, name in enumerate(classes) if name in NAMES]
+    if not labels:
+        raise ConfigError("signs are read by a detector with the class stop_sign, such as yolov5n")
+    return labels
+
+
 def read_signs(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, score: float) -> F64:
     """Where the stop signs of a picture stand.
 
@@ -62,10 +77,7 @@ def read_signs(found: Detections, camera: Camera, pose: F64, classes: Sequence[s
     Raises:
         ConfigError: The detector knows no stop signs.
     """
-    labels = [k for k, name in enumerate(classes) if name in NAMES]
-    if not labels:
-        raise ConfigError("signs are read by a detector with the class stop_sign, such as yolov5n")
-    chosen = (np.isin(found.label.cpu().numpy(), labels)) & (found.score.detach().cpu().numpy() >= score)
+    chosen = np.isin(found.label.cpu().numpy(), sign_labels(classes)) & (found.score.detach().cpu().numpy() >= score)
     box = found.box.detach().cpu().double().numpy()[chosen]
     depth = camera.intrinsic[1, 1] * FACE / np.maximum(box[:, 3] - box[:, 1], 1.0)
     middle = np.stack([0.5 * (box[:, 0] + box[:, 2]), 0.5 * (box[:, 1] + box[:, 3]), np.ones(len(box))], 1)
@@ -131,14 +143,18 @@ class SignMemory:
             [N] 1 or 0.
         """
         found = np.zeros(len(scenes), np.uint8)
-        for row, scene in enumerate(scenes.tolist()):
-            x, y, yaw = pose[row].astype(np.float64).tolist()
-            c, s = np.cos(yaw), np.sin(yaw)
-            for sign in self._known[scene]:
-                dx, dy = float(sign.place[0]) - x, float(sign.place[1]) - y
-                along, aside = c * dx + s * dy, c * dy - s * dx
-                counts = sign.hits >= self.settings.confirm and float(time[row]) - sign.last <= self.settings.memory
-                found[row] |= counts and -BEHIND < along < AHEAD and abs(aside) < ASIDE
+        signs = [(row, sign) for row, scene in enumerate(scenes.tolist()) for sign in self._known[scene]]
+        if not signs:
+            return found
+        row = np.array([one for one, _ in signs])
+        place = np.array([sign.place for _, sign in signs])
+        hits, last = (np.array(column) for column in zip(*((s.hits, s.last) for _, s in signs), strict=True))
+        yaw = pose[row, 2].astype(np.float64)
+        apart, c, s = place - pose[row, :2], np.cos(yaw), np.sin(yaw)
+        along, aside = c * apart[:, 0] + s * apart[:, 1], c * apart[:, 1] - s * apart[:, 0]
+        counts = (hits >= self.settings.confirm) & (time[row] - last <= self.settings.memory)
+        near = (along > -BEHIND) & (along < AHEAD) & (np.abs(aside) < ASIDE)
+        found[row[counts & near]] = 1
         return found
 
     def snapshot(self) -> Any:
