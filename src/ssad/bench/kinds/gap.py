@@ -108,8 +108,8 @@ class Gap(ScenarioKind):
             check_perturbation(name)
         if any(severity not in range(1, 6) for severity in suite.severities):
             raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
-        for one in suite.systems:
-            one.check()
+        for system in suite.systems:
+            system.check()
         versions = {one.name: one.version for one in suite.systems}
         versions |= {name: system_version(name) for name in suite.ceilings}
         scenarios, towns = described(suite)
