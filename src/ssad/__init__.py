@@ -8,6 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ssad.core.errors import missing_extra
 from ssad.core.version import __version__
 
 if TYPE_CHECKING:
@@ -86,7 +87,10 @@ __all__ = ["__version__", *_WHERE]  # noqa: PLE0604
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for."""
     if name in _WHERE:
-        return getattr(import_module(f"ssad.{_WHERE[name]}"), name)
+        try:
+            return getattr(import_module(f"ssad.{_WHERE[name]}"), name)
+        except ModuleNotFoundError as error:
+            raise missing_extra(error, f"ssad.{name}") or error from None
     raise AttributeError(f"module 'ssad' has no attribute '{name}'")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
 import ssad
-from ssad.core.errors import SSADError, install_extra
+from ssad.core.errors import EXTRA_OF, SSADError, install_extra
 from ssad.core.safeio import home
 
 
@@ -39,6 +39,7 @@ def examine() -> Iterator[Finding]:
     yield Finding("ssad", "ok", ssad.__version__)
     yield _machine()
     yield from _warp()
+    yield _torch()
     yield _carla()
     yield _home()
     yield from _towns()
@@ -70,6 +71,19 @@ def _warp() -> Iterator[Finding]:
         )
     except Exception as error:
         yield Finding("warp", "broken", f"{type(error).__name__}: {error}; reinstall the package warp-lang")
+
+
+def _torch() -> Finding:
+    try:
+        import torch
+        import torchvision
+    except Exception as error:
+        missing = isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF
+        why = "not installed" if missing else f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return Finding("perception", "missing", f"{why}; detectors, attacks and learned drivers need torch and "
+                       f"torchvision; {install_extra('perception')}")  # fmt: skip
+    gpu = "with CUDA" if torch.cuda.is_available() else "on the CPU"
+    return Finding("perception", "ok", f"torch {torch.__version__} {gpu}, torchvision {torchvision.__version__}")
 
 
 def _carla() -> Finding:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.evaluation.camera_truth import camera_truth
 from ssad.evaluation.detection import detect_scene, joined, match_boxes, score_2d, to_host
-from ssad.jobs.machine import gpu_workers
 from ssad.metrics.detection_boxes import TP_METRICS
 from ssad.training.batches import PictureSet
 from ssad.training.data import nuscenes_items
@@ -145,12 +143,6 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
         Small.room = 0
         with pytest.raises(torch.OutOfMemoryError):
             detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
-
-
-def test_processes_share_the_memory_of_the_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = [141 << 30, 24 << 30, 2 << 30]
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda k: SimpleNamespace(total_memory=sizes[k]))
-    assert [gpu_workers(n) for n in (0, 1, 2, 3)] == [0, 14, 20, 21]
 
 
 def test_tensors_are_changed_together_where_they_are_of_a_kind() -> None:

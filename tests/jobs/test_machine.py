@@ -152,7 +152,7 @@ def test_visible_gpus_follow_the_environment(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     assert visible_gpus() == []
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
-    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=SimpleNamespace(device_count=lambda: 3)))
+    monkeypatch.setattr("warp.get_cuda_device_count", lambda: 3)
     assert visible_gpus() == ["0", "1", "2"]
 
 
@@ -163,10 +163,8 @@ def test_visible_gpus_follow_the_environment(monkeypatch: pytest.MonkeyPatch) ->
 def test_gpus_are_shared_by_as_many_as_their_memory_takes(
     monkeypatch: pytest.MonkeyPatch, memory: tuple[int, ...], workers: int
 ) -> None:
-    def properties(k: int) -> SimpleNamespace:
-        return SimpleNamespace(total_memory=memory[k] * GIB)
-
-    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=SimpleNamespace(get_device_properties=properties)))
+    devices = [SimpleNamespace(total_memory=size * GIB) for size in memory]
+    monkeypatch.setattr("warp.get_cuda_devices", lambda: devices)
     assert gpu_workers(len(memory)) == workers
 
 

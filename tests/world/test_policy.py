@@ -11,7 +11,8 @@ import torch
 
 from ssad.core.checkpoints import Card, save_weights
 from ssad.core.errors import FormatError
-from ssad.world.policy import WIDTHS, load_policy, policy_of, tensors_of, to_controls
+from ssad.world.actions import WIDTHS, to_controls
+from ssad.world.policy import load_policy, policy_of, tensors_of
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World
 from tests.world.test_world import bank

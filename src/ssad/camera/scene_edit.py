@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import warp as wp
-from torch import Tensor
 
 from ssad.assets.mesh import Material, Mesh, build, merge
 from ssad.camera.lamps import Lamp
 from ssad.camera.photometry import per_lux
 from ssad.camera.render import Picture, View, develop_radiance, light_of, render
 from ssad.camera.scene import Decal, Layer, Scene, Thing
-from ssad.camera.texture import retexture, taps_of
 from ssad.core.errors import ConfigError
 from ssad.core.types import F64, Bool
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 CARD = Material("card", (0.05, 0.05, 0.05))
 LIFT = 1.0  # m: a card lies this high in its own frame, for what is low there casts no shadow
@@ -139,6 +139,10 @@ def render_with(
         return picture
     if not set(seen) <= set(textures):
         raise ConfigError(f"no texture {min(set(seen) - set(textures))}, which a view shows")
+    import torch  # for scenes with textures alone
+
+    from ssad.camera.texture import retexture, taps_of
+
     radiance = torch.from_numpy(np.array(picture.radiance))
     for number in seen:
         texture = textures[number].detach().cpu().float()

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from ssad.cli import data, exchange, looking, running
-from ssad.core.errors import SSADError, unknown_name
+from ssad.core.errors import SSADError, missing_extra, unknown_name
 from ssad.core.version import __version__
 from ssad.interchange.commands import ExportGroup, register
 from ssad.listing import ALIASES, LISTS
@@ -73,7 +73,13 @@ def list_names(
     for name, rows in LISTS.items():
         if chosen not in (None, name):
             continue
-        found = rows()
+        try:
+            found = rows()
+        except ModuleNotFoundError as error:
+            missing = missing_extra(error, f"the list of {name}")
+            if missing is None or chosen is not None:
+                raise (missing or error) from None
+            found = {str(missing): ""}
         if chosen is None:
             print(f"{name}:")
             if name == "scenarios":  # hundreds of single ones: only when asked for
@@ -120,6 +126,12 @@ def main() -> None:
         sys.exit(2)
     except SSADError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except ModuleNotFoundError as error:  # packages of extras are imported where they are needed
+        missing = missing_extra(error, "this command")
+        if missing is None:
+            raise
+        print(f"error: {missing}", file=sys.stderr)
         sys.exit(2)
     except typer.Abort:
         sys.exit(130)

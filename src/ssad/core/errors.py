@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import importlib.util
+import re
+import sys
 from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
 
 
 class SSADError(Exception):
@@ -25,6 +30,21 @@ class ConfigError(SSADError):
 
 class UnknownNameError(ConfigError):
     """A name that is neither built in nor offered by an installed package."""
+
+
+class MissingExtraError(ConfigError):
+    """What was asked for needs packages of an extra that are not installed.
+
+    Args:
+        what: What was asked for, such as "system 'ppo'".
+        package: A package of `EXTRA_OF` that is missing.
+    """
+
+    def __init__(self, what: str, package: str) -> None:
+        self.extra = EXTRA_OF[package]
+        super().__init__(
+            f"{what} needs the extra {self.extra} ({package} is not installed); {install_extra(self.extra)}"
+        )
 
 
 class MapError(SSADError):
@@ -66,12 +86,44 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError
 
 
 def install_extra(extra: str) -> str:
-    """Say how to install an optional dependency, for the end of a message.
+    """Say how to install an optional dependency here, for the end of a message.
 
     Args:
         extra: Name in `[project.optional-dependencies]` of pyproject.toml.
 
     Returns:
-        The hint, without a final stop.
+        The hint, without a final stop: for a checkout its extra, else the packages themselves.
     """
-    return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"
+    if (Path(__file__).resolve().parents[3] / "pyproject.toml").is_file():
+        return f"in the checkout of SSAD run: pip install '.[{extra}]' (with uv: uv sync --inexact --extra {extra})"
+    pip = importlib.util.find_spec("pip") is not None
+    tool = f"{sys.executable} -m pip install" if pip else f"uv pip install --python {sys.executable}"
+    return f"run: {tool} {' '.join(repr(package) for package in packages_of(extra)) or extra}"
+
+
+def packages_of(extra: str) -> list[str]:
+    """The requirements of an extra, as the installed package states them, such as "torch>=2.15.0"."""
+    try:
+        stated = [text.partition(";") for text in requires("ssad-testbed") or ()]
+    except PackageNotFoundError:
+        return []
+    wanted = re.compile(rf"""extra\s*==\s*['"]{re.escape(extra)}['"]""")
+    return [name.strip() for name, _, marker in stated if wanted.search(marker)]
+
+
+EXTRA_OF = {"torch": "perception", "torchvision": "perception"}
+"""Package that is imported where it is needed -> the extra that brings it."""
+
+
+def missing_extra(error: ModuleNotFoundError, what: str) -> MissingExtraError | None:
+    """Make the error for something that cannot be imported because an extra is missing.
+
+    Args:
+        error: What the import raised.
+        what: What was asked for, such as "system 'ppo'".
+
+    Returns:
+        The error, to be raised; None: no extra brings what is missing.
+    """
+    package = (error.name or "").partition(".")[0]
+    return MissingExtraError(what, package) if package in EXTRA_OF else None

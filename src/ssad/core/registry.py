@@ -17,7 +17,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.errors import EXTRA_OF, ConfigError, install_extra, missing_extra, unknown_name
 
 
 @dataclass(frozen=True)
@@ -135,11 +135,15 @@ def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:
 
     Raises:
         UnknownNameError: Nobody offers the name; the message has the three closest.
+        MissingExtraError: It needs an extra that is not installed.
         ConfigError: The module of a package or of the user does not import, or does not have the object.
     """
     if name in table:
         module, _, attribute = table[name].partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except ModuleNotFoundError as error:
+            raise missing_extra(error, f"{kind} '{name}'") or error from None
     plugins = {point.name: point for point in entry_points(group=f"ssad.{kind}s")}
     if name in plugins:
         return _import(kind, name, plugins[name].value)
@@ -206,4 +210,6 @@ def describe(error: BaseException) -> str:
 def _hint(error: BaseException, module: str, here: str) -> str:
     if isinstance(error, ModuleNotFoundError) and error.name == module.split(".", maxsplit=1)[0]:
         return f"; looked in {here} and the installed packages"
+    if isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF:
+        return f"; {install_extra(EXTRA_OF[error.name])}"
     return ""

@@ -12,7 +12,8 @@ from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
 from ssad.evaluation.camera_truth import scenes_of
-from ssad.evaluation.pictures import WIDTH, richest, tile, title_on
+from ssad.evaluation.drawing import title_on
+from ssad.evaluation.pictures import WIDTH, richest, tile
 from ssad.evaluation.scene_boxes import Examination, Watched, detector_of
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+import numpy.typing as npt
 
 from ssad.core.boxes import camera_yaw, size_columns
 from ssad.core.detections import Solids, Truth
@@ -15,6 +16,9 @@ from ssad.core.types import F64, Bool
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SensorFrame
 from ssad.datasets.nuscenes.splits import scenes_of_split
+
+if TYPE_CHECKING:
+    import torch
 
 NEAR = 0.1  # m in front of the camera at which boxes are cut
 
@@ -43,6 +47,42 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
         found: Annotations of its sample.
         hit: Whether only boxes with a LiDAR point count: what nobody can see is not learned.
     """
+    import torch
+
+    rows, box, turn = boxes_in_picture(frame, found, hit=hit)
+    assert frame.intrinsic is not None
+    own, centre = found.take(rows), found.centre @ turn[:3, :3].T + turn[:3, 3]
+    ahead = own.axes()[:, :, 0] @ turn[:3, :3].T
+    speed = own.velocity @ turn[:3, :3].T
+    label = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[name])) for name in own.category]
+    attribute = [_attribute(names) for names in own.attributes]
+
+    def floats(values: F64) -> torch.Tensor:
+        return torch.from_numpy(np.array(values, np.float32))
+
+    solid = Solids(
+        floats(centre[rows]), floats(own.size_lwh[:, size_columns("lwh", "lhw")]), floats(camera_yaw(ahead)),
+        floats(speed[:, [0, 2]]), torch.tensor(attribute, dtype=torch.int64),
+    )  # fmt: skip
+    return Truth(torch.tensor(label, dtype=torch.int64), floats(box), solid, floats(frame.intrinsic))
+
+
+def boxes_in_picture(
+    frame: SensorFrame, found: Annotations, *, hit: bool = True
+) -> tuple[npt.NDArray[np.intp], F64, F64]:
+    """Which boxes of a sample a camera should find: those of the ten classes whose middle is in its picture.
+
+    Args:
+        frame: The camera frame.
+        found: Annotations of its sample.
+        hit: Whether only boxes with a LiDAR point count.
+
+    Returns:
+        Their rows [N]; hulls of their corners [N, 4], pixels; from the world into the camera's frame [4, 4].
+
+    Raises:
+        ConfigError: It is no camera.
+    """
     if frame.intrinsic is None:
         raise ConfigError(f"{frame.channel} is no camera")
     wanted = np.array([CATEGORY_TO_CLASS.get(c) in MMDET3D_CLASSES for c in found.category], bool)
@@ -57,20 +97,7 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
     wanted &= (middle[:, 0] < frame.width) & (middle[:, 1] < frame.height)
     box, seen = _hulls(frame, found, turn)
     rows = np.flatnonzero(wanted & seen)
-    own = found.take(rows)
-    ahead = own.axes()[:, :, 0] @ turn[:3, :3].T
-    speed = own.velocity @ turn[:3, :3].T
-    label = [MMDET3D_CLASSES.index(str(CATEGORY_TO_CLASS[found.category[r]])) for r in rows]
-    attribute = [_attribute(found.attributes[r]) for r in rows]
-
-    def floats(values: F64) -> torch.Tensor:
-        return torch.from_numpy(np.array(values, np.float32))
-
-    solid = Solids(
-        floats(centre[rows]), floats(own.size_lwh[:, size_columns("lwh", "lhw")]), floats(camera_yaw(ahead)),
-        floats(speed[:, [0, 2]]), torch.tensor(attribute, dtype=torch.int64),
-    )  # fmt: skip
-    return Truth(torch.tensor(label, dtype=torch.int64), floats(box[rows]), solid, floats(frame.intrinsic))
+    return rows, box[rows], turn
 
 
 def _attribute(names: Sequence[str]) -> int:

@@ -17,12 +17,12 @@ from ssad.datasets.nuscenes.scene import SceneData, SensorFrame
 from ssad.detectors.mono3d.decode import corners
 from ssad.evaluation.camera_truth import camera_truth, scenes_of
 from ssad.evaluation.detection import to_images
+from ssad.evaluation.drawing import draw_edges, title_on
 from ssad.evaluation.scene_boxes import Examination, ShiftedScene, Watched, detector_of, shifter_of
 from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts import KNOWN
 
 WIDTH, COLUMNS, LEAST, STRONG = 640, 3, 0.3, 3
-EDGES = tuple((a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit)  # corners that differ in one axis
 TRUE, FOUND = (255, 255, 255), (255, 170, 30)
 
 
@@ -97,12 +97,6 @@ def tile(eye: tuple[Any, str], scene: SceneData, frame: SensorFrame, image: U8, 
     return np.asarray(canvas)
 
 
-def title_on(canvas: U8, text: str) -> None:
-    """Writes a name into the upper left corner."""
-    cv2.rectangle(canvas, (0, 0), (12 + 11 * len(text), 26), (0, 0, 0), -1)
-    cv2.putText(canvas, text, (7, 19), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
-
-
 def draw_flat(canvas: U8, boxes: torch.Tensor, scale: float, *, colour: tuple[int, int, int], width: int) -> None:
     """2D boxes."""
     for box in np.rint(boxes.cpu().double().numpy() * scale * 8).astype(int).tolist():
@@ -116,9 +110,4 @@ def draw_solids(
     if solid is None or not len(solid.yaw):
         return
     points = corners(solid.centre.double(), solid.size_lhw.double(), solid.yaw.double()).cpu().numpy()
-    for box in points[(points[..., 2] > 0.5).all(1)]:
-        flat = box @ intrinsic.T
-        place = np.rint(flat[:, :2] / flat[:, 2:] * scale * 8).clip(-1e6, 1e6).astype(int)
-        for a, b in EDGES:
-            first, last = (int(v) for v in place[a]), (int(v) for v in place[b])
-            cv2.line(canvas, tuple(first), tuple(last), colour, width, cv2.LINE_AA, 3)
+    draw_edges(canvas, points, intrinsic, scale, colour=colour, width=width)

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 
 from ssad.core import safeio
 from ssad.core.generators import Outcome
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64, AgentKind, EpisodeTrace
 from ssad.metrics.realism import motion_features, pooled, realism, wasserstein
+from ssad.roads.edge import edge_distances
+from ssad.roads.query import LaneQuery
 
 EPISODES: Final = 12  # of the reference
 MOVED: Final = 5.0  # m; who moves less is parked and says nothing
@@ -77,16 +78,14 @@ def _approach(outcome: Outcome) -> np.ndarray[Any, Any]:
 
 def motions(trace: EpisodeTrace, graph: LaneGraph, agents: Sequence[int]) -> list[dict[str, F64]]:
     """The features of the vehicles among some agents that move."""
-    from ssad.scenarios.dynamic.transition.road import raster_of
-
     found = []
+    query = LaneQuery(graph)
     for agent in agents:
         span = np.hypot(np.ptp(trace.x[:, agent]), np.ptp(trace.y[:, agent]))
         if span < MOVED or not AgentKind.NONE < trace.kind[agent] <= AgentKind.BICYCLE:
             continue
         path = np.stack([trace.x[:, agent], trace.y[:, agent]], 1).astype(np.float64)
-        edge = raster_of([graph], [path])(torch.from_numpy(path)[:, None], torch.zeros(len(path), dtype=torch.long))
-        found.append(motion_features(trace, agent, edge[:, 0].numpy()))
+        found.append(motion_features(trace, agent, edge_distances(query, path)))
     return found
 
 

@@ -105,9 +105,10 @@ def visible_gpus() -> list[str]:
     given = os.environ.get("CUDA_VISIBLE_DEVICES")
     if given is not None:
         return [name.strip() for name in given.split(",") if name.strip()]
-    import torch
+    import warp
 
-    return [str(k) for k in range(torch.cuda.device_count())]
+    quiet_warp()
+    return [str(k) for k in range(warp.get_cuda_device_count())]
 
 
 # processes that share a GPU: planning a shift and reading pictures is work for the host; and memory of each, bytes
@@ -118,7 +119,8 @@ def gpu_workers(gpus: int) -> int:
     """How many processes share so many GPUs (the first ones that are visible)."""
     if not gpus:
         return 0
-    import torch
+    import warp
 
-    memory = [torch.cuda.get_device_properties(k).total_memory for k in range(gpus)]
+    quiet_warp()
+    memory = [device.total_memory for device in warp.get_cuda_devices()[:gpus]]
     return sum(max(1, min(GPU_WORKERS, size // GPU_SHARE)) for size in memory)

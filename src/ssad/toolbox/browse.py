@@ -21,8 +21,8 @@ from ssad.core.types import F64, U8
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
-from ssad.evaluation.camera_truth import camera_truth
-from ssad.evaluation.pictures import draw_solids
+from ssad.evaluation.camera_truth import boxes_in_picture
+from ssad.evaluation.drawing import draw_edges
 
 WIDTH, REACH, SIDE = 640, 50.0, 640  # pixels of a picture, m around the ego from above, pixels of that
 BOX, GROUND, EGO = (255, 170, 30), (15, 19, 26), (96, 165, 250)
@@ -126,8 +126,9 @@ def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> d
         image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
     scale = WIDTH / image.shape[1]
     canvas: U8 = np.asarray(cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA))
-    truth = camera_truth(frame, found, hit=False)
-    draw_solids(canvas, truth.solid, np.asarray(frame.intrinsic, np.float64), scale, colour=BOX, width=1)
+    rows, _, turn = boxes_in_picture(frame, found, hit=False)
+    corners = found.take(rows).corners() @ turn[:3, :3].T + turn[:3, 3]
+    draw_edges(canvas, corners, np.asarray(frame.intrinsic, np.float64), scale, colour=BOX, width=1)
     save_picture(path, canvas)
     return {"file": path.name, "title": title, "size": (canvas.shape[1], canvas.shape[0])}
 

@@ -16,7 +16,7 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import F64, I32, Bool, Controller, End, Episode
 from ssad.drivers import make_system
-from ssad.world.policy import ACTIONS, WIDTHS, to_controls
+from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
 from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible
 from ssad.world.rollout import Loop
@@ -45,7 +45,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         literal: Equation 6 as it is printed, see `ssad.world.rewards.adversary`.
         off_road: What a step off the road costs, likewise.
         scale: The reward is multiplied by it.
-        action: As in `ssad.world.policy.to_controls`.
+        action: As in `ssad.world.actions.to_controls`.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ class Learning:
         algorithm: ppo, sac, td3 or ddpg.
         steps: Steps of the world, over all scenes.
         observation: Sensor that the policy looks at.
-        action: What it does, see `ssad.world.policy.to_controls`.
+        action: What it does, see `ssad.world.actions.to_controls`.
         reward: Name in `ssad.world.rewards.REWARDS`; an adversary's own reward has none.
         reward_scale: The reward is multiplied by it, so that values stay near 10.
         scenes: Scenes side by side.

@@ -14,7 +14,7 @@ from ssad.core.driving import Policies
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import ENDS, Controller, End, Episode
-from ssad.world.policy import ACTIONS, WIDTHS, to_controls
+from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import REWARDS, Reward
 from ssad.world.rollout import Drivers, Loop
 from ssad.world.scene_view import SceneViews, Window
@@ -45,7 +45,7 @@ def reward_of(reward: str | Reward) -> Reward:
 def action_space(kind: Action) -> gym.spaces.Box:
     """Ranges of the actions.
 
-    `safebench` [2], `frea` [3] and `pedals` [2] in [-1, 1]: see `ssad.world.policy.to_controls`. `controls`: [3]
+    `safebench` [2], `frea` [3] and `pedals` [2] in [-1, 1]: see `ssad.world.actions.to_controls`. `controls`: [3]
     throttle, brake in [0, 1] and steer in [-1, 1].
     """
     if kind == "controls":

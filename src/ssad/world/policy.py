@@ -1,7 +1,7 @@
 """Learned policies: weights with a card, what they look at, and the controls that they give; torch alone runs them.
 
 A policy is a stack of linear layers with ReLU between them, from one sensor of `ssad.world.sensors` to one action of
-`ssad.world.env.to_controls`. Its card says which ones.
+`ssad.world.actions.to_controls`. Its card says which ones.
 """
 
 from __future__ import annotations
@@ -19,39 +19,10 @@ from ssad.core.checkpoints import Card, load_card
 from ssad.core.driving import Observation
 from ssad.core.errors import FormatError
 from ssad.core.types import F32, Controller, Episode
+from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 
-WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversary": 24}
-"""Sensors that a policy can look at, and how many numbers they have."""
-ACTIONS: Mapping[str, int] = {"safebench": 2, "frea": 3, "pedals": 2, "adversary": 2}
-"""Actions that a policy can take, and how many numbers they have; see `to_controls`."""
 SQUASHES = ("clip", "tanh")
 _BOUND = 1.0e4
-
-
-def to_controls(kind: str, action: F32) -> F32:
-    """Policy actions [N, n] to throttle, brake, steer and reverse [N, 4].
-
-    `safebench`: acceleration / 3 m/s^2 and steer / 0.3, with at most 3 of 8 m/s^2 of brake. `frea`: throttle,
-    steer / 0.3 and brake. `pedals`: throttle, or below 0 the whole brake, and steer / 0.3. `adversary`: throttle,
-    below 0 in reverse, and steer / 0.3; no brake. All of them in [-1, 1]; beyond that they are cut.
-
-    Source: SafeBench (Xu et al. 2022) and FREA (Chen et al. 2024), their environments.
-    """
-    a = np.minimum(np.maximum(np.asarray(action, np.float32), -1.0), 1.0)
-    out = np.zeros((len(a), 4), np.float32)
-    first = a[:, 0]
-    if kind == "frea":
-        throttle, brake = first * 0.5 + 0.5, a[:, 2] * 0.5 + 0.5
-        out[:, 0] = throttle
-        out[:, 1] = np.where((brake < 0.05) | (throttle > brake), 0.0, brake)
-    else:
-        out[:, 0] = np.abs(first) if kind == "adversary" else np.maximum(first, 0.0)
-        if kind != "adversary":
-            out[:, 1] = np.maximum(-first, 0.0) * (3.0 / 8.0 if kind == "safebench" else 1.0)
-        else:
-            out[:, 3] = first <= 0.0
-    out[:, 2] = a[:, 1] * 0.3
-    return out
 
 
 @dataclass(frozen=True)

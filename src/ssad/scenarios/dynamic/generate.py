@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssad.core.driving import Choice, Driver, Policies, Selector, Sensor, WorldState
-from ssad.core.errors import ConfigError, SSADError
+from ssad.core.errors import ConfigError, MissingExtraError, SSADError
 from ssad.core.generators import Base, Generator, GeneratorFactory, Outcome, Proposal
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.registry import names, resolve
@@ -61,7 +61,10 @@ def generator_list() -> dict[str, str]:
     """Name of each generator that can be asked for -> what it does, in a line."""
     rows = {}
     for name, where in names("generator", GENERATORS).items():
-        about = (generator_factory(name).__doc__ or "").strip() if name in GENERATORS else ""
+        try:
+            about = (generator_factory(name).__doc__ or "").strip() if name in GENERATORS else ""
+        except MissingExtraError as error:
+            about = f"needs the extra {error.extra}"
         rows[name] = about.partition("\n")[0].rstrip(".") or where
     return rows
 

@@ -6,15 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64
+from ssad.roads.edge import CELL, edge_raster
 from ssad.roads.query import LaneQuery
-
-CELL = 0.5  # m
-MARGIN = 20.0  # m that a raster reaches beyond the points it is made for
 
 
 class RoadRaster:
@@ -30,16 +27,10 @@ class RoadRaster:
     def __init__(self, queries: Sequence[LaneQuery], points: Sequence[F64]) -> None:
         rasters, origins, shapes = [], [], []
         for query, held in zip(queries, points, strict=True):
-            origin = np.floor(held.min(0) - MARGIN)
-            shape = np.ceil((held.max(0) + MARGIN - origin) / CELL).astype(int) + 1
-            x, y = (origin[k] + CELL * np.arange(shape[k]) for k in (0, 1))
-            grid = np.stack(np.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
-            off = query.off_road(grid).reshape(shape[1], shape[0])
-            # the edge lies half-way between a cell on the road and one off it
-            outside, inside = (distance_transform_edt(mask) for mask in (off, ~off))
-            rasters.append((CELL * np.where(off, outside - 0.5, 0.5 - inside)).ravel())
+            raster, origin = edge_raster(query, held)
+            rasters.append(raster.ravel())
             origins.append(origin)
-            shapes.append(shape)
+            shapes.append(raster.shape[::-1])
         self._values = torch.from_numpy(np.concatenate(rasters))
         self._first = torch.tensor(np.cumsum([0, *(len(r) for r in rasters[:-1])]))
         self._origin = torch.from_numpy(np.array(origins))
