@@ -1,39 +1,76 @@
-"""Routes of the CARLA leaderboards: out and in again, Bench2Drive's types, what is refused."""
+"""Routes of the CARLA leaderboards: out and in again, what is refused; the types: `test_leaderboard_types`."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.command import ssad
 
-from ssad.core.types import SignalPlan
-from ssad.interchange.leaderboard import CLASSES, TYPES_2, export_leaderboard, export_leaderboard1, read_leaderboard
+from ssad.core.types import Actor, Pose, Scenario
+from ssad.drivers import make_system
+from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1, read_leaderboard
+from ssad.metrics import episode_metrics
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, import_routes, load_scenarios, read_scenarios
+from ssad.world.rollout import rollout
+from ssad.world.world import World
 
 PLACE = 0.01  # m
 
 
-@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
-def test_routes_come_back(every: int, tmp_path: Path) -> None:
-    """Leaderboard 2.0: towns, classes, key points and triggers; the class without a counterpart is named."""
-    scenarios = load_scenarios("precrash")[::every]
+def generated(count: int) -> list[Scenario]:
+    """Scenarios as generators of adversaries make them: an actor with a trajectory that bends."""
+    found = []
+    for k in range(count):
+        random = np.random.default_rng(k)
+        bend, speed = random.uniform(-0.02, 0.02), random.uniform(4.0, 9.0)
+        time = np.arange(0.0, 12.0, 0.5)
+        yaw = np.pi + bend * speed * time
+        x = 330.0 + np.concatenate([[0.0], np.cumsum(0.5 * speed * np.cos(yaw[:-1]))])
+        y = -1.75 + np.concatenate([[0.0], np.cumsum(0.5 * speed * np.sin(yaw[:-1]))])
+        rows = tuple(map(tuple, np.column_stack([time, x, y, yaw]).tolist()))
+        actor = Actor("adversary", "suv", Pose(*rows[0][1:]), trajectory=rows)
+        route = (Pose(217.0 + k, -5.25), Pose(317.0, -5.25))
+        found.append(Scenario(f"generated/{k:02d}", "Custom", "ProvingGround", route, actors=(actor,)))
+    return found
+
+
+@pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow)])
+def test_routes_come_back_as_the_same_drive(every: int, tmp_path: Path) -> None:
+    """Leaderboard 2.0, the 32 and 20 generated ones: everybody within 1 cm at every step, the same metrics."""
+    scenarios = [*load_scenarios("precrash")[::every], *generated(20)[::every]]
     (path,), lost = export_leaderboard(scenarios, tmp_path)
-    found, _ = read_leaderboard(path)
-    kept = [s for s in scenarios if s.type in TYPES_2]
-    assert len(found) == len(kept) == (28 if every == 1 else 6)
-    assert "scenarios of type LaneChanging: the leaderboard has none such" in lost
-    for one, other in zip(kept, found, strict=True):
-        assert (one.type, one.town) == (other.type, other.town)
-        assert one.trigger is not None
-        assert other.trigger is not None
-        ends = [(one.route[0], other.route[0]), (one.route[-1], other.route[-1]), (one.trigger, other.trigger)]
-        assert all(abs(a.x - b.x) < PLACE and abs(a.y - b.y) < PLACE for a, b in ends)
-        assert math.cos(one.trigger.yaw - other.trigger.yaw) > 0.9999
-        build_episode(other, load_town(other.town), seed=0)
+    found, nothing = read_leaderboard(path)
+    assert nothing == ("weather of a route" + (f" ({len(scenarios)} times)"),)
+    assert len(found) == len(scenarios) == (52 if every == 1 else 7)
+    assert any(line.startswith("actors of a Custom: the leaderboard drives its ego alone") for line in lost)
+    drives = []
+    for group in (scenarios, found):
+        episodes = [build_episode(s, load_town(s.town), seed=0) for s in group]
+        world = World(episodes, {e.town: load_town(e.town) for e in episodes})
+        drives.append(rollout(world, make_system("blind")))
+    for one, other in zip(*drives, strict=True):
+        assert len(one.x) == len(other.x)
+        assert np.hypot(one.x - other.x, one.y - other.y)[one.active].max() < PLACE, one.key
+        assert episode_metrics(one).as_dict() == pytest.approx(episode_metrics(other).as_dict(), nan_ok=True)
+
+
+def test_what_is_moved_in_the_file_is_moved(tmp_path: Path) -> None:
+    """Whoever edits the written file gets what it says."""
+    (path,), _ = export_leaderboard(load_scenarios("StraightObstacle/00"), tmp_path)
+    (before,), _ = read_leaderboard(path)
+    assert before.trigger is not None
+    text = path.read_text()
+    old = f'<trigger_point x="{before.trigger.x:.3f}"'
+    assert old in text
+    path.write_text(text.replace(old, f'<trigger_point x="{before.trigger.x + 5.0:.3f}"'))
+    (after,), _ = read_leaderboard(path)
+    assert after.trigger is not None
+    assert after.trigger.x == pytest.approx(before.trigger.x + 5.0)
+    assert (after.route, after.parameters) == (before.route, before.parameters)
 
 
 @pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
@@ -51,27 +88,27 @@ ROUTES = """<routes><route id="7" town="ProvingGround">
 <weathers><weather route_percentage="0" sun_altitude_angle="90"/></weathers>
 <waypoints><position x="217" y="5.25" z="0"/><position x="317" y="5.25" z="0"/></waypoints>
 <scenarios>
- <scenario name="a" type="DynamicObjectCrossing"><trigger_point x="247" y="5.25" z="0" yaw="360"/>
-  <distance value="40"/></scenario>
+ <scenario name="a" type="DynamicObjectCrossing"><trigger_point x="227" y="5.25" z="0" yaw="360"/>
+  <distance value="40"/><direction value="right"/><speed value="9"/></scenario>
  <scenario name="b" type="VanillaSignalizedTurnEncounterRedLight"><trigger_point x="1" y="5" z="0" yaw="0"/></scenario>
- <scenario name="c" type="Accident"><trigger_point x="247" y="5.25" z="0" yaw="0"/></scenario>
+ <scenario name="c" type="ControlLoss"><trigger_point x="247" y="5.25" z="0" yaw="0"/></scenario>
 </scenarios></route></routes>
 """
 
 
-def test_types_that_nobody_plays_are_named(tmp_path: Path) -> None:
+def test_what_is_not_played_is_named(tmp_path: Path) -> None:
     path = tmp_path / "b2d.xml"
     path.write_text(ROUTES)
     done = ssad("import", "leaderboard", path, tmp_path / "out.yaml")
     assert done.returncode == 0, done.stderr
     walker, red = read_scenarios(tmp_path / "out.yaml")
-    assert walker.type == "StraightObstacle"
     assert walker.trigger is not None
-    assert (walker.trigger.x, walker.trigger.y, walker.trigger.yaw) == (247.0, -5.25, 0.0)
-    assert red.signals == SignalPlan("red", "green", until=15.0)
-    for line in ("type Accident: no class here plays it", "weather of a route", "distance of DynamicObjectCrossing"):
+    assert (walker.trigger.x, walker.trigger.y, walker.trigger.yaw) == (227.0, -5.25, 0.0)
+    assert [actor.model for actor in walker.actors] == ["walker", "vending_machine"]
+    assert red.actors == ()
+    for line in ("type ControlLoss: it disturbs the ego's own controls", "weather of a route",
+                 "speed of DynamicObjectCrossing"):  # fmt: skip
         assert f"not carried over: {line}" in done.stdout
-    assert len(CLASSES) == 15
 
 
 def _cut(old: str, new: str = "") -> Callable[[str], str]:
@@ -97,8 +134,22 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "no number": (_cut('x="217"', 'x="here"'), "not a number"),
     "not finite": (_cut('x="317"', 'x="inf"'), "not a finite number"),
     "beyond everything": (_cut('x="317"', 'x="1e12"'), "beyond 100000 m"),
-    "no type": (_cut('type="Accident"'), "'type' is missing"),
-    "no trigger": (_cut('<trigger_point x="247" y="5.25" z="0" yaw="360"/>'), "has no trigger_point"),
+    "no type": (_cut('type="ControlLoss"'), "'type' is missing"),
+    "a distance beyond reason": (_cut('distance value="40"', 'distance value="1e9"'), "outside 0 to 500"),
+    "a distance that is none": (_cut('distance value="40"', 'distance value="far"'), "not a number"),
+    "a side that is none": (_cut('"right"', '"up"'), "not one of left, right"),
+    "own data, broken": (_cut('<speed value="9"/>', '<ssad scenario="{"/>'), "is not JSON"),
+    "own data, deep": (_cut('<speed value="9"/>', f'<ssad scenario="{"[" * 99999}"/>'), "is not JSON"),
+    "own data, no mapping": (_cut('<speed value="9"/>', '<ssad scenario="[]"/>'), "not a mapping"),
+    "own data, unknown key": (
+        _cut('<speed value="9"/>', "<ssad scenario='{\"run\": 1}'/>"),
+        "unknown key; known: name",
+    ),
+    "own data, not finite": (
+        _cut('<speed value="9"/>', '<ssad scenario=\'{"name": "a", "type": "Custom", "seed": NaN}\'/>'),
+        "bad.xml",
+    ),
+    "no trigger": (_cut('<trigger_point x="227" y="5.25" z="0" yaw="360"/>'), "has no trigger_point"),
     "nothing to play": (lambda text: text.replace("DynamicObjectCrossing", "A").replace("Vanilla", "B"), "no scenario"),
     "off the road": (lambda text: text.replace('y="5.25"', 'y="90"'), "no scenario in it can be played"),
 }

@@ -1,12 +1,14 @@
 """Routes of the CARLA leaderboards: 2.0 (and Bench2Drive) in and out, 1.0 out; `ssad import routes` reads 1.0.
 
 A scenario of a leaderboard is a type, a trigger and numbers; who takes part and what they do is code of the
-leaderboard. So a type here becomes the scenario class that plays the same situation, with its own actors, and back.
+leaderboard. `leaderboard_types` plays its types with the same actors. What is written holds beside the type the
+scenario itself, as a child that the leaderboard does not look at, so that it comes back as it was.
 CARLA's left-handed frame becomes ours here. Types and format: leaderboard 2.0 (leaderboard.carla.org) and Bench2Drive.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -18,44 +20,28 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
-from ssad.core.errors import FormatError, SSADError
-from ssad.core.safeio import MIB, dotted, dump_json, make_folder, read_xml, write_atomic
-from ssad.core.types import Episode, Pose, Scenario, SignalPlan
+from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.safeio import MIB, dump_json, make_folder, read_xml, write_atomic
+from ssad.core.seeding import generator
+from ssad.core.types import Episode, Pose, Scenario
 from ssad.interchange.export import Written, episode
+from ssad.interchange.leaderboard_site import LIMITS, Site
+from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, nobody
 from ssad.interchange.openscenario_places import Values
-from ssad.roads import load_town, town_names
-from ssad.scenarios.dynamic import CUSTOM, build_episode, parameter_box
-from ssad.scenarios.dynamic.schema import problems
+from ssad.roads import load_town, route_along, town_names
+from ssad.scenarios.dynamic import CUSTOM, build_episode
+from ssad.scenarios.dynamic.knowledge._placing import trigger_index
+from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element as Node
 
 MAX_BYTES: Final = 64 * MIB
-CLASSES: Final[Mapping[str, str]] = {
-    "DynamicObjectCrossing": "StraightObstacle",
-    "ParkingCrossingPedestrian": "StraightObstacle",
-    "VehicleTurningRoute": "TurningObstacle",
-    "VehicleTurningRoutePedestrian": "TurningObstacle",
-    "ParkedObstacleTwoWays": "VehiclePassing",
-    "OppositeVehicleRunningRedLight": "RedlightRunning",
-    "SignalizedJunctionLeftTurn": "UnprotectedLeftTurn",
-    "SignalizedJunctionRightTurn": "RightTurn",
-    "OppositeVehicleTakingPriority": "CrossingNegotiation",
-    "NonSignalizedJunctionLeftTurn": "CrossingNegotiation",
-    "NonSignalizedJunctionRightTurn": "CrossingNegotiation",
-    "VanillaSignalizedTurnEncounterGreenLight": CUSTOM,
-    "VanillaSignalizedTurnEncounterRedLight": CUSTOM,
-    "VanillaNonSignalizedTurn": CUSTOM,
-    "VanillaNonSignalizedTurnEncounterStopsign": CUSTOM,
-}
-"""Type of leaderboard 2.0 or Bench2Drive -> the class here that plays it; Custom: nobody but the ego takes part."""
-_SIGNALS = {
-    "VanillaSignalizedTurnEncounterGreenLight": SignalPlan("green", "red"),
-    "VanillaSignalizedTurnEncounterRedLight": SignalPlan("red", "green", until=15.0),
-}
-_FLOW = {"flow_speed": "speed"}  # number of a type -> parameter of the class
+OWN: Final = "ssad"  # the child of a scenario that holds what no type of the leaderboard says
+MOVED: Final = 0.01  # m
 TYPES_2: Final[Mapping[str, str]] = {
     "StraightObstacle": "DynamicObjectCrossing",
+    "LaneChanging": "OtherLeadingVehicle",
     "TurningObstacle": "VehicleTurningRoute",
     "VehiclePassing": "ParkedObstacleTwoWays",
     "RedlightRunning": "OppositeVehicleRunningRedLight",
@@ -63,7 +49,9 @@ TYPES_2: Final[Mapping[str, str]] = {
     "RightTurn": "SignalizedJunctionRightTurn",
     "CrossingNegotiation": "OppositeVehicleTakingPriority",
 }
-"""Class -> type of leaderboard 2.0."""
+"""Class -> type of leaderboard 2.0, or class of ScenarioRunner, which the leaderboard takes as well."""
+ALONE: Final = "FreeRide"
+"""Class of ScenarioRunner that stands for scenarios without a counterpart: nobody but the ego."""
 TYPES_1: Final[Mapping[str, str]] = {
     "StraightObstacle": "Scenario3",
     "TurningObstacle": "Scenario4",
@@ -84,7 +72,7 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
         path: The file.
 
     Returns:
-        A scenario for each on a route that a class here plays, and what is not carried over, a line each.
+        A scenario for each on a route that can be played here, and what is not carried over, a line each.
 
     Raises:
         FormatError: The file is broken, or no scenario in it can be played.
@@ -102,24 +90,29 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
         told = route.findall("scenarios/scenario")
         if not told:
             lost["a route without a scenario"] += 1
-        for item in told:
+        for number, item in enumerate(told):
             kind = values.text(item, "type")
-            name = f"leaderboard/{ident}/{kind}_{sum(s.name.startswith(f'leaderboard/{ident}/') for s in found):02d}"
-            if kind not in CLASSES:
-                lost[f"type {kind}: no class here plays it"] += 1
+            base = Scenario(
+                f"leaderboard/{ident}/{kind}_{number:02d}", CUSTOM, town, points, limits=LIMITS, group=kind,
+                source=f"leaderboard route {ident} of {path.name}",
+            )  # fmt: skip
+            own = item.find(OWN)
+            if own is None and kind not in TYPES:
+                lost[f"type {kind}: {UNPLAYED.get(kind, 'it is not known here')}"] += 1
                 continue
-            scenario = _scenario(values, item, points, Scenario(name, CLASSES[kind], town, points), lost)
-            scenario = replace(scenario, source=f"leaderboard route {ident} of {path.name}", group=kind)
-            for location, message in problems(scenario):
-                raise FormatError(f"{path}: route {ident[:40]}: {dotted(location)}: {message}")
             if town not in known:
-                lost[f"town {town} is not imported: its scenarios are not checked"] += 1
-            else:
-                try:
-                    build_episode(scenario, load_town(town), seed=0)
-                except SSADError as error:
-                    lost[str(error)] += 1
-                    continue
+                lost[f"town {town} is not imported: its scenarios cannot be built (ssad import map)"] += 1
+                continue
+            try:
+                scenario = _played(values, item, base, lost) if own is None else _kept(values, item, own, base)
+                build_episode(scenario, load_town(town), seed=0)
+            except FormatError:
+                raise
+            except ConfigError as error:
+                raise FormatError(f"{path}: route {ident[:40]}: {error}") from None
+            except SSADError as error:
+                lost[str(error)] += 1
+                continue
             found.append(scenario)
     if not found:
         why = "; ".join(list(lost)[:3]) or "it has no route"
@@ -141,23 +134,49 @@ def _place(values: Values, item: Node) -> tuple[float, float]:
     return values.number(item, "x"), 0.0 - values.number(item, "y")
 
 
-def _scenario(values: Values, item: Node, points: Sequence[Pose], base: Scenario, lost: Counter[str]) -> Scenario:
-    """The scenario of an item of a route."""
-    kind = values.text(item, "type")
-    if base.type == CUSTOM:
-        return replace(base, signals=_SIGNALS.get(kind, SignalPlan()))
+def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> Scenario:
+    """The scenario of an item of a route, with the actors of its type. RouteError: its town does not allow it."""
+    kind = base.group
+    play = TYPES[kind]
     trigger = item.find("trigger_point")
-    if trigger is None:
+    alone = getattr(play, "func", play) is nobody
+    if trigger is not None:
+        yaw = -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))
+        base = replace(base, trigger=None if alone else Pose(*_place(values, trigger), yaw))
+    elif not alone:
         raise values.fail(item, f"'{kind}' has no trigger_point")
-    yaw = -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))
-    box, parameters = parameter_box(base.type), {}
+    scenario_from(scenario_data(base))  # names and places, before anybody relies on them
+    graph = load_town(base.town)
+    route = route_along(graph, base.route)
+    start = 0 if alone else trigger_index(base, route)
+    site = Site(base, graph, route, start, item, values, generator("leaderboard", base.name))
+    play(site)
     for number in item:
-        if number.tag in _FLOW and _FLOW[number.tag] in box:
-            limit = box[_FLOW[number.tag]]
-            parameters[limit.name] = min(max(values.number(number, "value"), limit.low), limit.high)
-        elif number.tag != "trigger_point":
-            lost[f"{number.tag} of {kind}: a {base.type} has numbers of its own"] += 1
-    return replace(base, trigger=Pose(*_place(values, trigger), yaw), parameters=parameters)
+        if number.tag not in site.used and number.tag != "trigger_point":
+            lost[f"{number.tag[:40]} of {kind}"] += 1
+    return replace(base, actors=tuple(site.actors), signals=site.signals, target_speed=site.target_speed)
+
+
+def _kept(values: Values, item: Node, own: Node, base: Scenario) -> Scenario:
+    """The scenario that SSAD wrote; its route and trigger are those of the file where somebody has moved them."""
+    try:
+        data = json.loads(values.text(own, "scenario"))
+    except (ValueError, RecursionError) as error:
+        raise values.fail(own, f"scenario is not JSON: {str(error)[:100]}") from None
+    if not isinstance(data, dict):
+        raise values.fail(own, "scenario is not a mapping of keys")
+    scenario = scenario_from(data | {"town": base.town})
+    near = len(scenario.route) == len(base.route) and all(
+        math.dist((a.x, a.y), (b.x, b.y)) < MOVED for a, b in zip(scenario.route, base.route, strict=True)
+    )
+    scenario = scenario if near else replace(scenario, route=base.route)
+    trigger = item.find("trigger_point")
+    if trigger is None or scenario.trigger is None:
+        return scenario
+    x, y = _place(values, trigger)
+    if math.dist((x, y), (scenario.trigger.x, scenario.trigger.y)) < MOVED:
+        return scenario
+    return replace(scenario, trigger=Pose(x, y, -math.radians(math.remainder(values.number(trigger, "yaw"), 360.0))))
 
 
 # ---------------------------------------------------------------- out
@@ -172,17 +191,24 @@ def export_leaderboard(scenarios: Sequence[Scenario], out: Path, *, seed: int = 
         seed: Of the episodes that are built to check them.
 
     Raises:
-        SSADError: A scenario cannot be built, none has a counterpart, or a file cannot be written.
+        SSADError: A scenario cannot be built, or a file cannot be written.
     """
     root, lost = Element("routes"), list[str]()
-    for k, scenario in enumerate(_written(scenarios, TYPES_2, seed, lost)):
+    for k, scenario in enumerate(scenarios):
+        built = episode(scenario, seed)
+        kind = TYPES_2.get(scenario.type, scenario.group if scenario.group in TYPES else ALONE)
+        if kind == ALONE:
+            lost.append(f"actors of a {scenario.type}: the leaderboard drives its ego alone ({ALONE})")
+        else:
+            lost.append("who takes part, and how: the leaderboard's type has actors and numbers of its own")
         route = SubElement(root, "route", id=str(k), town=scenario.town)
         SubElement(SubElement(route, "weathers"), "weather", route_percentage="0", sun_altitude_angle="45.0")
         places = SubElement(route, "waypoints")
         for pose in scenario.route:
             SubElement(places, "position", _xyz(pose))
-        item = SubElement(SubElement(route, "scenarios"), "scenario", name=scenario.name, type=TYPES_2[scenario.type])
-        SubElement(item, "trigger_point", _xyz(_trigger(scenario)) | {"yaw": _yaw(_trigger(scenario))})
+        item = SubElement(SubElement(route, "scenarios"), "scenario", name=scenario.name, type=kind)
+        SubElement(item, "trigger_point", _xyz(_trigger(built.scenario)) | {"yaw": _yaw(_trigger(built.scenario))})
+        SubElement(item, OWN, scenario=dump_json(scenario_data(scenario)))
     return [_write(root, make_folder(out) / "routes.xml")], lost
 
 
