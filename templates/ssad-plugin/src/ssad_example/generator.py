@@ -1,0 +1,36 @@
+"""A search for collisions: the corners of the box of parameters, then points drawn evenly from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+
+from ssad.core.generators import Base, Outcome, Proposal
+from ssad.core.seeding import generator
+from ssad.scenarios.dynamic.search.box import Box
+
+
+class Corners:
+    """Corners of the box first, then points drawn evenly; it learns nothing."""
+
+    name = "example-corners"
+
+    def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
+        self._points = []
+        for base, seed in zip(bases, seeds, strict=True):
+            box = Box.of(base.scenario)
+            draw = generator("example corners", seed)
+            corners = [list(map(float, corner)) for corner in product((0, 1), repeat=min(box.dimension, 6))]
+            corners = [corner + [0.5] * (box.dimension - len(corner)) for corner in corners]
+            order = draw.permutation(len(corners))
+            points = [corners[k] for k in order] + draw.random((budget, box.dimension)).tolist()
+            self._points.append([box.at(point) for point in points[:budget]])
+        self._next = 0
+
+    def ask(self, count: int) -> list[list[Proposal]]:
+        """The next points of each base."""
+        return [[Proposal(one) for one in row[self._next : self._next + count]] for row in self._points]
+
+    def tell(self, outcomes: Sequence[Sequence[Outcome]]) -> None:
+        """Counts; a search that learns looks at `Outcome.danger`."""
+        self._next += max((len(row) for row in outcomes), default=0)
