@@ -4,7 +4,8 @@
     uv run python -m benchmarks.world_ratio ../before --json benchmarks/results/world-ratio.json
 
 Each version runs in a process of its own. Both go through the same steps again and again; the figure is the median of
-the ratios of processor times. It counts also where the machine has other things to do, which times alone do not.
+the ratios of processor times, which counts also where the machine has other things to do. On a GPU (`--device cuda`)
+it is the wall clock, and the machine must be idle.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ SCENARIOS = ROOT / "src" / "ssad" / "scenarios" / "dynamic" / "data" / "natural-
 WARM = 60  # steps before the first that counts, for traffic to be awake
 
 
-def serve(batch: int, steps: int) -> None:
-    """In a process of its own: for each line that comes, drive the same steps and answer with s of processor time."""
+def serve(batch: int, steps: int, device: str) -> None:
+    """In a process of its own: for each line that comes, drive the same steps and answer with the s that they took."""
+    import warp
+
     from ssad.core.types import Controller
     from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -35,16 +38,21 @@ def serve(batch: int, steps: int) -> None:
     graphs = {s.town: load_town(s.town) for s in scenarios}
     bank = [build_episode(s, graphs[s.town], seed=k) for k, s in enumerate(scenarios)]
     assign = [k % len(bank) for k in range(batch)]
-    world = World(bank, graphs, assign=assign, ego=Controller.AUTOPILOT, autoreset=True)
+    world = World(bank, graphs, assign=assign, ego=Controller.AUTOPILOT, autoreset=True, device=device)
+    clock = time.process_time if device == "cpu" else time.perf_counter
     for _ in range(WARM):
         world.step()
+    if device != "cpu":
+        world.capture()
     start = world.snapshot()
     for _ in sys.stdin:
         world.restore(start)
-        began = time.process_time()
+        warp.synchronize_device(device)
+        began = clock()
         for _ in range(steps):
             world.step()
-        print(f"took {time.process_time() - began}", flush=True)
+        warp.synchronize_device(device)
+        print(f"took {clock() - began}", flush=True)
 
 
 def ask(process: subprocess.Popen[str]) -> float:
@@ -58,9 +66,10 @@ def ask(process: subprocess.Popen[str]) -> float:
     raise SystemExit("a version has failed")
 
 
-def measure(before: Path, *, batch: int, steps: int, rounds: int) -> dict[str, Any]:
+def measure(before: Path, *, batch: int, steps: int, rounds: int, device: str) -> dict[str, Any]:
     """Speed of this version over that of another, as the median of the rounds and the middle half of them."""
     words = [sys.executable, __file__, str(before), "--serve", "--batch", str(batch), "--steps", str(steps)]
+    words += ["--device", device]
     pair = [
         subprocess.Popen(
             words, env=os.environ | {"PYTHONPATH": str(tree / "src")}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
@@ -77,13 +86,14 @@ def measure(before: Path, *, batch: int, steps: int, rounds: int) -> dict[str, A
     for process in pair:
         process.communicate()
     low, middle, high = statistics.quantiles(ratios, n=4)
-    return {"batch": batch, "steps": steps, "rounds": rounds, "ratio": middle, "low": low, "high": high}
+    return {"device": device, "batch": batch, "steps": steps, "rounds": rounds, "ratio": middle, "low": low, "high": high}
 
 
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path, help="folder of a checkout of the other version")
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, default=1024)
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--rounds", type=int, default=60)
@@ -91,9 +101,10 @@ def main() -> None:
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
-        serve(given.batch, given.steps)
+        serve(given.batch, given.steps, given.device)
         return
-    found = measure(given.before.resolve(), batch=given.batch, steps=given.steps, rounds=given.rounds)
+    sizes = {"batch": given.batch, "steps": given.steps, "rounds": given.rounds}
+    found = measure(given.before.resolve(), **sizes, device=given.device)
     print(f"{found['ratio']:.3f} times the speed of {given.before} ({found['low']:.3f} to {found['high']:.3f})")
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -119,10 +119,10 @@ PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights
 FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
     deformable=False, input_width=800, trained_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
-    start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.6,
-    threshold=0.02, vote=0.6, fade=0.02,
+    start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.7,
+    threshold=0.02, vote=0.7, fade=0.01,
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
-    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, vote=0.6, fade=0.02,
+    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, sure=0.5,
     code_weights=(*_LIGHT_WEIGHTS, *_PGD_WEIGHTS[9:]),
 )  # fmt: skip
