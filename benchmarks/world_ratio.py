@@ -70,13 +70,14 @@ def measure(before: Path, *, batch: int, steps: int, rounds: int, device: str) -
     """Speed of this version over that of another, as the median of the rounds and the middle half of them."""
     words = [sys.executable, __file__, str(before), "--serve", "--batch", str(batch), "--steps", str(steps)]
     words += ["--device", device]
+    others = [os.environ["PYTHONPATH"]] if "PYTHONPATH" in os.environ else []
+    paths = [os.pathsep.join([str(tree / "src"), *others]) for tree in (before, ROOT)]
     pair = [
         subprocess.Popen(
-            words, env=os.environ | {"PYTHONPATH": str(tree / "src")}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            text=True,
+            words, env=os.environ | {"PYTHONPATH": path}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
-        for tree in (before, ROOT)
-    ]  # fmt: skip
+        for path in paths
+    ]
     ratios = []
     for number in range(-1, rounds):
         order = (0, 1) if number % 2 else (1, 0)
@@ -86,7 +87,8 @@ def measure(before: Path, *, batch: int, steps: int, rounds: int, device: str) -
     for process in pair:
         process.communicate()
     low, middle, high = statistics.quantiles(ratios, n=4)
-    return {"device": device, "batch": batch, "steps": steps, "rounds": rounds, "ratio": middle, "low": low, "high": high}
+    about = {"device": device, "batch": batch, "steps": steps, "rounds": rounds}
+    return {**about, "ratio": middle, "low": low, "high": high}
 
 
 def main() -> None:
