@@ -152,7 +152,7 @@ def perturbed(
         Sensors, and perturbations of their pictures, by name.
     """
     family = perturbation_names()[name]
-    sensors: dict[str, Sensor] = {channel: onboard.camera(camera) for channel, camera in cameras.items()}
+    sensors: dict[str, Sensor] = dict(onboard.together(cameras))
     changes: dict[str, Perturbation] = {}
     for channel, camera in cameras.items():
         if family == "shift":

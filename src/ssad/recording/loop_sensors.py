@@ -8,9 +8,9 @@ Nothing is rendered unless a driver names the sensor in its `sensors`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import warp as wp
@@ -35,7 +35,8 @@ from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.world.models import MODELS
 
 DAY: Final = Weather(0.9, 2.2, 0.3)
-AT_ONCE, AT_ONCE_GPU = 1, 64  # views rendered in one call; on a CPU more do not pay
+AT_ONCE, AT_ONCE_GPU = 1, 192  # views rendered in one call; on a CPU more do not pay
+VIEW_MEMORY: Final = 100 << 20  # bytes that a view of 640 x 360 needs on a GPU, with shadows and textures
 WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
 
 
@@ -98,6 +99,7 @@ class Onboard:
         response: What stands between lens and picture; as the recorder's.
         device: Where it is rendered: cpu or cuda:0.
         attack: A physical attack on one of the agents, or on stop signs, in what cameras and LiDARs see.
+        resident: Whether pictures stay on a GPU, as torch tensors, for a driver that looks at them there.
     """
 
     def __init__(
@@ -107,7 +109,12 @@ class Onboard:
         response: Response = SENSOR,
         device: str = "cpu",
         attack: LiveAttack | None = None,
+        resident: bool = False,
     ) -> None:
+        self.resident = resident and device != "cpu"
+        self.at_once = AT_ONCE
+        if device != "cpu":
+            self.at_once = max(min(AT_ONCE_GPU, wp.get_device(device).total_memory // VIEW_MEMORY), 1)
         self.weather, self.response, self.device, self.attack = weather, response, device, attack
         self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
         self._simulator: Simulator | None = None
@@ -124,6 +131,22 @@ class Onboard:
     def rig(self, width: int = 640) -> dict[str, OnboardCamera]:
         """The six cameras of nuScenes by channel, for pictures so many pixels wide (16:9)."""
         return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
+
+    def together(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
+        """Cameras that are always read together: on a GPU those of one size are rendered in one call.
+
+        Args:
+            cameras: By the names of their sensors.
+        """
+        if self.device == "cpu":
+            return {name: self.camera(camera) for name, camera in cameras.items()}
+        sizes = {(camera.width, camera.height): Rig() for camera in cameras.values()}
+        found = {}
+        for name, camera in cameras.items():
+            rig = sizes[camera.width, camera.height]
+            rig.cameras.append(camera)
+            found[name] = OnboardCamera(self, camera, rig)
+        return found
 
     def lidar(self, lidar: Lidar = HDL32E) -> OnboardLidar:
         """A LiDAR as a sensor: points float32 [N, P, 5]: x, y, z in the sensor's frame, intensity, ring.
@@ -186,9 +209,11 @@ class Onboard:
         (own, *_) = self.attack.meshes(self._attacked(sight))
         return self.attack.dressed(found, sight.town.index(own), sight.town.stop_signs)
 
-    def render(self, sights: Sequence[Sight], camera: Camera) -> Picture:
-        """What sights in one town show, all of one edit (see `edit`), with its arrays left where they are."""
-        views, edit, scene = [self.view(sight, camera) for sight in sights], self.edit(sights[0]), sights[0].town.scene
+    def render(self, sights: Sequence[Sight], cameras: Sequence[Camera]) -> Picture:
+        """What sights in one town show, all of one edit (see `edit`), camera by camera, with its arrays left there."""
+        seen: dict[int, tuple[Thing, ...]] = {}
+        views = [self.view(sight, camera, seen) for camera in cameras for sight in sights]
+        edit, scene = self.edit(sights[0]), sights[0].town.scene
         if edit is None:
             return render(scene, views, download=False)
         picture = render_with(scene, views, edit.textures, edit.masks)
@@ -245,12 +270,16 @@ class Onboard:
         self._prepare(town, looks)
         return [Sight(row, town, looks, moments[step], agent) for row, step in enumerate(chosen)]
 
-    def view(self, sight: Sight, camera: Camera) -> View:
-        """A view through a camera that the agent carries."""
+    def view(self, sight: Sight, camera: Camera, seen: dict[int, tuple[Thing, ...]] | None = None) -> View:
+        """A view through a camera that the agent carries; `seen`: things of sights (by `id`) that were gathered."""
         looks, moment, agent = sight.looks, sight.moment, sight.agent
         weather = self.weather if isinstance(self.weather, Weather) else self.weather(looks.key)
         eye = sight.pose @ camera.to_ego
-        things = self.things(sight)
+        things = None if seen is None else seen.get(id(sight))
+        if things is None:
+            things = self.things(sight)
+            if seen is not None:
+                seen[id(sight)] = things
         lights = sight.town.lights(looks, moment, eye[:2, 3])
         body = MODELS[looks.models[agent]]
         nose = sight.pose @ upright_pose(0.5 * body.length - NOSE, 0.0, 0.0)
@@ -266,20 +295,45 @@ class Onboard:
         return view
 
 
+@dataclass(slots=True)
+class Rig:
+    """Cameras of one size that are rendered together, see `Onboard.together`.
+
+    Attributes:
+        cameras: The cameras.
+        moment: When and for whom they were last rendered.
+        read: Pictures of that moment that nobody has taken yet, by the camera's number.
+    """
+
+    cameras: list[Camera] = field(default_factory=list)
+    moment: tuple[bytes, ...] = ()
+    read: dict[int, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class OnboardCamera:
     """A camera that agents carry, see `Onboard.camera`."""
 
     onboard: Onboard
     camera: Camera
+    rig: Rig | None = None
 
     def follow(self, simulator: Simulator) -> None:
         """See `Onboard.follow`."""
         self.onboard.follow(simulator)
 
-    def __call__(self, simulator: Simulator, agents: I32) -> U8:
+    def __call__(self, simulator: Simulator, agents: I32) -> Any:
         """Pictures [N, 3, H, W] of agents [N, 2] (scene, agent); black where the episode has ended."""
-        return self._read(self.onboard.sights(simulator, agents), len(agents))
+        if self.rig is None:
+            return self._read(self.onboard.sights(simulator, agents), len(agents))
+        state = simulator.state()
+        moment = tuple(v.tobytes() for v in (state.time, state.pose, state.active, state.signal, agents))
+        number = self.rig.cameras.index(self.camera)
+        if moment != self.rig.moment or number not in self.rig.read:
+            cameras, sights = self.rig.cameras, self.onboard.sights(simulator, agents)
+            self.rig.moment = moment
+            self.rig.read = dict(enumerate(self._read_all(sights, len(agents), cameras)))
+        return self.rig.read.pop(number)
 
     def of_trace(
         self, trace: EpisodeTrace, graph: LaneGraph, *, agent: int = 0, steps: Sequence[int] | None = None
@@ -288,30 +342,52 @@ class OnboardCamera:
         sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
         return self._read(sights, len(sights))
 
-    def _read(self, sights: Sequence[Sight], count: int) -> U8:
+    def _read(self, sights: Sequence[Sight], count: int) -> Any:
         """All pictures in as few calls as possible."""
-        found = np.zeros((count, self.camera.height, self.camera.width, 3), np.uint8)
-        for part, picture in self.shots(sights):
-            found[[sight.row for sight in part]] = picture.image.numpy()  # type: ignore[attr-defined]
-        return np.moveaxis(found, -1, 1)
+        return self._read_all(sights, count, [self.camera])[0]
 
-    def shots(self, sights: Sequence[Sight]) -> Iterator[tuple[list[Sight], Picture]]:
+    def _read_all(self, sights: Sequence[Sight], count: int, cameras: Sequence[Camera]) -> Any:
+        """Pictures [C, N, 3, H, W] of cameras of one size; a tensor on the GPU where they stay there."""
+        shape = (len(cameras), count, self.camera.height, self.camera.width, 3)
+        if self.onboard.resident:
+            import torch
+
+            kept = torch.zeros(shape, dtype=torch.uint8, device=self.onboard.device)
+            for part, picture in self.shots(sights, cameras):
+                rows = torch.tensor([sight.row for sight in part], device=kept.device)
+                wp.synchronize_device(self.onboard.device)  # torch has a stream of its own
+                kept[:, rows] = wp.to_torch(picture.image).view(len(cameras), len(part), *shape[2:])
+                if kept.is_cuda:
+                    torch.cuda.synchronize(kept.device)
+            return kept.movedim(-1, 2)
+        found = np.zeros(shape, np.uint8)
+        for part, picture in self.shots(sights, cameras):
+            images = picture.image.numpy()  # type: ignore[attr-defined]
+            found[:, [sight.row for sight in part]] = images.reshape(len(cameras), len(part), *shape[2:])
+        return np.moveaxis(found, -1, 2)
+
+    def shots(
+        self, sights: Sequence[Sight], cameras: Sequence[Camera] | None = None
+    ) -> Iterator[tuple[list[Sight], Picture]]:
         """Render in as few calls as possible.
 
         Args:
             sights: What is to be seen.
+            cameras: Through which cameras of one size; None: this one.
 
         Yields:
-            Some of the sights, and what `ssad.camera.render.render` gives for them with its arrays left where they are.
+            Some of the sights, and what `ssad.camera.render.render` gives for them, camera by camera, with its arrays
+            left where they are.
         """
+        cameras = [self.camera] if cameras is None else cameras
         alike: dict[tuple[int, int], list[Sight]] = {}
         for sight in sights:
             alike.setdefault((id(sight.town), id(self.onboard.edit(sight))), []).append(sight)
-        at_once = AT_ONCE if self.onboard.device == "cpu" else AT_ONCE_GPU
+        at_once = max(self.onboard.at_once // len(cameras), 1)
         for here in alike.values():
             for k in range(0, len(here), at_once):
                 part = here[k : k + at_once]
-                yield part, self.onboard.render(part, self.camera)
+                yield part, self.onboard.render(part, cameras)
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,9 +89,13 @@ class PerceivingSystem(Schema):
                 raise ConfigError(f"system {self.name}, detector {self.detector}: {error}") from None
 
     def make(
-        self, watch: Callable[[Sighting | Known], None] | None = None, *, repair: Repair | None = None
+        self,
+        watch: Callable[[Sighting | Known], None] | None = None,
+        *,
+        repair: Repair | None = None,
+        device: str = "cpu",
     ) -> Perceiving:
-        """The driver; `watch` is told what it sees, `repair` mends one error of it."""
+        """The driver, its detector on a device; `watch` is told what it sees, `repair` mends one error of it."""
         cameras = front(self.width, self.cameras)
         eyes: CameraEyes | PerfectEyes
         if self.perfect:
@@ -99,7 +103,8 @@ class PerceivingSystem(Schema):
                 cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
             )  # fmt: skip
         else:
-            eyes = CameraEyes(_detector(self.detector, self.weights, self.input_width), cameras, threshold=self.low)
+            detector = _detector(self.detector, self.weights, self.input_width, device)
+            eyes = CameraEyes(detector, cameras, threshold=self.low, device=device)
         tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
         memory = float("inf") if self.sign_memory is None else self.sign_memory
         signs = SignReading(confirm=self.confirm, memory=memory, score=self.high) if self.reads_signs else None
@@ -125,9 +130,9 @@ def drive_perceiving(
         return *drive(orders, device=device, key=_paired), None
     own = PerceivingSystem.model_validate(spec["settings"])
     watcher = Watcher(front(own.width, own.cameras), len(orders))
-    driver = own.make(watcher, repair=repair)
-    driver.to(device)
-    onboard = Onboard(device=device, attack=worn(spec["perturbation"], spec["wearer"]) if "wearer" in spec else None)
+    driver = own.make(watcher, repair=repair, device=device)
+    attack = worn(spec["perturbation"], spec["wearer"]) if "wearer" in spec else None
+    onboard = Onboard(device=device, resident=True, attack=attack)
     sensors, changes = perturbed(
         onboard, driver.cameras, spec["perturbation"], spec["severity"], detector=driver.detector, seed=seed
     )
@@ -168,9 +173,9 @@ def _paired(order: Order) -> str:
 
 
 @lru_cache(maxsize=4)
-def _detector(name: str, weights: str | None, width: int | None) -> Any:
+def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
     """A detector, made once a process."""
     from ssad.detectors import make_detector
 
     options: dict[str, Any] = {} if width is None else {"input_width": width}
-    return make_detector(name, weights=weights, **options)
+    return make_detector(name, weights=weights, device=device, **options)

@@ -209,6 +209,8 @@ class Loop:
         for scene, agent in agents.tolist():
             episode, step = episodes[assigned[scene]], round(float(state.time[scene]) / self.simulator.dt)
             generators.append(generator("perturbation", episode.key, episode.seed, name, agent, step))
+        if hasattr(reading, "cpu"):  # pictures that stayed on a device
+            reading = reading.cpu().numpy()
         return perturbation.apply(reading, driver, state, generators)
 
 

@@ -185,10 +185,7 @@ class Ultralytics(Adapter):
 
     def choose(self, dense: Dense, least: float) -> list[Detections]:
         """Score sigmoid(class), suppressed within a class."""
-        return [
-            select(score, box, threshold=least, iou=NMS_IOU, limit=MOST, size=dense.size)
-            for score, box in zip(dense.logit.sigmoid(), dense.box, strict=True)
-        ]
+        return select(dense.logit.sigmoid(), dense.box, threshold=least, iou=NMS_IOU, limit=MOST, size=dense.size)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Literal
 
 import torch
@@ -83,11 +82,8 @@ class Mono3D(nn.Module):
         Raises:
             ConfigError: Another shape or type, or no intrinsic.
         """
-        size, lens = self._check(images, intrinsic)
-        scale = self._scale(size, lens)
-        lens, above = self._inside(lens, size, scale), self._above(size)
-        features = self.neck(self.backbone(self._prepare(images)))
-        maps = self.bbox_head(features, self._factor(lens), self._rays(features, lens))
+        maps, features, lens, size = self._maps(images, intrinsic)
+        scale, above = self._scale(size, lens), self._above(size)
         flat = flatten(maps)
         places = places_of(maps["cls_scores"], self.config.strides)
         with _exact(images):
@@ -102,6 +98,15 @@ class Mono3D(nn.Module):
             level=places.level, size=size, maps={**maps, "intrinsic": [lens]}, features=tuple(features),
         )  # fmt: skip
 
+    def _maps(
+        self, images: Tensor, intrinsic: Tensor | None
+    ) -> tuple[dict[str, list[Tensor]], Sequence[Tensor], Tensor, tuple[int, int]]:
+        """Maps of the head, what it reads, intrinsics in the network's input [B, 3, 3], and the picture's size."""
+        size, lens = self._check(images, intrinsic)
+        lens = self._inside(lens, size, self._scale(size, lens))
+        features = self.neck(self.backbone(self._prepare(images)))
+        return self.bbox_head(features, self._factor(lens), self._rays(features, lens)), features, lens, size
+
     @torch.no_grad()
     def predict(
         self, images: Tensor, intrinsic: Tensor | None = None, *, threshold: float | None = None
@@ -109,8 +114,8 @@ class Mono3D(nn.Module):
         """Detections of each image, best first: score class times centreness (times PGD's confidence of depth)."""
         least = check_threshold(self.name, self.config.threshold if threshold is None else threshold)
         with evaluating(self):
-            dense = self.dense(images, intrinsic)
-        return self._chosen(dense, least, best_first=True)
+            maps, _, lens, size = self._maps(images, intrinsic)  # without the boxes of all places
+        return self._chosen(maps, lens, size, threshold=least, best_first=True)
 
     def select(self, dense: Dense, threshold: float) -> list[Detections]:
         """Detections of each image in mmdetection3d's order, without the boxes that the source suppresses.
@@ -121,34 +126,41 @@ class Mono3D(nn.Module):
             dense: Raw outputs.
             threshold: Least score.
         """
-        return self._chosen(dense, threshold, best_first=False)
+        maps, lens = _head_maps(dense), dense.maps["intrinsic"][0]
+        return self._chosen(maps, lens, dense.size, threshold=threshold, best_first=False)
 
-    def _chosen(self, dense: Dense, threshold: float, *, best_first: bool) -> list[Detections]:
+    def _chosen(
+        self, maps: dict[str, list[Tensor]], lens: Tensor, size: tuple[int, int], *, threshold: float, best_first: bool
+    ) -> list[Detections]:
         """Suppression is a chain of small steps and runs on the host; the device is asked once, not for each step."""
-        with _exact(dense.logit):
-            flat, lens = flatten(_head_maps(dense)), dense.maps["intrinsic"][0]
-            places = places_of(dense.maps["cls_scores"], self.config.strides)
+        with _exact(lens):
+            flat, places = flatten(maps), places_of(maps["cls_scores"], self.config.strides)
             share = self._shares(flat, lens)
-            kept = self._leading(dense, share.amax(-1))
+            kept = self._leading(maps, share.amax(-1))
             share = share.gather(1, kept[..., None].expand(-1, -1, share.shape[2]))
             image, place, label = (share > threshold).nonzero(as_tuple=True)
             rows, score = kept[image, place], share[image, place, label]
             picked, xy = pick(flat, image, rows), places.xy[rows]
-            solids = centre, size, yaw = self._solids(picked, xy, lens, image)
-            ground = torch.stack([centre[:, 0], centre[:, 2], size[:, 0], size[:, 2], -yaw], -1).cpu()
-            ends = torch.searchsorted(image, torch.arange(len(lens) + 1, device=image.device)).tolist()
-            shown = self._boxes(picked, xy, solids, lens=lens[image], size=dense.size)
-            kinds = score.cpu(), label.cpu()
-            stay = self._suppressed(ground, shown.cpu(), *kinds, ends, best_first=best_first)
-            of = torch.cat(stay).to(image.device)
-            place3d = torch.cat([centre, size, picked.reg[:, 7:9]], 1)
-            if self.config.vote is not None:
-                place3d = self._voted(place3d.cpu(), shown.cpu(), *kinds, ends, stay).to(place3d)
-            else:
-                place3d = place3d[of]
-            centre, size, velocity = torch.split(place3d, [3, 3, 2], 1)
-            columns = score[of], label[of], shown[of], centre, size, yaw[of], velocity, picked.attribute[of].argmax(-1)
-            parts = zip(*(torch.split(column, [len(s) for s in stay]) for column in columns), strict=True)
+            solids = centre, extent, yaw = self._solids(picked, xy, lens, image)
+            shown = self._boxes(picked, xy, solids, lens=lens[image], size=size)
+            place3d = torch.cat([centre, extent, picked.reg[:, 7:9]], 1)
+            ground = torch.stack([centre[:, 0], centre[:, 2], extent[:, 0], extent[:, 2], -yaw], -1)
+            host = [v.cpu() for v in (image, label, score, shown, ground, place3d)]
+            image, label, score, shown, ground, place3d = host
+            stay = self._suppressed(ground, shown, score, label, image, best_first=best_first)
+            values = (
+                self._voted(place3d, shown, score, label, image, stay)
+                if self.config.vote is not None
+                else place3d[stay]
+            )
+            centre, extent, velocity = torch.split(values, [3, 3, 2], 1)
+            of, device = stay.to(lens.device), lens.device
+            columns = (
+                score[stay], label[stay], shown[stay], centre, extent, yaw[of], velocity,
+                picked.attribute[of].argmax(-1),
+            )  # fmt: skip
+            counts = torch.bincount(image[stay], minlength=len(lens)).tolist()
+            parts = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
 
     def _shares(self, flat: Flat, lens: Tensor) -> Tensor:
@@ -166,23 +178,25 @@ class Mono3D(nn.Module):
         return depth if flat.bins is None else self.bbox_head.fuse(depth, flat.bins, self._factor(lens))
 
     def _voted(  # noqa: PLR0917
-        self, values: Tensor, shown: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], stay: Sequence[Tensor]
+        self, values: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor, stay: Tensor
     ) -> Tensor:
         """Means of values of all candidates, by their scores, over those that show what a box that stays shows.
 
         Args:
-            values: Of all candidates [N, K].
+            values: Of all candidates [N, K], image by image.
             shown: Their boxes in the image [N, 4].
             score: Their scores [N].
             label: Their classes [N].
-            ends: Where each image's candidates begin, and where the last ones end.
-            stay: Rows of those that stay, by image.
+            image: Their images [N].
+            stay: Rows of those that stay, image by image.
 
         Returns:
-            One row for each that stays, image by image.
+            One row for each that stays.
         """
         means = [values[:0]]
-        for (start, end), rows in zip(pairwise(ends), stay, strict=True):
+        some, count = image[stay].unique_consecutive(return_counts=True)
+        starts, ends = torch.searchsorted(image, some), torch.searchsorted(image, some, right=True)
+        for rows, start, end in zip(stay.split(count.tolist()), starts.tolist(), ends.tolist(), strict=True):
             same = box_iou(shown[rows], shown[start:end]) >= self.config.vote
             same &= label[rows][:, None] == label[start:end]
             same[torch.arange(len(rows)), rows - start] = True  # a box without area as well
@@ -190,11 +204,11 @@ class Mono3D(nn.Module):
             means.append(weight @ values[start:end] / weight.sum(1, keepdim=True))
         return torch.cat(means)
 
-    def _leading(self, dense: Dense, best: Tensor) -> Tensor:
+    def _leading(self, maps: dict[str, list[Tensor]], best: Tensor) -> Tensor:
         """Places [B, R] of the best of each level, by their best scores [B, P]."""
         rows: list[Tensor] = []
         start = 0
-        for m in dense.maps["cls_scores"]:
+        for m in maps["cls_scores"]:
             count = m.shape[2] * m.shape[3]
             part = best[:, start : start + count]
             if count > self.config.before:
@@ -205,30 +219,40 @@ class Mono3D(nn.Module):
         return torch.cat(rows, 1)
 
     def _suppressed(
-        self, ground: Tensor, shown: Tensor, score: Tensor, label: Tensor, ends: Sequence[int], *,
-        best_first: bool,
-    ) -> list[Tensor]:  # fmt: skip
-        """Rows of each image's candidates that survive suppression; all on the host.
+        self, ground: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor, *, best_first: bool
+    ) -> Tensor:
+        """Rows of the candidates that survive suppression, image by image; all images at once, on the host.
 
         Args:
             ground: Rectangles of all candidates on the ground.
             shown: Their boxes in the image.
             score: Their scores.
             label: Their classes.
-            ends: Where each image's candidates begin, and where the last ones end.
+            image: Their images, ascending.
             best_first: Whether to order by score alone.
         """
-        stay = []
-        for start, end in pairwise(ends):
-            own = score[start:end]
-            rows = rotated_nms(ground[start:end], own, label[start:end], threshold=self.config.nms)
-            if self.config.image_nms is not None:
-                columns = shown[start:end][rows], own[rows], label[start:end][rows]
-                rows = rows[batched_nms(*columns, self.config.image_nms).sort()[0]]
-            if len(rows) > self.config.most or best_first:
-                rows = rows[own[rows].argsort(descending=True, stable=True)[: self.config.most]]
-            stay.append(rows + start)
-        return stay
+        rows = rotated_nms(ground, score, image * len(self.classes) + label, threshold=self.config.nms)
+        if self.config.image_nms is not None:
+            rows = self._suppressed_in_images(rows, shown, score, label, image)
+        first = image[rows]
+        long = torch.bincount(first)[first] > self.config.most
+        # by score alone within an image where it is asked for or there are too many, else as they are
+        place = torch.where(long | best_first, -score[rows].double(), torch.arange(len(rows)).double())
+        order = place.argsort(stable=True)
+        order = order[first[order].argsort(stable=True)]
+        rows, first = rows[order], first[order]
+        kept = torch.arange(len(rows)) - torch.searchsorted(first, first) < self.config.most
+        return rows[kept]
+
+    def _suppressed_in_images(self, rows: Tensor, shown: Tensor, score: Tensor, label: Tensor, image: Tensor) -> Tensor:
+        """Rows (image by image) without those whose boxes in the image overlap too much with better ones."""
+        assert self.config.image_nms is not None
+        parts = [rows[:0]]
+        for part in rows.split(image[rows].unique_consecutive(return_counts=True)[1].tolist()):
+            if len(part) > 1:
+                part = part[batched_nms(shown[part], score[part], label[part], self.config.image_nms).sort()[0]]  # noqa: PLW2901
+            parts.append(part)
+        return torch.cat(parts)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:

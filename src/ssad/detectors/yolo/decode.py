@@ -97,12 +97,15 @@ def decode(rule: str, raw: Tensor, grid: Grid) -> Tensor:
 
 def select(
     score: Tensor, box: Tensor, *, threshold: float, iou: float, limit: int, size: tuple[int, int]
-) -> Detections:
-    """Detections of one image, by suppression within each class.
+) -> list[Detections]:
+    """Detections of each image, by suppression within each class.
+
+    Candidates of all images are brought to the host at once, where suppression, a chain of small steps, runs.
 
     Args:
-        score: Scores [P, C]; each class of each place above the threshold is a candidate, up to the 30,000 best.
-        box: Boxes [P, 4]; they are clipped to the picture.
+        score: Scores [B, P, C]; each class of each place above the threshold is a candidate, up to the 30,000 best of
+            an image.
+        box: Boxes [B, P, 4]; they are clipped to the picture.
         threshold: Scores must be above it.
         iou: IoU above which the worse of two boxes of a class is dropped.
         limit: Maximum number of detections.
@@ -113,13 +116,22 @@ def select(
     """
     # NaN is above nothing, so broken weights give no detections instead of boxes that are none
     usable = (score > threshold) & box.isfinite().all(-1, keepdim=True)
-    place, label = usable.nonzero(as_tuple=True)
-    value = score[place, label]
-    order = value.argsort(descending=True, stable=True)[:MAX_CANDIDATES]
-    place, label, value = place[order], label[order], value[order]
-    found = box[place]
-    # float64: suppression by class shifts boxes far apart, and float32 would round them there
-    keep = batched_nms(found.double(), value.double(), label, iou)[:limit]
+    image, place, label = usable.nonzero(as_tuple=True)
+    values, boxes = score[image, place, label].cpu(), box[image, place].cpu()
+    count = torch.bincount(image.cpu(), minlength=len(score)).tolist()
+    chosen, first = [], 0
+    label = label.cpu()
+    for many in count:
+        own = slice(first, first + many)
+        rows = first + values[own].argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+        # float64: suppression by class shifts boxes far apart, and float32 would round them there
+        if many > 1:
+            rows = rows[batched_nms(boxes[rows].double(), values[rows].double(), label[rows], iou)]
+        chosen.append(rows[:limit])
+        first += many
+    keep = torch.cat([torch.zeros(0, dtype=torch.int64), *chosen])
     height, width = size
-    edge = torch.tensor([width, height, width, height], device=box.device, dtype=box.dtype)
-    return Detections(value[keep], label[keep], found[keep].clamp(min=0).minimum(edge))
+    edge = torch.tensor([width, height, width, height], dtype=box.dtype)
+    columns = values[keep], label[keep], boxes[keep].clamp(min=0).minimum(edge)
+    parts = zip(*(v.to(box.device).split([len(rows) for rows in chosen]) for v in columns), strict=True)
+    return [Detections(*part) for part in parts]

@@ -98,10 +98,7 @@ class Yolo(Adapter):
         """Score sigmoid(objectness) * sigmoid(class), suppressed by class."""
         assert dense.quality is not None
         score = dense.logit.sigmoid() * dense.quality.sigmoid()[..., None]
-        return [
-            select(one, box, threshold=least, iou=self.nms_iou, limit=self.limit, size=dense.size)
-            for one, box in zip(score, dense.box, strict=True)
-        ]
+        return select(score, dense.box, threshold=least, iou=self.nms_iou, limit=self.limit, size=dense.size)
 
     @torch.no_grad()
     def assign(self, dense: Dense, truth: Sequence[Truth]) -> Assignment:

@@ -197,7 +197,8 @@ class Perceiving:
 
     def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
         """What the cameras showed to a row."""
-        return {name: view.readings[name][row] for name in self.cameras}
+        shown = {name: view.readings[name][row] for name in self.cameras}
+        return {name: one.cpu().numpy() if hasattr(one, "cpu") else one for name, one in shown.items()}
 
     def _take_in(self, now: Mapping[int, float]) -> None:
         """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""

@@ -93,6 +93,7 @@ class CameraEyes:
         detector: The detector, or the name of one, which is made when it is first needed.
         cameras: Cameras by name; None: the front camera of nuScenes, 640 pixels wide.
         threshold: Least score of what it reports.
+        device: Where the detector computes; one that is not a name is there already.
         options: What the builder of a named detector takes.
     """
 
@@ -102,11 +103,12 @@ class CameraEyes:
         cameras: Mapping[str, Camera] | None = None,
         *,
         threshold: float = 0.1,
+        device: str = "cpu",
         **options: Any,
     ) -> None:
         self.cameras: Mapping[str, Camera] = front() if cameras is None else dict(cameras)
         self.sensors: tuple[str, ...] = tuple(self.cameras)
-        self.threshold, self.device = threshold, "cpu"
+        self.threshold, self.device = threshold, device
         self._given, self._options = detector, options
         self._made: Detector | None = None
 
@@ -144,29 +146,76 @@ class CameraEyes:
         """Nothing changes."""
 
     def look(self, view: Observation, rows: I64) -> dict[str, list[Detections | None]]:
-        """See `Eyes`."""
+        """See `Eyes`; on a GPU the pictures of all cameras of one size are one batch, on a CPU those of a camera."""
         found: dict[str, list[Detections | None]] = {}
-        for name, camera in self.cameras.items():
-            pictures = np.asarray(view.readings[name])[rows]
-            if pictures.shape[1:] != (3, camera.height, camera.width):
-                raise ConfigError(
-                    f"sensor '{name}' shows pictures of shape {pictures.shape[1:]}; expected "
-                    f"(3, {camera.height}, {camera.width})"
-                )
-            seen = np.flatnonzero(pictures.any((1, 2, 3)))
+        batches: dict[Any, list[tuple[str, I64, torch.Tensor]]] = {}
+        for name in self.cameras:
+            pictures = self._pictures(view, rows, name)
             found[name] = [None] * len(rows)
-            for k, one in zip(seen.tolist(), self.detect(pictures[seen], camera), strict=True):
+            seen = np.flatnonzero(pictures.flatten(1).any(1).cpu().numpy())
+            if len(seen):
+                shown = pictures if len(seen) == len(rows) else pictures[_at(seen, pictures)]
+                batches.setdefault(pictures.shape[1:] if pictures.is_cuda else name, []).append((name, seen, shown))
+        for batch in batches.values():
+            lens = np.array([self.cameras[name].intrinsic for name, seen, _ in batch for _ in seen], np.float32)
+            together = batch[0][2] if len(batch) == 1 else torch.cat([one for *_, one in batch])
+            places = [(name, k) for name, seen, _ in batch for k in seen.tolist()]
+            for (name, k), one in zip(places, self.detect(together, lens), strict=True):
                 found[name][k] = one
         return found
 
-    def detect(self, pictures: Any, camera: Camera) -> list[Detections]:
-        """What is in pictures uint8 [n, 3, H, W] of a camera."""
-        if not len(pictures):
-            return []
-        images = torch.from_numpy(np.ascontiguousarray(pictures)).to(self.device).float() / 255.0
-        lens = torch.from_numpy(camera.intrinsic.astype(np.float32)).to(self.device).expand(len(images), 3, 3)
-        needed = lens if self.detector.task == "3d" else None
-        return self.detector.predict(images, needed, threshold=self.threshold)
+    def _pictures(self, view: Observation, rows: I64, name: str) -> torch.Tensor:
+        """Pictures uint8 [n, 3, H, W] of a camera on the detector's device, from arrays or tensors."""
+        reading, camera = view.readings[name], self.cameras[name]
+        if reading.shape[1:] != (3, camera.height, camera.width):
+            raise ConfigError(
+                f"sensor '{name}' shows pictures of shape {tuple(reading.shape[1:])}; expected "
+                f"(3, {camera.height}, {camera.width})"
+            )
+        if not isinstance(reading, torch.Tensor):
+            reading = np.asarray(reading)
+            reading = torch.from_numpy(reading if reading.flags.writeable else reading.copy())
+        if len(rows) < len(reading):
+            reading = reading[_at(rows, reading)]
+        return reading.to(self.device).contiguous()
+
+    def detect(self, pictures: torch.Tensor, lens: Floats) -> list[Detections]:
+        """What is in pictures uint8 [n, 3, H, W] with intrinsics [n, 3, 3]; all of it on the host."""
+        needed = torch.from_numpy(lens).to(self.device) if self.detector.task == "3d" else None
+        room, found = _room(pictures), []
+        for k in range(0, len(pictures), room):
+            part = None if needed is None else needed[k : k + room]
+            found += self.detector.predict(pictures[k : k + room].float() / 255.0, part, threshold=self.threshold)
+        return on_host(found)
+
+
+def _room(pictures: torch.Tensor) -> int:
+    """Pictures that a detector is given at once: on a GPU as many as its memory holds with ease."""
+    if not pictures.is_cuda:
+        return max(len(pictures), 1)
+    return max(torch.cuda.get_device_properties(pictures.device).total_memory // (128 * 3 * pictures[0].numel()), 1)
+
+
+def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
+    return torch.from_numpy(rows).to(like.device)
+
+
+def on_host(found: list[Detections]) -> list[Detections]:
+    """Detections of some images on the host, brought there in one go and not image by image."""
+    if not found or found[0].score.device.type == "cpu":
+        return found
+    counts = [len(one.score) for one in found]
+
+    def brought(values: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
+        return torch.cat(list(values)).cpu().split(counts)
+
+    flat = [brought([getattr(one, name) for one in found]) for name in ("score", "label", "box")]
+    solids = [one.solid for one in found if one.solid is not None]
+    if len(solids) < len(found):
+        return [Detections(*part) for part in zip(*flat, strict=True)]
+    names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
+    deep = zip(*(brought([getattr(one, name) for one in solids]) for name in names), strict=True)
+    return [Detections(*part, Solids(*solid)) for *part, solid in zip(*flat, deep, strict=True)]
 
 
 class PerfectEyes:
