@@ -8,8 +8,6 @@ import html.parser
 import io
 import json
 import re
-import shutil
-import subprocess
 import zlib
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.browser import ask
 from helpers.run_folder import driving_lines, write_run
 
 from ssad.core import safeio
@@ -305,32 +304,82 @@ def test_nothing_is_wider_than_the_window_and_the_seek_bar_can_be_used(
     width: int, run_folder: Path, tmp_path: Path
 ) -> None:
     """A browser lays the page out; a frame of that width shows it, and a script tells what sticks out."""
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
-        pytest.skip("no Chromium here")
-    page = write_report(run_folder).read_text()
     script = """<script>addEventListener("load", () => setTimeout(() => {
         const wide = [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll, svg")
             && e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName + "." + e.className);
         const seek = document.getElementById("seek").getBoundingClientRect();
-        const told = JSON.stringify({inner: innerWidth, wide, seek: [seek.width, seek.height]});
-        document.documentElement.innerHTML = "<body><pre id=told>" + told + "</pre></body>";
+        tell({inner: innerWidth, wide, seek: [seek.width, seek.height]});
     }, 300))</script>"""
-    (tmp_path / "inner.html").write_text(page.replace("</body>", script + "</body>"))
-    frame = f'<iframe id=f src=inner.html style="width:{width}px;height:900px;border:0"></iframe>'
-    tell = """<script>setTimeout(() => {
-        document.body.innerHTML = "<pre>" + f.contentDocument.getElementById("told").textContent + "</pre>";
-    }, 2500)</script>"""
-    (tmp_path / "outer.html").write_text(f"<body>{frame}{tell}</body>")
-    words = ("--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--dump-dom")
-    done = subprocess.run(
-        [chromium, *words, "--virtual-time-budget=8000", f"--user-data-dir={tmp_path / 'profile'}",
-         (tmp_path / "outer.html").as_uri()], capture_output=True, text=True, check=True, timeout=120,
-    )  # fmt: skip
-    told = re.search(r"<pre>(\{.*?\})</pre>", done.stdout)
-    assert told, done.stdout[-500:]
-    found = json.loads(told[1])
+    page = write_report(run_folder).read_text().replace("</body>", script + "</body>")
+    found, console = ask(page, tmp_path, width=width)
+    assert console == []
     assert found["inner"] == width
     assert found["wide"] == []
     assert found["seek"][0] > 150
     assert found["seek"][1] >= 12
+
+
+@pytest.mark.slow
+def test_a_replay_plays_and_seeks_in_a_browser(run_folder: Path, tmp_path: Path) -> None:
+    script = """<script>const nap = (ms) => new Promise((then) => setTimeout(then, ms));
+    addEventListener("load", async () => {
+        await nap(500);
+        const seek = document.getElementById("seek"), picture = () => document.getElementById("canvas").toDataURL();
+        const to = async (part) => {
+            seek.value = Math.round(seek.max * part);
+            seek.dispatchEvent(new Event("input"));
+            await nap(200);
+            return [Number(seek.value), picture()];
+        };
+        document.getElementById("play").click();  // it plays from the start: now it stands
+        const [first, early] = await to(0.2), [second, late] = await to(0.8), [, again] = await to(0.2);
+        document.getElementById("play").click();
+        await nap(1000);
+        tell({steps: Number(seek.max), first, second, changed: early !== late, same: early === again,
+              played: Number(seek.value) - first});
+    })</script>"""
+    found, console = ask(write_report(run_folder).read_text().replace("</body>", script + "</body>"), tmp_path)
+    assert console == []
+    assert found["first"] == round(found["steps"] * 0.2)
+    assert found["second"] == round(found["steps"] * 0.8)
+    assert found["changed"]
+    assert found["same"]
+    assert found["played"] >= 2
+
+
+@pytest.mark.slow
+def test_a_video_plays_and_seeks_in_a_browser(run_folder: Path, tmp_path: Path) -> None:
+    trace = load_trace(run_folder / "traces" / "blind0.npz")
+    film = write_video(trace, load_town(trace.town), tmp_path / "film.mp4")
+    page = f"""<!DOCTYPE html><html><head><title>film</title></head><body>
+    <video id=film src={film.name} muted preload=auto></video><script>
+    const film = document.getElementById("film"), happens = (name) => new Promise((then) => film.addEventListener(
+        name, then, {{once: true}}));
+    const look = () => {{
+        const canvas = Object.assign(document.createElement("canvas"), {{width: 96, height: 54}});
+        const pen = canvas.getContext("2d");
+        pen.drawImage(film, 0, 0, 96, 54);
+        return pen.getImageData(0, 0, 96, 54).data.reduce((a, b, k) => (a * 31 + b * (k % 7 + 1)) % 1000003, 0);
+    }};
+    film.addEventListener("error", () => tell({{error: film.error.message}}));
+    film.addEventListener("canplaythrough", async () => {{
+        const size = [film.videoWidth, film.videoHeight], seen = [];
+        for (const part of [0.1, 0.9, 0.1]) {{
+            const there = happens("seeked");
+            film.currentTime = film.duration * part;
+            await there;
+            seen.push(look());
+        }}
+        const ended = happens("ended");
+        film.playbackRate = 8;
+        await film.play();
+        await ended;
+        tell({{size, duration: film.duration, seen, at: film.currentTime}});
+    }}, {{once: true}});
+    </script></body></html>"""
+    found, console = ask(page, tmp_path)
+    assert console == []
+    assert found["size"] == [960, 540]
+    assert found["duration"] == pytest.approx(len(trace.accel) * trace.dt, abs=0.2)
+    assert found["seen"][0] == found["seen"][2] != found["seen"][1]
+    assert found["at"] == pytest.approx(found["duration"], abs=0.2)
