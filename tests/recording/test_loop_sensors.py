@@ -125,6 +125,33 @@ def test_a_reading_does_not_depend_on_who_else_is_in_the_batch(monkeypatch: pyte
         assert np.array_equal(reading, together.shown[name, 1 - scene, agent, step]), (name, scene, step)
 
 
+@pytest.mark.parametrize("resident", [False, True])
+def test_cameras_that_are_read_together_are_rendered_at_once_and_show_the_same(
+    monkeypatch: pytest.MonkeyPatch, resident: bool
+) -> None:
+    cameras = {name: rig_camera(name, 96) for name in ("CAM_FRONT", "CAM_FRONT_LEFT")} | {"small": FRONT}
+    simulator, agents = world(0, 1, 0), np.array([[0, 0], [2, 0], [1, 0]], np.int32)
+    simulator.step(None)
+    alone = {name: Onboard().camera(camera)(simulator, agents) for name, camera in cameras.items()}
+    calls = []
+    monkeypatch.setattr(
+        loop_sensors, "render", lambda *args, **more: calls.append(len(args[1])) or render(*args, **more)
+    )
+    monkeypatch.setattr(loop_sensors, "AT_ONCE", 6)
+    onboard = Onboard()
+    onboard.resident = resident  # as on a GPU
+    sensors = onboard.together(cameras)
+    for _ in range(2):
+        for name, sensor in sensors.items():
+            shown = sensor(simulator, agents)
+            assert isinstance(shown, torch.Tensor) == resident
+            np.testing.assert_array_equal(np.asarray(shown), alone[name])
+    assert calls == [6, 3, 6, 3]
+    simulator.step(None)  # what was rendered of a moment is not shown at the next
+    later = sensors["CAM_FRONT_LEFT"](simulator, agents)
+    np.testing.assert_array_equal(np.asarray(later), Onboard().camera(cameras["CAM_FRONT_LEFT"])(simulator, agents))
+
+
 def test_only_what_is_asked_for_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     views, turns = [], []
     monkeypatch.setattr(loop_sensors, "render", lambda scene, asked, **more: views.append(len(asked)) or render(

@@ -133,13 +133,11 @@ class Onboard:
         return {channel: self.camera(rig_camera(channel, width)) for channel in RIG}
 
     def together(self, cameras: Mapping[str, Camera]) -> dict[str, OnboardCamera]:
-        """Cameras that are always read together: on a GPU those of one size are rendered in one call.
+        """Cameras that are always read together: those of one size are rendered in one call.
 
         Args:
             cameras: By the names of their sensors.
         """
-        if self.device == "cpu":
-            return {name: self.camera(camera) for name, camera in cameras.items()}
         sizes = {(camera.width, camera.height): Rig() for camera in cameras.values()}
         found = {}
         for name, camera in cameras.items():
@@ -328,7 +326,7 @@ class OnboardCamera:
             return self._read(self.onboard.sights(simulator, agents), len(agents))
         state = simulator.state()
         moment = tuple(v.tobytes() for v in (state.time, state.pose, state.active, state.signal, agents))
-        number = self.rig.cameras.index(self.camera)
+        number = next(k for k, camera in enumerate(self.rig.cameras) if camera is self.camera)
         if moment != self.rig.moment or number not in self.rig.read:
             cameras, sights = self.rig.cameras, self.onboard.sights(simulator, agents)
             self.rig.moment = moment
