@@ -12,8 +12,10 @@ from helpers.command import ssad
 
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError
+from ssad.core.types import Actor, Limits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard import Leaderboard, RoadOption, _plan, geolocation
+from ssad.recording.closed_loop import onboard_sensors
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.rollout import rollout
@@ -52,6 +54,13 @@ class Follower(AutonomousAgent):
         slow = input_data["speedometer"][1]["speed"] < self.speed
         return carla.VehicleControl(throttle=0.6 * slow, steer=max(-1.0, min(1.0, 1.2 * turn)), brake=0.0)
 """
+
+
+EYES = [
+    {"type": "sensor.lidar.ray_cast", "id": "lidar", "x": 0.0, "y": 0.0, "z": 2.0, "roll": 0, "pitch": 0, "yaw": 0},
+    {"type": "sensor.other.radar", "id": "radar", "x": 2.45, "y": 0.0, "z": 0.7, "roll": 0, "pitch": 0, "yaw": 0,
+     "horizontal_fov": 30, "vertical_fov": 20},
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -141,13 +150,81 @@ def test_what_an_agent_is_told(tmp_path: Path) -> None:
     assert told == {int(RoadOption.LEFT), int(RoadOption.LANEFOLLOW)}
 
 
+def test_lidar_and_radar(tmp_path: Path) -> None:
+    """A car ahead and to the right, and one on the left that comes nearer: where they are, and how fast."""
+    path = tmp_path / "eyes.py"
+    text = AGENT.replace("return [{", f"return {EYES} + [{{")
+    step = "def run_step(self, input_data, timestamp):\n        "
+    path.write_text(text.replace(step, step + "self.seen = getattr(self, 'seen', []) + [input_data]\n        "))
+    drives = ((0.0, 249.0, -5.25, 0.0), (3.0, 249.0, -5.25, 0.0))
+    nearer = ((0.0, 260.0, -1.75, math.pi), (3.0, 239.0, -1.75, math.pi))
+    actors = (
+        Actor("stands", "van", Pose(249.0, -5.25, 0.0), trajectory=drives),
+        Actor("comes", "van", Pose(260.0, -1.75, math.pi), trajectory=nearer),
+    )
+    route = (Pose(229.0, -3.5), Pose(300.0, -5.25))
+    scenario = Scenario("eyes", "Custom", "ProvingGround", route, actors=actors, limits=Limits(max_steps=6))
+    episode = build_episode(scenario, load_town("ProvingGround"), seed=0)
+    driver = make_system(f"leaderboard:{path}")
+    world = World([episode], {episode.town: load_town(episode.town)})
+    (trace,) = rollout(world, driver, sensors=onboard_sensors([driver], "cpu"))
+    seen = driver.act.__self__._agents[0].seen[4]
+    points, hits = seen["lidar"][1], seen["radar"][1]
+    assert points.dtype == hits.dtype == np.float32
+    assert points.shape[1] == hits.shape[1] == 4
+    assert 15_000 < len(points) < 40_000  # of 59,968, of which 45 % are lost, and those into the sky
+    assert np.hypot(points[:, 0], points[:, 1]).max() < 85.1
+    assert points[:, 3] == pytest.approx(np.exp(-0.004 * np.linalg.norm(points[:, :3], axis=1)), rel=1e-5)
+    x, y, yaw, v = trace.x[4, 0], trace.y[4, 0], trace.yaw[4, 0], trace.speed[4, 0]
+    for number, model in ((1, 0.5 * 5.2), (2, 0.5 * 5.2)):
+        dx, dy = trace.x[4, number] - x, trace.y[4, number] - y
+        ahead, right = dx * math.cos(yaw) + dy * math.sin(yaw), dx * math.sin(yaw) - dy * math.cos(yaw)
+        on = (abs(points[:, 0] - ahead) < model + 0.1) & (abs(points[:, 1] - right) < 1.1) & (points[:, 2] > -1.5)
+        assert on.sum() > 30
+        assert points[on, 0].min() == pytest.approx(ahead - model, abs=0.4)
+    speeds = np.unique(np.round(hits[hits[:, 3] != 0.0, 3] / np.cos(hits[hits[:, 3] != 0.0, 2]), 0))
+    stands = hits[(hits[:, 2] > 0.0) & (abs(hits[:, 0] - 17.0) < 2.0)]
+    comes = hits[(hits[:, 2] < 0.0) & (hits[:, 3] < -v - 4.0)]
+    assert len(stands) > 2
+    assert stands[:, 3] == pytest.approx(-v * np.cos(stands[:, 1]) * np.cos(stands[:, 2]), abs=0.05)
+    assert len(comes) > 2, speeds
+    assert comes[:, 3] == pytest.approx((-v - 7.0) * np.cos(comes[:, 1]) * np.cos(comes[:, 2]), abs=0.15)
+
+
 BAD = {
     "missing": (None, "no such file"),
     "broken": ("def", "importing it failed: SyntaxError"),
     "no entry": ("x = 1", "names no class"),
     "wrong entry": ("def get_entry_point(): return 'x'", "names no class"),
     "setup fails": (AGENT.replace("self.track, ", "1 / 0; self.track, "), "setup failed: ZeroDivisionError"),
-    "radar": (AGENT.replace("sensor.other.gnss", "sensor.other.radar"), "asks for the sensor sensor.other.radar"),
+    "depth": (AGENT.replace("sensor.other.gnss", "sensor.camera.depth"), "asks for the sensor sensor.camera.depth"),
+    "no list": (AGENT.replace("return [{", "return 7; [{"), "must give a list, not int"),
+    "sensors fails": (AGENT.replace("return [{", "return 1 / 0; [{"), "sensors.. failed: ZeroDivisionError"),
+    "no type": (AGENT.replace("return [{", "return [{}] + [{"), "asks for the sensor None"),
+    "one name twice": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.speedometer", "id": "imu"}] + [{'),
+        "the id 'imu'",
+    ),
+    "two of one": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.speedometer", "id": "b"}] + [{'),
+        "more than 1 sensors",
+    ),
+    "nine cameras": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.camera.rgb", "id": k} for k in range(9)] + [{'),
+        "more than 8 sensors",
+    ),
+    "a place that is none": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.lidar.ray_cast", "id": "l", "z": "up"}] + [{'),
+        "z is not a number",
+    ),
+    "far away": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.lidar.ray_cast", "id": "l", "z": float("nan")}] + [{'),
+        "outside -100 to 100",
+    ),
+    "a field beyond all": (
+        AGENT.replace("return [{", 'return [{"type": "sensor.other.radar", "id": "r", "horizontal_fov": 400}] + [{'),
+        "outside 0.1 to 170",
+    ),
     "huge": (
         AGENT.replace("return [{", 'return [{"type": "sensor.camera.rgb", "id": "c", "width": 10**6}] + [{'),
         "outside 1 to 4096",

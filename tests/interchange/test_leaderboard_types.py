@@ -211,6 +211,7 @@ def test_polite_drivers_get_by(tmp_path: Path) -> None:
     ("BlockedIntersection", ROUTES["Accident"], "passes no junction"),
     ("ParkedObstacle", Route("ProvingGround", ROUTES["Accident"].points, '<distance value="400"/>'), "the route ends"),
     ("HighwayExit", Route("Longreach", ROUTES["HighwayExit"].points, ""), "has no start_actor_flow"),
+    ("T_Junction", Route("ProvingGround", ((217.0, -1.75), (219.0, 1.75))), "the lanes that join them"),
     ("SignalizedJunctionRightTurn", ROUTES["NonSignalizedJunctionLeftTurn"], "no lane comes into junction"),
 ])  # fmt: skip
 def test_a_place_that_does_not_fit_is_named(kind: str, route: Route, message: str, tmp_path: Path) -> None:

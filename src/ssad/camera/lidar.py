@@ -44,6 +44,7 @@ class Lidar:
         lost: Share of returns that are lost whatever they hit.
         faint: Share of light (albedo times cosine of incidence over squared metres) at which a return is lost with
             probability 1/e; 0: none is lost for being faint.
+        width: Horizontal field, about the direction ahead, rad.
     """
 
     beams: F64
@@ -55,10 +56,11 @@ class Lidar:
     blind: float = 0.9
     lost: float = 0.003
     faint: float = 1e-6
+    width: float = 2.0 * np.pi
 
     def directions(self) -> F64:
         """Unit directions [azimuths, beams, 3] in the sensor frame."""
-        heading = (np.arange(self.azimuths) + 0.5) * (2 * np.pi / self.azimuths) - np.pi
+        heading = (np.arange(self.azimuths) + 0.5) * (self.width / self.azimuths) - 0.5 * self.width
         up = np.asarray(self.beams, np.float64)
         flat = np.stack([np.sin(heading), np.cos(heading), np.zeros_like(heading)], -1)
         rays = np.cos(up)[None, :, None] * flat[:, None]

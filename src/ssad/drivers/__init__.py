@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from ssad.core.driving import Believer, Driver
 from ssad.core.errors import ConfigError
@@ -14,6 +14,9 @@ from ssad.core.registry import Reference, check_arguments, label_of, resolve
 from ssad.core.safeio import read_bytes
 from ssad.core.seeding import digest
 from ssad.core.types import Controller
+
+if TYPE_CHECKING:
+    from ssad.camera.lidar import Lidar
 
 SYSTEMS: dict[str, str] = {
     "autopilot": "ssad.drivers.builtin:Autopilot",
@@ -100,6 +103,8 @@ class _Named:
         self.reset = system.reset
         self.act = system.act
         self.cameras: Mapping[str, Camera] = getattr(system, "cameras", {})
+        self.lidars: Mapping[str, Lidar] = getattr(system, "lidars", {})
+        self.radars: Mapping[str, Lidar] = getattr(system, "radars", {})
         if isinstance(system, Believer):
             self.believe = system.believe
         if callable(getattr(system, "to", None)):

@@ -6,7 +6,7 @@ agents need of them are put in their places.
 
 Each episode has an agent of its own. What agents are told, by id of the sensor: (number of the step, data). Frames are
 CARLA's, left-handed: y to the right, yaw clockwise. Source of the interface: the leaderboard's
-autoagents/autonomous_agent.py and its pages on sensors; of gnss: CARLA's Mercator projection about latitude 0.
+autoagents/autonomous_agent.py and its pages on sensors.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ssad.camera.lidar import Lidar
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.frames import Camera
@@ -31,17 +32,24 @@ from ssad.core.registry import describe
 from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import read_bytes
 from ssad.core.types import F32, F64, Controller, Episode, Route
+from ssad.drivers.leaderboard_sensors import (
+    CAMERA,
+    LIDAR,
+    MAP,
+    RADAR,
+    camera_of,
+    checked,
+    cloud,
+    geolocation,
+    lidar_of,
+    radar_of,
+)
 from ssad.roads import load_town, town_xodr
 
-RADIUS: Final = 6378137.0  # m, of the earth in CARLA's projection
 GRAVITY: Final = 9.81  # m/s^2
 STEP: Final = 0.1  # s
 TURN: Final = math.radians(30.0)  # a way through a junction that turns less goes straight on
 APART: Final = 50.0  # m between points of the plan that the base class keeps
-CAMERA: Final = "sensor.camera.rgb"
-KNOWN: Final = (
-    CAMERA, "sensor.other.gnss", "sensor.other.imu", "sensor.speedometer", "sensor.opendrive_map",
-)  # fmt: skip
 
 
 class RoadOption(enum.IntEnum):
@@ -118,11 +126,11 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{path}': {error}") from None
         self.version = hashlib.sha256(source + self._config.encode()).hexdigest()
         self._class = self._load(path)
-        self._asked = self._sensors(self._agent())
-        self.cameras: Mapping[str, Camera] = {
-            item["id"]: _camera(item) for item in self._asked if item["type"] == CAMERA
-        }
-        self.sensors = tuple(self.cameras)
+        self._asked = self._sensors()
+        self.cameras: Mapping[str, Camera] = {i["id"]: camera_of(i) for i in self._asked if i["type"] == CAMERA}
+        self.lidars: Mapping[str, Lidar] = {i["id"]: lidar_of(i) for i in self._asked if i["type"] == LIDAR}
+        self.radars: Mapping[str, Lidar] = {i["id"]: radar_of(i) for i in self._asked if i["type"] == RADAR}
+        self.sensors = (*self.cameras, *self.lidars, *self.radars)
         self._agents: list[Any] = []
         self._last: dict[int, tuple[float, float]] = {}
         self._maps: list[str] = []
@@ -160,26 +168,25 @@ class Leaderboard:
             raise ConfigError(f"system 'leaderboard:{self.path}': setup failed: {describe(error)}") from error
         return agent
 
-    def _sensors(self, agent: Any) -> list[dict[str, Any]]:
-        asked = agent.sensors()
-        for item in asked:
-            if not isinstance(item, dict) or "id" not in item or item.get("type") not in KNOWN:
-                told = item.get("type") if isinstance(item, dict) else item
-                raise ConfigError(
-                    f"system 'leaderboard:{self.path}': it asks for the sensor {told}; there are: {', '.join(KNOWN)}"
-                )
-        return list(asked)
+    def _sensors(self) -> list[dict[str, Any]]:
+        """What an agent asks for."""
+        agent, where = self._agent(), f"system 'leaderboard:{self.path}'"
+        try:
+            told = agent.sensors()
+        except Exception as error:
+            raise ConfigError(f"{where}: sensors() failed: {describe(error)}") from error
+        return checked(told, where)
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """A new agent for each episode, with the plan of its route."""
         for agent in self._agents:
             getattr(agent, "destroy", lambda: None)()
         self._agents, self._last = [], {}
-        wants_map = any(item["type"] == "sensor.opendrive_map" for item in self._asked)
+        wants_map = any(item["type"] == MAP for item in self._asked)
         self._maps = [town_xodr(episode.town) if wants_map else "" for episode in episodes]
         for episode in episodes:
             agent = self._agent()
-            self._sensors(agent)
+            agent.sensors()  # some prepare themselves there
             route = episode.agents[0].route
             assert route is not None
             gps, world = _plan(route, load_town(episode.town))
@@ -209,6 +216,11 @@ class Leaderboard:
                 picture = view.readings[item["id"]][row]
                 alpha = np.full((1, *picture.shape[1:]), 255, np.uint8)
                 value = np.concatenate([picture[::-1], alpha]).transpose(1, 2, 0).copy()
+            elif kind == LIDAR:
+                value = cloud(view.readings[item["id"]][row])
+            elif kind == RADAR:
+                seen = view.readings[item["id"]][row]
+                value = seen[seen[:, 0] > 0.0]
             elif kind == "sensor.other.gnss":
                 value = np.array(geolocation(float(view.pose[row, 0]), float(view.pose[row, 1])))
             elif kind == "sensor.other.imu":
@@ -229,36 +241,6 @@ class Leaderboard:
         compass = (0.5 * math.pi - yaw) % math.tau
         across = -float(view.speed[row]) * rate
         return np.array([float(view.accel[row]), across, GRAVITY, 0.0, 0.0, -rate, compass])
-
-
-def geolocation(x: float, y: float) -> tuple[float, float, float]:
-    """Latitude and longitude, degrees, and altitude, m, of a place of ours: x m east and y m north of (0, 0)."""
-    latitude = 360.0 * math.atan(math.exp(y / RADIUS)) / math.pi - 90.0
-    return latitude, math.degrees(x / RADIUS), 0.0
-
-
-def _camera(item: Mapping[str, Any]) -> Camera:
-    """A camera of an agent: x forward, y right, z up, m, from the middle of the car's base; angles in degrees."""
-    width, height = int(item.get("width", 800)), int(item.get("height", 600))
-    if not (0 < width <= 4096 and 0 < height <= 4096):
-        raise ConfigError(f"camera '{item['id']}': {width} x {height} pixels are outside 1 to 4096")
-    focal = 0.5 * width / math.tan(0.5 * math.radians(float(item.get("fov", 100.0))))
-    intrinsic = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
-    roll, pitch, yaw = (math.radians(float(item.get(key, 0.0))) for key in ("roll", "pitch", "yaw"))
-
-    def turn(axis: int, angle: float) -> F64:
-        c, s = math.cos(angle), math.sin(angle)
-        a, b = [k for k in range(3) if k != axis]
-        matrix = np.eye(3)
-        matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
-        return matrix
-
-    # CARLA: yaw clockwise seen from above, pitch upwards, roll clockwise seen from behind
-    forward = turn(2, -yaw) @ turn(1, pitch) @ turn(0, roll)
-    place = np.eye(4)
-    place[:3, :3] = forward @ np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    place[:3, 3] = float(item.get("x", 0.0)), -float(item.get("y", 0.0)), float(item.get("z", 0.0))
-    return Camera(width, height, intrinsic, place, channel=str(item["id"]))
 
 
 def _plan(route: Route, graph: LaneGraph) -> tuple[list[Any], list[Any]]:

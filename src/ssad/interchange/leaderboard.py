@@ -20,7 +20,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
-from ssad.core.errors import ConfigError, FormatError, SSADError
+from ssad.core.errors import ConfigError, FormatError, RouteError, SSADError
 from ssad.core.safeio import MIB, dump_json, make_folder, read_xml, write_atomic
 from ssad.core.seeding import generator
 from ssad.core.types import Episode, Pose, Scenario
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 MAX_BYTES: Final = 64 * MIB
 OWN: Final = "ssad"  # the child of a scenario that holds what no type of the leaderboard says
 MOVED: Final = 0.01  # m
+ROUND: Final = 1.5  # times its points' distance is more than the way of a route may be
 TYPES_2: Final[Mapping[str, str]] = {
     "StraightObstacle": "DynamicObjectCrossing",
     "LaneChanging": "OtherLeadingVehicle",
@@ -148,6 +149,11 @@ def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> S
     scenario_from(scenario_data(base))  # names and places, before anybody relies on them
     graph = load_town(base.town)
     route = route_along(graph, base.route)
+    told = sum(math.dist((a.x, a.y), (b.x, b.y)) for a, b in pairwise(base.route))
+    if route.length > ROUND * told + 50.0:
+        raise RouteError(
+            f"scenario {base.name}: its points make a way of {told:.0f} m, the lanes that join them {route.length:.0f} m"
+        )
     start = 0 if alone else trigger_index(base, route)
     site = Site(base, graph, route, start, item, values, generator("leaderboard", base.name))
     play(site)

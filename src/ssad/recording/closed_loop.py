@@ -202,16 +202,22 @@ def drive(
 
 
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
-    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own cameras."""
+    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own sensors."""
     asked = {name for driver in drivers for name in getattr(driver, "sensors", ())}
-    own = {name: camera for driver in drivers for name, camera in getattr(driver, "cameras", {}).items()}
-    if not asked & {*CAMERAS, LIDAR, *own}:
+    own = {
+        kind: {name: one for driver in drivers for name, one in getattr(driver, kind, {}).items()}
+        for kind in ("cameras", "lidars", "radars")
+    }
+    if not asked & {*CAMERAS, LIDAR}.union(*own.values()):
         return {}
+    from ssad.recording.loop_radar import OnboardRadar
     from ssad.recording.loop_sensors import Onboard
 
     onboard = Onboard(device=device)
-    cameras = {name: onboard.camera(camera) for name, camera in own.items()}
-    return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras}
+    cameras = {name: onboard.camera(camera) for name, camera in own["cameras"].items()}
+    lidars = {name: onboard.lidar(lidar) for name, lidar in own["lidars"].items()}
+    radars = {name: OnboardRadar(onboard, radar) for name, radar in own["radars"].items()}
+    return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras, **lidars, **radars}
 
 
 def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:

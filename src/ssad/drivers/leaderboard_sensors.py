@@ -1,0 +1,118 @@
+"""The sensors that an agent of the leaderboards asks for: their places and fields, and readings in CARLA's frames.
+
+CARLA: x forward, y right, z up, yaw clockwise, degrees. Facts: the leaderboard's agent_wrapper.py and
+sensor_interface.py (LiDAR of 64 channels from -30 to 10 degrees, 85 m, 600,000 points a second, of which 45 % are
+lost; radar of 1,500 points a second, 100 m); of gnss: CARLA's Mercator projection about latitude 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from ssad.camera.lidar import Lidar
+from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
+from ssad.core.types import F32, F64
+
+RADIUS: Final = 6378137.0  # m, of the earth in CARLA's projection
+CAMERA: Final = "sensor.camera.rgb"
+LIDAR: Final = "sensor.lidar.ray_cast"
+RADAR: Final = "sensor.other.radar"
+MAP: Final = "sensor.opendrive_map"
+LIMITS: Final[Mapping[str, int]] = {
+    CAMERA: 8, LIDAR: 2, RADAR: 4, "sensor.other.gnss": 1, "sensor.other.imu": 1, MAP: 1, "sensor.speedometer": 1,
+}  # fmt: skip
+"""Kinds of sensors -> how many of one an agent may have."""
+_FADE: Final = 0.004  # 1/m by which the intensity of a LiDAR's points falls
+_RANGE, _REACH = 85.0, 100.0  # m, of LiDAR and radar
+_RIGHT: Final = np.array(
+    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+)  # x right, y forward -> x forward, y left
+
+
+def checked(sensors: Any, where: str) -> list[dict[str, Any]]:
+    """What an agent's `sensors` gives. ConfigError for what no leaderboard allows."""
+    if not isinstance(sensors, Sequence):
+        raise ConfigError(f"{where}: its sensors() must give a list, not {type(sensors).__name__}")
+    found: list[dict[str, Any]] = []
+    for item in sensors:
+        kind = item.get("type") if isinstance(item, dict) else item
+        if not isinstance(item, dict) or "id" not in item or kind not in LIMITS:
+            raise ConfigError(f"{where}: it asks for the sensor {str(kind)[:60]}; there are: {', '.join(LIMITS)}")
+        if any(item["id"] == other["id"] for other in found):
+            raise ConfigError(f"{where}: two of its sensors have the id '{str(item['id'])[:60]}'")
+        found.append(item)
+        if sum(other["type"] == kind for other in found) > LIMITS[kind]:
+            raise ConfigError(f"{where}: it asks for more than {LIMITS[kind]} sensors {kind}")
+    return found
+
+
+def geolocation(x: float, y: float) -> tuple[float, float, float]:
+    """Latitude and longitude, degrees, and altitude, m, of a place of ours: x m east and y m north of (0, 0)."""
+    latitude = 360.0 * math.atan(math.exp(y / RADIUS)) / math.pi - 90.0
+    return latitude, math.degrees(x / RADIUS), 0.0
+
+
+def number(item: Mapping[str, Any], key: str, default: float, low: float, high: float) -> float:
+    """A number of a sensor. ConfigError if it is none, or outside its range."""
+    try:
+        value = float(item.get(key, default))
+    except (TypeError, ValueError):
+        raise ConfigError(f"sensor '{item['id']}': {key} is not a number: {str(item[key])[:40]}") from None
+    if not low <= value <= high:
+        raise ConfigError(f"sensor '{item['id']}': {key} is {value:g}, outside {low:g} to {high:g}")
+    return value
+
+
+def place_of(item: Mapping[str, Any], axes: F64) -> F64:
+    """Sensor to car [4, 4], from the middle of the car's base, of a sensor whose own frame has these axes [3, 3]."""
+    roll, pitch, yaw = (math.radians(number(item, key, 0.0, -720.0, 720.0)) for key in ("roll", "pitch", "yaw"))
+
+    def turn(axis: int, angle: float) -> F64:
+        c, s = math.cos(angle), math.sin(angle)
+        a, b = [k for k in range(3) if k != axis]
+        matrix = np.eye(3)
+        matrix[a, a], matrix[a, b], matrix[b, a], matrix[b, b] = c, -s, s, c
+        return matrix
+
+    # CARLA: yaw clockwise seen from above, pitch upwards, roll clockwise seen from behind
+    place = np.eye(4)
+    place[:3, :3] = turn(2, -yaw) @ turn(1, pitch) @ turn(0, roll) @ axes
+    x, y, z = (number(item, key, 0.0, -100.0, 100.0) for key in ("x", "y", "z"))
+    place[:3, 3] = x, 0.0 - y, z
+    return place
+
+
+def camera_of(item: Mapping[str, Any]) -> Camera:
+    """A camera of an agent."""
+    width, height = (int(number(item, key, size, 1, 4096)) for key, size in (("width", 800), ("height", 600)))
+    focal = 0.5 * width / math.tan(0.5 * math.radians(number(item, "fov", 100.0, 1.0, 170.0)))
+    intrinsic = np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
+    axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return Camera(width, height, intrinsic, place_of(item, axes), channel=str(item["id"]))
+
+
+def lidar_of(item: Mapping[str, Any]) -> Lidar:
+    """The LiDAR that a leaderboard gives its agents: a whole turn a step."""
+    beams = np.deg2rad(np.linspace(-30.0, 10.0, 64))
+    place = place_of(item, _RIGHT)
+    return Lidar(beams, 937, place, _RANGE, noise=0.0, period=0.1, blind=0.1, lost=0.45, faint=0.0)
+
+
+def radar_of(item: Mapping[str, Any]) -> Lidar:
+    """The rays of a radar: 12 times 12, evenly over its field."""
+    wide, high = (math.radians(number(item, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical"))
+    beams = (np.arange(12) + 0.5) * (high / 12) - 0.5 * high
+    place = place_of(item, _RIGHT)
+    return Lidar(beams, 12, place, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=wide)
+
+
+def cloud(points: F32) -> F32:
+    """CARLA's points [P, 4]: x forward, y right, z up, m, and intensity; of points [., 5] of the world's LiDAR."""
+    kept = points[points[:, 4] >= 0.0]
+    away = np.linalg.norm(kept[:, :3], axis=1)
+    return np.column_stack([kept[:, 1], kept[:, 0], kept[:, 2], np.exp(-_FADE * away)]).astype(np.float32)
