@@ -152,7 +152,7 @@ def _played(values: Values, item: Node, base: Scenario, lost: Counter[str]) -> S
     told = sum(math.dist((a.x, a.y), (b.x, b.y)) for a, b in pairwise(base.route))
     if route.length > ROUND * told + 50.0:
         raise RouteError(
-            f"scenario {base.name}: its points make a way of {told:.0f} m, the lanes that join them {route.length:.0f} m"
+            f"scenario {base.name}: its points make {told:.0f} m, the lanes that join them {route.length:.0f} m"
         )
     start = 0 if alone else trigger_index(base, route)
     site = Site(base, graph, route, start, item, values, generator("leaderboard", base.name))
