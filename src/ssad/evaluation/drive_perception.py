@@ -11,7 +11,7 @@ import numpy as np
 from ssad.core.driving import Belief
 from ssad.core.frames import Camera
 from ssad.core.rotations import upright_pose
-from ssad.core.types import F64, AgentKind, Bool, EpisodeTrace
+from ssad.core.types import F64, U8, AgentKind, Bool, EpisodeTrace
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.driver import Known, Sighting
 from ssad.drivers.perceiving.objects import I64, Objects
@@ -61,14 +61,14 @@ class Watcher:
     Args:
         cameras: Of the driver.
         scenes: How many.
-        every: s from one picture that is kept to the next.
+        every: s from one picture that is kept to the next, at least; the last one is always kept.
     """
 
-    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 1.0) -> None:
+    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 0.5) -> None:
         self.cameras, self.every = cameras, every
         self.looks: list[list[Any]] = [[] for _ in range(scenes)]
         self.known: list[list[Any]] = [[] for _ in range(scenes)]
-        self.shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
+        self._shots: list[list[tuple[float, Any]]] = [[] for _ in range(scenes)]
         self.signs: list[list[tuple[float, F64]]] = [[] for _ in range(scenes)]
 
     def __call__(self, told: Sighting | Known) -> None:
@@ -78,14 +78,34 @@ class Watcher:
             if told.signs is not None:
                 self.signs[told.scene].append((told.time, told.signs))
             for picture in list(told.pictures.values())[:1]:
-                self.shots[told.scene].append((told.time, np.ascontiguousarray(np.moveaxis(picture, 0, -1))))
+                self._keep(self._shots[told.scene], told.time, picture)
             return
         for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
             self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
 
+    def _keep(self, shots: list[tuple[float, Any]], time: float, picture: Any) -> None:
+        """The last picture stays as it came, often on a GPU, until it is known that it is kept."""
+        if len(shots) > 1 and shots[-1][0] - shots[-2][0] < self.every - 1e-4:
+            shots[-1] = time, picture
+            return
+        if shots:
+            shots[-1] = shots[-1][0], _upright(shots[-1][1])
+        shots.append((time, picture))
+
+    def shots(self, scene: int) -> list[tuple[float, U8]]:
+        """Pictures [H, W, 3] that the driver of a scene got, with their times, s."""
+        return [(time, _upright(picture)) for time, picture in self._shots[scene]]
+
     def perceived(self, scene: int) -> Perceived:
         """What was perceived in a scene."""
         return Perceived(self.looks[scene], self.known[scene], self.cameras, self.signs[scene])
+
+
+def _upright(picture: Any) -> U8:
+    """A picture [3, H, W], or one that is [H, W, 3] already, as an array [H, W, 3] of its own."""
+    if hasattr(picture, "cpu"):
+        picture = picture.cpu().numpy()
+    return np.ascontiguousarray(np.moveaxis(picture, 0, -1)) if picture.shape[0] == 3 else picture
 
 
 def in_view(trace: EpisodeTrace, step: int, cameras: Mapping[str, Camera]) -> Bool:

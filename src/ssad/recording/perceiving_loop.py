@@ -114,7 +114,7 @@ class PerceivingSystem(Schema):
 
 
 def drive_perceiving(
-    orders: Sequence[Order], *, device: str, seed: int, repair: Repair | None = None
+    orders: Sequence[Order], *, device: str, seed: int, repair: Repair | None = None, every: float = 0.5
 ) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
     """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
 
@@ -124,12 +124,13 @@ def drive_perceiving(
         device: Where the world and the cameras compute.
         seed: Of the perturbations.
         repair: What mends one error of the driver.
+        every: s from one picture that is kept to the next.
     """
     spec = orders[0].spec
     if spec["settings"] is None:
         return *drive(orders, device=device, key=_paired), None
     own = PerceivingSystem.model_validate(spec["settings"])
-    watcher = Watcher(front(own.width, own.cameras), len(orders))
+    watcher = Watcher(front(own.width, own.cameras), len(orders), every)
     driver = own.make(watcher, repair=repair, device=device)
     attack = worn(spec["perturbation"], spec["wearer"]) if "wearer" in spec else None
     onboard = Onboard(device=device, resident=True, attack=attack)

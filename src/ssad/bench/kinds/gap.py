@@ -176,10 +176,10 @@ class Gap(ScenarioKind):
                 metrics |= sign_metrics(trace, perceived, signs_of_route(town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
                 about["cause"] = cause_of_collision(trace, perceived)
-                if job.settings["sheets"] and seen.shots[k]:
+                if job.settings["sheets"] and (shots := seen.shots(k)):
                     result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"
                     safeio.make_folder(job.folder / "sheets")
-                    picture = drive_sheet(trace, perceived, seen.shots[k], town(trace.town))
+                    picture = drive_sheet(trace, perceived, shots, town(trace.town))
                     save_picture(job.folder / result["artefacts"]["sheet"], picture)
             metrics = {name: round(value, 6) if isinstance(value, float) else value for name, value in metrics.items()}
             about |= {"repaired": repaired[k]} if k in repaired else {}
@@ -195,11 +195,11 @@ class Gap(ScenarioKind):
         clean = replace(cell, spec={k: v for k, v in spec.items() if k != "wearer"} | {"perturbation": NONE})
         drives, again = [], []
         for one in [cell] if spec["perturbation"] == NONE else [clean, cell]:
-            _, (trace,), seen = drive_perceiving([one], device=plan.device, seed=plan.suite.seed)
+            _, (trace,), seen = drive_perceiving([one], device=plan.device, seed=plan.suite.seed, every=EVERY)
             again.append(trace)
-            if seen is not None and seen.shots[0]:
+            if seen is not None and (shots := seen.shots(0)):
                 title = f"{spec['perturbation']} {spec['severity']}" if one is cell and spec["severity"] else "clean"
-                drives.append(Seen(title, trace, seen.perceived(0), seen.shots[0]))
+                drives.append(Seen(title, trace, seen.perceived(0), shots))
         film = (drive_film(drives, graph, every=EVERY), EVERY) if drives else None
         return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film)
 

@@ -38,7 +38,8 @@ class Sighting:
         scene: Which scene.
         time: s when the pictures were taken.
         found: What was found in them, in the world; None: no camera had a picture.
-        pictures: What the cameras showed, uint8 [3, H, W] by name, where eyes look at pictures.
+        pictures: What the cameras showed, uint8 [3, H, W] by name, where eyes look at pictures; tensors where pictures
+            stay on a GPU.
         signs: Where the stop signs stand that were read, if the driver reads them: x, y in the world [M, 2], m.
         eye: From where: x, y [2].
     """
@@ -197,8 +198,7 @@ class Perceiving:
 
     def _pictures(self, view: Observation, row: int) -> dict[str, U8]:
         """What the cameras showed to a row."""
-        shown = {name: view.readings[name][row] for name in self.cameras}
-        return {name: one.cpu().numpy() if hasattr(one, "cpu") else one for name, one in shown.items()}
+        return {name: view.readings[name][row] for name in self.cameras}
 
     def _take_in(self, now: Mapping[int, float]) -> None:
         """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""
