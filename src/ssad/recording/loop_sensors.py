@@ -35,7 +35,7 @@ from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.world.models import MODELS
 
 DAY: Final = Weather(0.9, 2.2, 0.3)
-AT_ONCE, AT_ONCE_GPU = 1, 192  # views rendered in one call; on a CPU more do not pay
+AT_ONCE, AT_ONCE_GPU, AT_LEAST_GPU = 1, 192, 16  # views rendered in one call; on a CPU more do not pay
 VIEW_MEMORY: Final = 100 << 20  # bytes that a view of 640 x 360 needs on a GPU, with shadows and textures
 WITH_LAMPS: Final = (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS, AgentKind.MOTORCYCLE)
 
@@ -114,7 +114,8 @@ class Onboard:
         self.resident = resident and device != "cpu"
         self.at_once = AT_ONCE
         if device != "cpu":
-            self.at_once = max(min(AT_ONCE_GPU, wp.get_device(device).total_memory // VIEW_MEMORY), 1)
+            # other processes may share the device
+            self.at_once = max(min(AT_ONCE_GPU, wp.get_device(device).free_memory // 4 // VIEW_MEMORY), AT_LEAST_GPU)
         self.weather, self.response, self.device, self.attack = weather, response, device, attack
         self._towns: dict[str, tuple[LaneGraph, EpisodeScene]] = {}
         self._simulator: Simulator | None = None

@@ -34,6 +34,7 @@ NAMES: Mapping[int, str] = {
     AgentKind.CAR: "car", AgentKind.TRUCK: "truck", AgentKind.BUS: "bus", AgentKind.MOTORCYCLE: "motorcycle",
     AgentKind.BICYCLE: "bicycle", AgentKind.WALKER: "pedestrian", AgentKind.PROP: "barrier",
 }  # fmt: skip
+MEMORY = 100  # bytes that a detector needs on a GPU for each value of a picture, about
 _SLOTS = 64  # a scene has fewer agents: draws for all, so that none depends on how many there are
 
 
@@ -190,10 +191,12 @@ class CameraEyes:
 
 
 def _room(pictures: torch.Tensor) -> int:
-    """Pictures that a detector is given at once: on a GPU as many as its memory holds with ease."""
+    """Pictures that a detector is given at once: on a GPU as many as need a quarter of the memory that is left."""
     if not pictures.is_cuda:
         return max(len(pictures), 1)
-    return max(torch.cuda.get_device_properties(pictures.device).total_memory // (128 * 3 * pictures[0].numel()), 1)
+    device = pictures.device
+    left = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return max(left // 4 // (MEMORY * pictures[0].numel()), 16)
 
 
 def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
