@@ -227,9 +227,9 @@ def test_files_can_be_read_by_others_and_not_written(tmp_path: Path) -> None:
 def test_a_run_that_began_meanwhile_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = stores._lock
 
-    def lock(folder: Path) -> int:
+    def lock(folder: Path, what: str) -> int:
         (folder / "run.json").write_text(json.dumps({"identity": "b", "suite": {"name": "other"}}))
-        return real(folder)
+        return real(folder, what)
 
     monkeypatch.setattr(stores, "_lock", lock)
     with pytest.raises(StoreError, match="holds another run"):

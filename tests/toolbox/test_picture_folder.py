@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +53,7 @@ def test_pictures_are_shifted_in_place_and_all_else_is_linked(kitti: Path, tmp_p
     assert (tmp_path / "out" / "fog-3" / "image_2" / "000001.png").read_bytes() == whole
     other = ssad(*words, "--seed", "7")
     assert other.returncode == 2
-    assert "holds this shift with other settings" in other.stderr
+    assert "holds another run (suite ssad shift; differs in seed)" in other.stderr
 
 
 def test_a_broken_picture_fails_alone(kitti: Path, tmp_path: Path) -> None:
@@ -75,3 +80,32 @@ def test_the_camera_of_kitti_is_read(kitti: Path) -> None:
     image = read_image(kitti / "image_2" / "000000.png")
     assert camera_of(kitti / "image_2" / "000000.png", image).intrinsic[0].tolist() == [250, 0, 160]
     assert camera_of(kitti / "other" / "a.png", image).intrinsic[0, 0] == pytest.approx(0.79 * 320)
+
+
+def test_a_killed_run_goes_on_and_workers_change_no_byte(tmp_path: Path) -> None:
+    source, draws = tmp_path / "pictures", np.random.default_rng(1)
+    for number in range(16):
+        picture = draws.integers(0, 256, (360, 640, 3), dtype=np.uint8)
+        save_picture(source / f"{number:02d}.{'png' if number % 2 else 'jpg'}", picture)
+    words = ("shift", source, tmp_path / "out", "--shifts", "snow,gaussian", "--severity", "random", "--workers", "2")
+    run = subprocess.Popen(
+        [sys.executable, "-m", "ssad", *words], start_new_session=True, stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    lines = tmp_path / "out" / "results.jsonl"
+    while run.poll() is None and not (lines.exists() and lines.read_bytes().count(b"\n") >= 5):
+        time.sleep(0.005)
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    kept = [json.loads(line)["key"] for line in lines.read_text().splitlines(keepends=True) if line.endswith("\n")]
+    assert 5 <= len(kept) < 32
+    before = {key: (tmp_path / "out" / key).stat().st_ino for key in kept}
+    assert ssad(*words).returncode == 0
+    assert {key: (tmp_path / "out" / key).stat().st_ino for key in kept} == before
+    assert ssad("shift", source, tmp_path / "one", *words[3:-1], "1").returncode == 0
+    for root in ("snow-random", "gaussian-random"):
+        found, alone = (
+            {path.name: path.read_bytes() for path in (tmp_path / out / root).iterdir()} for out in ("out", "one")
+        )
+        assert found == alone
+        assert len(found) == 18

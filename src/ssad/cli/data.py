@@ -81,12 +81,12 @@ def shift(
         )
         return
     if source.is_dir() and not any(source.glob("*/sample_data.json")):
-        for name, value in (("--version", version), ("--split", split), ("--scenes", scenes), ("--ray", ray)):
+        for name, value in (("--version", version), ("--split", split), ("--scenes", scenes)):
             if value:
                 raise ConfigError(f"{name} is for a nuScenes folder; {source} has no VERSION/sample_data.json")
         raise typer.Exit(
             shift_picture_folder(
-                source, out, shifts=names, severity=severity,
+                source, out, shifts=names, severity=severity, workers=workers, ray=ray,
                 settings={"seed": seed, "calibration": calibration, "quality": quality, "subsampling": subsampling},
             )
         )  # fmt: skip

@@ -44,13 +44,14 @@ class Store:
         self.retried: frozenset[str] = frozenset()
 
     @classmethod
-    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False) -> Self:
+    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False, what: str = "ssad run") -> Self:
         """Take the folder for this run: a new one, or one of the same run that is resumed.
 
         Args:
             folder: The folder.
             run: What run.json shall say; its "identity" must equal that of a run already there.
             retry: Whether cells that failed are treated as if they had never run.
+            what: The command, for messages.
 
         Raises:
             StoreError: The folder cannot be written, is in use, or belongs to another run; nothing is changed then.
@@ -58,7 +59,7 @@ class Store:
         path = Path(folder)
         _check_content(path, run)
         safeio.make_folder(path)
-        store = cls(path, _lock(path))
+        store = cls(path, _lock(path, what))
         try:
             _check_content(path, run)  # again: another process may have begun meanwhile
             store._begin(run, retry=retry)
@@ -152,7 +153,7 @@ def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
     changed = sorted(k for k in {*old, *new} if old.get(k) != new.get(k)) or ["the code, a system or a town"]
     raise StoreError(
         f"{folder}: holds another run (suite {old.get('name')}; differs in {', '.join(changed)}); "
-        "choose another folder with --out or remove this one"
+        "choose another folder or remove this one"
     )
 
 

@@ -124,8 +124,9 @@ def shift_folder(
 
 
 def shift_picture_folder(
-    source: Path, out: Path, *, shifts: Sequence[str], severity: str, settings: Mapping[str, Any]
-) -> int:
+    source: Path, out: Path, *, shifts: Sequence[str], severity: str, workers: int | None, ray: str | None,
+    settings: Mapping[str, Any],
+) -> int:  # fmt: skip
     """Shift the pictures of a folder that is no nuScenes root, and print one line for each new folder.
 
     Args:
@@ -133,6 +134,8 @@ def shift_picture_folder(
         out: Folder of the new ones.
         shifts: See `shift_names`.
         severity: See `severities`.
+        workers: See `shift_pictures`.
+        ray: See `shift_pictures`.
         settings: See `shift_pictures`.
 
     Returns:
@@ -149,8 +152,9 @@ def shift_picture_folder(
     try:
         with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as live:
             written = shift_pictures(
-                source, out, shifts=chosen, severities=strengths, settings=settings, progress=live.show
-            )
+                source, out, shifts=chosen, severities=strengths, settings=settings, workers=workers, ray=ray,
+                progress=live.show,
+            )  # fmt: skip
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130
