@@ -29,6 +29,11 @@ PARTS = {
     "Other programs": ("interchange", "carla"),
     "Reference": ("api", "stability", *TOP),
 }
+MORE = (  # beside the names of `ssad`
+    "ssad.core.driving.Driver", "ssad.core.driving.Observation", "ssad.core.driving.Simulator",
+    "ssad.core.protocols.Detector", "ssad.core.generators.Generator", "ssad.world.check.check_driver",
+    "ssad.world.check.check_simulator", "ssad.detectors.check.check_detector", "ssad.world.env.VectorEnv",
+)  # fmt: skip
 SETTINGS = """site_name: SSAD
 site_description: A testbed for the safety and robustness of autonomous driving in safety-critical scenarios
 docs_dir: pages
@@ -98,7 +103,7 @@ def api_page() -> str:
     for name, value in sorted(named.items(), key=lambda item: item[0].lower()):
         home = getattr(value, "__module__", None) or "ssad"
         lines += [f"## `ssad.{name}`", "", f"::: {home}.{getattr(value, '__qualname__', name)}", ""]
-    for name in ("ssad.core.protocols.Detector", "ssad.core.driving.Simulator"):
+    for name in MORE:
         lines += [f"## `{name}`", "", f"::: {name}", ""]
     return "\n".join(lines)
 

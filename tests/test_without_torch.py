@@ -75,7 +75,7 @@ for words in (
 ):
     told(*words)
 try:
-    ssad.check_detector
+    ssad.make_detector("yolov5n")
 except ssad.SSADError as error:
     print(error)
 for name in FREE:
@@ -118,7 +118,7 @@ def test_drives_shifts_scores_and_reports_work_and_the_rest_names_the_extra(
         assert line.count("|") == 1, "one line"
         assert "needs the extra perception (torch is not installed); " in line
         assert "--extra perception)" in line
-    assert said[12].startswith("ssad.check_detector needs the extra perception")
+    assert said[12].startswith("detector 'yolov5n' needs the extra perception")
     assert said[13] == "[]"
 
 
