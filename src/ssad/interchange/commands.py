@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,7 @@ class Format(StrEnum):
     openscenario = "openscenario"
     leaderboard = "leaderboard"
     leaderboard1 = "leaderboard1"
+    commonroad = "commonroad"
 
 
 class ExportGroup(TyperGroup):
@@ -36,6 +38,7 @@ def register(exports: typer.Typer, imports: typer.Typer) -> None:
     exports.command("scenarios")(export_scenarios)
     imports.command("openscenario")(import_openscenario)
     imports.command("leaderboard")(import_leaderboard)
+    imports.command("commonroad")(import_commonroad)
 
 
 def export_scenarios(
@@ -45,19 +48,22 @@ def export_scenarios(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
     to: Annotated[Format, typer.Option("--format", help="Format.")],
     seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes: of their random traffic.")] = 0,
+    system: Annotated[
+        str, typer.Option(help="Drives the ego while others' trajectories are recorded (commonroad).")
+    ] = "autopilot",
 ) -> None:
     """Write scenarios for other programs, with the maps of their towns, and say what is not carried over.
 
     The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
     """
-    from ssad.interchange.export import export_openscenario
+    from ssad.interchange.export import export_commonroad, export_openscenario
     from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
     from ssad.scenarios.dynamic import load_scenarios
 
     chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
-    writers = {
+    writers: dict[Format, Callable[..., tuple[list[Path], list[str]]]] = {
         Format.openscenario: export_openscenario, Format.leaderboard: export_leaderboard,
-        Format.leaderboard1: export_leaderboard1,
+        Format.leaderboard1: export_leaderboard1, Format.commonroad: partial(export_commonroad, system=system),
     }  # fmt: skip
     written, lost = writers[to](chosen, out, seed=seed)
     print(f"{len(chosen)} scenarios: {len(written)} files written to {out}")
@@ -99,6 +105,36 @@ def import_leaderboard(
     save_scenarios(out, found)
     print(f"{len(found)} scenarios on {', '.join(sorted({s.town for s in found}))}; written to {out}")
     told("not carried over", lost)
+
+
+def import_commonroad(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xml", help="CommonRoad XML file, 2020a.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: its lanelets]")
+    ] = None,
+) -> None:
+    """Turn a CommonRoad XML file (2020a) into a scenario, and say what it does not carry over.
+
+    Lanelets that are no town's yet are stored as a town beside OUT.yaml too.
+    """
+    from ssad.core.lane_graph import save_graph
+    from ssad.core.safeio import home
+    from ssad.interchange.commonroad_reader import read_commonroad
+    from ssad.roads import import_map, town_names
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    found = read_commonroad(file, town=out.stem, map_name=on)
+    town = found.scenario.town
+    if not found.known:
+        if town_names().get(town) == "built-in":
+            raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
+        save_graph(found.graph, out.with_suffix(".npz"))
+        import_map(out.with_suffix(".npz"), town, home())
+    save_scenarios(out, found.scenario)
+    print(f"scenario {found.scenario.name}: {len(found.scenario.actors)} actors in {town}; written to {out}")
+    told("not carried over", found.lost)
 
 
 def check_yaml(out: Path) -> None:

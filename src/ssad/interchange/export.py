@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from ssad.core.errors import ConfigError, SSADError
+from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import Episode, Scenario
+from ssad.interchange.commonroad_writer import STILL, commonroad_text
 from ssad.interchange.openscenario_writer import openscenario_text
 from ssad.roads import load_town, town_signals, town_xodr
 from ssad.scenarios.dynamic import build_episode
+from ssad.scenarios.dynamic.frozen import frozen
 
 Written = tuple[list[Path], list[str]]
 """The files, and what they do not carry over, a line for each scenario that it is true of."""
@@ -43,6 +47,51 @@ def export_openscenario(scenarios: Sequence[Scenario], out: Path, *, seed: int =
         write_atomic(files[-1], text)
         lost += missing
     return files, lost
+
+
+def export_commonroad(scenarios: Sequence[Scenario], out: Path, *, seed: int = 0, system: str = "autopilot") -> Written:
+    """Write scenarios as CommonRoad XML 2020a, with the lanelets of their towns.
+
+    The format has trajectories alone: who answers to the ego, or draws lots, repeats what he does when a system drives
+    the ego.
+
+    Args:
+        scenarios: The scenarios.
+        out: Folder.
+        seed: Of the episodes.
+        system: Which system that is.
+
+    Raises:
+        SSADError: A scenario cannot be built or driven, or a file cannot be written.
+    """
+    files: list[Path] = []
+    lost: list[str] = []
+    folder = make_folder(out)
+    names = file_names(scenarios)
+    numbers: Counter[str] = Counter()
+    for scenario, name in zip(scenarios, names, strict=True):
+        graph = load_town(scenario.town)
+        fixed, repeated = _with_trajectories(episode(scenario, seed), graph, system)
+        if repeated:
+            lost.append(f"what others do by themselves: they repeat what they did beside '{system}'")
+        numbers[scenario.town] += 1
+        text, missing = commonroad_text(fixed, graph, number=numbers[scenario.town])
+        files.append(folder / f"{name}.xml")
+        write_atomic(files[-1], text)
+        lost += missing
+    return files, lost
+
+
+def _with_trajectories(nominal: Episode, graph: LaneGraph, system: str) -> tuple[Episode, bool]:
+    """An episode in which nobody but the ego decides anything, and whether that is another one than before."""
+    if all(agent.controller in STILL for agent in nominal.agents[1:]):
+        return nominal, False
+    from ssad.drivers import make_system
+    from ssad.world.rollout import rollout
+    from ssad.world.world import World
+
+    (trace,) = rollout(World([nominal], {nominal.town: graph}), make_system(system))
+    return build_episode(frozen(nominal, trace), graph, seed=nominal.seed), True
 
 
 def episode(scenario: Scenario, seed: int) -> Episode:

@@ -11,7 +11,6 @@ CARLA's ScenarioRunner writes world positions in CARLA's left-handed frame, whic
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,14 +21,14 @@ import numpy as np
 from ssad.core.errors import FormatError, RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import MIB, read_xml
-from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Scenario, SignalPlan, SignalState
+from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Route, Scenario, SignalPlan, SignalState
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_places import Places, Values
 from ssad.interchange.openscenario_triggers import Triggers
+from ssad.interchange.scenario_parts import plan_of, scenario_name
 from ssad.roads import load_town, route_along, town_names, town_signals
 from ssad.scenarios.dynamic import build_episode
-from ssad.scenarios.dynamic.episode import forced_signals
 from ssad.scenarios.dynamic.knowledge._placing import lane_path, shifted
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
@@ -41,7 +40,6 @@ STEP: Final = 0.1  # s of the world
 MAX_BYTES: Final = 64 * MIB
 WAY: Final = 200.0  # m along its lane that somebody without a route gets
 _CHANGE = 25.0  # m that a lane change takes where the file gives no distance
-_OTHER = re.compile(r"[^A-Za-z0-9_.:@+\-]+")
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class _Reader:
         route = self._ego_route()
         line = route_along(self.graph, route)
         start = self._centre(self.ego, self.places.start(self.ego.name, within=self.root))
-        name = _name(self.about.removeprefix("CARLA:")) or _name(stem) or "imported"
+        name = scenario_name(self.about.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
         speed = self.ego.target_speed or self.ego.speed or Scenario.target_speed
         scenario = Scenario(
             name=name, type="Custom", town=self.town, route=route,
@@ -448,7 +446,7 @@ class _Reader:
         normal = np.stack([-heading[:, 1], heading[:, 0]], 1) / np.hypot(*heading.T)[:, None]
         return tuple((x, y) for x, y in (line + left[:, None] * normal).tolist())
 
-    def _plan(self, line: object, forced: dict[str, str]) -> SignalPlan:
+    def _plan(self, line: Route, forced: dict[str, str]) -> SignalPlan:
         """The plan that forces just these signals; what no plan does is lost."""
         if not forced:
             return SignalPlan()
@@ -467,13 +465,10 @@ class _Reader:
                 until = float(self.own["signals_until"])
             except ValueError:
                 raise self.values.fail("Property", "ssad.signals_until is not a number") from None
-        for ego in ("program", "off", "red", "green"):
-            for others in ("program", "off", "red", "green"):
-                plan = SignalPlan(ego, others, until)
-                if forced_signals(self.graph, line, plan) == wanted:  # type: ignore[arg-type]
-                    return plan
-        self.lost[f"the states of {len(wanted)} signals, which no signal plan here gives"] += 1
-        return SignalPlan()
+        plan = plan_of(self.graph, line, wanted, until)
+        if plan is None:
+            self.lost[f"the states of {len(wanted)} signals, which no signal plan here gives"] += 1
+        return plan or SignalPlan()
 
 
 def _headed(positions: list[Element | None], poses: tuple[Pose, ...]) -> tuple[Pose, ...]:
@@ -496,9 +491,3 @@ def _straight(points: tuple[Pose, ...]) -> bool:
     length = math.dist((here.x, here.y), (there.x, there.y))
     ahead = math.cos(here.yaw) * (there.x - here.x) + math.sin(here.yaw) * (there.y - here.y)
     return length > 0.0 and length - ahead < 1e-6
-
-
-def _name(text: str) -> str:
-    """A text as the name of a scenario: other characters become -."""
-    parts = [_OTHER.sub("-", part).strip("-._:@+") for part in text.strip().split("/")]
-    return "/".join(part for part in parts if part)[:120]

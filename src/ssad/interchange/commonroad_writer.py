@@ -1,0 +1,208 @@
+"""Scenarios as CommonRoad XML 2020a: the town's lanelets, obstacles with trajectories, and the ego's planning problem.
+
+A planning problem is a start, a goal and the time for it: the goal is the end of the ego's route, reached with at most
+its target speed. Positions are centres of bodies. What only this program understands stands in the attribute `source`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+from xml.etree.ElementTree import Element, indent, tostring
+
+import numpy as np
+
+from ssad.core.errors import RouteError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import wrap_angle
+from ssad.core.types import F64, AgentKind, Controller, Episode, EpisodeAgent, Pose
+from ssad.interchange.commonroad_lanes import write_lanes
+from ssad.interchange.commonroad_xml import TYPES, VERSION, decimal, node, own_source, points
+from ssad.roads import route_along
+from ssad.world.models import model
+
+DATE: Final = "2026-01-01"  # required by the format; fixed, so that a scenario always gives the same text
+GOAL: Final = 10.0  # m around the end of the route that are the goal
+PARTS: Final = (1, 2, 4, 5, 10)  # of the world's step that a file's may be
+STILL: Final = (Controller.NONE, Controller.TRAJECTORY)
+_STATIC = {"barrier": "roadBoundary", "cone": "constructionZone"}
+
+
+def commonroad_text(
+    episode: Episode, graph: LaneGraph, *, number: int = 1, dt: float = 0.1
+) -> tuple[str, tuple[str, ...]]:
+    """An episode as CommonRoad XML 2020a.
+
+    Args:
+        episode: The episode; all but the ego stand or follow a trajectory (`ssad.scenarios.dynamic.frozen`).
+        graph: Its town.
+        number: Of the scenario in its map.
+        dt: Step of the world, s.
+
+    Returns:
+        The text, the same for the same episode, and what it does not carry over, a line each.
+
+    Raises:
+        ValueError: Somebody else moves by rules of his own.
+    """
+    return _Writer(episode, graph, dt).write(number)
+
+
+def benchmark_map(town: str) -> str:
+    """A town's name as benchmark ids have it: letters and digits."""
+    return "".join(c for c in town if c.isalnum() and c.isascii()) or "Town"
+
+
+class _Writer:
+    def __init__(self, episode: Episode, graph: LaneGraph, dt: float) -> None:
+        self.episode, self.graph, self.dt = episode, graph, _fitting(episode, dt)
+        limits = episode.limits
+        self.steps = max(1, round(min(limits.max_steps * dt, limits.max_time) / self.dt))
+        self.lost: list[str] = []
+
+    def write(self, number: int) -> tuple[str, tuple[str, ...]]:
+        episode, scenario = self.episode, self.episode.scenario
+        moving = [agent.name for agent in episode.agents[1:] if agent.controller not in STILL]
+        if moving:
+            raise ValueError(f"{scenario.name}: {', '.join(moving)} have no trajectory")
+        recorded = any(agent.trajectory for agent in episode.agents[1:])
+        own = {
+            "name": scenario.name,
+            "town": scenario.town,
+            "group": scenario.group or scenario.type,
+            "contact": episode.limits.contact,
+            "max_distance": episode.limits.max_distance,
+            "signals_until": episode.override_until,
+        }
+        root = Element("commonRoad", {
+            "timeStepSize": decimal(self.dt), "commonRoadVersion": VERSION, "author": "SSAD", "affiliation": "",
+            "source": own_source(own.items()), "date": DATE,
+            "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
+        })  # fmt: skip
+        place = node(root, "location")
+        for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
+            node(place, tag, value)
+        node(node(root, "scenarioTags"), "simulated")
+        first = self.graph.lanes + 1
+        free, lost = write_lanes(root, self.graph, episode.signal_override, dt=self.dt, number=first)
+        self.lost += lost
+        if episode.signal_override and episode.override_until < self.steps * self.dt:
+            self.lost.append(f"signals are forced only until {episode.override_until:g} s: here they stay")
+        others = list(enumerate(episode.agents[1:], free))  # their ids keep their order
+        for k, agent in others:
+            if self._stands(agent):
+                self._static(root, k, agent)
+        for k, agent in others:
+            if not self._stands(agent):
+                self._dynamic(root, k, agent)
+        if len(episode.agents) > 1:
+            self.lost.append("names of actors: obstacles have numbers")
+        self._problem(root, free + len(others))
+        indent(root, " ")
+        text = '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
+        return text, tuple(self.lost)
+
+    @staticmethod
+    def _stands(agent: EpisodeAgent) -> bool:
+        """Whether it is a static obstacle: a parked vehicle or a thing."""
+        return not agent.trajectory and model(agent.model).kind not in (AgentKind.WALKER, AgentKind.BICYCLE)
+
+    def _shape(self, obstacle: Element, agent: EpisodeAgent) -> None:
+        body = model(agent.model)
+        shape = node(node(obstacle, "shape"), "rectangle")
+        node(shape, "length", body.length)
+        node(shape, "width", body.width)
+
+    def _static(self, root: Element, number: int, agent: EpisodeAgent) -> None:
+        obstacle = node(root, "staticObstacle", id=number)
+        prop = model(agent.model).kind == AgentKind.PROP
+        node(obstacle, "type", _STATIC.get(agent.model, "unknown") if prop else "parkedVehicle")
+        self._shape(obstacle, agent)
+        _state(node(obstacle, "initialState"), 0, agent.pose, 0.0)
+
+    def _dynamic(self, root: Element, number: int, agent: EpisodeAgent) -> None:
+        first, rows = self._rows(agent)
+        if len(rows) < 2:
+            self.lost.append(f"{agent.name}, who is there for less than two steps")
+            return
+        obstacle = node(root, "dynamicObstacle", id=number)
+        node(obstacle, "type", TYPES[model(agent.model).kind])
+        self._shape(obstacle, agent)
+        step = np.diff(rows[:, :2], axis=0) / self.dt
+        ahead = np.stack([np.cos(rows[:, 2]), np.sin(rows[:, 2])], 1)
+        speed = (np.concatenate([step, step[-1:]]) * ahead).sum(1)
+        states = [
+            (first + k, Pose(*row), v) for k, (row, v) in enumerate(zip(rows.tolist(), speed.tolist(), strict=True))
+        ]
+        _state(node(obstacle, "initialState"), *states[0])
+        path = node(obstacle, "trajectory")
+        for state in states[1:]:
+            _state(node(path, "state"), *state)
+
+    def _rows(self, agent: EpisodeAgent) -> tuple[int, F64]:
+        """First step, and x, y, yaw [T, 3] at each step that an agent is there."""
+        if not agent.trajectory:
+            return 0, np.tile([agent.pose.x, agent.pose.y, agent.pose.yaw], (self.steps + 1, 1))
+        rows = np.array(agent.trajectory, np.float64)
+        first = max(0, math.ceil(rows[0, 0] / self.dt - 1e-6))
+        last = min(self.steps, math.floor(rows[-1, 0] / self.dt + 1e-6))
+        time = self.dt * np.arange(first, last + 1)
+        yaw = np.unwrap(rows[:, 3])
+        found = [np.interp(time, rows[:, 0], values) for values in (rows[:, 1], rows[:, 2], yaw)]
+        found[2] = np.asarray(wrap_angle(found[2]))
+        return first, np.stack(found, 1)
+
+    def _problem(self, root: Element, number: int) -> None:
+        ego = self.episode.agents[0]
+        assert ego.route is not None
+        problem = node(root, "planningProblem", id=number)
+        start = node(problem, "initialState")
+        points(node(start, "position"), [[ego.pose.x, ego.pose.y]])
+        yaw = float(wrap_angle(ego.pose.yaw))
+        for tag, value in (("velocity", ego.speed), ("orientation", yaw), ("yawRate", 0.0), ("slipAngle", 0.0)):
+            node(node(start, tag), "exact", float(value))
+        node(node(start, "time"), "exact", 0)
+        goal = node(problem, "goalState")
+        _interval(node(goal, "time"), 0, self.steps)
+        end = Pose(float(ego.route.xy[-1, 0]), float(ego.route.xy[-1, 1]), float(ego.route.yaw[-1]))
+        circle = node(node(goal, "position"), "circle")
+        node(circle, "radius", GOAL)
+        centre = node(circle, "center")
+        node(centre, "x", end.x)
+        node(centre, "y", end.y)
+        _interval(node(goal, "velocity"), 0.0, float(self.episode.scenario.target_speed))
+        self._check_way(ego, end)
+
+    def _check_way(self, ego: EpisodeAgent, end: Pose) -> None:
+        """Say what is lost where the shortest way to the goal is not the ego's route."""
+        assert ego.route is not None
+        try:
+            shortest = route_along(self.graph, (ego.pose, end))
+        except RouteError:
+            self.lost.append("the ego's route: its start is not where a route can begin")
+            return
+        if abs(shortest.length - ego.route.length) > 1.5:
+            self.lost.append("the ego's route: a planning problem has a goal alone, and the shortest way is another")
+        elif len(shortest.xy) != len(ego.route.xy):
+            self.lost.append("where the ego's route begins: a planning problem begins where the ego is")
+
+
+def _fitting(episode: Episode, dt: float) -> float:
+    """The longest step (`dt`, or a part of it) in which all trajectories have their rows; at least the last part."""
+    times = np.array([row[0] for agent in episode.agents for row in agent.trajectory])
+    inside = times[(times > 0.0) & (times < episode.limits.max_steps * dt)]
+    steps = [dt / part for part in PARTS]
+    fits = (step for step in steps if np.all(np.abs(inside / step - np.round(inside / step)) < 1e-6))
+    return next(fits, steps[-1])
+
+
+def _state(element: Element, step: int, pose: Pose, speed: float) -> None:
+    points(node(element, "position"), [[pose.x, pose.y]])
+    node(node(element, "orientation"), "exact", float(pose.yaw))
+    node(node(element, "time"), "exact", step)
+    node(node(element, "velocity"), "exact", float(speed))
+
+
+def _interval(element: Element, low: float, high: float) -> None:
+    node(element, "intervalStart", low)
+    node(element, "intervalEnd", high)

@@ -1,0 +1,175 @@
+"""What the writer and the reader of CommonRoad 2020a share: elements that hold text, and the names of things."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from ssad.core.errors import FormatError
+from ssad.core.lane_graph import Marking
+from ssad.core.types import F64, AgentKind, LaneType, SignalState
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+VERSION: Final = "2020a"
+STEP: Final = 0.1  # s of the world
+DIGITS: Final = 6  # decimals that are written; the format allows no exponents
+STOP, YIELD, TOP_SPEED = "206", "205", "274"  # signs of Germany and of Zamunda, CommonRoad's country of made-up maps
+
+LANE_TYPES: Final[dict[LaneType, str]] = {
+    LaneType.DRIVING: "urban",
+    LaneType.SHOULDER: "shoulder",
+    LaneType.SIDEWALK: "sidewalk",
+    LaneType.PARKING: "parking",
+    LaneType.BIKING: "bicycleLane",
+    LaneType.MEDIAN: "border",
+    LaneType.NONE: "restricted",
+}
+LANE_TYPE_OF: Final[dict[str, LaneType]] = {name: kind for kind, name in LANE_TYPES.items()} | {
+    "busStop": LaneType.SHOULDER, "restricted_area": LaneType.NONE,
+}  # fmt: skip
+"""laneletType -> kind of lane; every other one (urban, country, highway, interstate, ...) is for driving."""
+MARKINGS: Final[dict[Marking, str]] = {
+    Marking.NONE: "no_marking",
+    Marking.BROKEN: "dashed",
+    Marking.SOLID: "solid",
+    Marking.DOUBLE: "solid_solid",
+    Marking.CURB: "curb",
+    Marking.OTHER: "unknown",
+}
+MARKING_OF: Final[dict[str, Marking]] = {name: mark for mark, name in MARKINGS.items()} | {
+    "dashed_dashed": Marking.BROKEN, "broad_dashed": Marking.BROKEN, "broad_solid": Marking.SOLID,
+    "lowered_curb": Marking.CURB, "solid_dashed": Marking.OTHER, "dashed_solid": Marking.OTHER,
+}  # fmt: skip
+COLOURS: Final[dict[SignalState, str]] = {
+    SignalState.OFF: "inactive",
+    SignalState.RED: "red",
+    SignalState.YELLOW: "yellow",
+    SignalState.GREEN: "green",
+}
+STATE_OF: Final[dict[str, SignalState]] = {name: state for state, name in COLOURS.items()} | {
+    "redYellow": SignalState.RED
+}
+TYPES: Final[dict[AgentKind, str]] = {
+    AgentKind.CAR: "car",
+    AgentKind.TRUCK: "truck",
+    AgentKind.BUS: "bus",
+    AgentKind.MOTORCYCLE: "motorcycle",
+    AgentKind.BICYCLE: "bicycle",
+    AgentKind.WALKER: "pedestrian",
+}
+"""Kind -> obstacle type of a dynamic obstacle."""
+KINDS_OF: Final[dict[str, tuple[AgentKind, ...]]] = {name: (kind,) for kind, name in TYPES.items()} | {
+    "taxi": (AgentKind.CAR,),
+    "priorityVehicle": (AgentKind.CAR, AgentKind.TRUCK),
+    "train": (AgentKind.BUS,),
+    "unknown": (AgentKind.CAR, AgentKind.TRUCK, AgentKind.BUS),
+}
+"""Obstacle type -> kinds that may play it."""
+
+
+def node(parent: Element, tag: str, text: Any = None, **attributes: Any) -> Element:
+    """A new element under a parent, with a text and attributes."""
+    element = SubElement(parent, tag, {name: told(value) for name, value in attributes.items()})
+    if text is not None:
+        element.text = told(text)
+    return element
+
+
+def told(value: Any) -> str:
+    """A value as the format has it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return decimal(float(value)) if isinstance(value, (float, np.floating)) else str(value)
+
+
+def decimal(value: float) -> str:
+    """A number without an exponent."""
+    text = f"{value:.{DIGITS}f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def points(parent: Element, rows: npt.ArrayLike) -> None:
+    """Points [N, 2] or [N, 3] under an element."""
+    for row in np.asarray(rows, np.float64).tolist():
+        point = node(parent, "point")
+        for name, value in zip("xyz", row, strict=False):
+            node(point, name, value)
+
+
+class Texts:
+    """The texts of a document's elements as numbers; errors name the file and the element that has an id."""
+
+    def __init__(self, where: str) -> None:
+        self.where = where
+
+    def fail(self, element: Element | str, message: str) -> FormatError:
+        """A FormatError that says where."""
+        if isinstance(element, str):
+            return FormatError(f"{self.where}: {element}: {message}")
+        number = f" {element.get('id', '')[:20]}" if element.get("id") else ""
+        return FormatError(f"{self.where}: {element.tag}{number}: {message}")
+
+    def number(self, text: str | None, element: Element, what: str) -> float:
+        """A finite number. FormatError if the text is none."""
+        if text is None:
+            raise self.fail(element, f"{what} is missing")
+        try:
+            value = float(text)
+        except ValueError:
+            raise self.fail(element, f"{what} is '{text.strip()[:40]}', not a number") from None
+        if not math.isfinite(value) or abs(value) > 1e9:
+            raise self.fail(element, f"{what} is '{text.strip()[:40]}', not a number that can be used")
+        return value
+
+    def whole(self, text: str | None, element: Element, what: str) -> int:
+        """A whole number. FormatError if the text is none."""
+        value = self.number(text, element, what)
+        if value != int(value):
+            raise self.fail(element, f"{what} is '{(text or '').strip()[:40]}', not a whole number")
+        return int(value)
+
+    def ids(self, element: Element, tag: str) -> list[int]:
+        """What the children of a tag refer to."""
+        return [self.whole(child.get("ref"), element, f"{tag}: ref") for child in element.iterfind(tag)]
+
+    def points(self, element: Element | None, within: Element, what: str) -> F64:
+        """Points [N, 3] under an element; z is 0 where it is not given."""
+        if element is None:
+            raise self.fail(within, f"{what} is missing")
+        rows = [
+            [
+                self.number(point.findtext(axis, None if axis != "z" else "0"), within, f"{what}: {axis}")
+                for axis in "xyz"
+            ]
+            for point in element.iterfind("point")
+        ]
+        return np.array(rows, np.float64).reshape(-1, 3)
+
+    def value(self, element: Element | None, within: Element, what: str) -> tuple[float, float]:
+        """An exact value or an interval, as its ends."""
+        if element is None:
+            raise self.fail(within, f"{what} is missing")
+        if (exact := element.findtext("exact")) is not None:
+            value = self.number(exact, within, what)
+            return value, value
+        low, high = (self.number(element.findtext(k), within, f"{what}: {k}") for k in ("intervalStart", "intervalEnd"))
+        if low > high:
+            raise self.fail(within, f"{what}: an interval from {low:g} to {high:g}")
+        return low, high
+
+
+def own_values(source: str) -> dict[str, str]:
+    """What a `source` of this program's says: `SSAD; name=...; ...`."""
+    first, *rest = (part.strip() for part in source.split(";"))
+    return dict(part.split("=", 1) for part in rest if "=" in part) if first == "SSAD" else {}
+
+
+def own_source(values: Iterable[tuple[str, Any]]) -> str:
+    """The `source` that `own_values` reads."""
+    return "; ".join(["SSAD", *(f"{name}={str(value).replace(';', ',')}" for name, value in values)])

@@ -1,0 +1,40 @@
+"""Parts of a scenario that every reader of a foreign format makes in the same way."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final, Literal
+
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import Route, SignalPlan, SignalState
+from ssad.scenarios.dynamic.episode import forced_signals
+
+_OTHER = re.compile(r"[^A-Za-z0-9_.:@+\-]+")
+_CHOICES: Final[tuple[Literal["program", "off", "red", "green"], ...]] = ("program", "off", "red", "green")
+
+
+def scenario_name(text: str) -> str:
+    """A text as the name of a scenario: other characters become -; "" where nothing is left."""
+    parts = [_OTHER.sub("-", part).strip("-._:@+") for part in text.strip().split("/")]
+    return "/".join(part for part in parts if part)[:120]
+
+
+def plan_of(graph: LaneGraph, route: Route, states: Mapping[int, SignalState], until: float) -> SignalPlan | None:
+    """The plan that forces just these states.
+
+    Args:
+        graph: Lane graph of the town.
+        route: The ego's route.
+        states: Signal of the town -> its state.
+        until: When they end, s.
+
+    Returns:
+        The plan; None: no plan does that.
+    """
+    for ego in _CHOICES:
+        for others in _CHOICES:
+            plan = SignalPlan(ego, others, until)
+            if forced_signals(graph, route, plan) == states:
+                return plan
+    return None
