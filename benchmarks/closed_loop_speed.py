@@ -149,7 +149,11 @@ def main() -> None:
         )
         print(json.dumps(found[-1]), flush=True)
     if args.json:
-        args.json.write_text(json.dumps({"versions": versions(args.device), "cases": found}, indent=1) + "\n")
+        import torch
+
+        name = torch.cuda.get_device_name(args.device) if args.device.startswith("cuda") else "CPU"
+        told = {"device": name, "versions": versions(args.device), "cases": found}
+        args.json.write_text(json.dumps(told, indent=1) + "\n")
 
 
 if __name__ == "__main__":

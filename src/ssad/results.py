@@ -169,7 +169,14 @@ def make_plan(suite: str | Path, settings: Sequence[str] | Mapping[str, Any] = (
     return kind_of(chosen.kind).plan(chosen, device=pick_device(device))
 
 
-def run_plan(plan: Plan, folder: Path, resources: Resources, *, retry: bool = False) -> Results:
+def run_plan(
+    plan: Plan,
+    folder: Path,
+    resources: Resources,
+    *,
+    retry: bool = False,
+    only: Mapping[str, Sequence[str]] | None = None,
+) -> Results:
     """Run what is missing of a plan, and write its report.
 
     Args:
@@ -177,17 +184,18 @@ def run_plan(plan: Plan, folder: Path, resources: Resources, *, retry: bool = Fa
         folder: Results folder.
         resources: What the run may use.
         retry: Whether failed cells are run again.
+        only: As `only` of `run`.
 
     Returns:
-        The results, all of the plan.
+        The results, all that the folder has by now.
 
     Raises:
         SSADError: The folder cannot be written, holds another run, or no worker can start.
     """
     from ssad.bench.run import run as run_cells
 
-    run_cells(plan, folder, resources, retry=retry)
-    plan.kind.finish(plan, folder)
+    if len(run_cells(plan, folder, resources, retry=retry, only=only)) == len(plan.cells):
+        plan.kind.finish(plan, folder)
     write_report(folder)
     return load_results(folder)
 
@@ -201,6 +209,7 @@ def run(
     workers: int | None = None,
     ray: str | None = None,
     retry: bool = False,
+    only: Mapping[str, Sequence[str]] | None = None,
     quiet: bool = False,
 ) -> Results:
     """Run a suite and write its report, as the command `ssad run` does; called again, it goes on where it stopped.
@@ -214,6 +223,8 @@ def run(
         workers: Number of worker processes; None: one per core; 0: all in this process.
         ray: Address of a Ray cluster to run on; "local" starts one here.
         retry: Whether failed cells are run again.
+        only: Run a slice: the cells whose fields have one of these values, such as {"perturbation": ["none", "fog"]};
+            slices add up in the folder.
         quiet: Whether nothing is said about progress.
 
     Returns:
@@ -227,4 +238,4 @@ def run(
     plan = make_plan(suite, set, device=device)
     console = Console(stderr=True, quiet=quiet)
     folder = Path(out) if out is not None else Path("runs") / plan.suite.name
-    return run_plan(plan, folder, Resources(workers, ray, plan.device, console), retry=retry)
+    return run_plan(plan, folder, Resources(workers, ray, plan.device, console), retry=retry, only=only)

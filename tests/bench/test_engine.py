@@ -311,3 +311,19 @@ def test_a_changed_run_is_not_gone_on_with(tmp_path: Path, monkeypatch: pytest.M
         read_plan(tmp_path / "run")
     with pytest.raises(SSADError, match="holds another run"):
         go(dice(["a"]), tmp_path / "run")
+
+
+def test_slices_add_up_to_the_run(tmp_path: Path) -> None:
+    plan = own_kind.Dice().plan(dice([f"n-{i}" for i in range(3)], systems=["fair", "loaded"]))
+    quiet = Resources(0, console=Console(file=io.StringIO()))
+    first = run(plan, tmp_path, quiet, only={"system": ["fair"]})
+    assert {record["system"] for record in first} == {"fair"}
+    assert len(first) == len(table(tmp_path)) == 3
+    write_report(tmp_path)  # of what there is
+    assert len(run(plan, tmp_path, quiet, only={"system": ["loaded"]})) == len(plan.cells) == 6
+    for only, expected in (
+        ({"sytem": ["fair"]}, "system"),
+        ({"system": ["fiar"]}, "fair"),
+    ):
+        with pytest.raises(UnknownNameError, match=expected):
+            run(plan, tmp_path, quiet, only=only)

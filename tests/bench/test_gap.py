@@ -15,6 +15,7 @@ from rich.console import Console
 
 from ssad.bench.kind import Plan, Resources
 from ssad.bench.kinds.gap import Gap, GapSuite
+from ssad.bench.kinds.gap import _conditions as planned_conditions
 from ssad.bench.run import run
 from ssad.bench.suite import load_suite, suite_files
 from ssad.core.errors import SSADError
@@ -222,3 +223,12 @@ def test_the_suites_that_are_shipped_can_be_planned() -> None:
         suite = load_suite(name)
         assert isinstance(suite, GapSuite)
         assert set(suite.perturbations) <= set(perturbation_names())
+
+
+def test_the_suite_has_conditions_enough_for_its_rank_correlation() -> None:
+    suite = load_suite("gap")
+    assert isinstance(suite, GapSuite)
+    for system in (one for one in suite.systems if not one.perfect):
+        under = [(name, level) for own, name, level in planned_conditions(suite) if own == system and level]
+        assert len(under) == len(set(under)) >= 40
+        assert len({name for name, _ in under}) >= 15

@@ -13,7 +13,7 @@ from typing import Any
 from ssad.bench.kind import Cell, CellError, Job, Kind, Plan, Resources
 from ssad.bench.suite import command_of, kind_of
 from ssad.core import safeio
-from ssad.core.errors import ConfigError
+from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.seeding import digest
 from ssad.jobs.machine import default_workers, machine, versions
 from ssad.jobs.pool import Pool, open_pool
@@ -25,24 +25,56 @@ MOST = 1 << 30  # bytes of an artefact that is hashed
 
 
 def run(
-    plan: Plan, folder: str | Path, resources: Resources | None = None, *, retry: bool = False
+    plan: Plan,
+    folder: str | Path,
+    resources: Resources | None = None,
+    *,
+    retry: bool = False,
+    only: Mapping[str, Sequence[str]] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run what is missing (retry: and what failed) and return all records, in the order of the plan.
+    """Run what is missing (retry: and what failed) and return the records that there are, in the order of the plan.
+
+    Args:
+        plan: The whole run.
+        folder: Where its records are.
+        resources: What may be used.
+        retry: Whether failed cells run again.
+        only: Run a slice: the cells whose fields have one of these values, as text.
 
     Raises:
+        ConfigError: no cell has such a value.
         StoreError: the folder cannot be written, is in use, or holds another run.
         SSADError: no worker can start, or data cannot be made.
     """
     resources = resources or Resources(device=plan.device)
     header, out = run_json(plan), Path(folder).resolve()
     with Store.open(folder, header, retry=retry) as store:
-        missing = sorted((c for c in plan.cells if c.key not in store.results), key=plan.kind.order)
+        chosen = slice_of(plan, only or {})
+        missing = sorted((c for c in chosen if c.key not in store.results), key=plan.kind.order)
         if missing:
             again = [cell for cell in missing if cell.key in store.retried]
             settings = plan.kind.prepare(plan, out, resources, retry=again)
             job = Job(out, plan.device, settings)
             _Schedule(plan, job, store, header["versions"], resources).work(missing)
-        return [store.results[cell.key] for cell in plan.cells]
+        return [store.results[cell.key] for cell in plan.cells if cell.key in store.results]
+
+
+def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
+    """The cells whose fields have one of these values, as text. ConfigError: no cell has such a field or value."""
+    cells = list(plan.cells)
+    for name, wanted in only.items():
+        known = dict.fromkeys(str(cell.fields[name]) for cell in plan.cells if name in cell.fields)
+        if not known:
+            fields = dict.fromkeys(field for cell in plan.cells for field in cell.fields)
+            raise unknown_name("field of cells", name, fields)
+        for value in wanted:
+            if value not in known:
+                raise unknown_name(name, value, known)
+        cells = [cell for cell in cells if str(cell.fields.get(name)) in wanted]
+    if not cells:
+        asked = " and ".join(f"{name}={','.join(wanted)}" for name, wanted in only.items())
+        raise ConfigError(f"no cell has {asked} at once")
+    return cells
 
 
 def run_json(plan: Plan) -> dict[str, Any]:

@@ -34,6 +34,14 @@ def run(
     workers: Workers = None,
     ray: Ray = None,
     retry: Annotated[bool, typer.Option("--retry", help="Run failed cells again.")] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--only",
+            metavar="FIELD=VALUE,...",
+            help="Run a slice: cells with these values, such as perturbation=none,fog; slices add up in the folder.",
+        ),
+    ] = None,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resolved suite as YAML, and run nothing.")
     ] = False,
@@ -71,7 +79,7 @@ def run(
             print(line)
         return
     try:
-        results = run_plan(plan, folder, Resources(workers, ray, plan.device), retry=retry)
+        results = run_plan(plan, folder, Resources(workers, ray, plan.device), retry=retry, only=_wanted(only or []))
     except KeyboardInterrupt:
         print(f"stopped; finished cells are kept in {folder}; repeat the command to resume", file=sys.stderr)
         raise typer.Exit(130) from None
@@ -87,6 +95,17 @@ def run(
         console.print("to run the failed cells again, repeat the command with --retry")
     report(folder)
     raise typer.Exit(1 if failed else 0)
+
+
+def _wanted(texts: list[str]) -> dict[str, list[str]]:
+    """Values by field, of texts "field=value,value"."""
+    found: dict[str, list[str]] = {}
+    for text in texts:
+        name, sign, values = text.partition("=")
+        if not name or not sign or not values:
+            raise ConfigError(f"--only {text}: expected FIELD=VALUE,..., such as perturbation=none,fog")
+        found.setdefault(name, []).extend(values.split(","))
+    return found
 
 
 def report(folder: Dir) -> None:
