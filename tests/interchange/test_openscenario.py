@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.command import ssad
+from helpers.generated import generated
 
 from ssad.core.types import Actor, Episode, EpisodeTrace, Phase, Pose, Scenario
 from ssad.drivers import make_system
@@ -67,6 +69,15 @@ def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: s
     same_drives(built(scenarios), built(again), system)
 
 
+@pytest.mark.slow
+def test_generated_scenarios_come_back(tmp_path: Path) -> None:
+    """What four generators found, by parameters and by trajectories."""
+    scenarios = generated()
+    assert len(scenarios) == 20
+    assert sum(any(actor.trajectory for actor in s.actors) for s in scenarios) >= 8
+    same_drives(built(scenarios), built(returned(scenarios, tmp_path)), "autopilot")
+
+
 @pytest.mark.parametrize("every", [75, pytest.param(7, marks=pytest.mark.slow)])
 def test_trajectories_come_back(every: int, tmp_path: Path) -> None:
     """Natural traffic as it was recorded: also who appears later, and who leaves before the end."""
@@ -108,11 +119,14 @@ def test_commands(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("tool", "bundle", "suffix"), [
     ("qc_openscenario", "xoscBundle", "xosc"), ("qc_opendrive", "xodrBundle", "xodr"),
 ])  # fmt: skip
-def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", ["RedlightRunning/00", pytest.param("precrash", marks=pytest.mark.slow)])
+def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, names: str, tmp_path: Path) -> None:
+    """The pre-crash scenarios and 20 that generators found, with the maps of their towns."""
     program = shutil.which(tool)
     if program is None:
         pytest.skip(f"no {tool}: install asam-qc-openscenarioxml and asam-qc-opendrive in an environment of their own")
-    files, _ = export_openscenario(load_scenarios("RedlightRunning"), tmp_path)
+    files, _ = export_openscenario([*load_scenarios(names), *(generated() if names == "precrash" else [])], tmp_path)
+    assert len([p for p in files if p.suffix == ".xosc"]) == (52 if names == "precrash" else 1)
     for path in (p for p in files if p.suffix == f".{suffix}"):
         (tmp_path / "config.xml").write_text(
             f'<Config><Param name="InputFile" value="{path}"/><CheckerBundle application="{bundle}">'
@@ -122,6 +136,36 @@ def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, tmp_pat
         found = (tmp_path / "result.xqar").read_text()
         assert 'status="completed"' in found
         assert re.findall('<Issue .*?description="(.*?)"', found) == []
+
+
+@pytest.mark.parametrize("names", ["LaneChanging/00", pytest.param("generated", marks=pytest.mark.slow)])
+def test_esmini_has_everybody_where_their_trajectories_do(names: str, tmp_path: Path) -> None:
+    """esmini plays the files: who has a trajectory is where it says, to the centimetre; nobody stays out."""
+    program = os.environ.get("ESMINI_BIN")
+    if not program:
+        pytest.skip("no ESMINI_BIN: the path of the program esmini")
+    scenarios = generated() if names == "generated" else load_scenarios(names)
+    for scenario in scenarios:
+        folder = tmp_path / scenario.name.replace("/", "-")
+        path = next(p for p in export_openscenario([scenario], folder)[0] if p.suffix == ".xosc")
+        log = folder / "states.csv"
+        words = ["--osc", path, "--headless", "--fixed_timestep", "0.05", "--csv_logger", log, "--disable_stdout"]
+        subprocess.run([program, *words], cwd=folder, check=True, capture_output=True, timeout=120)
+        rows = [[cell.strip() for cell in line.split(",")] for line in log.read_text().splitlines() if line]
+        first = next(k for k, row in enumerate(rows) if row[0].startswith("Index"))
+        head = rows[first]
+        (episode,) = built([scenario])
+        for agent in episode.agents[1:]:
+            at = next(k for k, cell in enumerate(rows[first + 1]) if cell == agent.name)
+            x, y = (next(k for k in range(at, len(head)) if f"World_Position_{axis}" in head[k]) for axis in "XY")
+            here = np.array([[float(row[k]) for k in (1, x, y)] for row in rows[first + 1 :] if len(row) > y])
+            if not agent.trajectory:
+                assert np.hypot(*(here[0, 1:] - (agent.pose.x, agent.pose.y))) < CLOSE
+                continue
+            told = np.array(agent.trajectory)
+            kept = (here[:, 0] > max(told[0, 0], 0.0) + 0.1) & (here[:, 0] < told[-1, 0] - 0.1)
+            for k in (1, 2):
+                assert np.abs(here[kept, k] - np.interp(here[kept, 0], told[:, 0], told[:, k])).max() < CLOSE
 
 
 # ---------------------------------------------------------------- other programs' files
