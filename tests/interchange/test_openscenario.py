@@ -237,6 +237,16 @@ def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
     assert np.abs(trace.y[way > 35.0, 1] + 5.25).max() < 0.3
 
 
+@pytest.mark.parametrize(("place", "x", "y"), [
+    ('dLane="1" ds="-8"', 209.0, -1.75), ('dLane="2" ds="20"', 237.0, 1.75), ('dLane="3" ds="20"', 237.0, 5.25),
+])  # fmt: skip
+def test_places_behind_and_across_the_road(place: str, x: float, y: float, tmp_path: Path) -> None:
+    path = tmp_path / "behind.xosc"
+    path.write_text(FOREIGN.replace('dLane="1" ds="20"', place))
+    (actor,) = read_openscenario(path).scenario.actors
+    assert (actor.pose.x, actor.pose.y) == pytest.approx((x, y), abs=0.01)
+
+
 def _cut(old: str, new: str = "") -> Callable[[str], str]:
     def change(text: str) -> str:
         assert old in text
@@ -262,6 +272,10 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "nobody": (_cut('<EntityRef entityRef="adversary"/></A', '<EntityRef entityRef="x"/></A'), "no entity 'x'"),
     "no number": (_cut('ds="20"', 'ds="far"'), "'far', not a number"),
     "not finite": (_cut('x="217"', 'x="nan"'), "not a finite number"),
+    "far along lanes": (_cut('ds="20"', 'ds="1e300"'), "beyond 10000 m"),
+    "far beside": (_cut('dLane="1"', 'dLane="1e9"'), "no road has so many lanes"),
+    "no lane there": (_cut('dLane="1"', 'dLane="12"'), "there is no lane 12 beside"),
+    "a change beyond all lanes": (_cut('value="-1"', 'value="-1e300"'), "no road has so many lanes"),
     "beyond everything": (_cut('x="217"', 'x="1e300"'), "does not stand on a road"),
     "no parameter": (_cut('name="fast"', 'name="slow"'), "parameter $fast is not declared"),
     "expression": (_cut("$fast", "${2 * $fast}"), "expressions are not read"),

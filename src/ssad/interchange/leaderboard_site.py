@@ -19,13 +19,13 @@ from ssad.scenarios.dynamic.knowledge._meeting import time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
     Place,
     ahead,
+    behind,
     beside,
     junction_span,
     lane_path,
     pose_at,
     route_place,
     shifted,
-    straightest,
     turn_of,
     width_at,
 )
@@ -213,22 +213,11 @@ class Site:
             raise self.fail(f"no lane comes into junction {number} from where {self.item.get('type')} wants it")
         return best[2], best[3]
 
-    def behind(self, place: Place, distance: float) -> Place:
-        """The place that far back along lanes, straight on; where the road begins if it begins before."""
-        lane, s = place.lane, place.s - distance
-        while s < 0.0:
-            before = [n for n in self.graph.predecessors(lane).tolist() if straightest(self.graph, n) == lane]
-            if not before:
-                return Place(lane, 0.0)
-            lane = min(before, key=lambda n: abs(turn_of(self.graph, n)))
-            s += float(self.graph.length[lane])
-        return Place(lane, s)
-
     def before_junction(self, place: Place, distance: float) -> Place:
-        """As `behind`, but not through a junction."""
+        """The place that far back along lanes, but not through a junction."""
         back = place
         for metres in np.arange(2.0, distance + 0.1, 2.0).tolist():
-            here = self.behind(place, metres)
+            here = behind(self.graph, place, metres)
             if self.graph.junction[here.lane] >= 0:
                 break
             back = here
@@ -276,7 +265,7 @@ class Site:
         far = speed * (self.arrival(index) + after) - 0.5 * speed**2 / MODELS["compact"].max_accel
         last: Place | None = None
         for _ in range(6):
-            start = self.behind(lane, far)
+            start = behind(self.graph, lane, far)
             if last is not None and self.apart(start, last) < 8.0:
                 return  # the road begins here
             if self.graph.junction[start.lane] < 0:

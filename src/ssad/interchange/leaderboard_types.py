@@ -16,7 +16,7 @@ import numpy as np
 from ssad.core.types import Condition, LaneType, Phase, Pose, SignalPlan
 from ssad.interchange.leaderboard_site import CARS, SPEED, Site
 from ssad.scenarios.dynamic.knowledge._meeting import meeting_place, time_to_cover
-from ssad.scenarios.dynamic.knowledge._placing import beside, lane_path, pose_at
+from ssad.scenarios.dynamic.knowledge._placing import behind, beside, lane_path, pose_at
 from ssad.world.models import MODELS
 
 Play = Callable[[Site], None]
@@ -319,7 +319,7 @@ def taking_priority(site: Site, *, signals: SignalPlan) -> None:
 def emergency(site: Site) -> None:
     """A car comes from behind, 25 km/h faster than the ego, and wants to pass."""
     back = site.number("distance", 140.0, 10.0, 500.0)
-    start = site.behind(site.place(0), back)
+    start = behind(site.graph, site.place(0), back)
     if site.apart(start, site.place(0)) < 8.0:
         raise site.fail("there is no road behind the ego")
     site.driver("emergency car", start, back + site.route.length + 50.0, SPEED + 25.0 * KMH)

@@ -15,11 +15,13 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType, Pose
 from ssad.roads.query import nearest_all
-from ssad.scenarios.dynamic.knowledge._placing import Place, ahead, pose_at, shifted
+from ssad.scenarios.dynamic.knowledge._placing import Place, ahead, behind, pose_at, shifted
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
+LONGEST = 1.0e4  # m along lanes from one entity to another
+LANES = 20
 NEAR = 2.0  # m outside a lane at which somebody still belongs to it
 _PARAMETER = re.compile(r"^\$\{?\s*(\w+)\s*\}?$")
 
@@ -62,6 +64,13 @@ class Values:
         if not math.isfinite(value):
             raise self.fail(element, f"{name} is '{told[:40]}', not a finite number")
         return value
+
+    def lanes(self, element: Element, name: str) -> int:
+        """A number of lanes to the left, negative to the right. FormatError where no road has as many."""
+        value = self.number(element, name, 0.0)
+        if abs(value) > LANES:
+            raise self.fail(element, f"{name} is {value:g}: no road has so many lanes")
+        return int(value)
 
 
 class Places:
@@ -194,18 +203,19 @@ class Places:
             raise self.values.fail(element, "no lane under the entity that it refers to")
         dt = self.values.number(element, "dt" if element.tag == "RelativeRoadPosition" else "offset", 0.0)
         ds = self.values.number(element, "ds", self.values.number(element, "dsLane", 0.0))
-        over = int(self.values.number(element, "dLane", 0.0))
-        if ds < 0.0:
-            raise self.values.fail(element, f"ds is {ds:g} m: places behind an entity are not read")
-        place = ahead(self.graph, place, ds)
+        over = self.values.lanes(element, "dLane")
+        if abs(ds) > LONGEST:
+            raise self.values.fail(element, f"ds is {ds:g} m, beyond {LONGEST:g} m")
+        place = ahead(self.graph, place, ds) if ds >= 0.0 else behind(self.graph, place, -ds)
         pose = pose_at(self.graph, place)
+        left = over > 0
         for _ in range(abs(over)):
-            side = self.graph.left if over > 0 else self.graph.right
-            lane = int(side[place.lane])
+            lane = int((self.graph.left if left else self.graph.right)[place.lane])
             if lane < 0:
                 raise self.values.fail(element, f"there is no lane {over} beside the entity that it refers to")
             found = nearest_all(self.graph, (pose.x, pose.y), (LaneType(int(self.graph.kind[lane])),))
             at = int(np.flatnonzero(found[0] == lane)[0])
+            left ^= not self.graph.same_direction(place.lane, lane)  # what is further left is on the right of those
             place = Place(lane, float(found[1][at]))
             pose = pose_at(self.graph, place)
         return self._turned(element, shifted(pose, 0.0, dt))

@@ -323,7 +323,7 @@ class _Reader:
         if shape is not None and self.values.text(shape, "dynamicsDimension") in ("distance", "time"):
             value = self.values.number(shape, "value")
             length = value if self.values.text(shape, "dynamicsDimension") == "distance" else value * speed
-        entity.change = place, int(self.values.number(target, "value")), max(length, 5.0)
+        entity.change = place, self.values.lanes(target, "value"), max(length, 5.0)
 
     def _act_trigger(self, act: Element) -> None:
         """An act that waits for something has its actors wait for it: a phase of its own before all others."""

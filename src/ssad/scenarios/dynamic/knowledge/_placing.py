@@ -105,6 +105,18 @@ def ahead(graph: LaneGraph, place: Place, distance: float, *, stop_at_junction: 
     return Place(lane, s)
 
 
+def behind(graph: LaneGraph, place: Place, distance: float) -> Place:
+    """The place `distance` m further back, straight on at forks; where the road begins if it begins before."""
+    lane, s = place.lane, place.s - distance
+    while s < 0.0:
+        before = [n for n in graph.predecessors(lane).tolist() if straightest(graph, n) == lane]
+        if not before:
+            return Place(lane, 0.0)
+        lane = min(before, key=lambda n: abs(turn_of(graph, n)))
+        s += float(graph.length[lane])
+    return Place(lane, s)
+
+
 def lane_path(graph: LaneGraph, place: Place, distance: float) -> F64:
     """Points [N, 2] from a place on, straight on at forks, at most `distance` m."""
     pose = pose_at(graph, place)
