@@ -14,6 +14,7 @@ from rich.console import Console
 from ssad.bench import run as engine
 from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
 from ssad.bench.run import hash_artefacts, read_plan, run, run_json
+from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
@@ -420,6 +421,15 @@ def test_a_plan_is_read_back_unless_something_has_changed(bench: Bench, monkeypa
     monkeypatch.setattr(Words, "code", "1" * 12)
     with pytest.raises(ConfigError, match=": code changed"):
         read_plan(bench.folder)
+    header = safeio.read_json(bench.folder / "run.json")
+    for wrong, why in (
+        (header | {"suite": {"kind": "bench.test_run:Words"}}, "another version"),
+        ({"identity": "a"}, "no key 'suite'"),
+        (header | {"versions": 3}, "another version"),
+    ):
+        (bench.folder / "run.json").write_text(safeio.dump_json(wrong))
+        with pytest.raises(StoreError, match=f"not what ssad run writes: .*{why}"):
+            read_plan(bench.folder)
 
 
 def test_artefacts_are_hashed_file_by_file(tmp_path: Path) -> None:

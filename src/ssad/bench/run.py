@@ -10,10 +10,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from ssad.bench.kind import Cell, CellError, Job, Kind, Plan, Resources
 from ssad.bench.suite import command_of, kind_of
 from ssad.core import safeio
-from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.errors import ConfigError, StoreError, unknown_name
 from ssad.core.seeding import digest
 from ssad.jobs.machine import default_workers, machine, versions
 from ssad.jobs.pool import Pool, open_pool
@@ -99,8 +101,13 @@ def run_json(plan: Plan) -> dict[str, Any]:
 def read_plan(folder: str | Path) -> Plan:
     """The plan of a folder that holds a run. ConfigError when code or inputs have changed since."""
     header = read_run(folder)
-    kind = kind_of(str(header["suite"]["kind"]))
-    plan = kind.plan(kind.suite.model_validate(header["suite"]), device=header["versions"]["device"], check=False)
+    try:
+        kind = kind_of(str(header["suite"]["kind"]))
+        suite, device = kind.suite.model_validate(header["suite"]), str(header["versions"]["device"])
+    except (KeyError, TypeError, ValidationError) as error:
+        what = f"no key {error}" if isinstance(error, KeyError) else "its suite is of another version of SSAD"
+        raise StoreError(f"{folder}/run.json: not what ssad run writes: {what}; run the suite again") from None
+    plan = kind.plan(suite, device=device, check=False)
     now = run_json(plan)
     if now["identity"] != header["identity"]:
         what = ", ".join(name for name in ("code", *plan.inputs) if now[name] != header.get(name)) or "scenarios"

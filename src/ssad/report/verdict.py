@@ -106,6 +106,65 @@ def _gap(run: Run) -> list[str]:
     return found
 
 
+METHODS = {"monte-carlo": "plain Monte Carlo", "importance": "importance sampling"}
+
+
+def _how_often(run: Run) -> list[str]:
+    """How rare collisions are, by the method that knows best, and what plain Monte Carlo saw of them."""
+    found = []
+    for system, lines in _by(run, "system").items():
+        by_scenario: dict[str, list[Line]] = {}
+        for line in lines:
+            by_scenario.setdefault(str(((line.get("spec") or {}).get("scenario") or {}).get("name", "")), []).append(
+                line
+            )
+        for scenario, rows in by_scenario.items():
+            found += _rare(system, scenario, rows)
+    return found
+
+
+def _rare(system: str, scenario: str, rows: list[Line]) -> list[str]:
+    """The sentences of one driver in one scenario."""
+
+    def limits(row: Line) -> tuple[float, float]:
+        return _metric(row, "low"), _metric(row, "high")
+
+    seen = [row for row in rows if _metric(row, "per_million") > 0]
+    if not seen:
+        most = max(rows, key=lambda row: _metric(row, "episodes"))
+        top = limits(most)[1]
+        sure = "" if math.isnan(top) else f": fewer than {_million(top)} in a million (95 % limit)"
+        return [f"{system} did not collide in {_metric(most, 'episodes'):,.0f} episodes of {scenario}{sure}."]
+    # with an interval if there is one, then by how many collisions the estimate is worth
+    best = max(seen, key=lambda row: (not math.isnan(limits(row)[1]), _metric(row, "effective")))
+    low, high = limits(best)
+    sure = "too few repeats for an interval" if math.isnan(high) else f"95 %: {_million(low)} to {_million(high)}"
+    said = [
+        f"{system} collides in about {_million(_metric(best, 'per_million'))} of a million episodes of {scenario} "
+        f"({sure}; by {_method(best)}), {_metric(best, 'per_hour'):.3g} times in 1,000 h."
+    ]
+    for row in rows:
+        if row is not best and row.get("method") == "monte-carlo":
+            hits, tried = _metric(row, "events"), _metric(row, "episodes")
+            said.append(f"Plain Monte Carlo saw {f'{hits:.0f}' if hits else 'none'} in {tried:,.0f} episodes.")
+    known = [row for row in rows if not math.isnan(limits(row)[1])]
+    for other in known:
+        if other is not best and best in known and (limits(other)[1] < low or limits(other)[0] > high):
+            said.append(
+                f"The interval of {_method(other)} does not meet it: take more episodes before you trust either."
+            )
+    return said
+
+
+def _method(row: Line) -> str:
+    return METHODS.get(str(row.get("method")), str(row.get("method")))
+
+
+def _million(value: float) -> str:
+    """A number of episodes in a million, to two digits where it is small."""
+    return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
+
+
 def _sure(change: Cell) -> str:
     """A change with its interval; where there is none, it says so."""
     known = change.method not in ("range", "none") and change.interval
@@ -114,7 +173,7 @@ def _sure(change: Cell) -> str:
 
 VERDICTS: dict[str, Callable[[Run], list[str]]] = {
     "driving": _driving, "detection": _detection, "digital": _digital, "physical": _physical,
-    "adversarial": _adversarial, "gap": _gap,
+    "adversarial": _adversarial, "gap": _gap, "how-often": _how_often,
 }  # fmt: skip
 """Kind of a part -> what says its verdict."""
 

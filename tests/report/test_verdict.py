@@ -1,0 +1,70 @@
+"""The sentences that a report begins with."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.run_folder import write_run
+
+from ssad.report import write_report
+from ssad.report.load import load_run
+from ssad.report.verdict import verdict
+
+
+def estimate(
+    method: str, rate: float, low: float | None, high: float | None, *, events: int = 5, effective: float = 2.0
+) -> dict[str, Any]:
+    """A line of kind how-often."""
+    metrics = {"per_million": rate, "low": low, "high": high, "events": events, "effective": effective,
+               "episodes": 6000, "per_hour": rate * 0.45}  # fmt: skip
+    spec = {"scenario": {"name": "lane-traffic/05"}}
+    return {"key": method, "system": "autopilot", "group": "lane-traffic", "method": method, "status": "ok",
+            "reason": "", "spec": spec, "metrics": metrics, "n": 6000, "seed": 0, "suite": "h", "versions": {},
+            "artefacts": {}, "case": method, "cluster": "lane-traffic/05", "wall_s": 1.0}  # fmt: skip
+
+
+NONE = estimate("monte-carlo", 0.0, 0.0, 614.6, events=0, effective=0.0)
+WEIGHED = estimate("importance", 50.9, 7.85, 192.3, effective=1.9)
+BRANCHED = estimate("splitting", 61.8, None, None, events=149, effective=6.5)
+ABOUT = "autopilot collides in about"
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (
+            [NONE, BRANCHED, WEIGHED],
+            f"{ABOUT} 51 of a million episodes of lane-traffic/05 (95 %: 7.8 to 192; by importance sampling), "
+            "22.9 times in 1,000 h. Plain Monte Carlo saw none in 6,000 episodes.",
+        ),
+        (
+            [BRANCHED],
+            f"{ABOUT} 62 of a million episodes of lane-traffic/05 (too few repeats for an interval; by splitting), "
+            "27.8 times in 1,000 h.",
+        ),
+        (
+            [NONE],
+            "autopilot did not collide in 6,000 episodes of lane-traffic/05: fewer than 615 in a million (95 % limit).",
+        ),
+        (
+            [estimate("monte-carlo", 500.0, 100.0, 1400.0, events=3, effective=3.0), WEIGHED],
+            f"{ABOUT} 500 of a million episodes of lane-traffic/05 (95 %: 100 to 1,400; by plain Monte Carlo), "
+            "225 times in 1,000 h.",
+        ),
+        (
+            [estimate("monte-carlo", 500.0, 200.0, 1400.0, events=3, effective=1.0), WEIGHED],
+            f"{ABOUT} 51 of a million episodes of lane-traffic/05 (95 %: 7.8 to 192; by importance sampling), "
+            "22.9 times in 1,000 h. Plain Monte Carlo saw 3 in 6,000 episodes. The interval of plain Monte Carlo does "
+            "not meet it: take more episodes before you trust either.",
+        ),
+    ],
+)
+def test_how_rare_collisions_are(lines: list[dict[str, Any]], said: str, tmp_path: Path) -> None:
+    suite = {"name": "h", "kind": "how-often", "title": "How often"}
+    header = {"suite": suite, "identity": "x", "columns": [], "factors": ["system", "method"]}
+    folder = write_run(tmp_path / "run", header, lines)
+    sentences = verdict(load_run(folder))
+    assert " ".join(sentences) == said
+    assert all(sentence in write_report(folder).read_text() for sentence in sentences)
