@@ -83,4 +83,6 @@ def _cell(lines: Sequence[Line], column: Mapping[str, Any]) -> Cell:
         )
         for line, value in zip(lines, values, strict=True)
     ]  # fmt: skip
-    return Cell.of(estimate(cases, "share" if truths and all(truths) else "mean"))
+    cell = Cell.of(estimate(cases, "share" if truths and all(truths) else "mean"))
+    counts = len(values) == 1 and type(values[0]) is int
+    return replace(cell, digits=0 if counts or abs(cell.mean) >= 1000 else 1 if abs(cell.mean) >= 100 else 2)
