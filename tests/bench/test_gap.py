@@ -173,6 +173,12 @@ def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
             assert len(mesh.faces) > 100
             assert len(edit.textures) == 1
     assert cells[2].spec["wearer"] == 1
+    lit = mixed.model_copy(update={"perturbations": ["night", "shine-laser", "shine-shadow"]})
+    told = [(c.fields["perturbation"], c.fields["severity"], c.fields["cluster"]) for c in Gap().plan(lit).cells][2:]
+    assert told == [
+        ("night", 1, "short"), ("night", 1, "LaneChanging/00"), ("shine-laser", 2, "LaneChanging/00"),
+        ("shine-laser", 5, "LaneChanging/00"), ("shine-shadow", 1, "LaneChanging/00"),
+    ]  # fmt: skip
     assert texture_version("wear-grey") == ""
     assert len(texture_version("wear-das-yolov5n-twinford")) == 64
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ssad import World, build_episode, load_scenarios, load_town
-from ssad.core.errors import UnknownNameError
+from ssad import World, build_episode, load_scenarios, load_town, make_system
 from ssad.core.frames import Camera
 from ssad.recording.loop_sensors import Onboard
-from ssad.recording.loop_shifts import LOOP_SHIFTS, ShiftedCamera
+from ssad.recording.loop_shifts import ShiftedCamera, boxes_of
 from ssad.scenarios.static.shifts import ShiftSpec
+from ssad.world.rollout import Loop
 
 
 def test_fog_hides_the_same_at_all_times_and_noise_is_new_in_each_picture() -> None:
@@ -41,7 +41,60 @@ def test_fog_hides_the_same_at_all_times_and_noise_is_new_in_each_picture() -> N
     assert max(spread) < 0.5 * clear[road][0].std()
 
 
-def test_what_moves_objects_is_not_for_the_loop() -> None:
-    assert {"fog", "rain", "snow", "sunlight", "overexposure"} <= set(LOOP_SHIFTS)
-    with pytest.raises(UnknownNameError, match="fog"):
-        ShiftedCamera(Onboard().camera(Camera.typical(96, 54)), ShiftSpec("scale", 3))
+@pytest.fixture(scope="module")
+def following() -> tuple[World, np.ndarray]:
+    """Two drives behind others, who move."""
+    scenario = load_scenarios("LaneChanging")[0]
+    town = load_town(scenario.town)
+    episode = build_episode(scenario, town, seed=0)
+    loop = Loop(World([episode, replace(episode, key="other")], {town.name: town}), {0: make_system("autopilot")})
+    loop.reset()
+    for _ in range(45):
+        loop.step()
+    world = loop.simulator
+    assert isinstance(world, World)
+    return world, np.array([[0, 0], [1, 0]], np.int32)
+
+
+@pytest.mark.parametrize("name", ["scale", "shear", "rotation", "anomaly"])
+def test_objects_are_changed_or_added_and_the_rest_of_the_picture_stays(following, name: str) -> None:
+    world, agents = following
+    camera = Onboard().camera(Camera.typical(192, 108))
+    clear, plain = camera(world, agents), ShiftedCamera(camera, ShiftSpec(name, 0))(world, agents)
+    np.testing.assert_array_equal(plain, clear)
+    eyes = ShiftedCamera(camera, ShiftSpec(name, 5))
+    shown = eyes(world, agents)
+    changed = (shown != clear).any(1)
+    assert (changed.mean((1, 2)) < 0.3).all()
+    assert (changed.sum((1, 2)) > 20).all()
+    assert not changed[:, :12].any()  # the sky
+    np.testing.assert_array_equal(ShiftedCamera(camera, ShiftSpec(name, 5))(world, agents[1:])[0], shown[1])
+    assert not np.array_equal(shown[0], shown[1])  # drawn anew for each drive
+
+
+def test_the_boxes_of_objects_are_where_they_are_and_move_as_they_do(following) -> None:
+    world, agents = following
+    onboard, state = Onboard(), world.state()
+    boxes, own = boxes_of(onboard.sights(world, agents)[1], state.speed[1])
+    np.testing.assert_allclose(boxes.centre[:, :2], state.pose[1, 1:, :2])
+    np.testing.assert_allclose(boxes.size_lwh[:, :2], state.size[1, 1:], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(boxes.velocity, axis=1), np.abs(state.speed[1, 1:]), atol=1e-5)
+    np.testing.assert_allclose(own[:2] @ [np.cos(state.pose[1, 0, 2]), np.sin(state.pose[1, 0, 2])], state.speed[1, 0])
+    assert state.speed[1, 0] > 1.0
+
+
+def test_anomalies_stand_still_in_the_world(following) -> None:
+    world, agents = following
+    eyes = ShiftedCamera(Onboard().camera(Camera.typical(192, 108)), ShiftSpec("anomaly", 3))
+    eyes(world, agents[:1])
+    (first,) = eyes._contexts.values()
+    world.step()
+    eyes(world, agents[:1])
+    (second,) = eyes._contexts.values()
+    assert first is second
+    assert first.objects
+    route = world.episodes[0].agents[0].route.xy
+    places = np.array([one.place[:2] for one in first.objects])
+    away = np.hypot(*np.moveaxis(route[:, None] - places, -1, 0)).min(0)
+    assert away.min() > 1.0  # beside the way, which the ego itself needs
+    assert np.median(away) < 8.0  # some stand beyond its end

@@ -1,9 +1,10 @@
-"""What suites of kind `gap` can do to a camera: its faults, shifts, and attacks on its detector; severities 1 to 5."""
+"""What suites of kind `gap` can do to a camera and to what it sees: faults, shifts, attacks, textures, lights."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.types import F32, F64, AgentKind, Episode
 from ssad.recording.live_attack import SIGN
 from ssad.recording.live_attack import LiveAttack as PhysicalAttack
+from ssad.recording.loop_lights import FOUND, LIT, NIGHT, SHINE, light_version, shining
 from ssad.recording.loop_sensors import Onboard
 from ssad.recording.loop_shifts import LOOP_SHIFTS, ShiftedCamera
 from ssad.recording.target import class_of_target, parse_target
@@ -35,6 +37,7 @@ NONE: Final = "none"
 GREY: Final = "grey"
 GREY_SIGN: Final = "grey-sign"
 TEXTURE: Final = "texture"
+LIGHT: Final = "light"
 WEAR: Final = "wear-"
 TARGET: Final = "sedan"
 BESIDE: Final = 12.0  # m from a way within which its signs stand
@@ -44,51 +47,67 @@ STEPS: Final = 2  # gradient steps a picture; an attacker in the loop has no tim
 
 
 def perturbation_names() -> dict[str, str]:
-    """All perturbations -> their family: fault, shift, attack or texture."""
+    """All perturbations -> their family: fault, shift, attack, texture or light; lights that were found have none."""
     attacks = [name for name in ATTACKS if not needs(name)]
     return {
         NONE: "none", **dict.fromkeys(FAULTS, "fault"), **dict.fromkeys(LOOP_SHIFTS, "shift"),
         **dict.fromkeys((f"attack-{name}" for name in attacks), "attack"),
         **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
+        **dict.fromkeys(LIT, LIGHT),
     }  # fmt: skip
 
 
-def check_perturbation(name: str) -> None:
-    """UnknownNameError: there is no such perturbation."""
-    if name not in perturbation_names():
-        raise unknown_name("perturbation", name, perturbation_names())
+def family_of(name: str) -> str:
+    """Family of a perturbation.
+
+    Raises:
+        UnknownNameError: There is no such perturbation.
+        FormatError: There is no exported light in its folder.
+    """
+    if name.startswith(FOUND):
+        shining(name)
+        return LIGHT
+    names = perturbation_names()
+    if name not in names:
+        raise unknown_name("perturbation", name, names)
+    return names[name]
 
 
-def first_car(episode: Episode) -> int | None:
-    """Number of the first agent besides the ego that is a car, who wears a texture; None: there is none."""
-    cars = [k for k, one in enumerate(episode.agents) if k and MODELS[one.model].kind == AgentKind.CAR]
-    return cars[0] if cars else None
+def has_severities(name: str) -> bool:
+    """Whether a perturbation has severities 1 to 5, or one alone."""
+    return family_of(name) != TEXTURE and name not in (NIGHT, f"{SHINE}shadow") and not name.startswith(FOUND)
 
 
-def who_wears(name: str) -> str:
-    """Whom a texture is made for: car or stop_sign.
+def is_worn(name: str) -> bool:
+    """Whether a perturbation is on a car or on signs, so that drives without one are left out."""
+    return family_of(name) in (TEXTURE, LIGHT) and name != NIGHT
+
+
+def wearer(name: str, episode: Episode, graph: LaneGraph) -> int | None:
+    """Who wears a texture or is lit: the first agent besides the ego that is a car; None: nobody in this episode can.
 
     Args:
         name: Of the perturbation.
-    """
-    name = name.removeprefix(WEAR)
-    if name in (GREY, GREY_SIGN):
-        return SIGN if name == GREY_SIGN else "car"
-    return class_of_target(parse_target(load_texture(name)[1].target))
-
-
-def wearer(kind: str, episode: Episode, graph: LaneGraph) -> int | None:
-    """Number of the agent who wears a texture, 0 where stop signs do; None: nobody in this episode can.
-
-    Args:
-        kind: See `who_wears`.
         episode: The episode.
         graph: Its town.
+
+    Returns:
+        Number of the agent; 0 where stop signs wear it.
     """
-    if kind == SIGN:
+    if _made_for(name) == SIGN:
         route = episode.agents[0].route
         return 0 if route is not None and len(signs_of_route(graph, route.xy)) else None
-    return first_car(episode)
+    cars = (k for k, one in enumerate(episode.agents) if k and MODELS[one.model].kind == AgentKind.CAR)
+    return next(cars, None)
+
+
+@lru_cache(maxsize=256)
+def _made_for(name: str) -> str:
+    """Whom a perturbation is made for: car or stop_sign."""
+    name = name.removeprefix(WEAR)
+    if name not in shipped_textures():
+        return SIGN if name == GREY_SIGN else "car"
+    return class_of_target(parse_target(load_texture(name)[1].target))
 
 
 def signs_of_route(graph: LaneGraph, route: F32) -> F64:
@@ -99,14 +118,20 @@ def signs_of_route(graph: LaneGraph, route: F32) -> F64:
     return beside
 
 
-def worn(name: str, agent: int) -> PhysicalAttack:
-    """What makes an agent wear the texture of a perturbation, for `ssad.recording.loop_sensors.Onboard`.
+def worn(name: str, agent: int, *, severity: int = 1, seed: int = 0) -> PhysicalAttack:
+    """What makes an agent wear the texture of a perturbation, or lights it, for `Onboard`.
 
     Args:
-        name: Of the perturbation: a shipped texture; grey, grey-sign: a car, or the plate of a sign, painted grey all
-            over, the control.
+        name: Of the perturbation: a light; a shipped texture; grey, grey-sign: a car, or the plate of a sign, painted
+            grey all over, the control.
         agent: Who wears it; of no account where signs do.
+        severity: Of a light.
+        seed: Of a light.
     """
+    if family_of(name) == LIGHT:
+        light = shining(name, severity, seed)
+        assert light is not None  # nobody is lit by the night alone
+        return light.live(agent)
     name = name.removeprefix(WEAR)
     if name in (GREY, GREY_SIGN):
         target = SIGN if name == GREY_SIGN else TARGET
@@ -130,7 +155,9 @@ def worn(name: str, agent: int) -> PhysicalAttack:
 
 
 def texture_version(name: str) -> str:
-    """Hash of the texture of a perturbation; "" of the control."""
+    """Hash of the texture or of the exported light of a perturbation; "" of those that the code decides."""
+    if family_of(name) == LIGHT:
+        return light_version(name)
     name = name.removeprefix(WEAR)
     return "" if name in (GREY, GREY_SIGN) else load_texture(name)[1].hash
 
@@ -151,7 +178,7 @@ def perturbed(
     Returns:
         Sensors, and perturbations of their pictures, by name.
     """
-    family = perturbation_names()[name]
+    family = family_of(name)
     sensors: dict[str, Sensor] = dict(onboard.together(cameras))
     changes: dict[str, Perturbation] = {}
     for channel, camera in cameras.items():

@@ -23,8 +23,10 @@ from ssad.drivers.perceiving.tracker import Tracking
 from ssad.evaluation.drive_perception import Watcher
 from ssad.metrics import episode_metrics
 from ssad.recording.closed_loop import Order, drive
-from ssad.recording.loop_perturbations import perturbed, worn
-from ssad.recording.loop_sensors import Onboard
+from ssad.recording.lit_clips import at_hour
+from ssad.recording.loop_lights import hour_of
+from ssad.recording.loop_perturbations import LIGHT, family_of, perturbed, worn
+from ssad.recording.loop_sensors import DAY, Onboard
 
 Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
 
@@ -132,11 +134,11 @@ def drive_perceiving(
     own = PerceivingSystem.model_validate(spec["settings"])
     watcher = Watcher(front(own.width, own.cameras), len(orders), every)
     driver = own.make(watcher, repair=repair, device=device)
-    attack = worn(spec["perturbation"], spec["wearer"]) if "wearer" in spec else None
-    onboard = Onboard(device=device, resident=True, attack=attack)
-    sensors, changes = perturbed(
-        onboard, driver.cameras, spec["perturbation"], spec["severity"], detector=driver.detector, seed=seed
-    )
+    name, severity = spec["perturbation"], spec["severity"]
+    attack = worn(name, spec["wearer"], severity=severity, seed=seed) if "wearer" in spec else None
+    weather = at_hour(DAY, hour_of(name)) if family_of(name) == LIGHT else DAY
+    onboard = Onboard(weather=weather, device=device, resident=True, attack=attack)
+    sensors, changes = perturbed(onboard, driver.cameras, name, severity, detector=driver.detector, seed=seed)
     found = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
     return *found, watcher
 

@@ -31,14 +31,15 @@ from ssad.evaluation.drive_sheet import Seen, drive_film, drive_sheet
 from ssad.jobs.machine import quiet_warp
 from ssad.recording.closed_loop import episode_of, system_version, town
 from ssad.recording.loop_perturbations import (
+    LIGHT,
     NONE,
     TEXTURE,
-    check_perturbation,
-    perturbation_names,
+    family_of,
+    has_severities,
+    is_worn,
     signs_of_route,
     texture_version,
     wearer,
-    who_wears,
 )
 from ssad.recording.perceiving_loop import PerceivingSystem, drive_perceiving, drive_repaired
 
@@ -105,7 +106,7 @@ class Gap(ScenarioKind):
         """Names are looked up, detectors are built once; with `check`, each scenario is built once."""
         check_distinct(suite, "systems", [one.name for one in suite.systems] + suite.ceilings)
         for name in suite.perturbations:
-            check_perturbation(name)
+            family_of(name)
         if any(severity not in range(1, 6) for severity in suite.severities):
             raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
         for system in suite.systems:
@@ -115,17 +116,17 @@ class Gap(ScenarioKind):
         scenarios, towns = described(suite)
         conditions = _conditions(suite)
         wearers: dict[tuple[str, str], int | None] = {}
-        kinds = {name: who_wears(name) for name in suite.perturbations if _family(name) == TEXTURE}
-        if check or kinds:
+        on_somebody = [name for name in suite.perturbations if is_worn(name)]
+        if check or on_somebody:
             for one in scenarios:
                 episode = episode_of(self._cell(suite, one, conditions[0], 0, ""))
-                for name, kind in kinds.items():
-                    wearers[name, one.scenario.name] = wearer(kind, episode, town(one.scenario.town))
+                for name in on_somebody:
+                    wearers[name, one.scenario.name] = wearer(name, episode, town(one.scenario.town))
         cells = [
             self._cell(suite, one, condition, repetition, versions[_name(condition[0])], worn_by)
             for condition in conditions for one in scenarios
             for worn_by in [wearers.get((condition[1], one.scenario.name))]
-            if worn_by is not None or _family(condition[1]) != TEXTURE
+            if worn_by is not None or not is_worn(condition[1])
             for repetition in range(suite.repetitions)
         ]  # fmt: skip
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
@@ -138,15 +139,15 @@ class Gap(ScenarioKind):
         system, perturbation, severity = condition
         own = None if isinstance(system, str) else system.model_dump(mode="json")
         under = f"{perturbation}-{severity}/" if perturbation != NONE else ""
-        family = _family(perturbation)
-        texture = texture_version(perturbation) if family == TEXTURE else ""
+        family = family_of(perturbation)
+        texture = texture_version(perturbation) if family in (TEXTURE, LIGHT) else ""
         return self.scenario_cell(
             suite, one, version, suite.seed, texture, system=_name(system), chance=("episode", repetition),
             title=f"{_name(system)}/{under}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
             fields={"perturbation": perturbation, "severity": severity, "family": family},
             repetition=repetition, spread=suite.spread if repetition else 0.0, settings=own,
             perturbation=perturbation, severity=severity, repair=suite.repair and own is not None,
-            **({"wearer": worn_by} if family == TEXTURE else {}),
+            **({"wearer": worn_by} if is_worn(perturbation) else {}),
         )  # fmt: skip
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
@@ -208,10 +209,6 @@ def _name(system: str | PerceivingSystem) -> str:
     return system if isinstance(system, str) else system.name
 
 
-def _family(perturbation: str) -> str:
-    return perturbation_names()[perturbation]
-
-
 def _conditions(suite: GapSuite) -> list[tuple[str | PerceivingSystem, str, int]]:
     """System, perturbation, severity; ceilings first, then each system clean and perturbed."""
     found: list[tuple[str | PerceivingSystem, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
@@ -220,6 +217,6 @@ def _conditions(suite: GapSuite) -> list[tuple[str | PerceivingSystem, str, int]
         if not system.perfect:
             names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
             for name in names:
-                once = perturbation_names()[name] == TEXTURE  # a texture has no severity
-                found += [(system, name, severity) for severity in ([1] if once else dict.fromkeys(suite.severities))]
+                levels = dict.fromkeys(suite.severities) if has_severities(name) else [1]
+                found += [(system, name, severity) for severity in levels]
     return found

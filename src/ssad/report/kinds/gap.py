@@ -28,7 +28,8 @@ DROPS = {"AP": "AP", "target_recall": "recall of the object that matters", "coll
 BOUNDED = ("AP", "target_recall", "believed", "route_completion")
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
 SIZE, MARGIN = 360, 46
-COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)", "texture": "var(--s3)"}
+COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)", "texture": "var(--s3)",
+           "light": "var(--s4)"}  # fmt: skip
 
 
 def conditions(run: Run) -> dict[Condition, list[Line]]:
