@@ -196,6 +196,9 @@ def read_card(path: str | Path) -> Card:
     place = Path(path).expanduser()
     shard = SHARD.fullmatch(place.name)
     file = place if place.suffix == ".json" else place.with_name(f"{shard['stem'] if shard else place.stem}.json")
+    if not file.is_file():
+        why = f"no card {file.name} beside it, which says what the weights are" if place.is_file() else "no such file"
+        raise FormatError(f"{place}: {why}")
     data = read_json(file)
     known = {f.name for f in fields(Card)}
     kinds = {"data": str, "command": str, "seed": int, "classes": list, "metrics": dict, "config": dict, "hash": str}

@@ -98,19 +98,20 @@ def split_weights(text: str) -> tuple[str, str]:
     return (name, file) if equals and "?" not in name else (text, "")
 
 
-def check_arguments(kind: str, text: str, found: Any) -> None:
+def check_arguments(kind: str, text: str, found: Any, *, made: bool = False) -> None:
     """Check that what a reference names takes its arguments, without calling it.
 
     Args:
         kind: Singular noun for messages.
         text: The reference.
         found: What `resolve` found for it.
+        made: Whether a class is called with these arguments alone, so that it must need no others.
 
     Raises:
-        ConfigError: It takes no such arguments.
+        ConfigError: It takes no such arguments, or needs more.
     """
     options = Reference.of(text).options
-    if not options:
+    if not options and not (made and isinstance(found, type)):
         return
     if not callable(found):
         raise ConfigError(f"{kind} '{text}': it is an object, which takes no arguments; name its class instead")
@@ -176,7 +177,7 @@ def _import(kind: str, name: str, target: str) -> Any:
         sys.path.insert(0, here)
     try:
         value: Any = importlib.import_module(module_name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script that ends the process is no module
         why = describe(error) + _hint(error, module_name, here)
         raise ConfigError(f"{kind} '{name}': importing {module_name} failed: {why}") from error
     for part in attribute.split("."):

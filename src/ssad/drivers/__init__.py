@@ -58,7 +58,7 @@ def find_system(name: str) -> Any:
 
         return Leaderboard(weights)
     found = resolve("system", SYSTEMS, name)
-    check_arguments("system", text, found)
+    check_arguments("system", text, found, made=True)
     return found
 
 
