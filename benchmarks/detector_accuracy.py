@@ -268,8 +268,8 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         "(IoU 0.5). *Found*: share of these cars that a box with such a score or a higher one finds.",
         "",
         *table(["score", *(f"{n}: {what}" for n in parts for what in ("right", "found"))], rows),
-        "Below 0.5, scores of small cars are higher than the share that is right, so calibrated scores would find",
-        "no more of them. The last row is the most that any threshold finds. Of the rest, most lie in the dark, or have a",
+        "Below 0.5, scores of small cars are higher than the share that is right, so calibrated scores would not find",
+        "more of them. The last row is the most that any threshold finds. Of the rest, most lie in the dark, or have a",
         "box that lies a little beside them: an IoU of 0.3 is reached far more often. Found, by light:",
         "",
     ]

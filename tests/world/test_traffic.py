@@ -10,7 +10,7 @@ from helpers.quick import others_slow
 from world.worlds import GRAPHS, ego, episode, line_route, straight_graph
 
 from benchmarks.traffic import LENGTH, ROUTES, between_lanes, measure, town_routes, traffic, upper_limit
-from ssad.core.types import ENDS, Controller
+from ssad.core.types import ENDS, Controller, EpisodeAgent, Pose
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.world import World
@@ -72,6 +72,31 @@ def test_one_of_two_that_stand_nose_to_nose_backs_out() -> None:
     found = measure(graph, [scene], seconds=150.0)
     assert not found["stuck"]
     assert not found["contacts"]
+
+
+def test_a_motorcycle_does_not_wait_in_a_junction_for_good() -> None:
+    """It stands in the middle of one, behind it a car: too little room to drive in, but enough to move up."""
+    graph = load_town("Twinford")
+    for route in town_routes(graph, 40, 300.0):
+        inside = graph.junction[route.lane] >= 0
+        begin = int(inside.argmax())
+        leave = begin + int((~inside[begin:]).argmax())
+        if np.cos(route.yaw[leave] - route.yaw[begin]) > 0.99:
+            break
+    at, stop = (begin + leave) // 2, leave + 5
+    yaw = float(route.yaw[at])
+    x, y = (route.xy[at] - 0.3 * np.array([np.cos(yaw), np.sin(yaw)])).tolist()
+    rider = EpisodeAgent("rider", "motorcycle", Controller.AUTOPILOT, Pose(x, y, yaw), 0.0, 8.0, route=route)
+    ahead = Pose(float(route.xy[stop, 0]), float(route.xy[stop, 1]), float(route.yaw[stop]))
+    stands = ego(name="stands", controller=Controller.NONE, pose=ahead, route=None)
+    scene = traffic(graph, [route], 1, key=0, green=True)
+    world = World([replace(scene, agents=(rider, stands))], {graph.name: graph})
+    moved = []
+    for _ in range(600):
+        world.step()
+        moved.append(float(world.array("travelled")[0, 0]))
+        assert not world.array("touch").any()
+    assert moved[-1] - moved[350] > 1.5
 
 
 @pytest.mark.slow

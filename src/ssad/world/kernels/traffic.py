@@ -42,6 +42,7 @@ SIGHT = wp.constant(60.0)
 BACK_OUT = wp.constant(12.0)  # s after which one of two that stand nose to nose makes room
 NOSE_TO_NOSE = wp.constant(4.5)  # m
 MAKES_ROOM = wp.constant(9.0)  # m that who backs out leaves to the other
+LOCKED = wp.constant(40.0)  # s (longer than the shipped scenarios) after which a two-wheeler leaves a junction
 STANDS = wp.constant(0.2)  # m/s
 LONGEST = wp.constant(5.2)  # half length of the longest model, m
 
@@ -491,6 +492,8 @@ def meet(
         first = route[0] + state.progress[b, i]
         part = aim[0] - float(state.progress[b, i])
         line = line_ahead(roads, first, part, own[0])
+        if roads.rule[first][2] <= 0.0 and state.waited[b, i] > LOCKED:
+            line = -FAR  # it is so short that its front seems to be before the junction in which it stands
         if flags != 2:
             c = wp.cos(pose[2])
             s = wp.sin(pose[2])
