@@ -492,8 +492,10 @@ def meet(
         first = route[0] + state.progress[b, i]
         part = aim[0] - float(state.progress[b, i])
         line = line_ahead(roads, first, part, own[0])
-        if roads.rule[first][2] <= 0.0 and state.waited[b, i] > LOCKED:
-            line = -FAR  # it is so short that its front seems to be before the junction in which it stands
+        if line > -1.0 and roads.rule[first][2] <= 0.0:
+            # in the junction, and so short that its front seems to be before it
+            if state.waited[b, i] > LOCKED:
+                line = -FAR
         if flags != 2:
             c = wp.cos(pose[2])
             s = wp.sin(pose[2])
