@@ -141,6 +141,7 @@ class Replay:
         compared: What was compared, in words.
         picture: Makes a picture of what the system was shown and found, clean and under the cell's condition.
         film: Frames [H, W, 3] of what the driver saw, with the s from one to the next; None: there are none.
+        seen: What the driver saw, found and believed (`ssad.evaluation.drive_sheet.Seen`); None: it does not perceive.
     """
 
     cell: Cell
@@ -150,6 +151,7 @@ class Replay:
     compared: str = ""
     picture: Callable[[], U8] | None = None
     film: tuple[Iterator[U8], float] | None = None
+    seen: Any = None
 
 
 class CellError(SSADError):

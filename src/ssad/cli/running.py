@@ -159,6 +159,9 @@ def replay(
         int | None, typer.Option(min=1, help="Number of the agent that is attacked.  [default: the car nearest ahead]")
     ] = None,
     detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Also write the drive as MCAP with Foxglove's schemas (extra view).")
+    ] = False,
 ) -> None:
     """Run one cell again, compare it with its record bit by bit, and write a video and the trace, or a picture.
 
@@ -173,14 +176,20 @@ def replay(
     from ssad.core.safeio import make_folder
     from ssad.core.traces import save_trace
     from ssad.report import write_video
-    from ssad.report.video import save_frames
+    from ssad.report.video import frames, save_frames
 
     film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
+    if mcap:
+        from ssad.recording.drive_mcap import need_mcap, write_mcap
+
+        need_mcap()
     found = run_again(folder, cell)
     target = make_folder(out or folder / "replays") / found.cell.key
     verdict = f"differs: {found.difference}" if found.difference else "identical"
     if found.trace is None or found.graph is None:
         print(f"{found.cell.key} {found.cell.name}: {found.compared}, {verdict}")
+        if mcap:
+            raise ConfigError(f"--mcap: cell {found.cell.key} ({found.cell.name}) is no drive")
         if film_of is not None:
             raise ConfigError(f"--wear: cell {found.cell.key} ({found.cell.name}) is no drive")
         if found.picture is not None:
@@ -192,8 +201,12 @@ def replay(
     print(f"{found.cell.key} {found.cell.name}: {len(found.trace.accel) - 1} steps, {verdict}")
     print(f"video: {film}\ntrace: {target.with_suffix('.npz')}")
     if found.film is not None:
-        frames, dt = found.film
-        print(f"camera: {save_frames(frames, target.with_suffix(f'.camera.{video.value}'), dt=dt)}")
+        shown, dt = found.film
+        print(f"camera: {save_frames(shown, target.with_suffix(f'.camera.{video.value}'), dt=dt)}")
+    if mcap:
+        above = frames(found.trace, found.graph, size=(640, 360))
+        path = write_mcap(target.with_suffix(".mcap"), found.trace, found.graph, seen=found.seen, above=above)
+        print(f"mcap: {path}")
     if film_of is not None:
         print(f"film: {film_of(found.trace, found.graph, target.with_suffix(f'.worn.{video.value}'))}")
     raise typer.Exit(1 if found.difference else 0)

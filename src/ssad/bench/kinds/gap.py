@@ -198,11 +198,14 @@ class Gap(ScenarioKind):
         for one in [cell] if spec["perturbation"] == NONE else [clean, cell]:
             _, (trace,), seen = drive_perceiving([one], device=plan.device, seed=plan.suite.seed, every=EVERY)
             again.append(trace)
-            if seen is not None and (shots := seen.shots(0)):
+            if seen is not None:
+                shots = seen.shots(0)
                 title = f"{spec['perturbation']} {spec['severity']}" if one is cell and spec["severity"] else "clean"
                 drives.append(Seen(title, trace, seen.perceived(0), shots))
-        film = (drive_film(drives, graph, every=EVERY), EVERY) if drives else None
-        return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film)
+        filmed = [drive for drive in drives if drive.shots]
+        film = (drive_film(filmed, graph, every=EVERY), EVERY) if filmed else None
+        own = drives[-1] if drives and drives[-1].trace is again[-1] else None
+        return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film, seen=own)
 
 
 def _name(system: str | PerceivingSystem) -> str:
