@@ -21,6 +21,7 @@ from ssad.evaluation.drive_perception import (
     in_view,
     object_that_matters,
     phantom_stop,
+    track_metrics,
 )
 
 CAMERAS = {"front": rig_camera("CAM_FRONT", 640)}
@@ -83,6 +84,21 @@ def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> No
     assert [none[n] for n in ("AP", "recall", "target_recall", "believed")] == [0.0, 0.0, 0.0, 0.0]
     assert none["distance_error"] is None
     assert none["switches"] is None
+
+
+def test_tracks_are_scored_against_who_is_in_view() -> None:
+    trace = towards()
+    good = track_metrics(trace, perceived(trace, lambda k: [], lambda k: [(25.0, 0.0)]))
+    assert good == {"HOTA": 1.0, "MOTA": 1.0, "IDF1": 1.0}
+    half = track_metrics(trace, perceived(trace, lambda k: [], lambda k: [(25.0, 0.0)] * (k % 2)))
+    assert half["MOTA"] == pytest.approx(20 / 41)
+    invented = track_metrics(trace, perceived(trace, lambda k: [], lambda k: [(25.0, 0.0), (40.0, 9.0)]))
+    assert invented["MOTA"] == 0.0
+    assert invented["IDF1"] == pytest.approx(2 / 3)
+    bodies = (straight(0.0, 0.0, 0.0, 5.0, STEPS), straight(25.0, 0.0, 0.0, 0.0, STEPS))
+    passed = make_trace(STEPS, (*bodies, straight(-12.0, 3.0, 0.0, 5.0, STEPS)))
+    kept = track_metrics(passed, perceived(passed, lambda k: [], lambda k: [(25.0, 0.0), (-12.0 + 0.5 * k, 3.0)]))
+    assert kept["MOTA"] == 1.0  # who is behind is known and out of view
 
 
 def test_misplaced_objects_have_a_distance_error_and_invented_ones_are_phantoms() -> None:

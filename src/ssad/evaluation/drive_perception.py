@@ -19,6 +19,7 @@ from ssad.drivers.perceiving.signs import SAME
 from ssad.drivers.perceiving.tracker import Tracks
 from ssad.metrics.detection import match
 from ssad.metrics.detection_boxes import BoxTable
+from ssad.metrics.tracking import ENOUGH, TrackedFrame, similarity_of, track_scores
 
 NEAR: Final = (
     2.0  # m from the middle of an object within which it counts as found (as NeuroNCAP's recall of the target)
@@ -152,7 +153,8 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
         AP: average precision of all kinds together, the mean of those within 0.5, 1, 2 and 4 m. recall: of the objects
         in view. target_recall, and by band of distance: of the object that matters. distance_error: of that object
         where it was found roughly, m. phantoms: objects a look that are not there. believed: share of the steps with
-        the object that matters in view in which it is believed where it is. switches: changes of its track.
+        the object that matters in view in which it is believed where it is. switches: changes of its track. HOTA, MOTA
+        and IDF1: see `track_metrics`.
     """
     target = object_that_matters(trace)
     found_of: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
@@ -189,7 +191,29 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     }
     for low, high in BANDS:
         metrics[f"target_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
-    return metrics | _belief_metrics(trace, seen, target)
+    return metrics | _belief_metrics(trace, seen, target) | track_metrics(trace, seen)
+
+
+def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | None]:
+    """HOTA, MOTA and IDF1 of what is believed against who is in view, within 2 m; None: nobody ever was.
+
+    A track on somebody who is out of view, whom the driver may well remember, counts neither for nor against.
+    """
+    frames = []
+    for time, tracks in seen.known:
+        step = min(round(time / trace.dt), len(trace.x) - 1)
+        view = in_view(trace, step, seen.cameras)
+        place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
+        likeness = similarity_of(place, tracks.mean[:, :2], 2.0 * NEAR)
+        others = trace.active[step] & ~view
+        others[0] = False
+        best = likeness[view].max(0, initial=0.0)
+        kept = (best >= likeness[others].max(0, initial=0.0)) | (likeness[others].max(0, initial=0.0) < ENOUGH)
+        frames.append(TrackedFrame(np.flatnonzero(view), tracks.ident[kept], likeness[view][:, kept]))
+    scores = track_scores(frames)
+    if scores is None:
+        return dict.fromkeys(("HOTA", "MOTA", "IDF1"))
+    return {"HOTA": scores.hota, "MOTA": scores.mota, "IDF1": scores.idf1}
 
 
 def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, float | None]:
