@@ -432,6 +432,8 @@ def test_bad_beliefs_are_refused_in_one_line() -> None:
         (replace(good, kind=good.kind + 9), "belief: kind must be an AgentKind, 0 to 7"),
         (replace(good, signal=np.zeros((2, 5), np.int8)), "belief: signal has shape"),
         (replace(good, line_signal=good.line_signal + 99), "belief: line_signal must lie between"),
+        (replace(good, stop_sign=np.array([1, 2], np.uint8)), "belief: stop_sign must be 1 (known) or 0"),
+        (replace(good, stop_sign=np.array([1.0, np.nan])), "belief: stop_sign must be 1 (known) or 0"),
     ]
     for belief, message in cases:
         with pytest.raises(ConfigError) as error:

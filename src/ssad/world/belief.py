@@ -60,6 +60,8 @@ def check(belief: Belief, batch: int, signals: int, scenes: Bool) -> None:
             raise ConfigError(f"belief: {field.name} holds a number that is not finite")
     if not (np.asarray(belief.size)[used] > 0).all():
         raise ConfigError("belief: size must be above 0 m")
+    if belief.stop_sign is not None and not np.isin(np.asarray(belief.stop_sign)[scenes], (0, 1)).all():
+        raise ConfigError("belief: stop_sign must be 1 (known) or 0 (not known); None: all signs of the map are known")
     for name, value, limit in (
         ("signal", belief.signal, len(SignalState)),
         ("line_signal", belief.line_signal, signals),
