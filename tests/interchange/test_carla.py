@@ -13,17 +13,24 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 
+import cv2
 import numpy as np
 import pytest
 from helpers.command import ssad_process
 from helpers.quick import others_slow
+from matplotlib.path import Path as Path2D
 
+from ssad.camera.lidar import Lidar
 from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
 from ssad.core.types import Actor, Controller, Episode, EpisodeTrace, Limits, Pose, Scenario, SignalState
 from ssad.drivers import make_system
+from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
 from ssad.interchange import carla as adapter
 from ssad.interchange.carla import Carla, Server
+from ssad.interchange.carla_sensors import Own, eyes_of
 from ssad.metrics import episode_metrics
+from ssad.recording.closed_loop import asked_sensors
 from ssad.roads import load_town, town_signals
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.rollout import rollout
@@ -140,6 +147,158 @@ def test_what_only_carla_feels_ends_the_episode(carla: ModuleType) -> None:
     assert simulator.state().contact_agent[0] == -2
 
 
+# ---------------------------------------------------------------- CARLA's own sensors, and its Traffic Manager
+
+CENTRES = np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(90) + 0.5), -1).reshape(-1, 2)
+CAMERAS = {
+    "front": {"x": 1.5, "y": 0.0, "z": 1.6, "fov": 90.0},
+    "aside": {"x": 0.5, "y": 0.7, "z": 1.7, "yaw": 40.0, "pitch": -6.0, "roll": 12.0, "fov": 80.0},
+}
+PLACES = ((16.0, 0.0, 0.0), (11.0, -9.5, 0.6))  # ahead, left, turn: of the things that the ego sees
+
+
+def looked(system: object, names: Sequence[str], *, server: Server = SERVER, steps: int = 4) -> list[dict[str, object]]:
+    """What CARLA's own sensors show an ego that drives off among two cars."""
+    pose, route = Pose(230.0, -1.75, 0.0), (Pose(230.0, -1.75), Pose(300.0, -1.75))
+    actors = tuple(
+        Actor(f"car {k}", "suv", Pose(pose.x + x, pose.y + y, turn)) for k, (x, y, turn) in enumerate(PLACES)
+    )
+    scenario = Scenario("looks", "Custom", "ProvingGround", route, actors=actors, limits=Limits(max_steps=steps))
+    (episode,) = built([scenario])
+    eyes = eyes_of(asked_sensors([system]), 0.1)
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, eyes=eyes)
+    seen = []
+    mask = np.zeros((1, simulator.agents), bool)
+    mask[0, 0] = True
+    simulator.take(mask, Controller.FOLLOW, target_speed=8.0)
+    sensors = {name: Own(name) for name in eyes}
+    try:
+        while simulator.ended()[0] == 0:
+            got = {name: sensors[name](simulator, np.zeros((1, 2), np.int32))[0] for name in names}
+            seen.append(got | {"pose": simulator.state().pose[0].copy(), "speed": simulator.state().speed[0].copy()})
+            simulator.step()
+        assert all(not sensors[name](simulator, np.zeros((1, 2), np.int32))[0][..., :3].any() for name in names)
+    finally:
+        simulator.close()
+    assert not carla_world()._actors
+    return seen
+
+
+def carla_world() -> object:
+    return sys.modules["carla"].SERVERS["here", 2000]
+
+
+class Eyes:
+    """A driver that looks through a camera of a leaderboard, one whose axis is off the middle, a LiDAR and a radar."""
+
+    def __init__(self) -> None:
+        size = {"width": 160, "height": 90}
+        self.cameras = {name: camera_of({"id": name, **size, **item}) for name, item in CAMERAS.items()}
+        front = self.cameras["front"]
+        off = front.intrinsic + np.array([[0.0, 0.0, 24.0], [0.0, 0.0, -9.0], [0.0, 0.0, 0.0]])
+        self.cameras["off"] = Camera(front.width, front.height, off, front.to_ego, "off")
+        self.lidars = {"lidar": lidar_of({"id": "lidar", "z": 2.0, "yaw": -90.0})}
+        self.radars = {"radar": radar_of({"id": "radar", "x": 2.0, "z": 0.7})}
+        self.sensors = (*self.cameras, "lidar", "radar")
+
+
+@pytest.fixture
+def seen(carla: ModuleType) -> list[dict[str, object]]:
+    return looked(Eyes(), Eyes().sensors)
+
+
+def test_carla_s_cameras_see_what_stands_where(seen: list[dict[str, object]]) -> None:
+    """Middles of the two cars' silhouettes are where the camera's own geometry has them, at every step."""
+    eyes = Eyes()
+    half = np.array([[a, b, c] for a in (-2.3, 2.3) for b in (-0.965, 0.965) for c in (0.0, 1.85)])
+    checked = 0
+    for row in seen:
+        pose = row["pose"]
+        for name, camera in eyes.cameras.items():
+            picture = row[name]
+            assert picture.shape == (3, 90, 160)
+            assert picture.dtype == np.uint8
+            bodies, mask = picture[0] == 200, np.zeros((90, 160), bool)
+            for x, y, yaw in pose[1:3].tolist():
+                c, s = np.cos(yaw), np.sin(yaw)
+                world = half @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (x, y, 0.0)
+                c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+                ego = (world - (*pose[0, :2], 0.0)) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+                local = (ego - camera.to_ego[:3, 3]) @ camera.to_ego[:3, :3]
+                if local[:, 2].min() < 0.5:
+                    continue
+                spot = (local / local[:, 2:]) @ camera.intrinsic.T
+                hull = cv2.convexHull(spot[:, None, :2].astype(np.float32))[:, 0]
+                mask |= Path2D(hull).contains_points(CENTRES).reshape(90, 160)
+            both, either = (mask & bodies).sum(), (mask | bodies).sum()
+            if either > 60:
+                assert both / either > 0.93, name
+                checked += 1
+    assert checked > 8
+
+
+def test_carla_s_lidar_and_radar(seen: list[dict[str, object]]) -> None:
+    """Points lie on the ground or on bodies; their rings are those of their beams; the radar tells who comes nearer."""
+    eyes = Eyes()
+    lidar = eyes.lidars["lidar"]
+    for row in seen[1:]:
+        points, hits, pose = row["lidar"], row["radar"], row["pose"]
+        assert points.shape == (64 * 937, 5)
+        real = points[points[:, 4] >= 0.0]
+        assert len(real) > 20_000
+        assert not points[points[:, 4] < 0.0, :4].any()
+        up = np.arctan2(real[:, 2], np.hypot(real[:, 0], real[:, 1]))
+        assert np.abs(up - lidar.beams[real[:, 4].astype(int)]).max() < 1e-3
+        ego = real[:, :3].astype(np.float64) @ lidar.to_ego[:3, :3].T + lidar.to_ego[:3, 3]
+        c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+        world = ego @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + (*pose[0, :2], 0.0)
+        above = world[world[:, 2] > 0.05]
+        assert len(above) > 100
+        off = np.min([np.hypot(*(above[:, :2] - pose[k, :2]).T) for k in (1, 2)], axis=0)
+        assert off.max() < 2.6  # half the diagonal of the bodies
+        v = float(row["speed"][0])
+        ahead = hits[(hits[:, 0] > 0.0) & (abs(hits[:, 2]) < 0.05) & (hits[:, 1] > -0.02)]
+        gap = float(pose[1, 0] - pose[0, 0]) - 2.3 - 2.0
+        assert ahead[:, 0].min() == pytest.approx(gap, abs=0.1)
+        assert ahead[:, 3] == pytest.approx(-v * np.cos(ahead[:, 1]) * np.cos(ahead[:, 2]), abs=0.05)
+
+
+def test_what_carla_s_sensors_cannot_be_is_refused(carla: ModuleType) -> None:
+    camera = Camera.typical(64, 32)
+    wide = Camera(64, 32, camera.intrinsic * [[1.2], [1.0], [1.0]])
+    with pytest.raises(ConfigError, match="pixels are not square"):
+        eyes_of({"wide": wide}, 0.1)
+    with pytest.raises(ConfigError, match="not evenly spaced"):
+        eyes_of({"lidar": ("lidar", Lidar(np.array([-0.2, 0.0, 0.1]), 100))}, 0.1)
+    (episode,) = built(load_scenarios("StraightObstacle/00"))
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=SERVER, eyes={})
+    with pytest.raises(ConfigError, match="only the ego carries its sensors, not agent 1"):
+        Own("front")(simulator, np.array([[0, 1]]))
+
+
+def test_the_traffic_manager_drives_the_traffic(carla: ModuleType) -> None:
+    """Along the routes of the episode, whose speed they have; the ego and who is not traffic is left alone."""
+    (episode,) = built(load_scenarios("natural")[:1])
+    server = Server("here", 2000, timeout=5.0, traffic="manager")
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server)
+    (trace,) = rollout(simulator, make_system("blind"))
+    traffic = simulator._traffic
+    assert traffic is not None
+    assert traffic.driven
+    assert carla.CALLS["synchronous managers"] == 1
+    simulator.close()
+    assert carla.CALLS["synchronous managers"] == 0
+    assert carla.CALLS["Vehicle.set_autopilot"] == len(traffic.driven)
+    assert max(np.hypot(*np.ptp(np.stack([trace.x, trace.y]), axis=1))[sorted(traffic.driven)]) > 20.0
+    for number in traffic.driven:
+        assert episode.agents[number].controller == Controller.AUTOPILOT
+        route = episode.agents[number].route
+        assert route is not None
+        way = np.stack([trace.x[:, number], trace.y[:, number]], 1)[trace.active[:, number]]
+        gap = np.hypot(*(way[:, None] - route.xy[None]).transpose(2, 0, 1)).min(1)
+        assert gap.max() < 1.5
+
+
 FAULTS = (
     "Client.get_server_version", "version", "Client.get_world", "Client.get_available_maps", "Client.load_world",
     "World.get_map", "roads", "World.get_traffic_light_from_opendrive_id", "World.get_settings",
@@ -173,6 +332,37 @@ def test_a_server_that_fails_ends_in_a_line(carla: ModuleType, fault: str) -> No
         assert drive_there([episode], "blind")[0].end == "collision"  # the next one runs
 
 
+SENSOR_FAULTS = (
+    "silent sensors", "broken sensors", "World.spawn_actor:5", "Sensor.listen:2", "Sensor.stop:2", "Actor.destroy:3",
+    "Client.get_trafficmanager", "TrafficManager.set_synchronous_mode", "TrafficManager.set_random_device_seed",
+    "Vehicle.set_autopilot", "TrafficManager.set_desired_speed", "TrafficManager.set_path",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", others_slow(SENSOR_FAULTS, ("silent sensors", "TrafficManager.set_path")))
+def test_sensors_and_managers_that_fail_end_in_a_line(carla: ModuleType, fault: str) -> None:
+    (episode,) = built(load_scenarios("natural")[:1])
+    carla.FAULT = fault
+    server = Server("here", 2000, timeout=0.5, sensors="carla", traffic="manager")
+    eyes = eyes_of({"front": Camera.typical(32, 18), "lidar": ("lidar", lidar_of({"id": "lidar"}))}, 0.1)
+
+    def drive() -> None:
+        simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=server, eyes=eyes)
+        mask = np.zeros((1, simulator.agents), bool)
+        mask[0, 0] = True
+        simulator.take(mask, Controller.FOLLOW, target_speed=10.0)
+        simulator.step()
+        for name in eyes:
+            Own(name)(simulator, np.zeros((1, 2), np.int32))
+        for _ in range(60 if "Manager" in fault or "autopilot" in fault else 0):
+            simulator.step()  # until traffic that sleeps wakes
+        simulator.reset()
+
+    with pytest.raises(ConfigError, match=r"^CARLA at here:2000: ") as error:
+        drive()
+    assert len(str(error.value)) < 400
+
+
 def test_a_batch_and_a_bad_address_are_refused(carla: ModuleType) -> None:
     episodes = built(load_scenarios("StraightObstacle")[:2])
     with pytest.raises(ConfigError, match="one scene at a time, not 2"):
@@ -185,22 +375,29 @@ def test_a_batch_and_a_bad_address_are_refused(carla: ModuleType) -> None:
         "http://a",
         "carla://a b",
         "carla://a:-1",
+        "carla://a?sensors",
+        "carla://a?sensors=lidar",
+        "carla://a?eyes=carla",
+        "carla://a?sensors=carla&traffic=mine",
     ):
-        with pytest.raises(ConfigError, match="expected carla://HOST"):
+        with pytest.raises(ConfigError, match=r"expected carla://HOST|there is no .*; there are sensors="):
             Server.of(address)
+    both = Server.of("carla://a:3000/?sensors=carla&traffic=manager")
+    assert both == Server("a", 3000, sensors="carla", traffic="manager")
     assert Server.of("carla://a.b:3000") == Server("a.b", 3000)
     assert Server.of("carla://[::1]") == Server("::1")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "code"), [
-    ("", 0), ("World.tick:100", 1), ("version", 2), ("Client.get_server_version", 2),
+@pytest.mark.parametrize(("fault", "code", "more"), [
+    ("", 0, ""), ("World.tick:100", 1, ""), ("version", 2, ""), ("Client.get_server_version", 2, ""),
+    ("", 0, "?sensors=carla&traffic=manager"),
 ])  # fmt: skip
-def test_a_run_goes_on(fault: str, code: int, tmp_path: Path) -> None:
+def test_a_run_goes_on(fault: str, code: int, more: str, tmp_path: Path) -> None:
     """Through the command: a server that dies fails episodes, and one that never answers is a line."""
     path = f"{STAND_IN}:{Path(adapter.__file__).parent.parent.parent}"
     done = ssad_process(
-        "run", "precrash", "--out", str(tmp_path / "run"), "--set", "simulator=carla://here:2000",
+        "run", "precrash", "--out", str(tmp_path / "run"), "--set", f"simulator=carla://here:2000{more}",
         "--set", "systems=[blind]", "--set", "scenarios=[StraightObstacle]", "--set", "repetitions=1",
         PYTHONPATH=path, CARLA_STAND_IN_FAULT=fault,
     )  # fmt: skip
@@ -226,17 +423,20 @@ def _wheel() -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("old", "new", "code"), [
-    ("hand_brake=", "hand_brake=", 0), ("hand_brake=", "handbrake=", 1), ("set_target_velocity(", "set_speed(", 1),
+@pytest.mark.parametrize(("part", "old", "new", "code"), [
+    ("carla", "hand_brake=", "hand_brake=", 0), ("carla", "hand_brake=", "handbrake=", 1),
+    ("carla", "set_target_velocity(", "set_speed(", 1), ("carla_sensors", "a", "a", 0),
+    ("carla_sensors", "raw_data", "data", 1), ("carla_traffic", "a", "a", 0),
+    ("carla_traffic", "set_path", "set_way", 1),
 ])  # fmt: skip
-def test_mypy_checks_the_adapter_against_the_stubs(old: str, new: str, code: int, tmp_path: Path) -> None:
+def test_mypy_checks_the_stubs(part: str, old: str, new: str, code: int, tmp_path: Path) -> None:
     """Every class, method, argument and attribute; mypy does not find the wheel's stubs by itself."""
     place = tmp_path / "stubs" / "carla"
     place.mkdir(parents=True)
     for name in ("libcarla", "command"):
         text = (_wheel() / f"{name}.pyi").read_text(encoding="utf-8")
         (place / f"{name.replace('libcarla', '__init__')}.pyi").write_text(text, encoding="utf-8")
-    source = Path(adapter.__file__)
+    source = Path(adapter.__file__).with_name(f"{part}.py")
     changed = tmp_path / "adapter.py"
     changed.write_text(source.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
     words = ["--strict", "--cache-dir", str(tmp_path.parent / "mypy"), str(changed)]

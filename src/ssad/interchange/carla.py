@@ -31,6 +31,7 @@ from ssad.core.safeio import parse_xml
 from ssad.core.types import (
     F32,
     I32,
+    U8,
     AgentKind,
     Contact,
     Controller,
@@ -40,6 +41,8 @@ from ssad.core.types import (
     SignalState,
 )
 from ssad.interchange.bodies import BLUEPRINTS
+from ssad.interchange.carla_sensors import Carried, Eye
+from ssad.interchange.carla_traffic import Traffic
 from ssad.interchange.mirrored import Mirrored
 from ssad.roads import town_signals, town_xodr
 from ssad.world.kernels.data import Presence
@@ -55,7 +58,10 @@ PORT: Final = 2000
 ABOVE: Final = 0.3  # m above the road at which bodies are spawned, so that none sticks in it; they drop at once
 SAME: Final = 0.05  # m by which the length of a road may differ between two copies of a map
 GROUND: Final = ("static.road", "static.sidewalk", "static.ground", "static.terrain", "static.roadline")
-_ADDRESS = re.compile(r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?$")
+_ADDRESS = re.compile(
+    r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?(\?(?P<more>[a-z=&]*))?$"
+)
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"sensors": ("mirror", "carla"), "traffic": ("autopilot", "manager")}
 _FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # those that CARLA's physics do not move
 
 
@@ -68,21 +74,30 @@ class Server:
         port: Its first port.
         timeout: s that it may take for an answer; a map may take five times as long.
         weather: Preset of `carla.WeatherParameters`.
+        sensors: Whose cameras and LiDARs drivers look through: SSAD's in the `mirror`, or `carla`'s own.
+        traffic: Who drives the background traffic: SSAD's `autopilot`, or CARLA's Traffic `manager`.
     """
 
     host: str
     port: int = PORT
     timeout: float = 20.0
     weather: str = "ClearNoon"
+    sensors: str = "mirror"
+    traffic: str = "autopilot"
 
     @staticmethod
     def of(address: str) -> Server:
-        """The server of an address carla://HOST[:PORT]. ConfigError if it is none."""
+        """The server of an address carla://HOST[:PORT][?sensors=carla&traffic=manager]. ConfigError if it is none."""
         found = _ADDRESS.match(address)
         port = int(found["port"] or PORT) if found else 0
         if found is None or not 0 < port < 65535:
             raise ConfigError(f"simulator '{address}': expected carla://HOST or carla://HOST:PORT")
-        return Server(found["host"].strip("[]"), port)
+        told = [part.partition("=")[::2] for part in (found["more"] or "").split("&") if part]
+        for name, value in told:
+            if value not in _CHOICES.get(name, ()):
+                known = "; ".join(f"{key}={' or '.join(values)}" for key, values in _CHOICES.items())
+                raise ConfigError(f"simulator '{address}': there is no {name}={value}; there are {known}")
+        return Server(found["host"].strip("[]"), port, **dict(told))
 
     def __str__(self) -> str:
         return f"CARLA at {self.host}:{self.port}"
@@ -171,6 +186,7 @@ class Carla(Mirrored):
         *,
         server: Server,
         assign: Scenes | None = None,
+        eyes: Mapping[str, Eye] | None = None,
     ) -> None:
         self.mirror = World(episodes, graphs, assign=assign)
         if self.mirror.batch != 1:
@@ -188,6 +204,11 @@ class Carla(Mirrored):
         self._bodies: dict[int, carla.Actor] = {}
         self._middle: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
         self._sensor: carla.Sensor | None = None
+        self._carried = Carried(dict(eyes or {}), server.timeout, str(server))
+        self._frame = 0
+        self._traffic: Traffic | None = None
+        if server.traffic == "manager":
+            self._traffic = self._ask("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
         self._hits: list[tuple[int, str]] = []
         self._touching: set[int] = set()
         self._shown: dict[int, int] = {}
@@ -230,6 +251,9 @@ class Carla(Mirrored):
             if active[i] != Presence.ABSENT:
                 self._spawn(i, agent.pose)
         self._ask("attach the collision sensor", self._listen)
+        self._ask("attach its sensors", lambda: self._carried.attach(self.world, self._bodies[0], self._middle[0]))
+        if self._traffic is not None:
+            self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
         self._tick()  # everybody drops onto the road
         for i, agent in enumerate(episode.agents):
             if agent.speed != 0.0 and i in self._bodies and agent.controller not in _FREE:
@@ -273,7 +297,7 @@ class Carla(Mirrored):
         settings.substepping = True
         settings.max_substep_delta_time = 0.01
         settings.max_substeps = 10
-        settings.no_rendering_mode = True  # no camera of CARLA's is used
+        settings.no_rendering_mode = not any("camera" in eye.kind for eye in self._carried.eyes.values())
         self.world.apply_settings(settings)
         self.world.freeze_all_traffic_lights(True)
 
@@ -395,6 +419,11 @@ class Carla(Mirrored):
                 if said[i] in _FREE and i > 0:
                     continue
                 walks = MODELS[agent.model].kind == AgentKind.WALKER
+                if self._traffic is not None and i > 0 and said[i] == Controller.AUTOPILOT and not walks:
+                    if active[i] == Presence.AWAKE and i not in self._traffic.driven:
+                        told = partial(self._traffic.take, i, self._bodies[i], self._episode)
+                        self._ask(f"hand {agent.name} to its Traffic Manager", told)
+                    continue
                 order = self._walk if walks else self._control
                 yaw, told, who = float(poses[i, 2]), control[i], Controller(int(said[i]))
                 self._ask(f"control {agent.name}", partial(order, i, told, yaw, who))
@@ -421,7 +450,15 @@ class Carla(Mirrored):
         walker.apply_control(carla.WalkerControl(direction=ahead, speed=speed, jump=False))
 
     def _tick(self) -> None:
-        self._ask("advance", lambda: self.world.tick(self.server.timeout))
+        self._frame = self._ask("advance", lambda: self.world.tick(self.server.timeout))
+
+    def seen(self, name: str, who: Sequence[int]) -> F32 | U8:
+        """What one of CARLA's own sensors shows an agent (scene, number) now; only the ego carries them."""
+        if who[1] != 0:
+            raise ConfigError(f"{self.server}: only the ego carries its sensors, not agent {who[1]}")
+        if self.mirror.ended()[0] != End.RUNNING:
+            return self._carried.eyes[name].empty
+        return self._carried.reading(name, self._frame)
 
     def _places(self, time: float) -> F32:
         """[1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; who is not there stays where it was."""
@@ -494,6 +531,7 @@ class Carla(Mirrored):
             sensor, self._sensor = self._sensor, None
             self._ask("stop the collision sensor", sensor.stop)
             self._ask("take the collision sensor out", sensor.destroy)
+        self._ask("take its sensors out", self._carried.detach)
         for i in list(self._bodies):
             self._destroy(i)
 
@@ -501,6 +539,8 @@ class Carla(Mirrored):
         """Take out all that was spawned and give the server its settings back; a dead server is left alone."""
         with suppress(ConfigError):
             self._clear()
+            if self._traffic is not None:
+                self._ask("leave its Traffic Manager", self._traffic.end)
             self._ask("change its settings", lambda: self.world.apply_settings(self._found))
             _KEPT[self.server] = _Kept(self.client, self.world, self.town, self._lights)
 

@@ -20,8 +20,12 @@ from ssad.core.types import Episode, EpisodeTrace, Scenario
 from ssad.jobs.machine import quiet_warp
 
 if TYPE_CHECKING:
+    from ssad.camera.lidar import Lidar
+    from ssad.core.frames import Camera
     from ssad.drivers.careful.grade import Grade
 
+STEP = 0.1  # s
+WIDTH = 640  # pixels of a picture of nuScenes' rig
 HIGHWAY = "highway-env"  # as a set of scenarios
 HIGHWAY_TYPE = "ssad.interchange.highway_env:SCENARIO"
 
@@ -179,19 +183,24 @@ def drive(
 
     episodes = [replace(episode_of(order), key=key(order)) for order in orders]
     graphs = {episode.town: town(episode.town) for episode in episodes}
-    away = orders[0].spec.get("simulator")
-    simulator: Simulator
-    if away:
-        from ssad.interchange.carla import Carla, Server
-
-        simulator = Carla(episodes, graphs, server=Server.of(away))
-    else:
-        simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
     system = driver or system_of(orders[0].system)
     policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
     for one in (system, *policies.values()):
         if callable(getattr(one, "to", None)):
             one.to(device)  # type: ignore[attr-defined]
+    away = orders[0].spec.get("simulator")
+    simulator: Simulator
+    if away:
+        from ssad.interchange.carla import Carla, Server
+        from ssad.interchange.carla_sensors import Own, eyes_of
+
+        server = Server.of(away)
+        eyes = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}
+        simulator = Carla(episodes, graphs, server=server, eyes=eyes)
+        if eyes:
+            sensors = onboard_sensors(list(policies.values()), device) | {name: Own(name) for name in eyes}
+    else:
+        simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
     if sensors is None:
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
@@ -201,23 +210,42 @@ def drive(
     return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)]
 
 
+def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+    """The cameras that drivers ask for, and the LiDARs and radars beside a word that says which, by name."""
+    from ssad.camera.lidar import HDL32E
+    from ssad.camera.rig import rig_camera
+
+    found: dict[str, Camera | tuple[str, Lidar]] = {}
+    for driver in drivers:
+        own: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        own |= {name: ("lidar", one) for name, one in getattr(driver, "lidars", {}).items()}
+        own |= {name: ("radar", one) for name, one in getattr(driver, "radars", {}).items()}
+        for name in getattr(driver, "sensors", ()):
+            if name in own:
+                found[name] = own[name]
+            elif name in CAMERAS:
+                found[name] = rig_camera(name, WIDTH)
+            elif name == LIDAR:
+                found[name] = "lidar", HDL32E
+    return found
+
+
 def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
     """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own sensors."""
-    asked = {name for driver in drivers for name in getattr(driver, "sensors", ())}
-    own = {
-        kind: {name: one for driver in drivers for name, one in getattr(driver, kind, {}).items()}
-        for kind in ("cameras", "lidars", "radars")
-    }
-    if not asked & {*CAMERAS, LIDAR}.union(*own.values()):
+    asked = asked_sensors(drivers)
+    if not asked:
         return {}
     from ssad.recording.loop_radar import OnboardRadar
     from ssad.recording.loop_sensors import Onboard
 
     onboard = Onboard(device=device)
-    cameras = {name: onboard.camera(camera) for name, camera in own["cameras"].items()}
-    lidars = {name: onboard.lidar(lidar) for name, lidar in own["lidars"].items()}
-    radars = {name: OnboardRadar(onboard, radar) for name, radar in own["radars"].items()}
-    return {**onboard.rig(), LIDAR: onboard.lidar(), **cameras, **lidars, **radars}
+    found: dict[str, Sensor] = {}
+    for name, one in asked.items():
+        if isinstance(one, tuple):
+            found[name] = onboard.lidar(one[1]) if one[0] == "lidar" else OnboardRadar(onboard, one[1])
+        else:
+            found[name] = onboard.camera(one)
+    return found
 
 
 def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, Limits, Pose, Route, Scenario
 from ssad.interchange.bodies import MODEL_OF
-from ssad.roads import load_town, town_signals, town_xodr
+from ssad.roads import load_town, route_along, town_signals, town_xodr
 from ssad.roads.library import BUILT_IN
 from ssad.world.models import MODELS
 from ssad.world.world import World as Engine
@@ -111,20 +111,33 @@ class WorldSettings:
     no_rendering_mode: bool = False
 
 
+ATTRIBUTES = {
+    "sensor.camera.rgb": {"image_size_x", "image_size_y", "fov"},
+    "sensor.lidar.ray_cast": {
+        "channels", "range", "points_per_second", "rotation_frequency", "upper_fov", "lower_fov", "horizontal_fov",
+        "noise_stddev", "dropoff_general_rate",
+    },
+    "sensor.other.radar": {"horizontal_fov", "vertical_fov", "points_per_second", "range"},
+    "sensor.other.collision": set(),
+}  # fmt: skip
+
+
 class ActorBlueprint:
     def __init__(self, name: str) -> None:
-        self.id = name
+        self.id, self._told = name, {}
 
     def has_attribute(self, id: str) -> bool:
-        return id == "role_name"
+        return id in ATTRIBUTES.get(self.id, {"role_name"})
 
     def set_attribute(self, id: str, value: str) -> None:
-        assert id == "role_name"
+        assert self.has_attribute(id), id
+        assert isinstance(value, str)
+        self._told[id] = value
 
 
 class BlueprintLibrary:
     def find(self, id: str) -> ActorBlueprint:
-        if id not in MODEL_OF and id != "sensor.other.collision":
+        if id not in MODEL_OF and id not in ATTRIBUTES:
             raise IndexError(f"blueprint '{id}' not found")
         return ActorBlueprint(id)
 
@@ -136,6 +149,8 @@ class Actor:
         self._start_speed, self._wheel, self._physics, self._alive = 0.0, 0.0, True, True
         self._velocity = (0.0, 0.0)
         self._order = np.zeros(4, np.float32)
+        self._told, self._place = dict(blueprint._told), transform
+        self._path, self._speed = None, None  # of the Traffic Manager
 
     @property
     def bounding_box(self) -> BoundingBox:
@@ -171,6 +186,11 @@ class Vehicle(Actor):
         assert 0.0 <= control.brake <= 1.0
         self._order[:] = control.throttle, control.brake, -control.steer, control.reverse
 
+    def set_autopilot(self, enabled: bool = True, port: int = 8000) -> None:
+        _remote("Vehicle.set_autopilot")
+        assert port == 8000
+        self._path, self._world._engine = () if enabled else None, None
+
 
 class Walker(Actor):
     def apply_control(self, control: WalkerControl) -> None:
@@ -185,8 +205,90 @@ class CollisionEvent:
     other_actor: Actor
 
 
+class SensorData:
+    def __init__(self, frame: int) -> None:
+        self.frame = frame
+
+
+class Image(SensorData):
+    def __init__(self, frame: int, pixels: np.ndarray) -> None:
+        super().__init__(frame)
+        self.height, self.width, self.raw_data = *pixels.shape[:2], pixels.astype(np.uint8).tobytes()
+
+
+class LidarMeasurement(SensorData):
+    def __init__(self, frame: int, points: np.ndarray) -> None:
+        super().__init__(frame)
+        self.raw_data = points.astype(np.float32).tobytes()
+
+
+class RadarMeasurement(SensorData):
+    def __init__(self, frame: int, points: np.ndarray) -> None:
+        super().__init__(frame)
+        self.raw_data = points.astype(np.float32).tobytes()
+
+
+def _axes(rotation: Rotation) -> np.ndarray:
+    """Forward, right and up of a rotation of Unreal's, in its left-handed frame, as columns."""
+    p, y, r = (math.radians(v) for v in (rotation.pitch, rotation.yaw, rotation.roll))
+    cp, sp, cy, sy, cr, sr = math.cos(p), math.sin(p), math.cos(y), math.sin(y), math.cos(r), math.sin(r)
+    return np.array([
+        [cp * cy, sr * sp * cy - cr * sy, -(cr * sp * cy + sr * sy)],
+        [cp * sy, sr * sp * sy + cr * cy, cy * sr - cr * sp * sy],
+        [sp, -sr * cp, cr * cp],
+    ])  # fmt: skip
+
+
 class Sensor(Actor):
     _callback = None
+
+    def _rays(self) -> np.ndarray:
+        """Directions [..., 3] in the sensor's frame: x forward, y right, z up."""
+        told = {key: float(value) for key, value in self._told.items()}
+        if self.type_id == "sensor.camera.rgb":
+            w, h = int(told["image_size_x"]), int(told["image_size_y"])
+            f = 0.5 * w / math.tan(0.5 * math.radians(told["fov"]))
+            u, v = np.meshgrid((np.arange(w) + 0.5 - 0.5 * w) / f, (np.arange(h) + 0.5 - 0.5 * h) / f)
+            rays = np.stack([np.ones_like(u), u, -v], -1)
+            return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        wide = math.radians(told["horizontal_fov"])
+        if self.type_id == "sensor.lidar.ray_cast":
+            assert told["rotation_frequency"] == 1.0 / self._world._settings.fixed_delta_seconds
+            up = np.radians(np.linspace(told["lower_fov"], told["upper_fov"], int(told["channels"])))
+        else:
+            high = math.radians(told["vertical_fov"])
+            up = (np.arange(12) + 0.5) * high / 12 - 0.5 * high
+        count = round(told["points_per_second"] * 0.1 / len(up))
+        turn = (np.arange(count) + 0.5) * wide / count - 0.5 * wide
+        up, turn = np.meshgrid(up, turn, indexing="ij")
+        return np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], -1)
+
+    def _measure(self, frame: int) -> SensorData | None:
+        """Boxes on a plane."""
+        camera = self.type_id == "sensor.camera.rgb"
+        if camera and self._world._settings.no_rendering_mode:
+            return None
+        rays = self._rays()
+        x, y, yaw = self._parent._pose
+        car = _axes(Rotation(yaw=-math.degrees(yaw)))
+        turn = car @ _axes(self._place.rotation)
+        at = self._place.location
+        eye = np.array([x, -y, 0.0]) + car @ (at.x, at.y, at.z)
+        ways = (rays.reshape(-1, 3) @ turn.T) * (1.0, -1.0, 1.0)  # right-handed from here on
+        away, who = _cast(eye * (1.0, -1.0, 1.0), ways, [b for b in self._world._bodies if b is not self._parent])
+        if camera:
+            colours = np.array([[250, 0, 0, 255], [0, 100, 0, 255], [0, 0, 200, 255]])  # BGRA: sky, ground, bodies
+            kind = np.where(np.isinf(away), 0, np.where(who < 0, 1, 2))
+            return Image(frame, colours[kind].reshape(*rays.shape[:2], 4))
+        seen = away < float(self._told["range"])
+        points = rays.reshape(-1, 3)[seen] * away[seen, None]
+        if self.type_id == "sensor.lidar.ray_cast":
+            return LidarMeasurement(frame, np.column_stack([points, np.exp(-0.004 * away[seen])]))
+        others = [b for b in self._world._bodies if b is not self._parent]
+        moves = np.array([*(b._velocity for b in others), (0.0, 0.0)]).reshape(-1, 2)[who[seen]]
+        along = ((moves - self._parent._velocity) * ways[seen, :2]).sum(1)
+        up, across = np.arcsin(rays.reshape(-1, 3)[seen, 2]), np.arctan2(points[:, 1], points[:, 0])
+        return RadarMeasurement(frame, np.column_stack([along, across, up, away[seen]]))
 
     def listen(self, callback) -> None:
         _remote("Sensor.listen")
@@ -195,6 +297,46 @@ class Sensor(Actor):
     def stop(self) -> None:
         _remote("Sensor.stop")
         self._callback = None
+
+
+def _cast(eye: np.ndarray, ways: np.ndarray, bodies: list[Actor]) -> tuple[np.ndarray, np.ndarray]:
+    """How far rays [N, 3] go until they meet a body or the ground, and which body: -1 none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away = np.where(ways[:, 2] < 0.0, -eye[2] / ways[:, 2], np.inf)
+        who = np.full(len(ways), -1)
+        for k, body in enumerate(bodies):
+            x, y, yaw = body._pose
+            half = body.bounding_box.extent
+            c, s = math.cos(yaw), math.sin(yaw)
+            turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            start, way = turn @ (eye - (x, y, half.z)), ways @ turn.T
+            size = np.array([half.x, half.y, half.z])
+            one, other = (-size - start) / way, (size - start) / way
+            enter, leave = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
+            hit = (enter < leave) & (enter > 0.0) & (enter < away)
+            away, who = np.where(hit, enter, away), np.where(hit, k, who)
+    return away, who
+
+
+class TrafficManager:
+    def set_synchronous_mode(self, mode_switch: bool = True) -> None:
+        _remote("TrafficManager.set_synchronous_mode")
+        CALLS["synchronous managers"] += 1 if mode_switch else -1
+
+    def set_random_device_seed(self, value: int) -> None:
+        _remote("TrafficManager.set_random_device_seed")
+        assert isinstance(value, int)
+
+    def set_desired_speed(self, actor: Actor, speed: float) -> None:
+        _remote("TrafficManager.set_desired_speed")
+        actor._speed = speed / 3.6
+
+    def auto_lane_change(self, actor: Actor, enable: bool) -> None:
+        _remote("TrafficManager.auto_lane_change")
+
+    def set_path(self, actor: Actor, path: list[Location]) -> None:
+        _remote("TrafficManager.set_path")
+        actor._path, actor._world._engine = tuple((p.x, -p.y) for p in path), None
 
 
 class TrafficLight:
@@ -310,12 +452,29 @@ class World:
             yaw = body._pose[2]
             body._velocity = (body._start_speed * math.cos(yaw), body._start_speed * math.sin(yaw))
         touch = engine.array("touch")[0]
+        frame = CALLS["World.tick"]
         for sensor in [actor for actor in self._actors.values() if isinstance(actor, Sensor)]:
+            if sensor.type_id != "sensor.other.collision":
+                data = None if fault() == "silent sensors" else sensor._measure(frame)
+                if data is not None and sensor._callback is not None:
+                    if fault() == "broken sensors":
+                        data.raw_data = data.raw_data[:-3]
+                    sensor._callback(data)
+                continue
             me = bodies.index(sensor._parent)
             for j, other in enumerate(bodies):
                 if sensor._callback is not None and int(touch[me]) >> j & 1:
                     sensor._callback(CollisionEvent(sensor._parent, other))
-        return CALLS["World.tick"]
+        return frame
+
+    def _ahead(self, body: Actor) -> list[tuple[float, float]]:
+        """What of the path of the Traffic Manager lies before a body."""
+        x, y, yaw = body._pose
+        far = [math.hypot(px - x, py - y) for px, py in body._path]
+        near = far.index(min(far))
+        px, py = body._path[near]
+        behind = (px - x) * math.cos(yaw) + (py - y) * math.sin(yaw) < 0.0
+        return list(body._path[near + behind :]) or [(x + 5 * math.cos(yaw), y + 5 * math.sin(yaw))]
 
     def _build(self) -> None:
         """An engine of those who are there now, where and as fast as they are."""
@@ -327,8 +486,11 @@ class World:
         for body in self._bodies:
             name = MODEL_OF[body.type_id]
             moves = body._physics and MODELS[name].kind != AgentKind.PROP
-            who = Controller.EXTERNAL if moves else Controller.PLACED
-            agents.append(EpisodeAgent(str(body.id), name, who, Pose(*body._pose), body._start_speed, route=nowhere))
+            who, way, speed = Controller.EXTERNAL if moves else Controller.PLACED, nowhere, 8.0
+            if body._path:
+                who, speed = Controller.AUTOPILOT, body._speed
+                way = route_along(load_town(self._town), [Pose(*body._pose), *self._ahead(body)])
+            agents.append(EpisodeAgent(str(body.id), name, who, Pose(*body._pose), body._start_speed, speed, route=way))
         limits = Limits(max_steps=10**6, max_time=1e6, contact="count")
         scenario = Scenario("stand-in", "Custom", self._town, (Pose(0, 0), Pose(1, 0)))
         episode = Episode("stand-in", scenario, self._town, tuple(agents), limits=limits)
@@ -354,6 +516,11 @@ class Client:
     def get_server_version(self) -> str:
         _remote("Client.get_server_version")
         return "0.9.15" if fault() == "version" else "0.9.16"
+
+    def get_trafficmanager(self, client_connection: int = 8000) -> TrafficManager:
+        _remote("Client.get_trafficmanager")
+        assert client_connection == 8000
+        return TrafficManager()
 
     def get_available_maps(self) -> list[str]:
         _remote("Client.get_available_maps")
