@@ -239,7 +239,7 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
     from ssad.recording.loop_sensors import Onboard
 
     onboard = Onboard(device=device)
-    found: dict[str, Sensor] = {}
+    found: dict[str, Sensor] = {**onboard.rig(), LIDAR: onboard.lidar()}
     for name, one in asked.items():
         if isinstance(one, tuple):
             found[name] = onboard.lidar(one[1]) if one[0] == "lidar" else OnboardRadar(onboard, one[1])
