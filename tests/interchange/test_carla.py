@@ -27,8 +27,9 @@ from ssad.core.types import Actor, Controller, Episode, EpisodeTrace, Limits, Po
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
 from ssad.interchange import carla as adapter
-from ssad.interchange.carla import Carla, Server
+from ssad.interchange.carla import Carla
 from ssad.interchange.carla_sensors import Own, eyes_of
+from ssad.interchange.carla_server import Server
 from ssad.metrics import episode_metrics
 from ssad.recording.closed_loop import asked_sensors
 from ssad.roads import load_town, town_signals
@@ -426,7 +427,7 @@ def _wheel() -> Path:
 @pytest.mark.parametrize(("part", "old", "new", "code"), [
     ("carla", "hand_brake=", "hand_brake=", 0), ("carla", "hand_brake=", "handbrake=", 1),
     ("carla", "set_target_velocity(", "set_speed(", 1), ("carla_sensors", "a", "a", 0),
-    ("carla_sensors", "raw_data", "data", 1), ("carla_traffic", "a", "a", 0),
+    ("carla_sensors", "raw_data", "data", 1), ("carla_traffic", "a", "a", 0), ("carla_server", "a", "a", 0),
     ("carla_traffic", "set_path", "set_way", 1),
 ])  # fmt: skip
 def test_mypy_checks_the_stubs(part: str, old: str, new: str, code: int, tmp_path: Path) -> None:

@@ -12,20 +12,17 @@ change sign here and nowhere else. Facts of the interface: carla.readthedocs.io,
 from __future__ import annotations
 
 import math
-import re
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from ssad.core.driving import Scenes
-from ssad.core.errors import ConfigError, install_extra
+from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.safeio import parse_xml
 from ssad.core.types import (
@@ -42,6 +39,7 @@ from ssad.core.types import (
 )
 from ssad.interchange.bodies import BLUEPRINTS
 from ssad.interchange.carla_sensors import Carried, Eye
+from ssad.interchange.carla_server import Server, T, asked, connect
 from ssad.interchange.carla_traffic import Traffic
 from ssad.interchange.mirrored import Mirrored
 from ssad.roads import town_signals, town_xodr
@@ -52,83 +50,10 @@ from ssad.world.world import World
 if TYPE_CHECKING:
     import carla
 
-T = TypeVar("T")
-VERSION: Final = "0.9.16"
-PORT: Final = 2000
 ABOVE: Final = 0.3  # m above the road at which bodies are spawned, so that none sticks in it; they drop at once
 SAME: Final = 0.05  # m by which the length of a road may differ between two copies of a map
 GROUND: Final = ("static.road", "static.sidewalk", "static.ground", "static.terrain", "static.roadline")
-_ADDRESS = re.compile(
-    r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?(\?(?P<more>[a-z=&]*))?$"
-)
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"sensors": ("mirror", "carla"), "traffic": ("autopilot", "manager")}
 _FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # those that CARLA's physics do not move
-
-
-@dataclass(frozen=True)
-class Server:
-    """Where a CARLA server listens.
-
-    Attributes:
-        host: Name or address.
-        port: Its first port.
-        timeout: s that it may take for an answer; a map may take five times as long.
-        weather: Preset of `carla.WeatherParameters`.
-        sensors: Whose cameras and LiDARs drivers look through: SSAD's in the `mirror`, or `carla`'s own.
-        traffic: Who drives the background traffic: SSAD's `autopilot`, or CARLA's Traffic `manager`.
-    """
-
-    host: str
-    port: int = PORT
-    timeout: float = 20.0
-    weather: str = "ClearNoon"
-    sensors: str = "mirror"
-    traffic: str = "autopilot"
-
-    @staticmethod
-    def of(address: str) -> Server:
-        """The server of an address carla://HOST[:PORT][?sensors=carla&traffic=manager]. ConfigError if it is none."""
-        found = _ADDRESS.match(address)
-        port = int(found["port"] or PORT) if found else 0
-        if found is None or not 0 < port < 65535:
-            raise ConfigError(f"simulator '{address}': expected carla://HOST or carla://HOST:PORT")
-        told = [part.partition("=")[::2] for part in (found["more"] or "").split("&") if part]
-        for name, value in told:
-            if value not in _CHOICES.get(name, ()):
-                known = "; ".join(f"{key}={' or '.join(values)}" for key, values in _CHOICES.items())
-                raise ConfigError(f"simulator '{address}': there is no {name}={value}; there are {known}")
-        return Server(found["host"].strip("[]"), port, **dict(told))
-
-    def __str__(self) -> str:
-        return f"CARLA at {self.host}:{self.port}"
-
-
-def connect(server: Server) -> carla.Client:
-    """A client of a server that answers and is of the client's version.
-
-    Raises:
-        ConfigError: The package is missing, nobody answers, or the versions differ.
-    """
-    try:
-        import carla
-    except ImportError as error:
-        raise ConfigError(f"carla is not installed ({error}); {install_extra('carla')}") from None
-    client = carla.Client(server.host, server.port)
-    client.set_timeout(server.timeout)
-    there = _asked(server, "connect", client.get_server_version)
-    here = client.get_client_version()
-    if there != here:
-        raise ConfigError(f"{server}: the server is version {there}, the package carla {here}; both must be {VERSION}")
-    return client
-
-
-def _asked(server: Server, doing: str, call: Callable[[], T]) -> T:
-    """What a call gives; a ConfigError of one line where the server does not answer, or refuses."""
-    try:
-        return call()
-    except RuntimeError as error:
-        why = " ".join(str(error).split())[:200]
-        raise ConfigError(f"{server}: cannot {doing}: {why}; is the server running, and is it still?") from None
 
 
 @dataclass(frozen=True)
@@ -142,35 +67,6 @@ class _Kept:
 
 
 _KEPT: dict[Server, _Kept] = {}
-
-
-def probe(server: Server) -> None:
-    """Ask a server for its version, in a process of its own: the package's C++ may abort where it meets another server.
-
-    Raises:
-        ConfigError: It does not answer, is of another version, or the package is missing or dies.
-    """
-    code = "import sys; from ssad.interchange.carla import main; main(*sys.argv[1:])"
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, server.host, str(server.port)],
-            capture_output=True, text=True, check=False, timeout=3.0 * server.timeout,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise ConfigError(f"{server}: no answer in {3.0 * server.timeout:g} s") from None
-    if done.returncode == 2:
-        raise ConfigError(done.stdout.strip())
-    if done.returncode != 0:
-        raise ConfigError(f"{server}: the package carla ended with code {done.returncode} while it asked for a version")
-
-
-def main(host: str, port: str) -> None:
-    """What `probe` runs: exit code 2 and a line where `connect` fails."""
-    try:
-        connect(Server(host, int(port)))
-    except ConfigError as error:
-        print(error)
-        raise SystemExit(2) from None
 
 
 class Carla(Mirrored):
@@ -229,7 +125,7 @@ class Carla(Mirrored):
         return self.episodes[int(self.assigned[0])]
 
     def _ask(self, doing: str, call: Callable[[], T]) -> T:
-        return _asked(self.server, doing, call)
+        return asked(self.server, doing, call)
 
     # ------------------------------------------------------------ the start
 

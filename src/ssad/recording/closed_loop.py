@@ -191,8 +191,9 @@ def drive(
     away = orders[0].spec.get("simulator")
     simulator: Simulator
     if away:
-        from ssad.interchange.carla import Carla, Server
+        from ssad.interchange.carla import Carla
         from ssad.interchange.carla_sensors import Own, eyes_of
+        from ssad.interchange.carla_server import Server
 
         server = Server.of(away)
         eyes = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}

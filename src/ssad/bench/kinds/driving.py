@@ -170,7 +170,7 @@ class Driving(ScenarioKind):
         scenarios, towns = described(suite)
         away: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
         if away:
-            from ssad.interchange.carla import Server, probe
+            from ssad.interchange.carla_server import Server, probe
 
             server = Server.of(suite.simulator)
             if any(one.scenario.type == HIGHWAY_TYPE for one in scenarios):
