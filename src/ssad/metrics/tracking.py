@@ -61,7 +61,7 @@ class TrackScores:
 def similarity_of(places: F64, tracks: F64, reach: float) -> F64:
     """How well tracks [m, 2] lie on objects [n, 2] on the ground, [n, m]: 1 on the spot, falling to 0 at `reach` m."""
     apart = np.linalg.norm(places[:, None] - tracks[None], axis=-1)
-    return np.maximum(1.0 - apart / reach, 0.0)
+    return np.asarray(np.maximum(1.0 - apart / reach, 0.0), np.float64)
 
 
 def track_scores(frames: Sequence[TrackedFrame]) -> TrackScores | None:

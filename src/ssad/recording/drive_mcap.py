@@ -146,7 +146,8 @@ def _update(name: str, time: int, *, words: dict[str, str] | None = None, **part
 
 
 def _colour(name: str) -> Any:
-    return _new("Color", **dict(zip("rgba", COLOURS[name], strict=True)))
+    red, green, blue, opacity = COLOURS[name]
+    return _new("Color", r=red, g=green, b=blue, a=opacity)
 
 
 def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:

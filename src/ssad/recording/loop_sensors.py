@@ -305,7 +305,7 @@ class Rig:
     """
 
     cameras: list[Camera] = field(default_factory=list)
-    moment: tuple[bytes, ...] = ()
+    moment: tuple[object, ...] = ()
     read: dict[int, Any] = field(default_factory=dict)
 
 
@@ -326,7 +326,8 @@ class OnboardCamera:
         if self.rig is None:
             return self._read(self.onboard.sights(simulator, agents), len(agents))
         state = simulator.state()
-        moment = tuple(v.tobytes() for v in (state.time, state.pose, state.active, state.signal, agents))
+        parts = (state.time, state.pose, state.active, state.signal, agents)
+        moment = (id(simulator), *(v.tobytes() for v in parts))
         number = next(k for k, camera in enumerate(self.rig.cameras) if camera is self.camera)
         if moment != self.rig.moment or number not in self.rig.read:
             cameras, sights = self.rig.cameras, self.onboard.sights(simulator, agents)
@@ -339,7 +340,9 @@ class OnboardCamera:
     ) -> U8:
         """The pictures [T, 3, H, W] that an agent was shown; arguments and errors as `Onboard.sights_of_trace`."""
         sights = self.onboard.sights_of_trace(trace, graph, agent=agent, steps=steps)
-        return self._read(sights, len(sights))
+        shown = self._read(sights, len(sights))
+        found: U8 = shown.cpu().numpy() if self.onboard.resident else shown
+        return found
 
     def _read(self, sights: Sequence[Sight], count: int) -> Any:
         """All pictures in as few calls as possible."""

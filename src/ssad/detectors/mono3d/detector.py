@@ -194,9 +194,9 @@ class Mono3D(nn.Module):
             One row for each that stays.
         """
         means = [values[:0]]
-        some, count = image[stay].unique_consecutive(return_counts=True)
+        some, count = _runs(image[stay])
         starts, ends = torch.searchsorted(image, some), torch.searchsorted(image, some, right=True)
-        for rows, start, end in zip(stay.split(count.tolist()), starts.tolist(), ends.tolist(), strict=True):
+        for rows, start, end in zip(torch.split(stay, count), starts.tolist(), ends.tolist(), strict=True):
             same = box_iou(shown[rows], shown[start:end]) >= self.config.vote
             same &= label[rows][:, None] == label[start:end]
             same[torch.arange(len(rows)), rows - start] = True  # a box without area as well
@@ -248,7 +248,7 @@ class Mono3D(nn.Module):
         """Rows (image by image) without those whose boxes in the image overlap too much with better ones."""
         assert self.config.image_nms is not None
         parts = [rows[:0]]
-        for part in rows.split(image[rows].unique_consecutive(return_counts=True)[1].tolist()):
+        for part in torch.split(rows, _runs(image[rows])[1]):
             if len(part) > 1:
                 part = part[batched_nms(shown[part], score[part], label[part], self.config.image_nms).sort()[0]]  # noqa: PLW2901
             parts.append(part)
@@ -394,6 +394,13 @@ class Mono3D(nn.Module):
         images = (images.flip(1) * 255 - mean) / std
         above = self._above(size)
         return functional.pad(images, (0, -resized[1] % MULTIPLE, above, -(resized[0] + above) % MULTIPLE))
+
+
+def _runs(ascending: Tensor) -> tuple[Tensor, list[int]]:
+    """The numbers that occur among whole numbers in ascending order, and how often each does."""
+    count = torch.bincount(ascending)
+    some = count.nonzero()[:, 0]
+    return some, count[some].tolist()
 
 
 def _head_maps(dense: Dense) -> dict[str, list[Tensor]]:

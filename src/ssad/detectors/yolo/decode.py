@@ -133,5 +133,5 @@ def select(
     height, width = size
     edge = torch.tensor([width, height, width, height], dtype=box.dtype)
     columns = values[keep], label[keep], boxes[keep].clamp(min=0).minimum(edge)
-    parts = zip(*(v.to(box.device).split([len(rows) for rows in chosen]) for v in columns), strict=True)
+    parts = zip(*(torch.split(v.to(box.device), [len(rows) for rows in chosen]) for v in columns), strict=True)
     return [Detections(*part) for part in parts]

@@ -187,7 +187,7 @@ class CameraEyes:
         for k in range(0, len(pictures), room):
             part = None if needed is None else needed[k : k + room]
             found += self.detector.predict(pictures[k : k + room].float() / 255.0, part, threshold=self.threshold)
-        return on_host(found)
+        return on_host(found) if pictures.is_cuda else found
 
 
 def _room(pictures: torch.Tensor) -> int:
@@ -204,13 +204,11 @@ def _at(rows: I64, like: torch.Tensor) -> torch.Tensor:
 
 
 def on_host(found: list[Detections]) -> list[Detections]:
-    """Detections of some images on the host, brought there in one go and not image by image."""
-    if not found or found[0].score.device.type == "cpu":
-        return found
+    """Detections of images [at least one] on the host, brought there in one go and not image by image."""
     counts = [len(one.score) for one in found]
 
     def brought(values: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        return torch.cat(list(values)).cpu().split(counts)
+        return torch.split(torch.cat(list(values)).cpu(), counts)
 
     flat = [brought([getattr(one, name) for one in found]) for name in ("score", "label", "box")]
     solids = [one.solid for one in found if one.solid is not None]
@@ -218,7 +216,8 @@ def on_host(found: list[Detections]) -> list[Detections]:
         return [Detections(*part) for part in zip(*flat, strict=True)]
     names = ("centre", "size_lhw", "yaw", "velocity", "attribute")
     deep = zip(*(brought([getattr(one, name) for one in solids]) for name in names), strict=True)
-    return [Detections(*part, Solids(*solid)) for *part, solid in zip(*flat, deep, strict=True)]
+    parts = zip(*flat, deep, strict=True)
+    return [Detections(score, label, box, Solids(*solid)) for score, label, box, solid in parts]
 
 
 class PerfectEyes:
