@@ -57,11 +57,11 @@ class Store:
             StoreError: The folder cannot be written, is in use, or belongs to another run; nothing is changed then.
         """
         path = Path(folder)
-        _check_content(path, run)
+        _check_content(path, run, what)
         safeio.make_folder(path)
         store = cls(path, _lock(path, what))
         try:
-            _check_content(path, run)  # again: another process may have begun meanwhile
+            _check_content(path, run, what)  # again: another process may have begun meanwhile
             store._begin(run, retry=retry)
         except BaseException:
             store.close()
@@ -138,7 +138,7 @@ def _failed(record: Mapping[str, Any]) -> bool:
     return bool(record.get("status", "ok") != "ok")
 
 
-def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
+def _check_content(folder: Path, run: Mapping[str, Any], what: str) -> None:
     """Refuse a folder that belongs to something else."""
     if folder.exists() and not folder.is_dir():
         raise StoreError(f"{folder}: is a file; choose a folder with --out")
@@ -153,7 +153,7 @@ def _check_content(folder: Path, run: Mapping[str, Any]) -> None:
     changed = sorted(k for k in {*old, *new} if old.get(k) != new.get(k)) or ["the code, a system or a town"]
     raise StoreError(
         f"{folder}: holds another run (suite {old.get('name')}; differs in {', '.join(changed)}); "
-        "choose another folder or remove this one"
+        f"choose another folder{' with --out' if what == 'ssad run' else ''} or remove this one"
     )
 
 
