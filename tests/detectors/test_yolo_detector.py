@@ -192,7 +192,7 @@ def test_selection_equals_suppression_class_by_class() -> None:
     corner = 80 * torch.rand(400, 2, generator=source)
     box = torch.cat((corner, corner + 5 + 30 * torch.rand(400, 2, generator=source)), 1)
     box[7] = torch.nan
-    found = select(score, box, threshold=0.4, iou=0.45, limit=10_000, size=(90, 100))
+    (found,) = select(score[None], box[None], threshold=0.4, iou=0.45, limit=10_000, size=(90, 100))
     expected = []
     for label in range(3):
         rows = ((score[:, label] > 0.4) & box.isfinite().all(1)).nonzero().flatten()
@@ -201,10 +201,16 @@ def test_selection_equals_suppression_class_by_class() -> None:
     assert list(zip(found.score.tolist(), found.label.tolist(), strict=True)) == sorted(expected, reverse=True)
     assert (found.box[:, [0, 2]] <= 100).all()
     assert (found.box[:, [1, 3]] <= 90).all()
-    few = select(score, box, threshold=0.4, iou=0.45, limit=5, size=(90, 100))
+    (few,) = select(score[None], box[None], threshold=0.4, iou=0.45, limit=5, size=(90, 100))
     assert torch.equal(few.score, found.score[:5])
-    none = select(score, box, threshold=1.0, iou=0.45, limit=5, size=(90, 100))
+    (none,) = select(score[None], box[None], threshold=1.0, iou=0.45, limit=5, size=(90, 100))
     assert none.box.shape == (0, 4)
+    scores, boxes = torch.stack([0 * score, score, score.flip(0)]), torch.stack([box, box, box.flip(0)])
+    empty, same, other = select(scores, boxes, threshold=0.4, iou=0.45, limit=5, size=(90, 100))
+    assert empty.box.shape == (0, 4)
+    for one in (same, other):  # images of a batch do not know each other
+        assert torch.equal(one.score, few.score)
+        assert torch.equal(one.box, few.box)
 
 
 def test_the_best_30_000_candidates_are_compared_and_no_more() -> None:
@@ -214,7 +220,7 @@ def test_the_best_30_000_candidates_are_compared_and_no_more() -> None:
     box = torch.tensor([[0.0, 0, 10, 10]]).repeat(40_000, 1)
     box[rank == 29_999] = torch.tensor([40.0, 0, 50, 10])
     box[rank == 30_000] = torch.tensor([80.0, 0, 90, 10])
-    found = select(score[:, None], box, threshold=0.1, iou=0.5, limit=300, size=(100, 100))
+    (found,) = select(score[None, :, None], box[None], threshold=0.1, iou=0.5, limit=300, size=(100, 100))
     assert found.box[:, 0].tolist() == [0, 40]
     assert found.score.tolist() == pytest.approx([1 - 1 / 50_000, 1 - 30_000 / 50_000])
 
