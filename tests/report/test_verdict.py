@@ -68,3 +68,36 @@ def test_how_rare_collisions_are(lines: list[dict[str, Any]], said: str, tmp_pat
     sentences = verdict(load_run(folder))
     assert " ".join(sentences) == said
     assert all(sentence in write_report(folder).read_text() for sentence in sentences)
+
+
+def told(folder: Path, kind: str, rows: list[dict[str, Any]], *, planned: int = 0) -> str:
+    """The verdict on lines with these fields."""
+    lines = [
+        {"key": str(k), "status": "ok", "reason": "", "n": 1, "seed": 0, "suite": "s", "versions": {}, "wall_s": 0.0,
+         "artefacts": {}, "spec": {}, "case": str(k), "cluster": str(k), **row}
+        for k, row in enumerate(rows)
+    ]  # fmt: skip
+    header = {"suite": {"name": "s", "kind": kind}, "identity": "x"}
+    header |= {"cells": [{"key": str(k)} for k in range(planned)]} if planned else {}
+    return " ".join(verdict(load_run(write_run(folder, header, lines))))
+
+
+def test_searches_of_one_system_share_a_sentence(tmp_path: Path) -> None:
+    rows = [
+        {"system": "autopilot", "generator": generator, "metrics": {"survived": alive, "CR": hit if alive else None}}
+        for generator, alive, hit in (
+            ("random", True, False), ("random", True, True), ("king", True, True), ("king", False, None),
+        )
+    ]  # fmt: skip
+    assert told(tmp_path, "adversarial", rows) == (
+        "autopilot is made to collide in scenarios that it survives unchanged: random in 1 of 2, king in 1 of 1."
+    )
+
+
+@pytest.mark.parametrize(("noise", "said"), [(0.4, "what lies between is the attack's"), (0.1, "does no more than")])
+def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: float, said: str) -> None:
+    scores = {"": 0.5, "noise": noise, "pgd": 0.2}
+    rows = [{"detector": "d", "attack": name, "metrics": {"mAP": value}} for name, value in scores.items()]
+    assert said in told(tmp_path / "all", "digital", rows)
+    # before an attack has been run there is nothing to say of noise, and the page says that it is early
+    assert told(tmp_path / "some", "digital", rows[:2], planned=3) == "Not finished: 2 of 3 cells have run."

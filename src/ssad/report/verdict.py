@@ -18,6 +18,8 @@ def verdict(run: Run) -> list[str]:
     """What a part has found, in plain words, from its records."""
     say = VERDICTS.get(run.kind)
     sentences = [] if say is None else say(run)
+    if len(run.lines) < run.planned:
+        sentences = [f"Not finished: {len(run.lines)} of {run.planned} cells have run.", *sentences]
     return [sentence for sentence in sentences if sentence] or ["See the table."]
 
 
@@ -49,10 +51,10 @@ def _digital(run: Run) -> list[str]:
         scores = {str(line.get("attack") or ""): _metric(line, "mAP") for line in lines}
         noise = scores.pop("noise", math.nan)
         found.append(_worst(detector, "mAP", scores, "attack"))
-        if not math.isnan(noise):
-            found.append(
-                f"Random noise of the same size leaves {detector} an mAP of {noise:.0%}: what was lost is the attack's."
-            )
+        if found[-1] and not math.isnan(noise):
+            lowest = min(value for name, value in scores.items() if name not in ("", "clean") and not math.isnan(value))
+            told = "what lies between is the attack's" if lowest < noise else "the attack does no more than that"
+            found.append(f"Random noise of the same size leaves {detector} an mAP of {noise:.0%}: {told}.")
     return found
 
 
@@ -74,14 +76,14 @@ def _physical(run: Run) -> list[str]:
 
 
 def _adversarial(run: Run) -> list[str]:
-    """Collisions that each generator finds."""
+    """Collisions that each generator finds, a sentence a system."""
     found = []
-    for generator, lines in _by(run, "generator").items():
-        alive = [line for line in lines if _metric(line, "survived") == 1.0]
-        hit = sum(_metric(line, "CR") == 1.0 for line in alive)
-        found.append(
-            f"{generator} makes the system collide in {hit} of {len(alive)} scenarios that it survives unchanged."
-        )
+    for system, lines in _by(run, "system").items():
+        counts = []
+        for generator in dict.fromkeys(str(line.get("generator") or "") for line in lines):
+            own = [line for line in lines if line.get("generator") == generator and _metric(line, "survived") == 1.0]
+            counts.append(f"{generator} in {sum(_metric(line, 'CR') == 1.0 for line in own)} of {len(own)}")
+        found.append(f"{system} is made to collide in scenarios that it survives unchanged: {', '.join(counts)}.")
     return found
 
 
@@ -91,11 +93,11 @@ def _gap(run: Run) -> list[str]:
     every = gap.conditions(run)
     for system, perturbation, severity in every:
         lines = every[system, perturbation, severity]
-        rate = _mean(_metric(line, "collision") for line in lines)
+        hits = sum(_metric(line, "collision") == 1.0 for line in lines)
         if not severity:
             part = _mean(_metric(line, "AP") for line in lines)
             sees = "" if math.isnan(part) else f" It found objects with an AP of {part:.2f} on the way."
-            found.append(f"{system} collided in {rate:.0%} of {len(lines)} drives.{sees}")
+            found.append(f"{system} collided in {hits} of {len(lines)} drives.{sees}")
             continue
         fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
         if not math.isnan(fall.mean) and not math.isnan(rise.mean):
