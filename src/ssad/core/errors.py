@@ -111,7 +111,7 @@ def packages_of(extra: str) -> list[str]:
     return [name.strip() for name, _, marker in stated if wanted.search(marker)]
 
 
-EXTRA_OF = {"torch": "perception", "torchvision": "perception"}
+EXTRA_OF = {"torch": "perception", "torchvision": "perception", "scenic": "scenic"}
 """Package that is imported where it is needed -> the extra that brings it."""
 
 

@@ -54,7 +54,7 @@ def nearest_model(category: str, size: Sequence[float]) -> str | None:
 
     Args:
         category: Of OpenSCENARIO (`car`, `truck`, ..., `pedestrian`), or `prop`.
-        size: Length, width, height, m.
+        size: Length, width and, where it is known, height, m.
 
     Returns:
         Of the models of that category the one whose size differs least; None where nothing is like it.
@@ -65,6 +65,6 @@ def nearest_model(category: str, size: Sequence[float]) -> str | None:
     def differs(name: str) -> float:
         body = MODELS[name]
         own = (body.length, body.width, body.height)
-        return sum(abs(a - b) for a, b in zip(own, size, strict=True))
+        return sum(abs(a - b) for a, b in zip(own, size, strict=False))
 
     return min((m.name for m in models), key=differs, default=None)

@@ -39,6 +39,7 @@ def register(exports: typer.Typer, imports: typer.Typer) -> None:
     imports.command("openscenario")(import_openscenario)
     imports.command("leaderboard")(import_leaderboard)
     imports.command("commonroad")(import_commonroad)
+    imports.command("scenic")(import_scenic)
 
 
 def export_scenarios(
@@ -135,6 +136,47 @@ def import_commonroad(
     save_scenarios(out, found.scenario)
     print(f"scenario {found.scenario.name}: {len(found.scenario.actors)} actors in {town}; written to {out}")
     told("not carried over", found.lost)
+
+
+def import_scenic(  # noqa: PLR0917
+    file: Annotated[Path, typer.Argument(metavar="FILE.scenic", help="Scenic program. It is code: it is run.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="TOWN", help="Town.  [default: named as the program's map]")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="Samples.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first sample; each has one more.")] = 0,
+    steps: Annotated[int, typer.Option(min=1, max=10_000, help="Most steps of a simulation, 0.1 s each.")] = 300,
+) -> None:
+    """Simulate samples of a Scenic program here, and turn what happens into scenarios. Needs the extra `scenic`.
+
+    The ego is driven anew; all others repeat what the program had them do.
+    """
+    from ssad.core.errors import MissingExtraError, SSADError
+    from ssad.interchange.scenic_programs import load_program, sample
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    program = load_program(file, on)
+    found = []
+    failed: list[str] = []
+    lost: list[str] = []
+    for number in range(seed, seed + count):
+        try:
+            drawn = sample(program, number, steps=steps)
+        except MissingExtraError:
+            raise
+        except SSADError as error:
+            failed.append(str(error))
+            continue
+        found.append(drawn.scenario)
+        lost += drawn.lost
+    if not found:
+        raise ConfigError(failed[0])
+    save_scenarios(out, found)
+    print(f"{len(found)} scenarios in {program.town}; written to {out}")
+    told("not sampled", failed)
+    told("not carried over", lost)
 
 
 def check_yaml(out: Path) -> None:

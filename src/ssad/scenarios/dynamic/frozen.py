@@ -47,7 +47,7 @@ def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) ->
             # things stand by themselves; a vehicle without phases is a parked one
             actors.append(Actor(trace.names[agent], trace.models[agent], agent_pose(rows[0])))
             continue
-        told = told_rows(_stopping(rows, until) if trace.active[-1, agent] else rows)
+        told = told_rows(stopping(rows, until) if trace.active[-1, agent] else rows)
         actors.append(Actor(trace.names[agent], trace.models[agent], Pose(*told[0][1:]), trajectory=told))
     return replace(
         base, name=name or base.name, type=CUSTOM, trigger=None, placements=(), parameters=values,
@@ -63,7 +63,7 @@ def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:
         name: Of the actor.
         rows: Its time s, x, y m and yaw rad [T, 4]; at their end it brakes to a stop.
     """
-    told = told_rows(_stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
+    told = told_rows(stopping(np.asarray(rows, np.float64), scenario.limits.max_steps * 0.1), thin=False)
     pose = Pose(*told[0][1:])
     return replace(
         scenario,
@@ -114,8 +114,8 @@ def _rows(trace: EpisodeTrace, agent: int) -> F64 | None:
     return np.stack(columns, 1)
 
 
-def _stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
-    """The rows, and after them a stop straight ahead, until a time s."""
+def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
+    """Rows [T, 4] of time, x, y and yaw, and after them a stop straight ahead, until a time s."""
     end, before = rows[-1], rows[-2]
     heading = np.array([np.cos(end[3]), np.sin(end[3])])
     speed = float((end[1:3] - before[1:3]) @ heading / (end[0] - before[0]))

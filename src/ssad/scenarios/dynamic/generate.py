@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,9 @@ GENERATORS: dict[str, str] = {
     "cat": "ssad.scenarios.dynamic.transition.trajectory:Cat",
 }
 """Name of a generator -> "module:object", a `GeneratorFactory`."""
+SCENIC = "scenic:"
+"""scenic:FILE.scenic is a generator that samples a Scenic program."""
+_PROGRAMS = {SCENIC: "ssad.interchange.scenic_programs:ScenicSearch"}
 BATCH = 8  # rollouts of a base side by side
 SCENES = 64  # episodes of one world
 _STILL = 0.05  # m; who moves less in an episode is no adversary
@@ -51,6 +55,8 @@ def generator_factory(name: str) -> GeneratorFactory:
         UnknownNameError: There is none of that name; the message has the closest ones.
         ConfigError: It cannot be imported, or cannot be called.
     """
+    if name.startswith(SCENIC):
+        return partial(cast(Any, resolve("generator", _PROGRAMS, SCENIC)), name.removeprefix(SCENIC))
     found = resolve("generator", GENERATORS, name)
     if not callable(found):
         raise ConfigError(f"generator '{name}': expected a class or function (bases, *, seeds, budget)")
