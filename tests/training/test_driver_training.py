@@ -19,6 +19,7 @@ from ssad.drivers.rl.learned import PPO
 from ssad.training.adversary import AdversaryPlan, run_adversary_training
 from ssad.training.driver import DriverPlan, draw_episodes, find_scenarios, run_driver_training
 from ssad.training.reinforcement import LEARNINGS, find_learning, learn, make_model, read_log
+from ssad.world.actions import CHOICES
 from ssad.world.policy import load_policy
 
 pytest.importorskip("stable_baselines3", reason="needs the extra train")
@@ -88,15 +89,22 @@ def test_a_training_begins_with_the_networks_of_another(tmp_path: Path) -> None:
 
 def test_what_is_learned_is_what_is_exported(tmp_path: Path) -> None:
     """The exported policy acts as the model of stable-baselines3 does without its noise."""
-    ddpg = {"ddpg": replace(LEARNINGS["td3"], algorithm="ddpg")}
-    for algorithm in ("ppo", "sac", "td3", "ddpg"):
-        learning = find_learning(LEARNINGS | ddpg, algorithm, dict(SMALL))
+    more = {"ddpg": replace(LEARNINGS["td3"], algorithm="ddpg"), "dqn": replace(LEARNINGS["sac"], algorithm="dqn")}
+    for algorithm in ("ppo", "sac", "td3", "ddpg", "dqn"):
+        learning = find_learning(LEARNINGS | more, algorithm, dict(SMALL))
         from ssad.training.reinforcement import policy_now
 
         model = make_model(learning, environment(learning))
         rows = np.random.default_rng(0).normal(0, 1, (8, 69)).astype(np.float32)
         expected, _ = model.predict(rows, deterministic=True)
+        expected = CHOICES[expected] if algorithm == "dqn" else expected
         np.testing.assert_allclose(policy_now(model, learning).actions(rows), expected, atol=1e-5)
+
+
+def test_a_training_that_chooses_needs_an_action_of_two_numbers() -> None:
+    learning = replace(find_learning(LEARNINGS, "sac", dict(SMALL)), algorithm="dqn", action="frea")
+    with pytest.raises(ConfigError, match="between actions of two numbers"):
+        make_model(learning, environment(learning))
 
 
 def environment(learning):

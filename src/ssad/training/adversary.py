@@ -39,6 +39,10 @@ ADVERSARIES |= {
         LEARNINGS["td3"], algorithm="ddpg", steps=100_000, observation="adversary", action="adversary",
         reward="adversary", draws=6, gamma=0.98, batch=256, validate=25_000,
     ),
+    "adv-dqn": replace(
+        LEARNINGS["sac"], algorithm="dqn", steps=100_000, observation="adversary", action="adversary",
+        reward="adversary", draws=6, gamma=0.98, lr=5e-4, batch=256, noise=0.05, validate=25_000,
+    ),
 }  # fmt: skip
 """How adversaries are trained."""
 REWARDS = ("adversary", "colliding", "feasible")

@@ -86,7 +86,7 @@ def train_driver(
 @train_app.command("adversary")
 def train_adversary(
     algorithm: Annotated[
-        str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea, adv-sac or adv-ddpg.")
+        str, typer.Argument(metavar="ALGORITHM", help="adv-ppo, frea, adv-sac, adv-ddpg or adv-dqn.")
     ] = "adv-ppo",
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[

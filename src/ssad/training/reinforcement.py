@@ -23,6 +23,7 @@ from ssad.core.checkpoints import Card, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
 from ssad.training.recipe import Above, Decay, FromNone, Part, Whole, changed
+from ssad.world.actions import ACTIONS, CHOICES
 from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
 
 LOG, LAST = "log.jsonl", "last.pt"
@@ -34,7 +35,7 @@ class Learning:
     """How a policy is trained: all that decides the result but the scenarios.
 
     Attributes:
-        algorithm: ppo, sac, td3 or ddpg.
+        algorithm: ppo, sac, td3, ddpg or dqn (which chooses between actions, see `ssad.world.actions.CHOICES`).
         steps: Steps of the world, over all scenes.
         observation: Sensor that the policy looks at.
         action: What it does, see `ssad.world.actions.to_controls`.
@@ -50,7 +51,8 @@ class Learning:
         epochs: ppo: passes over them.
         gae: ppo: lambda of the advantages.
         entropy: ppo: weight of the entropy.
-        noise: ppo: first standard deviation of the actions; td3, ddpg: of the noise added to them.
+        noise: ppo: first standard deviation of the actions; td3, ddpg: of the noise added to them; dqn: share of random
+            choices after the first third of the training.
         buffer: all but ppo: steps that are remembered.
         first: all but ppo: steps with random actions before the first update.
         updates: all but ppo: gradient steps after each step of all scenes.
@@ -58,7 +60,7 @@ class Learning:
         seed: Of all random draws.
     """
 
-    algorithm: Literal["ppo", "sac", "td3", "ddpg"]
+    algorithm: Literal["ppo", "sac", "td3", "ddpg", "dqn"]
     steps: Whole
     observation: Literal["safebench", "frea", "traffic", "adversary"] = "traffic"
     action: Literal["safebench", "frea", "pedals", "adversary"] = "pedals"
@@ -143,6 +145,17 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
     if learning.algorithm in ("td3", "ddpg"):
         size = env.action_space.shape
         more["action_noise"] = sb3.common.noise.NormalActionNoise(np.zeros(size), np.full(size, learning.noise))
+    if learning.algorithm == "dqn":
+        if ACTIONS[learning.action] != CHOICES.shape[1]:
+            raise ConfigError(f"dqn chooses between actions of two numbers; '{learning.action}' has another number")
+        from ssad.world.sb3 import Choosing
+
+        env = Choosing(env)
+        more |= {
+            "exploration_fraction": 1 / 3,
+            "exploration_final_eps": learning.noise,
+            "target_update_interval": 1_000,
+        }
     return getattr(sb3, learning.algorithm.upper())("MlpPolicy", env, **more, **common)
 
 
@@ -185,6 +198,8 @@ def export(model: Any, learning: Learning) -> tuple[dict[str, torch.Tensor], dic
         body, head, squash = model.policy.mlp_extractor.policy_net, model.policy.action_net, "clip"
     elif learning.algorithm == "sac":
         body, head, squash = model.actor.latent_pi, model.actor.mu, "tanh"
+    elif learning.algorithm == "dqn":
+        body, head, squash = model.q_net.q_net, None, "best"
     else:
         body, head, squash = model.actor.mu, None, "tanh"
     layers = [part for part in [*body, head] if isinstance(part, torch.nn.Linear)]
@@ -210,7 +225,7 @@ def learn(
 ) -> dict[str, Any]:
     """Train a model, or go on where OUT/last.pt stopped.
 
-    OUT/last.pt holds all that is needed to go on (sac and td3: what they remember, too), OUT/log.jsonl a line for each
+    OUT/last.pt holds all that is needed to go on (all but ppo: what they remember, too), OUT/log.jsonl a line for each
     validation. A checkpoint is written only while all weights are finite.
 
     Args:

@@ -13,6 +13,9 @@ WIDTHS: Mapping[str, int] = {"safebench": 4, "frea": 24, "traffic": 69, "adversa
 ACTIONS: Mapping[str, int] = {"safebench": 2, "frea": 3, "pedals": 2, "adversary": 2}
 """Actions that a policy can take, and how many numbers they have; see `to_controls`."""
 
+CHOICES: F32 = np.array(np.meshgrid([-1, 0, 1], [-1, -0.5, 0, 0.5, 1], indexing="ij"), np.float32).reshape(2, -1).T
+"""Actions of two numbers that a policy which values each of them chooses from [15, 2]."""
+
 
 def to_controls(kind: str, action: F32) -> F32:
     """Policy actions [N, n] to throttle, brake, steer and reverse [N, 4].

@@ -19,9 +19,9 @@ from ssad.core.checkpoints import Card, load_card
 from ssad.core.driving import Observation
 from ssad.core.errors import FormatError
 from ssad.core.types import F32, Controller, Episode
-from ssad.world.actions import ACTIONS, WIDTHS, to_controls
+from ssad.world.actions import ACTIONS, CHOICES, WIDTHS, to_controls
 
-SQUASHES = ("clip", "tanh")
+SQUASHES = ("clip", "tanh", "best")
 _BOUND = 1.0e4
 
 
@@ -33,7 +33,8 @@ class Policy:
         observation: Name of the sensor.
         action: Kind of the action.
         layers: Weight [out, in] and bias [out] of each layer.
-        squash: How the last layer's numbers come into [-1, 1]: "clip" or "tanh".
+        squash: How the last layer's numbers become an action: "clip" or "tanh" into [-1, 1]; "best": they are the
+            values of `CHOICES`, and the largest is taken.
         card: Where it comes from.
     """
 
@@ -59,6 +60,8 @@ class Policy:
             for k in range(weight.shape[1]):
                 total = total + x[:, k : k + 1] * weight[:, k]
             x = total if number + 1 == len(self.layers) else total.clamp(min=0.0)
+        if self.squash == "best":
+            return CHOICES[x.numpy().argmax(1)]
         x = x.double().tanh().float() if self.squash == "tanh" else x.clamp(-1.0, 1.0)
         found: F32 = x.numpy()
         return found
@@ -129,8 +132,11 @@ def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
             before = f"the observation '{observation}'" if number == 0 else "the layer before it"
             raise FormatError(f"{where}: layer {number} has the shape {shape}, but {before} has {width} numbers")
         width = weight.shape[0]
-    if width != ACTIONS[action]:
-        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' has {ACTIONS[action]}")
+    if squash == "best" and ACTIONS[action] != CHOICES.shape[1]:
+        raise FormatError(f"{where}: a policy that chooses has an action of two numbers; '{action}' has another number")
+    wanted = len(CHOICES) if squash == "best" else ACTIONS[action]
+    if width != wanted:
+        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' takes {wanted}")
     return Policy(observation, action, layers, squash, card)
 
 

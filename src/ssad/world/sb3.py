@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from stable_baselines3.common.vec_env import VecEnv
+from gymnasium.spaces import Discrete
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from ssad.world.actions import CHOICES
 from ssad.world.env import VectorEnv
 
 
@@ -96,3 +98,22 @@ class SB3VecEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 may n
         self._returns[done] = 0.0
         self._lengths[done] = 0
         return observation, reward.astype(np.float32), done, infos
+
+
+class Choosing(VecEnvWrapper):  # type: ignore[misc]  # stable-baselines3 may not be installed
+    """The same scenes for an algorithm that chooses: actions are numbers of rows of `ssad.world.actions.CHOICES`."""
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv, action_space=Discrete(len(CHOICES)))
+
+    def reset(self) -> Any:
+        """Start all scenes."""
+        return self.venv.reset()
+
+    def step_async(self, actions: npt.NDArray[np.integer[Any]]) -> None:
+        """Keep the actions of the next step [num_envs]."""
+        self.venv.step_async(CHOICES[actions])
+
+    def step_wait(self) -> Any:
+        """One step in every scene."""
+        return self.venv.step_wait()
