@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pickle
 import re
 import tomllib
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import typer
 
 from ssad.cli import app
-from ssad.core.errors import LISTED, install_extra, unknown_name
+from ssad.core.errors import LISTED, MissingExtraError, install_extra, unknown_name
 from ssad.core.safeio import parse_yaml
 from ssad.core.version import __version__
 from ssad.listing import LISTS
@@ -68,6 +69,13 @@ def test_extras_that_messages_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert {"carla", "ray", "ultralytics"} <= arguments("install_extra") <= set(extras)
     assert "'.[ray]'" in install_extra("ray")
+
+
+def test_a_missing_extra_is_told_by_a_worker_too() -> None:
+    """An error with more arguments than its text has: a process that cannot read it would lose all its work."""
+    error = pickle.loads(pickle.dumps(MissingExtraError("generator 'x'", "scenic")))
+    assert isinstance(error, MissingExtraError)
+    assert (error.extra, "generator 'x' needs the extra scenic" in str(error)) == ("scenic", True)
 
 
 def test_nobody_is_sent_to_a_package_index_for_ssad() -> None:

@@ -78,7 +78,11 @@ def _attack_list() -> dict[str, str]:
 def _generator_list() -> dict[str, str]:
     from ssad.scenarios.dynamic.generate import generator_list
 
-    return generator_list() | {"module:object": "a generator of your own (docs/generators.md)"}
+    more = {
+        "scenic:FILE.scenic": "samples of a Scenic program (docs/interchange.md)",
+        "module:object": "a generator of your own (docs/generators.md)",
+    }
+    return generator_list() | more
 
 
 def _detector_list() -> dict[str, str]:

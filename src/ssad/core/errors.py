@@ -41,10 +41,14 @@ class MissingExtraError(ConfigError):
     """
 
     def __init__(self, what: str, package: str) -> None:
-        self.extra = EXTRA_OF[package]
+        self.extra, self._given = EXTRA_OF[package], (what, package)
         super().__init__(
             f"{what} needs the extra {self.extra} ({package} is not installed); {install_extra(self.extra)}"
         )
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+        """So that a worker can send it home."""
+        return MissingExtraError, self._given
 
 
 class MapError(SSADError):

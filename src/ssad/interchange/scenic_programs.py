@@ -99,7 +99,7 @@ def load_program(path: Path, town: str | None = None, parameters: Mapping[str, A
         try:
             import scenic
         except ModuleNotFoundError:
-            raise MissingExtraError(f"{path}:", "scenic") from None
+            raise MissingExtraError(f"{path}", "scenic") from None
         given = dict(parameters or {})
         if town is not None:
             given["map"] = str(_map_file(town))

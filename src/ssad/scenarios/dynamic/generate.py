@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.util import find_spec
 from typing import Any, cast
 
 import numpy as np
@@ -56,6 +57,8 @@ def generator_factory(name: str) -> GeneratorFactory:
         ConfigError: It cannot be imported, or cannot be called.
     """
     if name.startswith(SCENIC):
+        if find_spec("scenic") is None:
+            raise MissingExtraError(f"generator '{name}'", "scenic")
         return partial(cast(Any, resolve("generator", _PROGRAMS, SCENIC)), name.removeprefix(SCENIC))
     found = resolve("generator", GENERATORS, name)
     if not callable(found):
