@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.leaderboard_routes import ROUTES, Route, write_routes
+from helpers.leaderboard_routes import ROUTES, Route, flow, write_routes
 
 from ssad.core.errors import FormatError
 from ssad.core.types import F64, EpisodeTrace, Scenario, SignalPlan
@@ -211,6 +211,7 @@ def test_polite_drivers_get_by(tmp_path: Path) -> None:
     ("BlockedIntersection", ROUTES["Accident"], "passes no junction"),
     ("ParkedObstacle", Route("ProvingGround", ROUTES["Accident"].points, '<distance value="400"/>'), "the route ends"),
     ("HighwayExit", Route("Longreach", ROUTES["HighwayExit"].points, ""), "has no start_actor_flow"),
+    ("HighwayExit", ROUTES["HighwayExit"]._replace(children=flow((600.0, -9.4), (220.0, 7.625))), "its flow has"),
     ("T_Junction", Route("ProvingGround", ((217.0, -1.75), (219.0, 1.75))), "the lanes that join them"),
     ("SignalizedJunctionRightTurn", ROUTES["NonSignalizedJunctionLeftTurn"], "no lane comes into junction"),
 ])  # fmt: skip

@@ -148,6 +148,9 @@ def test_esmini_has_everybody_where_their_trajectories_do(names: str, tmp_path: 
     for scenario in scenarios:
         folder = tmp_path / scenario.name.replace("/", "-")
         path = next(p for p in export_openscenario([scenario], folder)[0] if p.suffix == ".xosc")
+        # esmini knows lamps that are on or off, not ScenarioRunner's "green": it plays the files without their signals
+        forced = r"(?s)<GlobalAction>\s*<InfrastructureAction>.*?</GlobalAction>"
+        path.write_text(re.sub(forced, "", path.read_text()))
         log = folder / "states.csv"
         words = ["--osc", path, "--headless", "--fixed_timestep", "0.05", "--csv_logger", log, "--disable_stdout"]
         subprocess.run([program, *words], cwd=folder, check=True, capture_output=True, timeout=120)
@@ -163,9 +166,15 @@ def test_esmini_has_everybody_where_their_trajectories_do(names: str, tmp_path: 
                 assert np.hypot(*(here[0, 1:] - (agent.pose.x, agent.pose.y))) < CLOSE
                 continue
             told = np.array(agent.trajectory)
-            kept = (here[:, 0] > max(told[0, 0], 0.0) + 0.1) & (here[:, 0] < told[-1, 0] - 0.1)
-            for k in (1, 2):
-                assert np.abs(here[kept, k] - np.interp(here[kept, 0], told[:, 0], told[:, k])).max() < CLOSE
+            fast = np.hypot(*np.diff(told[:, 1:3], axis=0).T) / np.diff(told[:, 0]) > 2.0
+            told, fast = told[1:-1], fast[1:] & fast[:-1]
+            # where esmini has a sample, but for its first step
+            seen = np.abs(told[:, 0] / 0.05 - np.round(told[:, 0] / 0.05)) < 1e-3
+            seen &= (told[:, 0] > max(agent.trajectory[0][0], 0.0) + 0.1) & (told[:, 0] < here[-1, 0] - 0.1)
+            assert (seen & fast).any()
+            off = [np.abs(np.interp(told[:, 0], here[:, 0], here[:, k]) - told[:, k]) for k in (1, 2)]
+            assert max(one[seen & fast].max() for one in off) < CLOSE
+            assert max(one[seen].max() for one in off) < 0.1  # it smooths how somebody sets off and stops
 
 
 # ---------------------------------------------------------------- other programs' files

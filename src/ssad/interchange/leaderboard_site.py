@@ -40,6 +40,7 @@ SPEED: Final = 8.0  # m/s that the ego is taken to drive where the leaderboard m
 PICK_UP: Final = 2.5  # m/s^2 at which it is taken to start
 LIMITS: Final = Limits(max_steps=900, max_time=90.0)
 FLOW: Final = 45.0  # s for which cars of a flow keep coming
+LONGEST: Final = 600.0  # m of the way of a flow
 CARS: Final = ("compact", "coupe", "suv", "car")
 _ROAD = (LaneType.DRIVING, LaneType.PARKING, LaneType.BIKING, LaneType.SHOULDER)
 _NEAR = 10.0  # m from a lane within which a place of the file belongs to it
@@ -278,6 +279,9 @@ class Site:
 
         They appear where it begins and leave where it ends; at the start they are all along it.
         """
+        length = float(np.hypot(*np.diff(way, axis=0).T).sum())
+        if length > LONGEST:
+            raise self.fail(f"the way of its flow has {length:.0f} m, more than {LONGEST:.0f} m")
         table = _timed(way, speed)
         passing = -float(table[-1, 0])
         while (passing := passing + float(self.random.uniform(*gap)) / speed) < FLOW:
