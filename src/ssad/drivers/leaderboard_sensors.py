@@ -40,7 +40,7 @@ def checked(sensors: Any, where: str) -> list[dict[str, Any]]:
         raise ConfigError(f"{where}: its sensors() must give a list, not {type(sensors).__name__}")
     found: list[dict[str, Any]] = []
     for item in sensors:
-        kind = item.get("type") if isinstance(item, dict) else item
+        kind: Any = item.get("type") if isinstance(item, dict) else item
         if not isinstance(item, dict) or "id" not in item or kind not in LIMITS:
             raise ConfigError(f"{where}: it asks for the sensor {str(kind)[:60]}; there are: {', '.join(LIMITS)}")
         if any(item["id"] == other["id"] for other in found):
@@ -106,7 +106,7 @@ def lidar_of(item: Mapping[str, Any]) -> Lidar:
 def radar_of(item: Mapping[str, Any]) -> Lidar:
     """The rays of a radar: 12 times 12, evenly over its field."""
     wide, high = (math.radians(number(item, f"{key}_fov", 30.0, 0.1, 170.0)) for key in ("horizontal", "vertical"))
-    beams = (np.arange(12) + 0.5) * (high / 12) - 0.5 * high
+    beams: F64 = (np.arange(12, dtype=np.float64) + 0.5) * (high / 12) - 0.5 * high
     place = place_of(item, _RIGHT)
     return Lidar(beams, 12, place, _REACH, noise=0.0, period=0.1, blind=0.1, lost=0.0, faint=0.0, width=wide)
 

@@ -61,7 +61,8 @@ class Policy:
                 total = total + x[:, k : k + 1] * weight[:, k]
             x = total if number + 1 == len(self.layers) else total.clamp(min=0.0)
         if self.squash == "best":
-            return CHOICES[x.numpy().argmax(1)]
+            chosen: F32 = CHOICES[x.numpy().argmax(1)]
+            return chosen
         x = x.double().tanh().float() if self.squash == "tanh" else x.clamp(-1.0, 1.0)
         found: F32 = x.numpy()
         return found
