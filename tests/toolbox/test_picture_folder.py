@@ -100,6 +100,7 @@ def test_a_killed_run_goes_on_and_workers_change_no_byte(tmp_path: Path) -> None
     kept = [json.loads(line)["key"] for line in lines.read_text().splitlines(keepends=True) if line.endswith("\n")]
     assert 5 <= len(kept) < 32
     before = {key: (tmp_path / "out" / key).stat().st_ino for key in kept}
+    (tmp_path / "out" / "snow-random" / ".06-1-6662ce8e.tmp.jpg").write_bytes(b"half a picture")  # as a kill leaves it
     assert ssad(*words).returncode == 0
     assert {key: (tmp_path / "out" / key).stat().st_ino for key in kept} == before
     assert ssad("shift", source, tmp_path / "one", *words[3:-1], "1").returncode == 0

@@ -421,6 +421,9 @@ def make_folder(path: str | Path) -> Path:
     return folder
 
 
+_TEMPORARY = re.compile(r"\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?")  # see `atomic_path`
+
+
 @contextlib.contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) that replaces it when the block ends well.
@@ -441,6 +444,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed processes left of `atomic_path` in a folder; not in those below it."""
+    for path in folder.glob(".*") if folder.is_dir() else ():
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, data: str | bytes) -> None:

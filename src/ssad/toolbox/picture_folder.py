@@ -19,7 +19,7 @@ import numpy as np
 from ssad.core.errors import ConfigError, SSADError, StoreError
 from ssad.core.frames import Camera, Frame
 from ssad.core.images import encode_jpeg, read_image
-from ssad.core.safeio import dump_json, make_folder, read_text, write_atomic
+from ssad.core.safeio import dump_json, make_folder, read_text, remove_unfinished, write_atomic
 from ssad.core.types import U8
 from ssad.jobs.machine import quiet_warp
 from ssad.jobs.pool import open_pool
@@ -137,6 +137,8 @@ def shift_pictures(
             _picture(path, source, root, how=how, settings=settings)
             for root, how in conditions.items() for path in pictures
         ]  # fmt: skip
+        for folder in {(one.root / one.key).parent for one in wanted}:
+            remove_unfinished(folder)
         missing = [one for one in wanted if _name(one) not in store.results or not (one.root / one.key).is_file()]
         with open_pool(len(missing), workers=workers, ray=ray) as pool:
             for one in missing:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -148,9 +147,9 @@ def _clear(root: Path, version: str) -> None:
     if (root / UNFINISHED).exists():
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     for folder in (root.parent, root, root / FOLDER, root / version):
-        for path in folder.glob(".*") if folder.is_dir() else ():
-            if re.fullmatch(r"\.probe-\d+|\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?", path.name):
-                path.unlink(missing_ok=True)
+        safeio.remove_unfinished(folder)
+        for path in folder.glob(".probe-*"):
+            path.unlink(missing_ok=True)
 
 
 def _finish(

@@ -137,7 +137,7 @@ def policy_of(card: Card, state: Mapping[str, Tensor], where: str) -> Policy:
         raise FormatError(f"{where}: a policy that chooses has an action of two numbers; '{action}' has another number")
     wanted = len(CHOICES) if squash == "best" else ACTIONS[action]
     if width != wanted:
-        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' takes {wanted}")
+        raise FormatError(f"{where}: the last layer gives {width} numbers, the action '{action}' has {wanted}")
     return Policy(observation, action, layers, squash, card)
 
 
