@@ -66,9 +66,9 @@ def test_in_view_is_what_a_camera_shows_and_nothing_hides() -> None:
         (-9.0, 0.0, 0.0, 0.0),
         (5.0, 9.0, 0, 0),
     )
-    assert in_view(make_trace(2, bodies), 0, CAMERAS).tolist() == [False, True, False, False, False]
+    assert in_view(make_trace(2, bodies), [0, 1], CAMERAS).tolist() == [[False, True, False, False, False]] * 2
     left = CAMERAS | {"left": rig_camera("CAM_FRONT_LEFT", 640)}
-    assert in_view(make_trace(2, bodies), 0, left).tolist() == [False, True, False, False, True]
+    assert in_view(make_trace(2, bodies), [1], left).tolist() == [[False, True, False, False, True]]
 
 
 def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> None:

@@ -62,10 +62,10 @@ class Watcher:
     Args:
         cameras: Of the driver.
         scenes: How many.
-        every: s from one picture that is kept to the next, at least; the last one is always kept.
+        every: s from one picture that is kept to the next, at least; the last one is always kept. None: none are kept.
     """
 
-    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float = 0.5) -> None:
+    def __init__(self, cameras: Mapping[str, Any], scenes: int, every: float | None = 0.5) -> None:
         self.cameras, self.every = cameras, every
         self.looks: list[list[Any]] = [[] for _ in range(scenes)]
         self.known: list[list[Any]] = [[] for _ in range(scenes)]
@@ -78,15 +78,17 @@ class Watcher:
             self.looks[told.scene].append((told.time, told.found))
             if told.signs is not None:
                 self.signs[told.scene].append((told.time, told.signs))
-            for picture in list(told.pictures.values())[:1]:
-                self._keep(self._shots[told.scene], told.time, picture)
+            if self.every is not None:
+                for picture in list(told.pictures.values())[:1]:
+                    self._keep(self._shots[told.scene], told.time, picture, self.every)
             return
         for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
             self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
 
-    def _keep(self, shots: list[tuple[float, Any]], time: float, picture: Any) -> None:
+    @staticmethod
+    def _keep(shots: list[tuple[float, Any]], time: float, picture: Any, every: float) -> None:
         """The last picture stays as it came, often on a GPU, until it is known that it is kept."""
-        if len(shots) > 1 and shots[-1][0] - shots[-2][0] < self.every - 1e-4:
+        if len(shots) > 1 and shots[-1][0] - shots[-2][0] < every - 1e-4:
             shots[-1] = time, picture
             return
         if shots:
@@ -109,23 +111,30 @@ def _upright(picture: Any) -> U8:
     return np.ascontiguousarray(np.moveaxis(picture, 0, -1)) if picture.shape[0] == 3 else picture
 
 
-def in_view(trace: EpisodeTrace, step: int, cameras: Mapping[str, Camera]) -> Bool:
-    """Which agents [A] the ego's cameras can see: not hidden, near enough, their middle within a picture."""
-    kind = np.where(trace.active[step], trace.kind, int(AgentKind.NONE)).astype(np.int32)
-    kind[0] = AgentKind.NONE
-    pose = np.stack([trace.x[step], trace.y[step], trace.yaw[step]], -1)
+def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Camera]) -> Bool:
+    """Which agents [N, A] the ego's cameras can see at N steps: not hidden, near enough, their middle in a picture."""
+    at = np.asarray(steps, np.int64)
+    kind = np.where(trace.active[at], trace.kind, int(AgentKind.NONE)).astype(np.int32)
+    kind[:, 0] = AgentKind.NONE
+    pose = np.stack([trace.x[at], trace.y[at], trace.yaw[at]], -1)
     size = np.stack([trace.length, trace.width], -1)
-    truth = Belief(pose[None].astype(np.float32), trace.speed[step][None], size[None], kind[None])
-    seen = in_sight(pose[None, 0, :2].astype(np.float32), truth, REACH)[0]
-    ego = upright_pose(*pose[0].astype(np.float64).tolist())
-    inside = np.zeros(len(kind), bool)
+    truth = Belief(pose.astype(np.float32), trace.speed[at], np.broadcast_to(size, (len(at), *size.shape)), kind)
+    seen = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
+    egos = np.array([upright_pose(*one) for one in pose[:, 0].astype(np.float64).tolist()]).reshape(-1, 4, 4)
+    ones = np.ones(kind.shape)
+    places = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
+    inside = np.zeros(kind.shape, bool)
     for camera in cameras.values():
-        to_camera = np.linalg.inv(ego @ camera.to_ego)
-        places = np.column_stack([pose[:, :2], np.full(len(pose), 0.8), np.ones(len(pose))]) @ to_camera[:3].T
-        depth = np.maximum(places[:, 2], 1e-6)
-        column = places[:, 0] / depth * camera.intrinsic[0, 0] + camera.intrinsic[0, 2]
-        inside |= (places[:, 2] > 0.5) & (column >= 0) & (column < camera.width)
+        to_camera = np.linalg.inv(egos @ camera.to_ego)
+        across, ahead = (np.einsum("nak,nk->na", places, to_camera[:, row]) for row in (0, 2))
+        column = across / np.maximum(ahead, 1e-6) * camera.intrinsic[0, 0] + camera.intrinsic[0, 2]
+        inside |= (ahead > 0.5) & (column >= 0) & (column < camera.width)
     return np.asarray(seen & inside)
+
+
+def _steps(trace: EpisodeTrace, told: Sequence[tuple[float, Any]]) -> list[int]:
+    """The steps of what was noted at times."""
+    return [min(round(time / trace.dt), len(trace.x) - 1) for time, _ in told]
 
 
 def object_that_matters(trace: EpisodeTrace) -> int | None:
@@ -160,9 +169,8 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     found_of: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
     hits, there, phantoms, looks = 0, 0, 0, 0
     tables: list[tuple[F64, Bool, Objects | None]] = []
-    for time, found in seen.looks:
-        step = min(round(time / trace.dt), len(trace.x) - 1)
-        view = in_view(trace, step, seen.cameras)
+    steps = _steps(trace, seen.looks)
+    for (_, found), step, view in zip(seen.looks, steps, in_view(trace, steps, seen.cameras), strict=True):
         place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         tables.append((place, view, found))
         looks += 1
@@ -199,10 +207,8 @@ def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | Non
 
     A track on somebody who is out of view, whom the driver may well remember, counts neither for nor against.
     """
-    frames = []
-    for time, tracks in seen.known:
-        step = min(round(time / trace.dt), len(trace.x) - 1)
-        view = in_view(trace, step, seen.cameras)
+    frames, steps = [], _steps(trace, seen.known)
+    for (_, tracks), step, view in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
         place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
         likeness = similarity_of(place, tracks.mean[:, :2], 2.0 * NEAR)
         others = trace.active[step] & ~view
@@ -329,10 +335,9 @@ def phantom_stop(trace: EpisodeTrace, seen: Perceived) -> float:
 
 
 def _belief_metrics(trace: EpisodeTrace, seen: Perceived, target: int | None) -> dict[str, float | None]:
-    believed, idents = [], []
-    for time, tracks in seen.known:
-        step = min(round(time / trace.dt), len(trace.x) - 1)
-        if target is None or not in_view(trace, step, seen.cameras)[target]:
+    believed, idents, steps = [], [], _steps(trace, seen.known)
+    for (_, tracks), step, view in zip(seen.known, steps, in_view(trace, steps, seen.cameras), strict=True):
+        if target is None or not view[target]:
             continue
         gap = _gaps(tracks, trace, step, target)
         believed.append(float(gap.min(initial=np.inf) < NEAR))
@@ -348,7 +353,7 @@ def _state(trace: EpisodeTrace, step: int, agent: int, seen: Perceived) -> str:
     for then, tracks in seen.known:
         if abs(then - time) < 0.5 * trace.dt and _gaps(tracks, trace, step, agent).min(initial=np.inf) < NEAR:
             return "known"
-    if not in_view(trace, step, seen.cameras)[agent]:
+    if not in_view(trace, [step], seen.cameras)[0, agent]:
         return "hidden"
     last = [found for then, found in seen.looks if then <= time + 0.5 * trace.dt][-1:]
     if not last or last[0] is None or not len(last[0]):

@@ -142,7 +142,7 @@ def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: 
         part = slice(graph.offset[lane], graph.offset[lane + 1])
         if near[part].any():
             cv2.polylines(canvas, [pixels(graph.xy[part])], False, LANE, 2, cv2.LINE_AA)
-    view = in_view(trace, step, seen.cameras)
+    view = in_view(trace, [step], seen.cameras)[0]
     for agent in np.flatnonzero(trace.active[step]):
         colour = EGO if agent == 0 else THERE if view[agent] else UNSEEN
         pose = np.array([trace.x[step, agent], trace.y[step, agent], trace.yaw[step, agent]], np.float64)

@@ -43,6 +43,7 @@ TARGET: Final = "sedan"
 BESIDE: Final = 12.0  # m from a way within which its signs stand
 SHARES: Final = (1.0, 0.9, 0.8, 0.7, 0.6)  # sizes of a patch that are tried, of the one that was trained
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that attacks may move a pixel by, by severity
+AT_ONCE, AT_ONCE_GPU = 8, 24  # pictures that are attacked at once; other processes may share the GPU's memory
 STEPS: Final = 2  # gradient steps a picture; an attacker in the loop has no time for more
 
 
@@ -190,5 +191,8 @@ def perturbed(
             method = name.removeprefix("attack-")
             attack = make_attack(method, **({"steps": STEPS} if method in ("pgd", "cw", "momentum", "apgd") else {}))
             budget = Budget(px(RADII[severity - 1]))
-            changes[channel] = LiveAttack(attack, budget, detector=detector, intrinsic=camera.intrinsic)
+            at_once = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
+            changes[channel] = LiveAttack(
+                attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=at_once
+            )  # fmt: skip
     return sensors, changes

@@ -55,7 +55,8 @@ class ShiftedCamera:
             ]  # fmt: skip
             episodes = [simulator.episodes[simulator.assigned[scene]] for scene in scenes]
             self._learn(part, frames, images, episodes)
-            shifted, _ = shift_images(images, frames, self.spec, contexts=self._contexts)
+            device = self.camera.onboard.device  # where it is fast: pictures and depths were brought to the host
+            shifted, _ = shift_images(images, frames, self.spec, contexts=self._contexts, device=device)
             found[[sight.row for sight in part]] = shifted
         return np.moveaxis(found, -1, 1)
 

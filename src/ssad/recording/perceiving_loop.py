@@ -116,7 +116,12 @@ class PerceivingSystem(Schema):
 
 
 def drive_perceiving(
-    orders: Sequence[Order], *, device: str, seed: int, repair: Repair | None = None, every: float = 0.5
+    orders: Sequence[Order],
+    *,
+    device: str,
+    seed: int,
+    repair: Repair | None = None,
+    every: float | None = 0.5,
 ) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
     """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
 
@@ -126,7 +131,7 @@ def drive_perceiving(
         device: Where the world and the cameras compute.
         seed: Of the perturbations.
         repair: What mends one error of the driver.
-        every: s from one picture that is kept to the next.
+        every: s from one picture that is kept to the next; None: none are kept.
     """
     spec = orders[0].spec
     if spec["settings"] is None:
@@ -162,7 +167,7 @@ def drive_repaired(
     if not hit:
         return {}
     repair = Repair(dict(enumerate(hit.values())))
-    _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair)
+    _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair, every=None)
     return {
         k: {"collision": bool(episode_metrics(one, stop_signs=False).collision),
             "same": bool((one.contact_agent == agent).any())}

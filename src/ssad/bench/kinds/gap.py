@@ -166,7 +166,9 @@ class Gap(ScenarioKind):
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drives the episodes as one batch, and measures component and system."""
         seed = job.settings["seed"]
-        episodes, traces, seen = drive_perceiving(cells, device=job.device, seed=seed)
+        episodes, traces, seen = drive_perceiving(
+            cells, device=job.device, seed=seed, every=0.5 if job.settings["sheets"] else None
+        )
         repair = cells[0].spec["repair"]
         repaired = drive_repaired(cells, traces, device=job.device, seed=seed) if repair else {}
         results: dict[str, dict[str, Any]] = {}
