@@ -72,28 +72,38 @@ def _moves(base: Base) -> bool:
 
 
 def transfer(
-    systems: Sequence[str], base: Base, made: Sequence[Scenario], device: str, *, seed: int
-) -> dict[str, dict[str, float]]:
+    systems: Sequence[str],
+    bases: Sequence[Base],
+    made: Sequence[Sequence[Scenario]],
+    device: str,
+    *,
+    seeds: Sequence[int],
+) -> list[dict[str, dict[str, float]]]:
     """How other systems fare in what was found against one.
 
     Args:
         systems: The others.
-        base: What was searched.
-        made: What was found.
+        bases: What was searched.
+        made: What was found in each, at least one scenario.
         device: Where the world computes.
-        seed: Of the episodes.
+        seeds: Of the episodes of each base.
 
     Returns:
-        Name of a system -> `base`, whether it collides in the base, and `found`, the share of `made` in which it does.
+        For each base: name of a system -> `base`, whether it collides in the base, and `found`, the share of `made` in
+        which it does.
     """
     from ssad.drivers import make_system
     from ssad.scenarios.dynamic.generate import Trials
 
-    rows = {}
+    rows: list[dict[str, dict[str, float]]] = [{} for _ in bases]
+    groups = [[(one, base.graph, seed) for one in (base.scenario, *found)]
+              for base, found, seed in zip(bases, made, seeds, strict=True)]  # fmt: skip
     for name in systems:
         trials = Trials(partial(make_system, name), make_system, device=device)
-        hits = [float(collides(trials.base(one, base.graph, seed=seed))) for one in (base.scenario, *made)]
-        rows[name] = {"base": hits[0], "found": float(np.mean(hits[1:]))}
+        driven = iter(trials.bases([one for group in groups for one in group]))
+        for row, group in zip(rows, groups, strict=True):
+            hits = [float(collides(next(driven))) for _ in group]
+            row[name] = {"base": hits[0], "found": float(np.mean(hits[1:]))}
     return rows
 
 

@@ -116,7 +116,6 @@ def _natural(device: str) -> dict[str, F64]:
     trials = Trials(lambda: make_system("autopilot"), make_system, device=device)
     chosen = scenarios[:: max(1, len(scenarios) // EPISODES)][:EPISODES]
     found = []
-    for scenario in chosen:
-        base = trials.base(scenario, load_town(scenario.town), seed=0)
+    for base in trials.bases([(scenario, load_town(scenario.town), 0) for scenario in chosen]):
         found += motions(base.trace, base.graph, range(1, len(base.trace.names)))
     return pooled(found)

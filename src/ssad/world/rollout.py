@@ -317,7 +317,8 @@ def rollout(
         lengths[running] = step
         if (simulator.ended() != End.RUNNING).all():
             break
-    return [_trace(simulator, rows, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
+    whole = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return [_trace(simulator, whole, b, int(lengths[b]) + 1) for b in range(simulator.batch)]
 
 
 def route_signals(graph: LaneGraph, route: Route) -> I32:
@@ -351,15 +352,14 @@ def _row(state: WorldState) -> dict[str, npt.NDArray[np.generic]]:
     }
 
 
-def _trace(simulator: Simulator, rows: list[dict[str, npt.NDArray[np.generic]]], b: int, steps: int) -> EpisodeTrace:
+def _trace(simulator: Simulator, rows: dict[str, npt.NDArray[np.generic]], b: int, steps: int) -> EpisodeTrace:
+    """Of scene b, from the steps of all scenes [T, B, ...]."""
     episode = simulator.episodes[simulator.assigned[b]]
     graph = simulator.graphs[episode.town]
     state = simulator.state()
     n = int((state.kind[b] != AgentKind.NONE).sum())
-    agent: dict[str, Any] = {name: np.stack([row[name][b, :n] for row in rows[:steps]]) for name in _AGENT}
-    ego: dict[str, Any] = {
-        name: np.stack([row[name][b] for row in rows[:steps]]) for name in rows[0] if name not in _AGENT
-    }
+    agent: dict[str, Any] = {name: rows[name][:steps, b, :n].copy() for name in _AGENT}
+    ego: dict[str, Any] = {name: rows[name][:steps, b].copy() for name in rows if name not in _AGENT}
     route = episode.agents[0].route
     assert route is not None  # checked when the world was built
     near = route_signals(graph, route)

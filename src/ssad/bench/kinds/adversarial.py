@@ -19,6 +19,7 @@ from ssad.core.generators import Base, Outcome
 from ssad.core.safeio import plain
 from ssad.core.source import source_version
 from ssad.core.traces import motion_hash, save_trace
+from ssad.core.types import Scenario
 from ssad.evaluation.found_collisions import AVOIDERS, collides, grades, refusal, saved_collisions, transfer
 from ssad.evaluation.search_scores import likeness, reference, summary
 from ssad.recording.closed_loop import grade_of, system_version, town
@@ -134,10 +135,10 @@ class Adversarial(ScenarioKind):
 
         system, spec = cells[0].system, cells[0].spec
         trials = Trials(lambda: make_system(system), make_system, device=job.device)
-        bases = {}
-        for cell in cells:
-            scenario = scenario_from(cell.spec["scenario"])
-            bases[cell.key] = trials.base(scenario, town(scenario.town), seed=cell.seed)
+        scenarios = [scenario_from(cell.spec["scenario"]) for cell in cells]
+        seeds = [cell.seed for cell in cells]
+        driven = trials.bases([(s, town(s.town), seed) for s, seed in zip(scenarios, seeds, strict=True)])
+        bases = {cell.key: base for cell, base in zip(cells, driven, strict=True)}
         factory = generator_factory(spec["generator"])
         alive: list[Cell] = []
         results: dict[str, dict[str, Any]] = {}
@@ -160,18 +161,23 @@ class Adversarial(ScenarioKind):
             after=lambda asked: clock.update({asked: time.process_time() - began}),
         )  # fmt: skip
         usual = reference(job.folder, job.device)
-        for cell, base, row in zip(alive, chosen, outcomes, strict=True):
-            about = self._save(cell, base, row, trials, job.folder)
-            metrics = {"applies": True, "survived": True, **summary(row), **about.pop("metrics")}
+        saved = [
+            self._save(cell, base, row, job.folder) for cell, base, row in zip(alive, chosen, outcomes, strict=True)
+        ]
+        kept = self._drive_again(alive, chosen, [made for _, made in saved], trials)
+        for cell, base, row, (about, _), more in zip(alive, chosen, outcomes, saved, kept, strict=True):
+            metrics = {"applies": True, "survived": True, **summary(row), **more.pop("metrics")}
             metrics |= likeness(row, base.graph, usual)
             metrics["seconds"] = max(clock.values()) / len(alive)
             spent = [s for asked, s in clock.items() if metrics["CR"] and asked >= metrics["rollouts"]]
             metrics["seconds_first"] = min(spent, default=math.nan) / len(alive)
-            results[cell.key] = {**about, "metrics": plain(metrics), "case": cell.key, "n": len(row)}
+            results[cell.key] = {**about, **more, "metrics": plain(metrics), "case": cell.key, "n": len(row)}
         return results
 
-    def _save(self, cell: Cell, base: Base, row: Sequence[Outcome], trials: Any, folder: Path) -> dict[str, Any]:
-        """Writes the most distinct collisions as scenarios, drives each again, and keeps the trace of the first."""
+    def _save(
+        self, cell: Cell, base: Base, row: Sequence[Outcome], folder: Path
+    ) -> tuple[dict[str, Any], list[Scenario]]:
+        """Writes the most distinct collisions as scenarios, and keeps the trace of the first."""
         mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
         stem = f"{base.scenario.name}/{cell.spec['generator']}{mark}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
@@ -179,17 +185,29 @@ class Adversarial(ScenarioKind):
             folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem
         )  # fmt: skip
         if not found:
-            return {"metrics": {"replayed": None}}
+            return {}, []
         assert found[0].trace is not None
         save_trace(folder / artefacts["trace"], found[0].trace)
+        return {"artefacts": artefacts, "adversaries": list(found[0].adversaries)}, made
+
+    def _drive_again(
+        self, cells: Sequence[Cell], bases: Sequence[Base], made: Sequence[Sequence[Scenario]], trials: Any
+    ) -> list[dict[str, Any]]:
+        """Drives what was saved again, grades it, and drives it with other systems; of all cells side by side."""
+        kept: list[dict[str, Any]] = [{"metrics": {"replayed": None}} for _ in cells]
+        some = [k for k, scenarios in enumerate(made) if scenarios]
         # with another seed: what is saved must not depend on one
-        seed = cell.seed + 1
-        again = [trials.base(scenario, base.graph, seed=seed) for scenario in made]
-        metrics = {"replayed": sum(map(collides, again)) / len(again)}
-        if cell.spec["grade"]:
-            hits = [one for one in again if collides(one)]
-            metrics |= grades([grade_of(one.episode, one.trace, trials.device).metrics() for one in hits], hits)
-        return {
-            "artefacts": artefacts, "adversaries": list(found[0].adversaries), "metrics": metrics,
-            "transfer": transfer(cell.spec["transfer"], base, made, trials.device, seed=seed),
-        }  # fmt: skip
+        seeds = [cells[k].seed + 1 for k in some]
+        again = iter(
+            trials.bases([(s, bases[k].graph, seed) for k, seed in zip(some, seeds, strict=True) for s in made[k]])
+        )
+        others = transfer(
+            cells[0].spec["transfer"], [bases[k] for k in some], [made[k] for k in some], trials.device, seeds=seeds
+        )
+        for k, moved in zip(some, others, strict=True):
+            hits = [one for one in (next(again) for _ in made[k]) if collides(one)]
+            metrics = {"replayed": len(hits) / len(made[k])}
+            if cells[k].spec["grade"]:
+                metrics |= grades([grade_of(one.episode, one.trace, trials.device).metrics() for one in hits], hits)
+            kept[k] = {"metrics": metrics, "transfer": moved}
+        return kept

@@ -95,13 +95,23 @@ class Trials:
     device: str = "cpu"
 
     def base(self, scenario: Scenario, graph: LaneGraph, *, seed: int) -> Base:
-        """A scenario as it is, driven once.
+        """A scenario as it is, driven once; see `bases`."""
+        return self.bases([(scenario, graph, seed)])[0]
+
+    def bases(self, scenarios: Sequence[tuple[Scenario, LaneGraph, int]]) -> list[Base]:
+        """Scenarios as they are, each in its town and with its seed, driven once, side by side.
 
         Raises:
-            SSADError: It cannot be built or driven.
+            SSADError: One cannot be built or driven.
         """
-        episode = build_episode(scenario, graph, seed=seed)
-        return Base(episode, graph, self._drive([episode], {graph.name: graph}, {})[0][0])
+        found: list[Base] = []
+        for start in range(0, len(scenarios), SCENES):
+            part = scenarios[start : start + SCENES]
+            episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in part]
+            traces, _ = self._drive(episodes, {graph.name: graph for _, graph, _ in part}, {})
+            rows = zip(episodes, part, traces, strict=True)
+            found += [Base(episode, graph, trace) for episode, (_, graph, _), trace in rows]
+        return found
 
     def run(self, proposals: Sequence[tuple[Base, Proposal]]) -> list[Outcome]:
         """Drive proposals, each in its base's town and with its seed; what cannot be built is a failed outcome."""
