@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -47,15 +48,16 @@ AT_ONCE, AT_ONCE_GPU = 8, 24  # pictures that are attacked at once; other proces
 STEPS: Final = 2  # gradient steps a picture; an attacker in the loop has no time for more
 
 
-def perturbation_names() -> dict[str, str]:
+@lru_cache(maxsize=1)
+def perturbation_names() -> Mapping[str, str]:
     """All perturbations -> their family: fault, shift, attack, texture or light; lights that were found have none."""
     attacks = [name for name in ATTACKS if not needs(name)]
-    return {
+    return MappingProxyType({
         NONE: "none", **dict.fromkeys(FAULTS, "fault"), **dict.fromkeys(LOOP_SHIFTS, "shift"),
         **dict.fromkeys((f"attack-{name}" for name in attacks), "attack"),
         **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
         **dict.fromkeys(LIT, LIGHT),
-    }  # fmt: skip
+    })  # fmt: skip
 
 
 def family_of(name: str) -> str:
@@ -160,7 +162,12 @@ def texture_version(name: str) -> str:
     if family_of(name) == LIGHT:
         return light_version(name)
     name = name.removeprefix(WEAR)
-    return "" if name in (GREY, GREY_SIGN) else load_texture(name)[1].hash
+    return "" if name in (GREY, GREY_SIGN) else _hash_of(name)
+
+
+@lru_cache(maxsize=256)
+def _hash_of(texture: str) -> str:
+    return load_texture(texture)[1].hash
 
 
 def perturbed(
