@@ -157,7 +157,7 @@ def adversary_table(data: dict[str, Any]) -> list[str]:
                 for adversary, row in rows.items():
                     cells = [text(row["CR"]), *(text(row[k]) if adversary else "" for k in ("more", "valid", "off"))]
                     known = PUBLISHED.get(ego, {}).get(town)
-                    other = "" if known is None or "x 2" in adversary else f"{known[bool(adversary)]:.2f}"
+                    other = f"{known[bool(adversary)]:.2f}" if known and adversary in ("", "adv-ppo x 1") else ""
                     lines.append(f"| {town} | {ego} | {adversary or 'none'} | {' | '.join(cells)} | {other} |")
     return [*lines, ""]
 
