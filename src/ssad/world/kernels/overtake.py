@@ -12,7 +12,7 @@ from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, LEADERS, NO_LEADER, End, EpisodeArrays, Presence, Roads, Seen, State, Work
 from ssad.world.kernels.lanes import lanes_left, metres_left, on_oncoming_lane, way_frame
 from ssad.world.kernels.shared import boxes_touch, route_frame
-from ssad.world.kernels.traffic import idm_gap, line_ahead
+from ssad.world.kernels.traffic import REGISTERS, idm_gap, line_ahead
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -378,7 +378,7 @@ def choose_lane(
         state.react[b, i] = wp.min(state.react[b, i], idm_gap(v, 0.0, wp.max(gap - PULL_OUT, 0.1)))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
 def change_lanes(
     bank: EpisodeArrays,
     roads: Roads,
