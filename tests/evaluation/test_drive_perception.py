@@ -21,6 +21,7 @@ from ssad.evaluation.drive_perception import (
     in_view,
     object_that_matters,
     phantom_stop,
+    sign_metrics,
     track_metrics,
 )
 
@@ -184,3 +185,16 @@ def test_lost_pictures_count_as_looks_in_which_nothing_was_found() -> None:
     half = perceived(trace, lambda k: [(25.0, 0.0)] if k % 4 else None, lambda k: [])
     assert component_metrics(trace, half, sure=0.3)["target_recall"] == pytest.approx(10 / 21)
     assert no_objects().score.shape == (0,)
+
+
+def test_signs_are_read_from_how_far_and_where_they_stand() -> None:
+    trace = make_trace(STEPS, (straight(0.0, 0.0, 0.0, 5.0, STEPS),))
+    sign = np.array([[30.0, 3.0]])
+    # read from 15 m on; before, something is read where no sign stands
+    looks = [(k * trace.dt, sign if 30.0 - 0.5 * k <= 15.0 else sign + np.array([0.0, 20.0])) for k in range(STEPS)]
+    found = sign_metrics(trace, Perceived([], [], CAMERAS, looks), sign)
+    assert found["sign_recall"] == pytest.approx(11 / 41)
+    assert (found["sign_recall_5_20"], found["sign_recall_20_40"]) == (pytest.approx(11 / 20), 0.0)
+    assert found["sign_read_at"] == pytest.approx(np.hypot(15.0, 3.0))
+    nowhere = sign_metrics(trace, Perceived([], [], CAMERAS, looks), np.zeros((0, 2)))
+    assert set(nowhere.values()) == {None}

@@ -27,7 +27,8 @@ NEAR: Final = (
 ROUGH: Final = 5.0  # m within which something was found, but in the wrong place
 BANDS: Final = ((0.0, 15.0), (15.0, 30.0), (30.0, 60.0))  # m
 REACH: Final = 60.0  # m
-NEAREST_SIGN, FARTHEST_SIGN = 5.0, 40.0  # m ahead within which a stop sign should be read
+# m ahead within which a stop sign should be read: the sizes that attacks on signs are made at, and those met before
+SIGN_BANDS: Final = ((5.0, 20.0), (20.0, 40.0))
 BEFORE: Final = 3.0  # s before a collision that are looked at
 CAUSES: Final[Mapping[str, str]] = {
     "hidden": "out of the cameras' view or hidden",
@@ -231,10 +232,10 @@ def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, 
         signs: Where the stop signs stand that the route comes by, x, y [N, 2].
 
     Returns:
-        sign_recall: share of the looks with such a sign 5 to 40 m ahead in which it was read. sign_read_at: m from the
-        sign at which one was first read.
+        sign_recall: share of the looks with such a sign 5 to 40 m ahead in which it was read; sign_recall_5_20 and so
+        on: the same within a band of `SIGN_BANDS`. sign_read_at: m from the sign at which one was first read.
     """
-    looks, read = 0, []
+    looks: list[tuple[float, bool]] = []  # m to the sign ahead, whether it was read
     for time, places in seen.signs:
         step = min(round(time / trace.dt), len(trace.x) - 1)
         ego = np.array([trace.x[step, 0], trace.y[step, 0]], np.float64)
@@ -242,14 +243,17 @@ def sign_metrics(trace: EpisodeTrace, seen: Perceived, signs: F64) -> dict[str, 
         away = signs - ego
         ahead = away @ (np.cos(yaw), np.sin(yaw))
         aside = np.abs(away @ (-np.sin(yaw), np.cos(yaw)))
-        near = np.flatnonzero((ahead > NEAREST_SIGN) & (ahead < FARTHEST_SIGN) & (aside < 0.5 * ahead))
+        near = np.flatnonzero((ahead > SIGN_BANDS[0][0]) & (ahead < SIGN_BANDS[-1][1]) & (aside < 0.5 * ahead))
         if len(near):
-            looks += 1
             sign = near[ahead[near].argmin()]
-            reach = SAME * float(np.linalg.norm(away[sign])) + 1.0
-            if len(places) and float(np.linalg.norm(places - signs[sign], axis=1).min()) < reach:
-                read.append(float(np.linalg.norm(away[sign])))
-    return {"sign_recall": len(read) / looks if looks else None, "sign_read_at": max(read, default=None)}
+            apart = float(np.linalg.norm(away[sign]))
+            gap = np.linalg.norm(places - signs[sign], axis=1).min(initial=np.inf)
+            looks.append((apart, bool(gap < SAME * apart + 1.0)))
+    rows = np.array(looks, float).reshape(-1, 2)
+    found: dict[str, float | None] = {"sign_recall": _mean(rows[:, 1])}
+    for low, high in SIGN_BANDS:
+        found[f"sign_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
+    return found | {"sign_read_at": max((apart for apart, read in looks if read), default=None)}
 
 
 def average_precision(looks: Sequence[tuple[F64, Bool, Objects | None]]) -> float | None:

@@ -20,6 +20,7 @@ from ssad.core.images import save_picture
 from ssad.core.traces import first_difference, load_trace
 from ssad.evaluation.drive_perception import (
     BANDS,
+    SIGN_BANDS,
     cause_of_collision,
     component_metrics,
     hard_braking,
@@ -99,6 +100,10 @@ class Gap(ScenarioKind):
         Column("min_ttc", "least time to collision", "s", "higher"),
         Column("stop_signs", "stop signs run", "", "lower"),
         Column("sign_recall", "share of the looks in which the stop sign ahead was read", "", "higher"),
+        *(
+            Column(f"sign_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            for a, b in SIGN_BANDS
+        ),
         Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher"),
         Column("hard_braking", "times of braking above 4 m/s^2", "", "lower"),
         Column("phantom_stop_s", "time stood before a phantom", "s", "lower"),
