@@ -102,7 +102,7 @@ def coverage(given: argparse.Namespace) -> None:
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
             pupil = make_process(1000, noise_of(given), device="cpu")  # it branches on the host
-            proposal = learn(pupil, random, components=2, rounds=2, episodes=2000)
+            proposal = learn(pupil, random, components=2, rounds=2, episodes=2000, defence=given.defence)
             training.append(pupil.work())
         found, _ = importance(process, proposal, random, episodes=given.each, training=training[-1])
         sampling.append([found.probability, found.low, found.high, found.effective, found.work])
@@ -143,6 +143,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=100)
     parser.add_argument("--share", type=int, default=10, help="estimates that share a proposal")
     parser.add_argument("--each", type=int, default=15_000, help="episodes of an estimate")
+    parser.add_argument("--defence", type=float, default=0.1, help="share of the proposal that is not moved")
     parser.add_argument("--splittings", type=int, default=40)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()

@@ -54,8 +54,8 @@ key has another future.
   from where they passed that score. The mean of its estimate is the probability for any N and score. The interval comes
   from independent repeats (Student's, with room for skew), at least 8 of them.
 * **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
-  a mixture of the noise as it is (10 %, so that no weight exceeds 10) and of moved ones, learned from the failures that
-  splitting finds and then by the cross-entropy method. Learning counts as work. Intervals are mid-p gamma limits of a
+  a mixture of the noise as it is (10 %, so that no weight exceeds 10), of moved ones, learned from the failures that
+  splitting finds and then by the cross-entropy method, and of copies of these moved half as far. Learning counts as work. Intervals are mid-p gamma limits of a
   compound Poisson sum, which hold also for few events of unlike weight; n is the effective number.
 * Drivers must not remember anything between steps: those inside the world and learned policies do not.
 

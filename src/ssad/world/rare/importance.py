@@ -2,8 +2,10 @@
 
 The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
 means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
-the cross-entropy method, from those of each round's episodes, each with its weight. The weights are exact, since the
-likelihood ratio of moved normal numbers needs only their sums.
+the cross-entropy method, from those of each round's episodes, each with its weight. Copies that are moved half as far
+stand between both: failures that need less than most would else be drawn by the defence alone, hardly ever, and weigh as
+much as all others together. The weights are exact, since the likelihood ratio of moved normal numbers needs only their
+sums.
 
 Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Rubinstein and
 Kroese, "The Cross-Entropy Method" (2004).
@@ -35,6 +37,11 @@ class Proposal:
 
     share: F64
     means: F64
+
+    def spread(self) -> Proposal:
+        """The same with a copy of each moved component that is moved half as far; the two share its share."""
+        share = np.concatenate([self.share[:1], 0.5 * self.share[1:], 0.5 * self.share[1:]])
+        return Proposal(share, np.vstack([0.5 * self.means, self.means]))
 
     def log_ratios(self, total: F64, count: F64) -> F64:
         """[n, K] log of each moved component's likelihood over that of the process as it is."""
@@ -102,7 +109,7 @@ def learn(
     Args:
         process: The process; its batch is the number of splitting's particles.
         random: Source of chance.
-        components: Moved components, so that several ways to fail can be learned.
+        components: Moved components that are learned, so that several ways to fail can be; see also `Proposal.spread`.
         rounds: Of the cross-entropy method.
         episodes: Of each round.
         defence: Share of the process as it is.
@@ -123,7 +130,7 @@ def learn(
         total, count, weight = (v[drawn.failed] for v in (drawn.total, drawn.count, drawn.weight))
         # few episodes must not decide alone
         weight = np.minimum(weight, 10.0 * weight.mean())
-    return proposal
+    return proposal.spread()
 
 
 def _fit(
