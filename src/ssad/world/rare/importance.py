@@ -3,9 +3,9 @@
 The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
 means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
 the cross-entropy method, from those of each round's episodes, each with its weight. Copies that are moved half as far
-stand between both: failures that need less than most would else be drawn by the defence alone, hardly ever, and weigh as
-much as all others together. The weights are exact, since the likelihood ratio of moved normal numbers needs only their
-sums.
+stand between both: failures that need less than most would else be drawn by the defence alone, hardly ever, and weigh
+as much as all others together. The weights are exact, since the likelihood ratio of moved normal numbers needs only
+their sums.
 
 Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Rubinstein and
 Kroese, "The Cross-Entropy Method" (2004).
