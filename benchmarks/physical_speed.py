@@ -1,9 +1,10 @@
 """Where the time of an attack step goes: python benchmarks/physical_speed.py [--images N] [--device cuda] [--out FILE]
 
-A step shows a car at 20 m with a camouflage (print, light, lens, sensor, JPEG), runs YOLOv5n on the picture and takes
-the gradient back to the texture. Rendering is all but the detector: forward, and backward from the picture. Medians
-over pictures of the process's own time (of the wall clock on a GPU), for whole pictures and for the part around the
-target that a `window` shows.
+A step shows a car at 20 m with a camouflage, runs YOLOv5n on the picture and takes the gradient back to the texture. It
+has stages: the print of each picture, the light from it, what lens, sensor and JPEG make of that, the detector forward
+and backward, and the gradient back through the sensor and from the light to the texture. Rendering is all but the
+detector. Medians over steps of the process's own time (of the wall clock on a GPU), for whole pictures and for the part
+around the target that a `window` shows.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import os
 import statistics
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -45,27 +47,35 @@ def clock(device: str) -> float:
     return 1e3 * time.perf_counter()
 
 
-def step(
-    detector: Any, views: list[View], colour: torch.Tensor, window: int | None, device: str
-) -> tuple[float, float]:
-    """Ms of rendering and of the detector in one step."""
-    draws, start = [torch.Generator().manual_seed(k) for k in range(len(views))], clock(device)
-    textures, truths = {0: albedo_of(Expectation().draw(colour, draws))}, [view.truth for view in views]
-    images = type(views[0].picture).together([view.picture for view in views], textures, draws)
+STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")
+
+
+def step(detector: Any, views: list[View], colour: torch.Tensor, window: int | None, device: str) -> tuple[float, ...]:
+    """Ms of each of `STAGES` in one step."""
+    draws, pictures = [torch.Generator().manual_seed(k) for k in range(len(views))], [view.picture for view in views]
+    times, truths = [clock(device)], [view.truth for view in views]
+    textures = {0: albedo_of(Expectation().draw(colour, draws))}
+    times.append(clock(device))
+    radiance, read = type(pictures[0]).lit(pictures, textures)
+    times.append(clock(device))
+    light = radiance.detach().requires_grad_()
+    images = type(pictures[0]).developed(pictures, light, read, draws)
     if window is not None:
         parts = [around_target(images[k : k + 1], truth, window, draws[k]) for k, truth in enumerate(truths)]
         images, truths = torch.cat([part for part, _ in parts]), [truth for _, truth in parts]
-    forward = clock(device)
+    times.append(clock(device))
     leaf = images.detach().requires_grad_()
     dense = detector.dense(leaf)
     with torch.no_grad():
         assignment = detector.assign(dense, truths)
     value = make_objective("hide")(dense, Situation(detector, assignment, TARGET)).mean()
     (slope,) = torch.autograd.grad(value, leaf)
-    asked = clock(device)
-    images.backward(slope)
-    done = clock(device)
-    return forward - start + done - asked, asked - forward
+    times.append(clock(device))
+    (slope,) = torch.autograd.grad(images, light, slope)
+    times.append(clock(device))
+    radiance.backward(slope)
+    times.append(clock(device))
+    return tuple(later - earlier for earlier, later in pairwise(times))
 
 
 def measure(count: int, device: str) -> dict[str, Any]:
@@ -85,10 +95,14 @@ def measure(count: int, device: str) -> dict[str, Any]:
             parts = [views[k : k + batch] for k in range(0, count - batch + 1, batch)]
             step(detector, parts[0], colour, window, device)
             times = [step(detector, one, colour, window, device) for one in parts]
-            render, detect = (statistics.median(column) / batch for column in zip(*times, strict=True))
+            stages = {
+                stage: statistics.median(column) / batch
+                for stage, column in zip(STAGES, zip(*times, strict=True), strict=True)
+            }
+            whole, detect = sum(stages.values()), stages["detector"]
             rows[name] = {
-                "render_ms": render, "detector_ms": detect, "share": render / (render + detect),
-                "paper_minutes": BUDGET * (render + detect) / 60e3,
+                "render_ms": whole - detect, "detector_ms": detect, "share": 1.0 - detect / whole,
+                "paper_minutes": BUDGET * whole / 60e3, "stages_ms": stages,
             }  # fmt: skip
     torch_device = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} thread"
     return {"device": torch_device, "images": count, "window": WINDOW, "batch": batch, "rows": rows}

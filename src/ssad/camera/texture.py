@@ -9,13 +9,14 @@ between the panels of an atlas) take no part, at any level: what is printed ther
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.functional import avg_pool2d
 
 from ssad.assets.mesh import Mesh, Rectangle
 from ssad.core.errors import ConfigError
@@ -180,30 +181,38 @@ def pyramid(texture: Tensor, mask: Tensor | None = None) -> Tensor:
         raise ConfigError(f"a texture must be [3, H, W], not {list(texture.shape)}")
     sizes = levels_of((texture.shape[-2], texture.shape[-1]))
     weight = torch.ones_like(texture[..., :1, :, :]) if mask is None else mask.to(texture.dtype)[None]
-    level, rows = texture, [texture.flatten(-2).mT]
+    total, totals, weights = texture * weight, [], []  # of the texels of the mask below, over four to the level
     for _ in sizes[1:]:
-        summed = functional.avg_pool2d(level * weight, 2, ceil_mode=True, divisor_override=4)
-        weight = functional.avg_pool2d(weight, 2, ceil_mode=True, divisor_override=4)
-        level = summed / weight.clamp_min(1e-30)
-        rows.append(level.flatten(-2).mT)
-    return torch.cat(rows, -2).reshape(-1, 3)
+        total, weight = (avg_pool2d(one, 2, ceil_mode=True, divisor_override=4) for one in (total, weight))
+        totals.append(total.flatten(-2))
+        weights.append(weight.flatten(-2))
+    rows = [texture.flatten(-2)]
+    if totals:
+        rows.append(torch.cat(totals, -1) / torch.cat(weights, -1).clamp_min(1e-30))
+    return torch.cat(rows, -1).mT.reshape(-1, 3)
 
 
-def joined(taps: Sequence[Taps], pixels: Sequence[Tensor]) -> Taps:
-    """The taps of several pictures as those of one batch, each with a texture of its own.
+def joined(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int, part: tuple[int, int]) -> Taps:
+    """The taps of several pictures as those of a batch of parts of them, each with a texture of its own.
 
     Args:
         taps: Of one texture in each picture, all of one size and mask.
-        pixels: The pixels [F] of each in the batch.
+        corners: Row and column at which the part of each picture begins.
+        width: Of the pictures, px.
+        part: Height and width of the parts, which hold all pixels of the taps.
     """
-    if len(taps) == 1:
-        return replace(taps[0], pixel=pixels[0])
     rows = sum(height * width for height, width in levels_of(taps[0].size))
-    return Taps(
-        taps[0].size, taps[0].mask, torch.cat(list(pixels)), torch.cat([one.light for one in taps]),
-        torch.cat([one.index + number * rows for number, one in enumerate(taps)]),
-        torch.cat([one.weight for one in taps]),
+    (high, wide), counts = part, [len(one.pixel) for one in taps]
+    starts = [((number * high - y) * wide - x, number * rows) for number, (y, x) in enumerate(corners)]
+    where = taps[0].pixel.device
+    moved = torch.tensor(starts).to(where).repeat_interleave(
+        torch.tensor(counts).to(where), 0, output_size=sum(counts)
     )  # fmt: skip
+    pixel, index, weight, light = (
+        torch.cat([getattr(one, name) for one in taps]) for name in ("pixel", "index", "weight", "light")
+    )
+    pixel = pixel + pixel.div(width, rounding_mode="floor") * (wide - width) + moved[:, 0]
+    return Taps(taps[0].size, taps[0].mask, pixel, light, index + moved[:, 1:], weight)
 
 
 def retexture(taps: Taps, texture: Tensor, radiance: Tensor) -> Tensor:

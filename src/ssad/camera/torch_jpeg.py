@@ -9,12 +9,13 @@ cut off at black or white have slope zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ssad.core.errors import ConfigError
 
@@ -84,31 +85,60 @@ def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
     return luminance, chrominance
 
 
-@lru_cache(maxsize=1)
-def _cosines() -> np.ndarray:
-    """The orthonormal DCT-II [8, 8], a row for each frequency."""
-    k = np.arange(8)
-    rows = np.cos(np.pi * (2 * k + 1) * k[:, None] / 16) / 2
-    rows[0] /= np.sqrt(2)
-    return np.asarray(rows)
+@dataclass(frozen=True, slots=True)
+class _Pass:
+    """A one-dimensional integer DCT of libjpeg, applied to columns [8, N] of whole numbers as float64, exactly.
 
-
-def _fast_pass(lines: Tensor) -> Tensor:
-    """Fast DCT of libjpeg along the first axis of integers [8, ...], with 8-bit constants.
-
-    By Arai, Agui and Nakajima. Each frequency comes out scaled by `_fast_divisors`.
+    Attributes:
+        inner: [K, 8]; what of the input is rounded down before it is used.
+        direct: [8, 8]; and of what is not, which each output takes.
+        taken: [8, K]; what of the rounded values each output takes.
+        bias: [8, 1]; added before outputs are rounded down.
     """
-    a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
-    s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
-    d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4
-    even, odd, low = s0 + s3, s1 + s2, s0 - s3
-    turned = (s1 - s2 + low) * 181 >> 8
-    e0, e1, e2 = d3 + d2, d2 + d1, d1 + d0
-    shared = (e0 - e2) * 98 >> 8
-    f0, f2 = (e0 * 139 >> 8) + shared, (e2 * 334 >> 8) + shared
-    f1 = e1 * 181 >> 8
-    g0, g1 = d0 + f1, d0 - f1
-    return torch.stack([even + odd, g0 + f2, low + turned, g1 - f0, even - odd, g1 + f0, low - turned, g0 - f2])
+
+    inner: Tensor
+    direct: Tensor
+    taken: Tensor
+    bias: Tensor
+
+    def __call__(self, columns: Tensor) -> Tensor:
+        """The frequencies [8, N]."""
+        if not len(self.inner):
+            return torch.floor(torch.addmm(self.bias, self.direct, columns))
+        return torch.addmm(self.direct @ columns, self.taken, torch.floor(self.inner @ columns))
+
+
+@dataclass(frozen=True, slots=True)
+class _Code:
+    """How blocks become steps and pixels again: all in float64, whose whole numbers are exact.
+
+    Attributes:
+        passes: Along rows and along columns of a block.
+        divisors: What a coefficient of luminance and one of chrominance are divided by [64, 2], rows before columns.
+        steps: What a step of each is worth [64, 2].
+        pixels: From coefficients to the pixels of a block [64, 64].
+    """
+
+    passes: tuple[_Pass, _Pass]
+    divisors: Tensor
+    steps: Tensor
+    pixels: Tensor
+
+
+def _fast_pass() -> list[np.ndarray]:
+    """Fast DCT of libjpeg with 8-bit constants, as the matrices of `_Pass`.
+
+    By Arai, Agui and Nakajama. Each frequency comes out scaled by `_fast_divisors`.
+    """
+    unit = np.eye(13)
+    a, (turned, shared, t0, t2, f1) = unit[:8], unit[8:]
+    s, d = a[:4] + a[7:3:-1], a[:4] - a[7:3:-1]
+    even, odd, low = s[0] + s[3], s[1] + s[2], s[0] - s[3]
+    e0, e1, e2 = d[3] + d[2], d[2] + d[1], d[1] + d[0]
+    inner = [(s[1] - s[2] + low) * 181, (e0 - e2) * 98, e0 * 139, e2 * 334, e1 * 181]
+    f0, f2, g0, g1 = t0 + shared, t2 + shared, d[0] + f1, d[0] - f1
+    rows = np.stack([even + odd, g0 + f2, low + turned, g1 - f0, even - odd, g1 + f0, low - turned, g0 - f2])
+    return [np.stack(inner)[:, :8] / 256, rows[:, :8], rows[:, 8:], np.zeros((8, 1))]
 
 
 def _fast_divisors(table: np.ndarray) -> np.ndarray:
@@ -117,88 +147,118 @@ def _fast_divisors(table: np.ndarray) -> np.ndarray:
     return np.asarray(np.floor(table * np.rint(np.outer(scales, scales) * 2**14) / 2**11 + 0.5))
 
 
-def _accurate_pass(lines: Tensor, *, first: bool) -> Tensor:
-    """Accurate DCT of libjpeg along the first axis of integers [8, ...], with 13-bit constants.
+def _accurate_pass(*, first: bool) -> list[np.ndarray]:
+    """Accurate DCT of libjpeg with 13-bit constants, as the matrices of `_Pass`.
 
     By Loeffler, Ligtenberg and Moschytz. The first pass keeps two extra bits and the second removes them: the result is
     in eighths.
     """
-    a0, a1, a2, a3, a4, a5, a6, a7 = lines.unbind()
-    s0, s1, s2, s3 = a0 + a7, a1 + a6, a2 + a5, a3 + a4
-    d0, d1, d2, d3 = a0 - a7, a1 - a6, a2 - a5, a3 - a4
-    even, odd, low, high = s0 + s3, s1 + s2, s0 - s3, s1 - s2
+    a = np.eye(8)
+    s, d = a[:4] + a[7:3:-1], a[:4] - a[7:3:-1]
+    even, odd, low, high = s[0] + s[3], s[1] + s[2], s[0] - s[3], s[1] - s[2]
     turned = (high + low) * 4433
-    shared = (d3 + d1 + d2 + d0) * 9633
-    z1, z2 = (d3 + d0) * -7373, (d2 + d1) * -20995
-    z3, z4 = (d3 + d1) * -16069 + shared, (d2 + d0) * -3196 + shared
-    rows = [
-        even + odd, d0 * 12299 + z1 + z4, turned + low * 6270, d1 * 25172 + z2 + z3,
-        even - odd, d2 * 16819 + z2 + z4, turned - high * 15137, d3 * 2446 + z1 + z3,
-    ]  # fmt: skip
-    bits = 11 if first else 15
-    for k in (1, 2, 3, 5, 6, 7):
-        rows[k] = rows[k] + (1 << (bits - 1)) >> bits
-    for k in (0, 4):
-        rows[k] = rows[k] << 2 if first else rows[k] + 2 >> 2
-    return torch.stack(rows)
+    shared = (d[3] + d[1] + d[2] + d[0]) * 9633
+    z1, z2 = (d[3] + d[0]) * -7373, (d[2] + d[1]) * -20995
+    z3, z4 = (d[3] + d[1]) * -16069 + shared, (d[2] + d[0]) * -3196 + shared
+    rows = np.stack([
+        even + odd, d[0] * 12299 + z1 + z4, turned + low * 6270, d[1] * 25172 + z2 + z3,
+        even - odd, d[2] * 16819 + z2 + z4, turned - high * 15137, d[3] * 2446 + z1 + z3,
+    ])  # fmt: skip
+    bits = np.array([-2 if first else 2, *[11 if first else 15] * 3] * 2, float)[:, None]
+    bias = np.where(bits > 0, 0.5, 0.0)
+    return [np.zeros((0, 8)), rows / 2**bits, np.zeros((8, 0)), bias]
 
 
-def _steps(blocks: Tensor, table: np.ndarray, *, fast: bool) -> Tensor:
-    """How many steps each coefficient of blocks [..., 8, 8] of whole numbers has, to libjpeg's last bit."""
-    lines = blocks.movedim(-1, 0).to(torch.int32).contiguous()
+@lru_cache(maxsize=16)
+def _code(quality: int, device: torch.device, *, fast: bool) -> _Code:
+    """Made once for a quality where it is needed: small copies to a GPU cost more than what they are for."""
+
+    def there(values: np.ndarray) -> Tensor:
+        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
+
+    tables = np.stack(quantisation(quality), -1).astype(np.float64)  # vertical and horizontal frequency, plane
     if fast:
-        found, divisors = _fast_pass(_fast_pass(lines).movedim(-1, 0).contiguous()), _fast_divisors(table)
+        passes = [_fast_pass()] * 2
+        divisors = np.stack([_fast_divisors(tables[..., k]) for k in range(2)], -1)
     else:
-        once = _accurate_pass(lines, first=True).movedim(-1, 0).contiguous()
-        found, divisors = _accurate_pass(once, first=False), 8 * table
-    # vertical and horizontal frequency, blocks
-    step = torch.as_tensor(divisors.astype(np.int32), device=blocks.device).reshape(8, 8, *[1] * (found.ndim - 2))
-    whole = found.sign() * torch.div(found.abs() + step // 2, step, rounding_mode="floor")
-    return whole.movedim((0, 1), (-2, -1)).to(blocks.dtype)
+        passes, divisors = [_accurate_pass(first=True), _accurate_pass(first=False)], 8 * tables
+    k = np.arange(8)
+    cosines = np.cos(np.pi * (2 * k + 1) * k[:, None] / 16) / 2  # the orthonormal DCT-II, a row for each frequency
+    cosines[0] /= np.sqrt(2)
+    with torch.inference_mode(mode=False):
+        along, down = (_Pass(*map(there, one)) for one in passes)
+        pixels = there(np.kron(cosines.T, cosines.T))
+        return _Code((along, down), there(divisors.reshape(64, 2)), there(tables.reshape(64, 2)), pixels)
 
 
-def _compress(plane: Tensor, table: np.ndarray, *, fast: bool) -> Tensor:
-    """Whole codes [..., H, W], in whole blocks of 8 x 8, through quantisation and back."""
-    cosines = torch.as_tensor(_cosines(), dtype=plane.dtype, device=plane.device)
-    step = torch.as_tensor(table, dtype=plane.dtype, device=plane.device)
-    height, width = plane.shape[-2:]
-    blocks = plane.reshape(*plane.shape[:-2], height // 8, 8, width // 8, 8).transpose(-3, -2) - 128
-    with torch.no_grad():
-        whole = _steps(blocks, table, fast=fast)
-    kept = _straight(cosines @ blocks @ cosines.T / step, whole) * step
-    pixels = _nearest(cosines.T @ kept @ cosines + 128)
-    return pixels.transpose(-3, -2).reshape(plane.shape).clamp(0, 255)
+def _coded(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tuple[Tensor, Tensor]:
+    """Planes [B, C, H, W] of whole codes, in whole blocks of 8 x 8, through quantisation and back; not cut off.
+
+    Args:
+        bright: Luminance.
+        colours: Chrominance, of the same or another size.
+        quality: Of JPEG.
+        fast: Whether the encoder takes the fast DCT.
+    """
+    code, planes = _code(quality, bright.device, fast=fast), (bright, colours)
+    folded = [
+        plane.reshape(*plane.shape[:2], plane.shape[2] // 8, 8, -1, 8).permute(5, 3, 0, 1, 2, 4) for plane in planes
+    ]
+    count = [plane.numel() // 64 for plane in planes]
+    columns = torch.cat([one.reshape(8, 8, -1) for one in folded], 2).double() - 128.0
+    along, down = code.passes
+    rows = along(columns.flatten(1)).reshape(8, 8, -1).transpose(0, 1)  # horizontal frequency, now second
+    found = down(rows.reshape(8, -1)).reshape(64, -1)  # vertical, then horizontal frequency
+
+    def spread(table: Tensor) -> Tensor:
+        return torch.cat([table[:, k : k + 1].expand(64, n) for k, n in enumerate(count)], 1)
+
+    divisors = spread(code.divisors)
+    steps = torch.floor((found.abs() + torch.floor(divisors / 2)) / divisors).copysign(found)
+    pixels = torch.floor(code.pixels @ (steps * spread(code.steps)) + (128.5 + TIE)).to(bright.dtype)
+    back = []
+    for plane, part in zip(planes, torch.split(pixels, count, 1), strict=True):
+        size, channels, height, width = plane.shape
+        blocks = part.reshape(8, 8, size, channels, height // 8, width // 8)
+        back.append(blocks.permute(2, 3, 4, 0, 5, 1).reshape(plane.shape))
+    return back[0], back[1]
 
 
-def _to_ycbcr(codes: Tensor) -> Tensor:
-    """Whole Y, Cb and Cr of whole R, G and B [B, 3, H, W], to libjpeg's last bit."""
-    weights = torch.tensor(TO_YCBCR, dtype=codes.dtype, device=codes.device) / 65536
-    middle = torch.tensor([0.0, 128.0, 128.0], dtype=codes.dtype, device=codes.device).reshape(3, 1, 1)
-    smooth = torch.einsum("ij,bjhw->bihw", weights, codes) + middle
-    with torch.no_grad():
-        red, green, blue = codes.to(torch.int32).unbind(1)
-        halves = (32768, (128 << 16) + 32767, (128 << 16) + 32767)
-        rows = [a * red + b * green + c * blue + half >> 16 for (a, b, c), half in zip(TO_YCBCR, halves, strict=True)]
-        whole = torch.stack(rows, 1).to(codes.dtype)
-    return _straight(smooth, whole)
+@lru_cache(maxsize=8)
+def _colour_weights(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+    """R, G, B to Y, Cb, Cr [3, 3], what is added before they are rounded down [3, 1, 1], and back [3, 3]."""
+    halves = torch.tensor([32768, (128 << 16) + 32767, (128 << 16) + 32767], dtype=torch.float64) / 65536
+    with torch.inference_mode(mode=False):
+        there = torch.tensor(TO_YCBCR, dtype=dtype, device=device) / 65536
+        return there, halves.to(device, dtype).reshape(3, 1, 1), torch.tensor(FROM_YCBCR, dtype=dtype, device=device)
+
+
+def _mixed(weights: Tensor, planes: Tensor) -> Tensor:
+    """Planes [B, 3, H, W] as sums of them."""
+    return torch.einsum("ij,bjhw->bihw", weights, planes)
+
+
+@lru_cache(maxsize=32)
+def _by_turns(first: float, second: float, count: int, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """What is added along a row before it is rounded down [W]."""
+    with torch.inference_mode(mode=False):
+        return torch.tensor([first, second], dtype=dtype, device=device).repeat(-(-count // 2))[:count]
 
 
 def _halved(plane: Tensor) -> Tensor:
-    """The mean of each 2 x 2; halves go down and up by turns along a row, as in libjpeg."""
-    total = plane[..., ::2, ::2] + plane[..., ::2, 1::2] + plane[..., 1::2, ::2] + plane[..., 1::2, 1::2]
-    bias = 1.0 + torch.arange(total.shape[-1], device=plane.device) % 2
-    return _straight(total / 4, torch.floor((total + bias) / 4))
+    """The mean of each 2 x 2 whole codes; halves go down and up by turns along a row, as in libjpeg."""
+    mean = avg_pool2d(plane, 2)
+    return torch.floor(mean + _by_turns(0.25, 0.5, mean.shape[-1], plane.device, plane.dtype))
 
 
 def _doubled(plane: Tensor) -> Tensor:
     """Twice the size by weights 3 : 1 along each side ("fancy upsampling"), with libjpeg's rounding."""
-    wide = pad(plane, (1, 1, 1, 1), mode="replicate")
-    middle = 3 * wide[..., 1:-1, :]
-    rows = torch.stack([middle + wide[..., :-2, :], middle + wide[..., 2:, :]], -2).flatten(-3, -2)
-    middle = 3 * rows[..., 1:-1]
-    total = torch.stack([middle + rows[..., :-2], middle + rows[..., 2:]], -1)
-    bias = torch.tensor([8.0, 7.0], dtype=plane.dtype, device=plane.device)
-    return _straight(total / 16, torch.floor((total + bias) / 16)).flatten(-2)
+    wide = _widened(plane)
+    return torch.floor(wide + _by_turns(8 / 16, 7 / 16, wide.shape[-1], plane.device, plane.dtype))
+
+
+def _widened(plane: Tensor) -> Tensor:
+    return interpolate(plane, scale_factor=2, mode="bilinear", align_corners=False)
 
 
 def block_of(subsampling: str) -> int:
@@ -259,20 +319,35 @@ def compressed(
     Raises:
         ConfigError: There is no such quality.
     """
-    luminance, chrominance = quantisation(quality)
-    planes = _to_ycbcr(_nearest(image.clamp(0.0, 1.0) * 255))
-    bright, colours = planes[:, :1], planes[:, 1:]
-    if subsampling == "420":
-        # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the last
-        halves = [((height + 1) // 2, (width + 1) // 2) for height, width in sizes]
-        colours = _halved(colours)
-        colours = _repeated(colours, [(height, colours.shape[3]) for height, _ in halves])
-        colours = _doubled(_repeated(_compress(colours, chrominance, fast=fast), halves))
-    else:
-        colours = _compress(colours, chrominance, fast=fast)
-    back = torch.tensor(FROM_YCBCR, dtype=image.dtype, device=image.device)
-    decoded = torch.cat([_compress(bright, luminance, fast=fast), colours - 128], 1)
-    return _nearest(torch.einsum("ij,bjhw->bihw", back, decoded)).clamp(0, 255) / 255
+    quantisation(quality)
+    halves = [((height + 1) // 2, (width + 1) // 2) for height, width in sizes]
+    halved = subsampling == "420"
+    image = image.clamp(0.0, 1.0)
+    with torch.no_grad():
+        there, half, _ = _colour_weights(image.device, torch.float64)
+        planes = torch.floor(_mixed(there, torch.floor(image * 255 + (0.5 + TIE)).double()) + half).to(image.dtype)
+        bright, colours = planes[:, :1], planes[:, 1:]
+        if halved:
+            # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the
+            # last
+            colours = _halved(colours)
+            colours = _repeated(colours, [(height, colours.shape[3]) for height, _ in halves])
+        bright, colours = _coded(bright, colours, quality, fast=fast)
+        inside = (bright > 0) & (bright < 255), (colours > 0) & (colours < 255)
+        bright, colours = bright.clamp(0, 255), colours.clamp(0, 255)
+        if halved:
+            colours = _doubled(_repeated(colours, halves))
+        there, _, back = _colour_weights(image.device, image.dtype)
+        codes = torch.floor(_mixed(back, torch.cat([bright, colours - 128], 1)) + (0.5 + TIE))
+        shown = (codes > 0) & (codes < 255)
+        codes = codes.clamp(0, 255) / 255
+    if not image.requires_grad:
+        return codes
+    # without rounding, blocks are what they were: what is left are the colours' means, and what is cut off
+    planes = _mixed(there, image)
+    bright, colours = planes[:, :1] * inside[0], planes[:, 1:]
+    colours = _widened(_repeated(avg_pool2d(colours, 2) * inside[1], halves)) if halved else colours * inside[1]
+    return _straight(_mixed(back, torch.cat([bright, colours], 1)) * shown, codes)
 
 
 def jpeg(image: Tensor, quality: int = 92, subsampling: str = "420", *, fast: bool | None = None) -> Tensor:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,12 +36,15 @@ from ssad.camera.texture import Taps
 from ssad.camera.torch_jpeg import ACCURATE, block_of, compressed, extended, quantisation
 from ssad.core.errors import ConfigError
 
+TOP = 0.99975 * BRIGHTEST  # light at which the curve is cut off
+TOE = 0.0031308  # light below which sRGB is linear
+
 # ---------------------------------------------------------------- from light to colour
 
 
-@lru_cache(maxsize=8)
-def _lens_weights(blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4].
+@lru_cache(maxsize=16)
+def _lens_weights(blur: float, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Weights of the lens [3, 3], and of lens and mosaic [4, 3, 4, 4]; kept, since each copy to a GPU takes long.
 
     The latter lead from a square of four pixels with a border of one pixel to the photosites of the square.
     """
@@ -51,11 +55,17 @@ def _lens_weights(blur: float) -> tuple[np.ndarray, np.ndarray]:
     for site, colour in enumerate((0, 1, 1, 2)):
         y, x = divmod(site, 2)
         square[site, colour, y : y + 3, x : x + 3] = spread
-    return spread, square
+    return _kept(spread, device, dtype), _kept(square, device, dtype)
 
 
-@lru_cache(maxsize=1)
-def _demosaic_weights() -> np.ndarray:
+def _kept(values: np.ndarray, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Values for any later call, whatever the mode of this one."""
+    with torch.inference_mode(mode=False):
+        return torch.as_tensor(values, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=8)
+def _demosaic_weights(device: torch.device, dtype: torch.dtype) -> Tensor:
     """[12, 1, 6, 6]: from a square of four with a border of two px to its colours, those of one colour together."""
     itself = np.zeros((5, 5))
     itself[2, 2] = 8.0
@@ -69,15 +79,14 @@ def _demosaic_weights() -> np.ndarray:
         for site, weights in enumerate(sites):
             y, x = divmod(site, 2)
             square[4 * colour + site, 0, y : y + 5, x : x + 5] = np.array(weights) / 8
-    return square
+    return _kept(square, device, dtype)
 
 
-def _squares(picture: Tensor, weights: np.ndarray, border: int) -> Tensor:
+def _squares(picture: Tensor, weights: Tensor, border: int) -> Tensor:
     """A picture [B, C, H, W], mirrored at its borders, in squares of four: [B, C', H, W]."""
     height, width = picture.shape[2:]
     wide = pad(picture, (border, border + width % 2, border, border + height % 2), mode="reflect")
-    kernel = torch.as_tensor(weights, dtype=picture.dtype, device=picture.device)
-    return pixel_shuffle(conv2d(wide, kernel, stride=2), 2)[:, :, :height, :width]
+    return pixel_shuffle(conv2d(wide, weights, stride=2), 2)[:, :, :height, :width]
 
 
 def photosites(light: Tensor, sensor: Sensor) -> Tensor:
@@ -95,12 +104,12 @@ def photosites(light: Tensor, sensor: Sensor) -> Tensor:
     """
     sensor.check_size(*light.shape[1:3])
     colours = light.permute(0, 3, 1, 2)
-    spread, square = _lens_weights(sensor.blur)
+    spread, square = _lens_weights(sensor.blur, light.device, light.dtype)
     if sensor.mosaic:
         return _squares(colours, square, 1)[:, 0]
     if sensor.blur == 0:
         return light
-    kernel = torch.as_tensor(spread, dtype=light.dtype, device=light.device).expand(3, 1, 3, 3)
+    kernel = spread.expand(3, 1, 3, 3)
     return conv2d(pad(colours, (1, 1, 1, 1), mode="reflect"), kernel, groups=3).permute(0, 2, 3, 1)
 
 
@@ -138,7 +147,7 @@ def demosaic(raw: Tensor) -> Tensor:
     Returns:
         Linear colours, [B, H, W, 3]; noise and edges can take them a little below zero.
     """
-    return _squares(raw[:, None], _demosaic_weights(), 2).permute(0, 2, 3, 1)
+    return _squares(raw[:, None], _demosaic_weights(raw.device, raw.dtype), 2).permute(0, 2, 3, 1)
 
 
 def curve(light: Tensor) -> Tensor:
@@ -150,11 +159,33 @@ def curve(light: Tensor) -> Tensor:
     Returns:
         sRGB in [0, 1]. The slope is finite everywhere.
     """
-    light = light.clamp(0.0, 0.99975 * BRIGHTEST)
-    soft = torch.where(
-        light > KNEE, KNEE + (1 - KNEE) * (1 - torch.exp(-(light - KNEE).clamp_min(0.0) / SHOULDER)), light
-    )
-    return torch.where(soft <= 0.0031308, soft * 12.92, 1.055 * soft.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+    found: Tensor = _Curve.apply(light)
+    return found
+
+
+def _soft(light: Tensor) -> tuple[Tensor, Tensor]:
+    """Light in 0..4 under the shoulder, and what is left of a change of it."""
+    left = torch.exp((KNEE - light.clamp_min(KNEE)) / SHOULDER)
+    return light.clamp_max(KNEE) + (1 - KNEE) * (1 - left), left
+
+
+class _Curve(torch.autograd.Function):
+    """The curve with its slope written out: half of the operations, which is what time goes into on a GPU."""
+
+    @staticmethod
+    def forward(context: Any, light: Tensor) -> Tensor:
+        context.save_for_backward(light)
+        soft, _ = _soft(light.clamp(0.0, TOP))
+        return torch.where(soft <= TOE, soft * 12.92, 1.055 * soft.clamp_min(TOE) ** (1 / 2.4) - 0.055)
+
+    @staticmethod
+    def backward(context: Any, slope: Tensor) -> Tensor:
+        (light,) = context.saved_tensors
+        soft, left = _soft(light.clamp(0.0, TOP))
+        steep = torch.where(soft <= TOE, 12.92, (1.055 / 2.4) * soft.clamp_min(TOE) ** (1 / 2.4 - 1))
+        bent = torch.where(light > KNEE, ((1 - KNEE) / SHOULDER) * left, 1.0)
+        changed: Tensor = slope * steep * bent * ((light > 0.0) & (light < TOP))
+        return changed
 
 
 def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator) -> Tensor:
@@ -170,6 +201,21 @@ def draw_noise(shape: Sequence[int], sensor: Sensor, generator: torch.Generator)
     """
     size = (*shape, 3)[: 3 if sensor.mosaic else 4]
     return torch.randn(size, generator=generator, device=generator.device)
+
+
+def large_draws(generators: Sequence[torch.Generator], device: torch.device) -> list[torch.Generator]:
+    """Where to draw a number for each pixel or texel: on the CPU the same generators, on a GPU others that follow.
+
+    A GPU draws other numbers than the CPU would; to draw there and copy would take longer than all else of a picture.
+
+    Args:
+        generators: On the CPU.
+        device: Where the numbers are needed.
+    """
+    if device.type == "cpu":
+        return list(generators)
+    seeds = [int(torch.randint(1 << 62, (1,), generator=one)) for one in generators]
+    return [torch.Generator(device).manual_seed(seed) for seed in seeds]
 
 
 def develop(
@@ -397,14 +443,18 @@ class Window:
         """
         picture = develop(radiance, exposure, self.sensor, noise)
         _, height, width = self.shape
-        parts, sizes = [], []
-        for one, (rows, columns), (y, x) in zip(picture, self.coded, self.read, strict=True):
-            size = min(rows[1], height) - rows[0], min(columns[1], width) - columns[0]
-            top, left = rows[0] - y[0], columns[0] - x[0]
-            inside = one[:, top : top + size[0], left : left + size[1]]
-            parts.append(extended(inside, rows[1] - rows[0], columns[1] - columns[0]))
-            sizes.append(size)
-        image = torch.stack(parts)
+        parts, sizes, corners = [], [], []
+        for (rows, columns), (y, x) in zip(self.coded, self.read, strict=True):
+            sizes.append((min(rows[1], height) - rows[0], min(columns[1], width) - columns[0]))
+            corners.append((rows[0] - y[0], columns[0] - x[0]))
+        whole = _size(self.coded[0])
+        if len({*sizes, whole}) == 1 and len(set(corners)) == 1:  # as of all pictures whose border is not near
+            (top, left), (high, wide) = corners[0], whole
+            image = picture[:, :, top : top + high, left : left + wide]
+        else:
+            for one, (top, left), (high, wide) in zip(picture, corners, sizes, strict=True):
+                parts.append(extended(one[:, top : top + high, left : left + wide], *whole))
+            image = torch.stack(parts)
         if self.quality is None:
             return image
         return compressed(image, sizes, self.quality, self.subsampling, fast=self.quality < ACCURATE)
@@ -419,13 +469,38 @@ class Window:
         Returns:
             [B, 3, H, W]; differentiable in both.
         """
-        renewed = []
-        for n, ((y, x), (rows, columns)) in enumerate(zip(self.changed, self.coded, strict=True)):
-            top, left = y[0] - rows[0], x[0] - columns[0]
-            one = picture[n].clone()  # each by itself: a copy into the batch would cost its gradient as often
-            one[:, slice(*y), slice(*x)] = developed[n, :, top : top + y[1] - y[0], left : left + x[1] - x[0]]
-            renewed.append(one)
-        return torch.stack(renewed)
+        found: Tensor = _Paste.apply(developed, picture, self.changed, self.coded)
+        return found
+
+
+class _Paste(torch.autograd.Function):
+    """`Window.paste`: one copy a picture each way, where slices would copy whole pictures for their gradient."""
+
+    @staticmethod
+    def forward(
+        context: Any, developed: Tensor, picture: Tensor, changed: Sequence[Rectangle], coded: Sequence[Rectangle]
+    ) -> Tensor:
+        context.parts = parts = []
+        found = picture.clone()
+        for n, ((y, x), (rows, columns)) in enumerate(zip(changed, coded, strict=True)):
+            inside = slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
+            parts.append(((n, slice(None), slice(*y), slice(*x)), (n, slice(None), *inside)))
+            found[parts[-1][0]] = developed[parts[-1][1]]
+        context.size = developed.shape
+        return found
+
+    @staticmethod
+    def backward(context: Any, slope: Tensor) -> tuple[Tensor, Tensor | None, None, None]:
+        renewed, before = slope.new_zeros(context.size), slope.clone() if context.needs_input_grad[1] else None
+        for there, here in context.parts:
+            renewed[here] = slope[there]
+            if before is not None:
+                before[there] = 0.0
+        return renewed, before, None, None
+
+
+def _size(rectangle: Rectangle) -> tuple[int, int]:
+    return rectangle[0][1] - rectangle[0][0], rectangle[1][1] - rectangle[1][0]
 
 
 def develop_at(

@@ -25,6 +25,7 @@ import numpy.typing as npt
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import F64
 
+NEAR = 0.1  # m in front of a camera at which boxes are cut
 UNIT_CORNERS: F64 = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 
@@ -86,6 +87,25 @@ class TrackedBoxes(WorldBoxes):
     def empty() -> TrackedBoxes:
         """No boxes."""
         return TrackedBoxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 3)), (), np.zeros(0))
+
+
+def hulls(corners: F64, intrinsic: F64, size: tuple[int, int]) -> F64:
+    """What 3D boxes cover of a picture: the rectangles around their corners, cut at its border.
+
+    Args:
+        corners: [N, 8, 3] in the camera's frame (x right, y down, z forward), m; those nearer than `NEAR` are moved
+            there.
+        intrinsic: The camera's matrix [3, 3].
+        size: Width and height of the picture, px.
+
+    Returns:
+        x1, y1, x2, y2 [N, 4], px.
+    """
+    local = corners.copy()
+    local[..., 2] = np.maximum(local[..., 2], NEAR)
+    flat = local @ intrinsic.T
+    place = flat[..., :2] / flat[..., 2:]
+    return np.concatenate([np.clip(place.min(1), 0, size), np.clip(place.max(1), 0, size)], 1)
 
 
 def size_columns(given: str, wanted: str) -> list[int]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ssad.core.boxes import camera_yaw, size_columns
+from ssad.core.boxes import NEAR, camera_yaw, hulls, size_columns
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_ATTRIBUTES, MMDET3D_CLASSES, NO_ATTRIBUTE
@@ -19,8 +19,6 @@ from ssad.datasets.nuscenes.splits import scenes_of_split
 
 if TYPE_CHECKING:
     import torch
-
-NEAR = 0.1  # m in front of the camera at which boxes are cut
 
 
 def scenes_of(data: NuScenes, split: str) -> tuple[str, ...]:
@@ -106,11 +104,7 @@ def _attribute(names: Sequence[str]) -> int:
 
 def _hulls(frame: SensorFrame, found: Annotations, turn: F64) -> tuple[F64, Bool]:
     """2D boxes [N, 4] at pixel edges of 3D boxes, cut at the border, and which have any area."""
-    local = found.corners() @ turn[:3, :3].T + turn[:3, 3]
-    local[..., 2] = np.maximum(local[..., 2], NEAR)
     assert frame.intrinsic is not None
-    flat = local @ frame.intrinsic.T
-    place = flat[..., :2] / flat[..., 2:]
-    limit = np.array([frame.width, frame.height])
-    box = np.concatenate([np.clip(place.min(1), 0, limit), np.clip(place.max(1), 0, limit)], 1)
-    return box, ((box[:, 2:] - box[:, :2]) > 1.0).all(1)
+    local = found.corners() @ turn[:3, :3].T + turn[:3, 3]
+    box = hulls(local, frame.intrinsic, (frame.width, frame.height))
+    return box, np.asarray(((box[:, 2:] - box[:, :2]) > 1.0).all(1))

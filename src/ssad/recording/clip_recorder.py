@@ -27,6 +27,7 @@ from ssad.camera.lamps import NOSE, own_lamps
 from ssad.camera.render import Picture, View, Weather, render
 from ssad.camera.scene import Decal, Layer, Scene, Thing
 from ssad.core import safeio
+from ssad.core.boxes import UNIT_CORNERS, hulls
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
@@ -321,13 +322,24 @@ def _annotate(
                 crowd[n] |= not faces(who.pose, view.pose[:3, 3])
                 tall = plate_height(who.body)
             middle = who.pose[:3, 3] + [0.0, 0.0, tall]
+            x1, y1, x2, y2 = _hull(view, who.pose, who.body.size).tolist()
             objects.append(
                 {"label": label, "box": labels.box[n].tolist(),
                  "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
-                 "visible": round(float(labels.share[n]), 3),
+                 "hull": [x1, y1, x2 - x1, y2 - y1], "visible": round(float(labels.share[n]), 3),
                  "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}
             )  # fmt: skip
     return objects, ""
+
+
+def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
+    """x1, y1, x2, y2 around all of a body's 3D box in a picture, whether it is seen or not, px."""
+    corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
+    turn = np.linalg.inv(view.pose) @ pose
+    camera = view.camera
+    return np.round(
+        hulls((corners @ turn[:3, :3].T + turn[:3, 3])[None], camera.intrinsic, (camera.width, camera.height))[0], 2
+    )
 
 
 def record_clips(
@@ -417,7 +429,8 @@ class ClipView:
         row: What the annotation file says of it.
         scene: Street and bodies.
         view: Camera, things (the target first, tag `TARGET`) and light.
-        objects: What is annotated in it: label (index into `CLASSES`), bbox (x, y, width, height), area, target ...
+        objects: What is annotated in it: label (index into `CLASSES`), bbox (x, y, width, height) of what is seen, hull
+            (the same of the whole 3D box), area, target ...
     """
 
     file: str

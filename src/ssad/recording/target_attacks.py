@@ -67,7 +67,9 @@ class TargetAttacks:
 
     def clips(self, recording: str, count: int, detector: str) -> TargetClips:
         """The first pictures of a recording as they are, or with a target that waits for a texture."""
-        return TargetClips(self.folder / "data" / recording, count, tuple(self.detector(detector).classes), self.device)
+        made = self.detector(detector)
+        folder = self.folder / "data" / recording
+        return TargetClips(folder, count, tuple(made.classes), self.device, whole=made.task == "3d")
 
     def texture(self, spec: TextureSpec) -> Tensor:
         """A texture [3, H, W], sRGB; trained now if it has to be. ConfigError as for `TextureFolder.texture`."""

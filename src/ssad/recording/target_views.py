@@ -29,12 +29,15 @@ class TargetClips:
         count: Number of pictures.
         classes: Names of the detector's classes, in its order.
         device: Where pictures are rendered and shown.
+        whole: Whether true boxes are those around the whole 3D boxes, as 3D detectors give them, and not around what is
+            seen.
     """
 
     folder: Path
     count: int
     classes: tuple[str, ...] = CLASSES
     device: str = "cpu"
+    whole: bool = False
 
     def rows(self) -> list[Mapping[str, Any]]:
         """What the annotation file says of each picture. FormatError: no recording of this version."""
@@ -44,7 +47,11 @@ class TargetClips:
         """Drive, picture [1, 3, H, W] in 0 to 1 and truth, as they were recorded. FormatError as for `rows`."""
         for row, objects in clip_rows(self.folder)[: self.count]:
             image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
-            yield drive_of(row), image.permute(2, 0, 1)[None].float() / 255, target_truth(row, objects, self.classes)
+            yield (
+                drive_of(row),
+                image.permute(2, 0, 1)[None].float() / 255,
+                target_truth(row, objects, self.classes, whole=self.whole),
+            )
 
     def wearing(self, surface: Surface) -> Iterator[tuple[str, View]]:
         """Drive and picture with a target that waits for a texture, one after another.
@@ -60,7 +67,10 @@ class TargetClips:
         for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
             wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             seen |= bool(len(wearing.taps[0].pixel))
-            yield drive_of(clip.row), View(wearing, target_truth(clip.row, clip.objects, self.classes))
+            yield (
+                drive_of(clip.row),
+                View(wearing, target_truth(clip.row, clip.objects, self.classes, whole=self.whole)),
+            )
         if not seen:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
@@ -68,13 +78,16 @@ class TargetClips:
             )
 
 
-def target_truth(row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> Truth:
+def target_truth(
+    row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], classes: Sequence[str], *, whole: bool = False
+) -> Truth:
     """What is annotated in a picture, the target first, in a detector's classes; what it does not know is left out.
 
     Args:
         row: Of the picture.
         objects: What is in it.
         classes: Names of the detector's classes.
+        whole: See `TargetClips`.
 
     Raises:
         ConfigError: The detector does not know the target's class.
@@ -84,7 +97,7 @@ def target_truth(row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], c
     if names[0] not in classes:
         raise ConfigError(f"a detector without a class {names[0]} cannot find the target")
     known = [k for k, name in enumerate(names) if name in classes]
-    x, y, width, height = np.array([ordered[k]["bbox"] for k in known], np.float64).T
+    x, y, width, height = np.array([ordered[k]["hull" if whole else "bbox"] for k in known], np.float64).T
     return Truth(
         torch.tensor([list(classes).index(names[k]) for k in known]),
         torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),

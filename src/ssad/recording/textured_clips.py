@@ -22,7 +22,7 @@ from ssad.camera.render import Picture, render
 from ssad.camera.scene import Decal, Layer
 from ssad.camera.sensor import Sensor
 from ssad.camera.texture import Taps, joined, retexture, taps_of
-from ssad.camera.torch_sensor import Rectangle, Window
+from ssad.camera.torch_sensor import Rectangle, Window, large_draws
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -87,15 +87,12 @@ class TexturedClip:
         masks = masks or {}
         (top, left), (height, width) = self.corner, self.image.shape[:2]
         part = (top, top + self.radiance.shape[0]), (left, left + self.radiance.shape[1])
-        taps = {
-            k: _moved(taps_of(self, size, texture=k, mask=masks.get(k)), part, ((0, height), (0, width)))
-            for k, size in sizes.items()
-        }
+        taps = {k: _moved(taps_of(self, size, texture=k, mask=masks.get(k)), part, width) for k, size in sizes.items()}
         touched = torch.cat([one.pixel for one in taps.values()])
         window = Window.around(touched, (1, height, width), sensor, quality=quality)
         radiance = _cut(torch.tensor(self.radiance), part, window.read[0])
         before = torch.tensor(self.image).to(device).permute(2, 0, 1)
-        own = {k: window.taps(one).to(device) for k, one in taps.items()}
+        own = {k: one.to(device) for k, one in taps.items()}
         return Wearing(window, radiance.to(device), self.exposure, own, before)
 
 
@@ -107,7 +104,7 @@ class Wearing:
         window: What is developed anew.
         part: Radiance of what the window reads, without the textures [h, w, 3].
         exposure: What radiance is multiplied by.
-        taps: What pixels of the part see of each texture, by its number.
+        taps: What pixels of the picture see of each texture, by its number.
         before: The whole picture as it was recorded, uint8 [3, H, W].
     """
 
@@ -150,60 +147,77 @@ class Wearing:
         Raises:
             ConfigError: A texture of another size or beyond 0 to 1; one is missing.
         """
-        first = pictures[0].window
+        radiance, window = cls.lit(pictures, textures)
+        return cls.developed(pictures, radiance, window, noise)
+
+    @staticmethod
+    def lit(pictures: Sequence[Wearing], textures: Mapping[int, Tensor]) -> tuple[Tensor, Window]:
+        """The first half of `together`: the radiance [B, h, w, 3] that a window of all pictures reads."""
+        first, number = pictures[0].window, len(pictures)
         missing = sorted(set(pictures[0].taps) - set(textures))
         if missing:
             raise ConfigError(f"no texture {missing[0]}")
         window = first
-        if len(pictures) > 1:
+        if number > 1:
             window = Window.of(
-                [one.window.changed[0] for one in pictures], (len(pictures), *first.shape[1:]), first.sensor,
+                [one.window.changed[0] for one in pictures], (number, *first.shape[1:]), first.sensor,
                 quality=first.quality, subsampling=first.subsampling,
             )  # fmt: skip
-        parts = list(zip(pictures, window.read, strict=True))
-        radiance = torch.stack([_cut(one.part, one.window.read[0], read) for one, read in parts])
-        for number in pictures[0].taps:
-            taps = [one.taps[number] for one in pictures]
-            pixels = [
-                _moved(one.taps[number], one.window.read[0], read, k).pixel for k, (one, read) in enumerate(parts)
-            ]
-            radiance = retexture(joined(taps, pixels), textures[number], radiance)
+        (rows, columns), (_, _, wide) = window.read[0], first.shape
+        size = rows[1] - rows[0], columns[1] - columns[0]
+        radiance = pictures[0].part.new_zeros((number, *size, 3))
+        for own, one, read in zip(radiance, pictures, window.read, strict=True):
+            there, here = _overlap(one.window.read[0], read)
+            own[there] = one.part[here]
+        corners = [(read[0][0], read[1][0]) for read in window.read]
+        for layer in pictures[0].taps:
+            taps = joined([one.taps[layer] for one in pictures], corners, wide, size)
+            radiance = retexture(taps, textures[layer], radiance)
+        return radiance, window
+
+    @staticmethod
+    def developed(
+        pictures: Sequence[Wearing], radiance: Tensor, window: Window, noise: Sequence[torch.Generator] | None
+    ) -> Tensor:
+        """The second half of `together`: what lens, sensor and JPEG make of it, in the whole pictures."""
         sample = None
         if noise is not None:
-            drawn = []
-            for (one, read), draws in zip(parts, noise, strict=True):
-                size = one.part.shape[:2] if first.sensor.mosaic else one.part.shape
-                drawn.append(_cut(torch.randn(size, generator=draws), one.window.read[0], read))
-            sample = torch.stack(drawn).to(radiance)
+            mosaic = window.sensor.mosaic
+            sample = radiance.new_zeros(radiance.shape[: 3 if mosaic else 4])
+            large = large_draws(noise, radiance.device)
+            for own, one, read, draws in zip(sample, pictures, window.read, large, strict=True):
+                there, here = _overlap(one.window.read[0], read)
+                shape = one.part.shape[:2] if mosaic else one.part.shape
+                own[there] = torch.randn(shape, generator=draws, device=draws.device)[here]
         exposure = torch.tensor([one.exposure for one in pictures]).to(radiance)
         before = torch.stack([one.before for one in pictures]).float().div_(255)
         return window.paste(window.develop(radiance, exposure, sample), before)
+
+
+def _overlap(own: Rectangle, wanted: Rectangle) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Where the pixels that two rectangles share lie in the wanted one, and in one's own."""
+    shared = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, wanted, strict=True)]
+    there, here = (
+        tuple(slice(low - one[0], max(low, high) - one[0]) for (low, high), one in zip(shared, sides, strict=True))
+        for sides in (wanted, own)
+    )
+    return there, here
 
 
 def _cut(values: Tensor, own: Rectangle, wanted: Rectangle) -> Tensor:
     """What values [h, w, ...] of a rectangle are in another one; 0 outside of their own."""
     if own == wanted:
         return values
-    shape = [high - low for low, high in wanted]
-    inside = [(max(a[0], b[0]), min(a[1], b[1])) for a, b in zip(own, wanted, strict=True)]
-    found = values.new_zeros((*shape, *values.shape[2:]))
-    if all(low < high for low, high in inside):
-        there, here = (
-            tuple(slice(low - one[0], high - one[0]) for (low, high), one in zip(inside, rectangle, strict=True))
-            for rectangle in (wanted, own)
-        )
-        found[there] = values[here]
+    there, here = _overlap(own, wanted)
+    found = values.new_zeros((*(high - low for low, high in wanted), *values.shape[2:]))
+    found[there] = values[here]
     return found
 
 
-def _moved(taps: Taps, own: Rectangle, wanted: Rectangle, number: int = 0) -> Taps:
-    """Taps into a rectangle as taps into another one that holds their pixels, the picture `number` of a batch."""
-    if own == wanted and not number:
-        return taps
-    (rows, columns), width = wanted, own[1][1] - own[1][0]
-    y, x = taps.pixel // width + (own[0][0] - rows[0]), taps.pixel % width + (own[1][0] - columns[0])
-    high, wide = rows[1] - rows[0], columns[1] - columns[0]
-    return replace(taps, pixel=(number * high + y) * wide + x)
+def _moved(taps: Taps, own: Rectangle, width: int) -> Taps:
+    """Taps into a rectangle as taps into the whole picture, which is so wide."""
+    (rows, columns), wide = own, own[1][1] - own[1][0]
+    return replace(taps, pixel=(taps.pixel // wide + rows[0]) * width + taps.pixel % wide + columns[0])
 
 
 def textured_clips(

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ssad.camera.torch_sensor import large_draws
 from ssad.core.errors import ConfigError
 
 
@@ -43,20 +44,22 @@ class Expectation:
 
         Args:
             colour: sRGB [3, H, W] in 0 to 1.
-            generators: One for each car, on the CPU, so that the draws are the same on every device.
+            generators: One for each car, on the CPU; the noise of texels is drawn where the texture is (see
+                `large_draws`).
 
         Returns:
             [B, 3, H, W] in 0 to 1, differentiable in `colour`.
         """
-
-        def uniform(low: float, high: float, *shape: int) -> Tensor:
-            drawn = torch.stack([torch.rand(shape, generator=one) for one in generators])
-            return (low + (high - low) * drawn).to(colour)
-
-        found = colour.expand(len(generators), *colour.shape)
-        if self.shift > 0.0 or self.turn > 0.0:
-            angle = uniform(-self.turn, self.turn, 1)[:, 0]
-            move = uniform(-2.0 * self.shift, 2.0 * self.shift, 2)
+        found: Tensor = colour.expand(len(generators), *colour.shape)
+        moved = self.shift > 0.0 or self.turn > 0.0
+        ranges = [(-self.turn, self.turn), (-2.0 * self.shift, 2.0 * self.shift)]
+        ranges = [ranges[0], ranges[1], ranges[1]] if moved else []
+        ranges += [self.contrast, (-self.brightness, self.brightness)]
+        low, high = torch.tensor(ranges).T
+        drawn = torch.stack([torch.rand(len(ranges), generator=one) for one in generators])
+        values = (low + (high - low) * drawn).to(colour)  # all in one copy
+        if moved:
+            angle, move = values[:, 0], values[:, 1:3]
             height, width = colour.shape[1:]
             aspect = width / height
             cos, sin = torch.cos(angle), torch.sin(angle)
@@ -65,10 +68,12 @@ class Expectation:
             ], 1)  # fmt: skip
             grid = functional.affine_grid(rows, list(found.shape), align_corners=False)
             found = functional.grid_sample(found, grid, mode="bilinear", padding_mode="border", align_corners=False)
-        factor = uniform(*self.contrast, 1, 1, 1)
-        found = 0.5 + factor * (found - 0.5) + uniform(-self.brightness, self.brightness, 1, 1, 1)
+        factor, offset = (values[:, k, None, None, None] for k in (-2, -1))
+        found = 0.5 + factor * (found - 0.5) + offset
         if self.noise > 0.0:
-            found = found + uniform(-self.noise, self.noise, *colour.shape)
+            large = large_draws(generators, colour.device)
+            texels = torch.stack([torch.rand(colour.shape, generator=one, device=one.device) for one in large])
+            found = found + (2.0 * self.noise * texels - self.noise).to(colour)
         return found.clamp(0.0, 1.0)
 
 
