@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import csv
 import importlib.util
 import inspect
 import json
@@ -138,14 +139,45 @@ def test_what_only_carla_feels_ends_the_episode(carla: ModuleType) -> None:
     mask = np.zeros((1, simulator.agents), bool)
     mask[0, 0] = True
     simulator.take(mask, Controller.FOLLOW, target_speed=5.0)
-    simulator._hits.append((999, "static.road"))
+    simulator._events.hits.append((999, "static.road"))
     simulator.step()
     assert simulator.ended()[0] == 0
-    simulator._hits.append((998, "static.wall"))
+    simulator._events.hits.append((998, "static.wall"))
     simulator.step()
     assert simulator.ended()[0] == 1
     assert simulator.state().contact[0] == 8
     assert simulator.state().contact_agent[0] == -2
+
+
+def test_the_lane_sensor_counts_what_the_body_crosses(carla: ModuleType) -> None:
+    """A change to the lane on the left: each corner crosses the broken line once; the mirror counts the body once."""
+    route = (Pose(230.0, -5.25), Pose(300.0, -5.25))
+    scenario = Scenario("changes", "Custom", "ProvingGround", route, limits=Limits(max_steps=80))
+    (episode,) = built([scenario])
+    simulator = Carla([episode], {episode.town: load_town(episode.town)}, server=SERVER)
+    nothing = {"lane_crossings": 0, "lane_markings": {}}
+    for _ in range(2):  # after a reset again
+        assert simulator.measured == nothing
+        invasions, crossed = 0, []
+        for step in range(70):
+            yaw, y = float(simulator.state().pose[0, 0, 2]), float(simulator.state().pose[0, 0, 1])
+            turn = min(max(0.4 * (-1.75 - y if step > 15 else -5.25 - y), -0.25), 0.25) - yaw
+            simulator.step(np.array([[[0.6, 0.0, 0.6 * turn]] + [[0.0] * 3] * (simulator.agents - 1)], np.float32))
+            invasions += int(simulator.state().lane_invasion[0])
+            crossed.append(simulator.measured["lane_crossings"])
+            if step == 15:
+                assert simulator.measured == nothing
+        assert simulator.state().pose[0, 0, 1] == pytest.approx(-1.75, abs=0.3)
+        assert simulator.measured["lane_markings"] == {"Broken": 4}
+        assert 2 <= simulator.measured["lane_crossings"] <= 4
+        assert invasions == 1
+        assert crossed == sorted(crossed)
+        simulator.reset()
+    simulator._events.crossed.append((simulator._frame, ("Solid",)))  # told late, of the drop onto the road
+    assert simulator.measured == nothing
+    simulator.close()
+    assert not carla_world()._actors
+    assert carla.CALLS["Sensor.listen"] == carla.CALLS["Sensor.stop"] == 6
 
 
 # ---------------------------------------------------------------- CARLA's own sensors, and its Traffic Manager
@@ -306,11 +338,12 @@ FAULTS = (
     "World.apply_settings", "World.freeze_all_traffic_lights", "World.set_weather", "World.get_blueprint_library",
     "World.try_spawn_actor", "nothing", "World.spawn_actor:3", "Sensor.listen", "World.tick", "World.tick:20",
     "World.get_snapshot:7", "Vehicle.apply_control:9", "Walker.apply_control", "TrafficLight.set_state",
-    "Actor.destroy",
+    "Actor.destroy", "World.spawn_actor:4", "World.spawn_actor:5", "Sensor.listen:2", "Sensor.stop:2",
+    "gone sensor.other.lane_invasion", "gone sensor.other.collision",
 )  # fmt: skip
 
 
-QUICK = ("version", "nothing", "World.tick:20")
+QUICK = ("version", "nothing", "World.tick:20", "World.spawn_actor:5", "gone sensor.other.lane_invasion")
 
 
 @pytest.mark.parametrize("fault", others_slow(FAULTS, QUICK))
@@ -334,7 +367,7 @@ def test_a_server_that_fails_ends_in_a_line(carla: ModuleType, fault: str) -> No
 
 
 SENSOR_FAULTS = (
-    "silent sensors", "broken sensors", "World.spawn_actor:5", "Sensor.listen:2", "Sensor.stop:2", "Actor.destroy:3",
+    "silent sensors", "broken sensors", "World.spawn_actor:7", "Sensor.listen:3", "Sensor.stop:3", "Actor.destroy:3",
     "Client.get_trafficmanager", "TrafficManager.set_synchronous_mode", "TrafficManager.set_random_device_seed",
     "Vehicle.set_autopilot", "TrafficManager.set_desired_speed", "TrafficManager.set_path",
 )  # fmt: skip
@@ -411,6 +444,13 @@ def test_a_run_goes_on(fault: str, code: int, more: str, tmp_path: Path) -> None
     bad = [record for record in records if record["status"] != "ok"]
     assert (len(bad) > 0) == bool(fault)
     assert all("CARLA at here:2000: cannot" in record["reason"] for record in bad)
+    for record in records:  # what CARLA's lane sensor counts stands beside what the mirror measures
+        if record["status"] == "ok":
+            assert {"lane_invasions", "off_road"} <= set(record["metrics"])
+            assert record["metrics"]["lane_crossings"] == record["measured"]["lane_crossings"]
+            assert sum(record["measured"]["lane_markings"].values()) >= record["metrics"]["lane_crossings"]
+    with (tmp_path / "run" / "tables" / "metrics.csv").open(newline="") as file:
+        assert {"OR", "LI", "LC"} <= {row["column"] for row in csv.DictReader(file)}
 
 
 # ---------------------------------------------------------------- the real wheel
@@ -428,6 +468,7 @@ def _wheel() -> Path:
     ("carla", "hand_brake=", "hand_brake=", 0), ("carla", "hand_brake=", "handbrake=", 1),
     ("carla", "set_target_velocity(", "set_speed(", 1), ("carla_sensors", "a", "a", 0),
     ("carla_sensors", "raw_data", "data", 1), ("carla_traffic", "a", "a", 0), ("carla_server", "a", "a", 0),
+    ("carla_events", "a", "a", 0), ("carla_events", "crossed_lane_markings", "markings", 1),
     ("carla_traffic", "set_path", "set_way", 1),
 ])  # fmt: skip
 def test_mypy_checks_the_stubs(part: str, old: str, new: str, code: int, tmp_path: Path) -> None:

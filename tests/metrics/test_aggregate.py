@@ -163,6 +163,7 @@ PUBLISHED = {
     "ACC": ("acceleration", "m/s^2", "lower", "mean", 1.0, None),
     "YV": ("yaw_velocity", "rad/s", "lower", "mean", 1.0, None),
     "LI": ("lane_invasions", "", "lower", "mean", 1.0, None),
+    "LC": ("lane_crossings", "", "lower", "mean", 1.0, None),
     "CE": ("collision_events", "", "lower", "mean", 1.0, None),
     "IS": ("impact_speed", "m/s", "lower", "mean", 1.0, None),
     "AV_cc": ("avoided_by_cc", "", "", "bounded", 1.0, None),

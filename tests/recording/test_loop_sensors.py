@@ -305,7 +305,8 @@ def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest
     monkeypatch.setattr(driving, "episode_of", lambda cell: short)
     monkeypatch.setattr(driving, "system_of", lambda name: watcher)
     cell = SimpleNamespace(key="a", system="watcher", spec={"scenario": {"type": short.scenario.type}})
-    _, (trace,) = driving.drive([cell], device="cpu")
+    _, (trace,), measured = driving.drive([cell], device="cpu")
+    assert not measured  # by sensors of another simulator
     camera = Onboard().rig()["CAM_BACK"]
     assert np.array_equal(watcher.shown["CAM_BACK", 0, 0, 1], camera.of_trace(trace, town(), steps=[1])[0])
     found = driving.onboard_sensors([Watcher("above"), Watcher("LIDAR_TOP")], "cpu")

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,7 @@ from ssad.core.types import (
     SignalState,
 )
 from ssad.interchange.bodies import BLUEPRINTS
+from ssad.interchange.carla_events import Events
 from ssad.interchange.carla_sensors import Carried, Eye
 from ssad.interchange.carla_server import Server, T, asked, connect
 from ssad.interchange.carla_traffic import Traffic
@@ -99,13 +100,12 @@ class Carla(Mirrored):
         self._found: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
         self._bodies: dict[int, carla.Actor] = {}
         self._middle: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
-        self._sensor: carla.Sensor | None = None
+        self._events = Events(str(server))
         self._carried = Carried(dict(eyes or {}), server.timeout, str(server))
         self._frame = 0
         self._traffic: Traffic | None = None
         if server.traffic == "manager":
             self._traffic = self._ask("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
-        self._hits: list[tuple[int, str]] = []
         self._touching: set[int] = set()
         self._shown: dict[int, int] = {}
         self._controls: F32 = np.zeros((1, self.agents, 4), np.float32)
@@ -123,6 +123,11 @@ class Carla(Mirrored):
     @property
     def _episode(self) -> Episode:
         return self.episodes[int(self.assigned[0])]
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """What the ego's own sensors have counted in this episode, as `Events.measured`."""
+        return self._events.measured
 
     def _ask(self, doing: str, call: Callable[[], T]) -> T:
         return asked(self.server, doing, call)
@@ -146,7 +151,7 @@ class Carla(Mirrored):
         for i, agent in enumerate(episode.agents):
             if active[i] != Presence.ABSENT:
                 self._spawn(i, agent.pose)
-        self._ask("attach the collision sensor", self._listen)
+        self._ask("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
         self._ask("attach its sensors", lambda: self._carried.attach(self.world, self._bodies[0], self._middle[0]))
         if self._traffic is not None:
             self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
@@ -154,7 +159,7 @@ class Carla(Mirrored):
         for i, agent in enumerate(episode.agents):
             if agent.speed != 0.0 and i in self._bodies and agent.controller not in _FREE:
                 self._ask(f"set the speed of {agent.name}", partial(self._speed, i, agent.pose, agent.speed))
-        self._hits.clear()
+        self._events.begin(self._frame)
 
     def _load(self, town: str) -> None:
         import carla
@@ -241,18 +246,6 @@ class Carla(Mirrored):
 
         ahead = carla.Vector3D(speed * math.cos(pose.yaw), -speed * math.sin(pose.yaw), 0.0)
         self._bodies[i].set_target_velocity(ahead)
-
-    def _listen(self) -> None:
-        import carla
-
-        blueprint = self.world.get_blueprint_library().find("sensor.other.collision")
-        sensor = cast("carla.Sensor", self.world.spawn_actor(blueprint, carla.Transform(), attach_to=self._bodies[0]))
-
-        def hit(event: carla.CollisionEvent) -> None:
-            self._hits.append((event.other_actor.id, event.other_actor.type_id))
-
-        self._sensor = sensor
-        sensor.listen(hit)
 
     # ------------------------------------------------------------ a step
 
@@ -394,7 +387,8 @@ class Carla(Mirrored):
 
     def _felt(self) -> None:
         """What the collision sensor felt and the mirror did not see: bodies of another shape, things of the town."""
-        hits, self._hits = self._hits, []
+        self._ask("look after its sensors", self._events.check)
+        hits, self._events.hits = self._events.hits, []
         number = {body.id: i for i, body in self._bodies.items()}
         felt = {number.get(who, -1 - abs(who)) for who, kind in hits if not kind.startswith(GROUND)} - {0}
         fresh = felt - self._touching
@@ -421,12 +415,8 @@ class Carla(Mirrored):
 
     def _clear(self) -> None:
         """Take out all that was spawned."""
-        self._hits.clear()
         self._touching = set()
-        if self._sensor is not None:
-            sensor, self._sensor = self._sensor, None
-            self._ask("stop the collision sensor", sensor.stop)
-            self._ask("take the collision sensor out", sensor.destroy)
+        self._ask("take its collision and lane sensors out", self._events.detach)
         self._ask("take its sensors out", self._carried.detach)
         for i in list(self._bodies):
             self._destroy(i)

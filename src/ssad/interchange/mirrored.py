@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from ssad.core.driving import Belief, WorldState
 from ssad.core.types import I32, Bool, Controller
 from ssad.world.world import World
@@ -19,6 +22,11 @@ class Mirrored:
     def state(self) -> WorldState:
         """Where everybody is."""
         return self.mirror.state()
+
+    @property
+    def measured(self) -> Mapping[str, Any]:
+        """What it has counted in this episode by sensors of its own, beside what the mirror measures."""
+        return {}
 
     def ended(self) -> I32:
         """[B] why scenes ended, an index into ENDS."""

@@ -58,6 +58,7 @@ METRICS: dict[str, Metric] = {
         Metric("ACC", "acceleration", "m/s^2", "lower", "mean", "acceleration"),
         Metric("YV", "yaw_velocity", "rad/s", "lower", "mean", "yaw velocity"),
         Metric("LI", "lane_invasions", "", "lower", "mean", "lane invasions"),
+        Metric("LC", "lane_crossings", "", "lower", "mean", "lane markings crossed, by CARLA's own sensor"),
         Metric("CE", "collision_events", "", "lower", "mean", "collision events an episode (FREA)"),
         Metric("IS", "impact_speed", "m/s", "lower", "mean", "impact speed of collisions"),
         Metric("AV_cc", "avoided_by_cc", "", "", "bounded", "collisions that the human of UN R157 avoids"),

@@ -77,6 +77,7 @@ class EpisodeMetrics:
         pet: Post-encroachment time, s (10: none).
         min_distance: Least distance to another agent, m (NaN: there is none).
         impact_speed: Speed of the ego against what it hit first, m/s (NaN: it hit nothing).
+        lane_crossings: Times that the simulator's own sensor saw lane markings crossed (NaN: it has none).
         avoided_by_cc: 1 if the careful and competent human driver of UN R157 avoids the collision that was, else 0
             (NaN: there was none, or it was not graded); likewise the others.
         avoided_by_reg157: Of UN R157, 5.2.5.2.
@@ -109,6 +110,7 @@ class EpisodeMetrics:
     pet: float
     min_distance: float
     impact_speed: float = math.nan
+    lane_crossings: float = math.nan
     avoided_by_cc: float = math.nan
     avoided_by_reg157: float = math.nan
     avoided_by_rss: float = math.nan

@@ -165,8 +165,11 @@ def drive(
     sensors: Mapping[str, Sensor] | None = None,
     perturbation: Mapping[str, Perturbation] | None = None,
     key: Callable[[Order], str] = attrgetter("key"),
-) -> tuple[list[Episode], list[EpisodeTrace]]:
+) -> tuple[list[Episode], list[EpisodeTrace], Mapping[str, Any]]:
     """Episodes and traces of orders that share a system and a simulator, run as one batch.
+
+    The third is what a simulator counts by sensors of its own (`ssad.interchange.carla_events`), which drives one order
+    at a time; else it is empty.
 
     Args:
         orders: What is to be driven.
@@ -206,9 +209,10 @@ def drive(
         sensors = onboard_sensors([system, *policies.values()], device)
     try:
         traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
+        measured = dict(getattr(simulator, "measured", {}))
     finally:
         getattr(simulator, "close", lambda: None)()
-    return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)]
+    return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)], measured
 
 
 def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:

@@ -135,7 +135,7 @@ def drive_perceiving(
     """
     spec = orders[0].spec
     if spec["settings"] is None:
-        return *drive(orders, device=device, key=_paired), None
+        return *drive(orders, device=device, key=_paired)[:2], None
     own = PerceivingSystem.model_validate(spec["settings"])
     watcher = Watcher(front(own.width, own.cameras), len(orders), every)
     driver = own.make(watcher, repair=repair, device=device)
@@ -145,7 +145,7 @@ def drive_perceiving(
     onboard = Onboard(weather=weather, device=device, resident=True, attack=attack)
     sensors, changes = perturbed(onboard, driver.cameras, name, severity, detector=driver.detector, seed=seed)
     found = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
-    return *found, watcher
+    return *found[:2], watcher
 
 
 def drive_repaired(

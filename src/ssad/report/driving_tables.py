@@ -81,14 +81,15 @@ def natural_table(run: DrivingRun) -> Table | None:
 
 def full_table(run: DrivingRun) -> Table:
     """Every metric for every system and group."""
+    shown = tuple(s for s in METRICS if s != "LC" or run.measures(s))
     rows = [
-        Row((system, run.headings[group]), tuple(Cell.of(values[s]) for s in METRICS))
+        Row((system, run.headings[group]), tuple(Cell.of(values[s]) for s in shown))
         for (system, group), values in run.numbers.items()
     ]
     note = f"Avg. is the mean of the eight pre-crash scenarios' values. {METHODS}"
     if not run.measures("SS"):
         note += " SS is not measured, since no town of this run has stop signs; the driving score is without them."
-    return Table("metrics", "All metrics", ("System", "Group"), tuple(METRICS), tuple(rows), note)
+    return Table("metrics", "All metrics", ("System", "Group"), shown, tuple(rows), note)
 
 
 def normalised_table(run: DrivingRun) -> Table:

@@ -209,12 +209,15 @@ class Driving(ScenarioKind):
     def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
         """Drives the episodes as one batch of the world, measures them, writes their traces."""
         began = time.perf_counter()
-        episodes, traces = drive(cells, device=job.device)
+        episodes, traces, measured = drive(cells, device=job.device)
         shared = (time.perf_counter() - began) / len(cells)
         results: dict[str, dict[str, Any]] = {}
         for cell, episode, trace in zip(cells, episodes, traces, strict=True):
             began = time.perf_counter()
             result = drive_record(cell, episode, trace, job.folder)
+            if measured:
+                result["metrics"]["lane_crossings"] = measured["lane_crossings"]
+                result["measured"] = plain(measured)
             if job.settings["witness"] and trace.end == "collision" and embedded(cell):
                 found = grade_of(episode, trace, job.device)
                 result["metrics"] |= found.metrics()
@@ -224,7 +227,7 @@ class Driving(ScenarioKind):
 
     def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
         """See `ScenarioKind`."""
-        _, (trace,) = drive([cell], device=plan.device)
+        _, (trace,), _ = drive([cell], device=plan.device)
         return trace
 
     def finish(self, plan: Plan, folder: Path) -> None:

@@ -54,7 +54,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
         matrix=_matrix(run),
         failures=[r for r in run.records if r.status != "ok"],
         witness=_witness(run),
-        metrics=METRICS,
+        metrics={name: metric for name, metric in METRICS.items() if name in named["metrics"].columns},
         stop_signs=run.measures("SS"),
         # "</" would end the script element that holds the data
         replay=safeio.dump_json(replay).replace("</", "<\\/"),

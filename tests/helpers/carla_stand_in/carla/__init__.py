@@ -5,7 +5,8 @@ with physics move as those of `ssad.world`, so that an episode must go as in the
 SSAD's towns. Frames are CARLA's: left-handed, degrees.
 
 FAULT, or the environment variable CARLA_STAND_IN_FAULT, makes it fail: "World.tick:12" raises at the 12th call of that
-method and at all calls after it; "version", "roads" and "nothing" are said where they are used.
+method and at all calls after it; "version", "roads", "nothing", "silent sensors", "broken sensors" and "gone SENSOR"
+are said where they are used.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from enum import IntEnum
 
 import numpy as np
 
-from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, Limits, Pose, Route, Scenario
+from ssad.core.lane_graph import Marking
+from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario
 from ssad.interchange.bodies import MODEL_OF
 from ssad.roads import load_town, route_along, town_signals, town_xodr
 from ssad.roads.library import BUILT_IN
+from ssad.roads.query import LaneQuery
 from ssad.world.models import MODELS
 from ssad.world.world import World as Engine
 
@@ -119,6 +122,7 @@ ATTRIBUTES = {
     },
     "sensor.other.radar": {"horizontal_fov", "vertical_fov", "points_per_second", "range"},
     "sensor.other.collision": set(),
+    "sensor.other.lane_invasion": set(),
 }  # fmt: skip
 
 
@@ -157,6 +161,10 @@ class Actor:
         body = MODELS[MODEL_OF[self.type_id]]
         half = Vector3D(0.5 * body.length, 0.5 * body.width, 0.5 * body.height)
         return BoundingBox(Location(0.0, 0.0, 0.5 * body.height), half)
+
+    @property
+    def is_alive(self) -> bool:
+        return self.id in self._world._actors
 
     def destroy(self) -> bool:
         _remote("Actor.destroy")
@@ -205,9 +213,34 @@ class CollisionEvent:
     other_actor: Actor
 
 
+class LaneMarkingType(IntEnum):
+    Other = 0
+    Broken = 1
+    Solid = 2
+    SolidSolid = 3
+    Curb = 9
+
+    def __str__(self) -> str:
+        return self.name
+
+
+MARKINGS = {Marking.BROKEN: "Broken", Marking.SOLID: "Solid", Marking.DOUBLE: "SolidSolid", Marking.CURB: "Curb"}
+
+
+class LaneMarking:
+    def __init__(self, type: LaneMarkingType) -> None:
+        self.type = type
+
+
 class SensorData:
     def __init__(self, frame: int) -> None:
         self.frame = frame
+
+
+class LaneInvasionEvent(SensorData):
+    def __init__(self, frame: int, actor: Actor, crossed_lane_markings: list[LaneMarking]) -> None:
+        super().__init__(frame)
+        self.actor, self.crossed_lane_markings = actor, crossed_lane_markings
 
 
 class Image(SensorData):
@@ -241,6 +274,26 @@ def _axes(rotation: Rotation) -> np.ndarray:
 
 class Sensor(Actor):
     _callback = None
+    _lanes = None
+
+    def _cross(self, frame: int) -> LaneInvasionEvent | None:
+        """The markings that corners of the body have crossed since the last frame; none in junctions."""
+        x, y, yaw = self._parent._pose
+        half = self._parent.bounding_box.extent
+        at = [(a * half.x, b * half.y) for a in (-1, 1) for b in (-1, 1)]
+        c, s = math.cos(yaw), math.sin(yaw)
+        corners = [(x + c * u - s * v, y + s * u + c * v) for u, v in at]
+        graph = load_town(self._world._town)
+        lanes = LaneQuery(graph).nearest(np.array(corners, np.float32), tuple(LaneType)).lane.tolist()
+        before, self._lanes = self._lanes, lanes
+        found = []
+        for old, new in zip(before or lanes, lanes, strict=True):
+            if old == new or min(old, new) < 0 or max(graph.junction[[old, new]]) >= 0:
+                continue
+            for side, marking in ((graph.left, graph.left_marking), (graph.right, graph.right_marking)):
+                if side[old] == new:
+                    found.append(LaneMarking(LaneMarkingType[MARKINGS.get(Marking(int(marking[old])), "Other")]))
+        return LaneInvasionEvent(frame, self._parent, found) if found else None
 
     def _rays(self) -> np.ndarray:
         """Directions [..., 3] in the sensor's frame: x forward, y right, z up."""
@@ -454,7 +507,14 @@ class World:
         touch = engine.array("touch")[0]
         frame = CALLS["World.tick"]
         for sensor in [actor for actor in self._actors.values() if isinstance(actor, Sensor)]:
-            if sensor.type_id != "sensor.other.collision":
+            if fault() == f"gone {sensor.type_id}" and CALLS["World.tick"] == 9:
+                del self._actors[sensor.id]
+            elif sensor.type_id == "sensor.other.lane_invasion":
+                event = sensor._cross(frame)
+                if event is not None and sensor._callback is not None:
+                    sensor._callback(event)
+                continue
+            elif sensor.type_id != "sensor.other.collision":
                 data = None if fault() == "silent sensors" else sensor._measure(frame)
                 if data is not None and sensor._callback is not None:
                     if fault() == "broken sensors":
