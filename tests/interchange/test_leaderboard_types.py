@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from helpers.leaderboard_routes import ROUTES, Route, flow, write_routes
 
 from ssad.core.errors import FormatError
-from ssad.core.types import F64, EpisodeTrace, Scenario, SignalPlan
+from ssad.core.types import F64, Controller, EpisodeTrace, Scenario, SignalPlan
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import read_leaderboard
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED
@@ -106,6 +107,35 @@ def test_a_car_is_braked_hard_and_goes_on(played: dict[str, tuple[Scenario, Epis
     stops = int(np.flatnonzero(speed[4:] < speed[:-4] - 2.0)[0])  # in 0.4 s
     assert trace.driven[stops] == pytest.approx(20.0, abs=6.0)
     assert trace.end == "collision"
+
+
+@pytest.mark.parametrize("speed", [3.0, 5.0])
+def test_waits_begin_with_what_they_wait_for(speed: float, tmp_path: Path) -> None:
+    """However late the ego comes: 10 s in which a car stands, and up to 1.5 s between walkers who wait for the ego."""
+    kinds = ("BlockedIntersection", "HardBreakRoute", "PedestrianCrossing")
+    found, _ = read_leaderboard(write_routes(tmp_path / "routes.xml", kinds))
+    free = [replace(s, target_speed=speed, limits=replace(s.limits, contact="count", max_steps=600)) for s in found]
+    episodes = [build_episode(s, load_town(s.town), seed=0) for s in free]
+    world = World(episodes, {e.town: load_town(e.town) for e in episodes})
+    take = np.arange(world.agents) == 0
+    world.take(np.tile(take, (world.batch, 1)), Controller.FOLLOW, target_speed=speed)
+    begun: list[dict[tuple[int, int], int]] = [{} for _ in found]
+    for step in range(600):
+        world.step()
+        for b, row in enumerate(world.array("phase")):
+            for agent, count in enumerate(row.tolist()):
+                for phase in range(count):
+                    begun[b].setdefault((agent, phase), step)
+    blocked, ahead, people = begun
+    assert blocked[1, 1] - blocked[1, 0] == 100
+    assert ahead[1, 2] - ahead[1, 1] == 100
+    first = {people[agent, 0] for agent in (1, 2, 3)}
+    assert max(first) - min(first) <= 2
+    idle = [phase.when.value for actor in found[2].actors for phase in actor.phases if phase.when.kind == "after"]
+    assert len(idle) == 3
+    assert max(idle) - min(idle) > 0.2
+    for agent, wait in enumerate(idle, 1):
+        assert 0.1 * (people[agent, 1] - people[agent, 0]) == pytest.approx(wait, abs=0.1)
 
 
 def test_the_queue_stands(played: dict[str, tuple[Scenario, EpisodeTrace]]) -> None:

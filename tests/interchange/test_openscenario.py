@@ -15,7 +15,8 @@ import pytest
 from helpers.command import ssad
 from helpers.generated import generated
 
-from ssad.core.types import Actor, Episode, EpisodeTrace, Phase, Pose, Scenario
+from ssad.core.errors import FormatError
+from ssad.core.types import Actor, Condition, Episode, EpisodeTrace, Limits, Phase, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario
@@ -67,6 +68,30 @@ def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: s
     again = returned(scenarios, tmp_path)
     assert [s.name for s in again] == [s.name for s in scenarios]
     same_drives(built(scenarios), built(again), system)
+
+
+def waiting(first: Condition) -> Scenario:
+    """Somebody who goes by the ego, 1.5 s later slower, and stands 2 s after that."""
+    phases = (
+        Phase(0.0, first), Phase(6.0, Condition("after", 1.5)), Phase(1.0, Condition("after", 2.0)),
+        Phase(0.0, Condition("after", 2.5)),
+    )  # fmt: skip
+    car = Actor("car", "suv", Pose(242.0, -1.75, 0.0), phases=phases)
+    route = (Pose(217.0, -5.25), Pose(317.0, -5.25))
+    return Scenario("waits/00", "Custom", "ProvingGround", route, actors=(car,), limits=Limits(max_steps=160))
+
+
+@pytest.mark.parametrize("first", [Condition("ego_distance", 15.0), Condition("after", 1.0)])
+def test_waits_come_back(first: Condition, tmp_path: Path) -> None:
+    """Phases that begin so long after another, whenever that begins."""
+    scenario = waiting(first)
+    (again,) = returned([scenario], tmp_path)
+    told = [phase.when for phase in again.actors[0].phases]
+    assert told == [replace(first, kind="time") if first.kind == "after" else first] + [
+        phase.when for phase in scenario.actors[0].phases[1:]
+    ]
+    for system in ("autopilot", "blind"):
+        same_drives(built([scenario]), built([again]), system)
 
 
 @pytest.mark.slow
@@ -125,8 +150,9 @@ def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, names: 
     program = shutil.which(tool)
     if program is None:
         pytest.skip(f"no {tool}: install asam-qc-openscenarioxml and asam-qc-opendrive in an environment of their own")
-    files, _ = export_openscenario([*load_scenarios(names), *(generated() if names == "precrash" else [])], tmp_path)
-    assert len([p for p in files if p.suffix == ".xosc"]) == (52 if names == "precrash" else 1)
+    more = generated() if names == "precrash" else [waiting(Condition("ego_distance", 15.0))]
+    files, _ = export_openscenario([*load_scenarios(names), *more], tmp_path)
+    assert len([p for p in files if p.suffix == ".xosc"]) == (52 if names == "precrash" else 2)
     for path in (p for p in files if p.suffix == f".{suffix}"):
         (tmp_path / "config.xml").write_text(
             f'<Config><Param name="InputFile" value="{path}"/><CheckerBundle application="{bundle}">'
@@ -244,6 +270,47 @@ def test_a_scenario_of_scenario_runner_is_driven(tmp_path: Path) -> None:
     way = trace.x[:, 1] - trace.x[0, 1]
     assert np.abs(trace.y[way < 10.0, 1] + 1.75).max() < 0.2
     assert np.abs(trace.y[way > 35.0, 1] + 5.25).max() < 0.3
+
+
+LATER = """<Event name="stop" priority="overwrite"><Action name="stop"><PrivateAction><LongitudinalAction><SpeedAction>
+  <SpeedActionDynamics dynamicsShape="step" value="0" dynamicsDimension="time"/>
+  <SpeedActionTarget><AbsoluteTargetSpeed value="0"/></SpeedActionTarget></SpeedAction></LongitudinalAction>
+  </PrivateAction></Action><StartTrigger><ConditionGroup><Condition name="c" delay="3.5" conditionEdge="none">
+  <ByValueCondition><StoryboardElementStateCondition storyboardElementType="event" storyboardElementRef="go"
+   state="startTransition"/></ByValueCondition></Condition></ConditionGroup></StartTrigger></Event> </Maneuver>"""
+
+
+def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
+    """After a distance, after another event, after a time; a delay after somebody else's event is named."""
+    path = tmp_path / "late.xosc"
+    text = FOREIGN.replace('<Condition name="c" delay="0"', '<Condition name="c" delay="2"', 1)
+    text = text.replace("</Maneuver>", LATER, 1)
+    path.write_text(text)
+    found = read_openscenario(path)
+    (actor,) = found.scenario.actors
+    near = Condition("ego_distance", 15.0)
+    assert actor.phases == (Phase(0.0, near), Phase(9.0, Condition("after", 2.0)), Phase(0.0, Condition("after", 3.5)))
+    assert not any("delay" in line for line in found.lost)
+    (trace,) = drive(built([found.scenario]), "blind")
+    gap = np.hypot(trace.x[:, 0] - trace.x[:, 1], trace.y[:, 0] - trace.y[:, 1])
+    moving, speed = int(np.flatnonzero(trace.speed[:, 1] > 0.0)[0]), trace.speed[:, 1]
+    assert moving - 1 - int(np.flatnonzero(gap < 15.0)[0]) == 20
+    assert int(np.flatnonzero(np.diff(speed) > 0.1)[-1]) + 1 == moving - 1 + 35  # from then on it brakes
+
+    path.write_text(text.replace('storyboardElementRef="go"', 'storyboardElementRef="a"'))
+    found = read_openscenario(path)
+    assert any("the delay of the trigger of 'stop' after another event" in line for line in found.lost)
+    path.write_text(text.replace('state="startTransition"', 'state="completeState"'))
+    found = read_openscenario(path)
+    assert found.scenario.actors == (actor,)
+    assert any("is counted from where the event before begins" in line for line in found.lost)
+    timed = re.sub("(?s)<ByEntityCondition>.*?</ByEntityCondition>", '<ByValueCondition><SimulationTimeCondition '
+                   'value="1.5" rule="greaterThan"/></ByValueCondition>', text, count=1)  # fmt: skip
+    path.write_text(timed)
+    assert read_openscenario(path).scenario.actors[0].phases[0] == Phase(9.0, Condition("time", 3.5))
+    path.write_text(text.replace('delay="2"', 'delay="soon"'))
+    with pytest.raises(FormatError, match="delay is 'soon', not a number"):
+        read_openscenario(path)
 
 
 @pytest.mark.parametrize(("place", "x", "y"), [

@@ -51,7 +51,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     if kind == "Custom":
         condition = st.builds(
             Condition,
-            st.sampled_from(["always", "ego_distance", "ego_speed", "travelled", "time"]),
+            st.sampled_from(["always", "ego_distance", "ego_speed", "travelled", "time", "after"]),
             positive,
             st.just(0),
         )

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.core.types import ENDS, Condition, Controller, EpisodeAgent, Limits, Phase, Pose
+from ssad.core.types import ENDS, Condition, Controller, Episode, EpisodeAgent, Limits, Phase, Pose
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_simulator
 from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS
 from ssad.world.world import World
-from tests.world.worlds import GRAPHS, NO_PASSING, ego, episode, line_route
+from tests.world.worlds import DEVICES, GRAPHS, NO_PASSING, ego, episode, line_route
 
 
 def run(world: World, steps: int, action=(0.0, 0.0, 0.0)) -> None:
@@ -166,6 +166,67 @@ def test_phases_are_latched_and_in_order() -> None:
     ego_x = 10.0 + 4.0 * 0.1 * begun
     assert 60.0 - ego_x < 35.0 + 0.5
     assert seen[-1][1] == 0.0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_phase_waits_after_the_one_before_it(device: str) -> None:
+    """However late that one begins: in a batch, from a snapshot and after a reset; its count is in the hash."""
+
+    def scene(speed: float, *waits: float) -> Episode:
+        phases = (
+            Phase(3.0, Condition("ego_distance", 35.0, 0)),
+            *(Phase(1.0 + k, Condition("after", wait)) for k, wait in enumerate(waits)),
+        )
+        lead = EpisodeAgent("a", "suv", Controller.SCRIPT, Pose(60.0, 0.0, 0.0), phases=phases)
+        return episode(ego(controller=Controller.FOLLOW, target_speed=speed, speed=speed), lead)
+
+    def begun(world: World, steps: int) -> tuple[list[list[int]], list[list[str]]]:
+        phases, hashes = [], []
+        for _ in range(steps):
+            world.step()
+            phases.append(world.array("phase")[:, 1].tolist())
+            hashes.append(world.hashes())
+        return phases, hashes
+
+    scenes = [scene(4.0, 2.0, 1.5), scene(8.0, 2.0, 1.5), scene(8.0, 0.0, 3.0), scene(8.0)]
+    world = World(scenes, GRAPHS, device=device)
+    start = world.hashes()
+    phases, hashes = begun(world, 100)
+    firsts = []
+    for b, waits in enumerate(((2.0, 1.5), (2.0, 1.5), (0.0, 3.0), ())):
+        order = [row[b] for row in phases]
+        at = [next(k for k, n in enumerate(order) if n >= wanted) for wanted in range(1, 2 + len(waits))]
+        assert np.diff(at).tolist() == [round(10 * wait) for wait in waits]
+        firsts.append(at[0])
+    assert firsts[0] > firsts[1] + 10
+    assert firsts[1] == firsts[2] == firsts[3]
+    for b in range(4):  # alone as in the batch
+        alone = World(scenes[b : b + 1], GRAPHS, device=device)
+        assert [row[0] for row in begun(alone, 100)[1]] == [row[b] for row in hashes]
+    world.reset()
+    assert world.hashes() == start
+    middle = firsts[1] + 8
+    assert begun(world, middle)[1] == hashes[:middle]
+    kept = world.snapshot()
+    assert (world.array("since")[:, 1] > 0).tolist() == [False, True, True, False]
+    other = World(scenes, GRAPHS, device=device)
+    other.restore(kept)
+    assert begun(other, 40)[1] == hashes[middle : middle + 40]
+    other.restore(kept)
+    other.put("since", world.array("since") - 1)
+    assert [a != b for a, b in zip(other.hashes(), world.hashes(), strict=True)] == [True] * 4
+
+
+def test_a_first_phase_waits_after_the_start() -> None:
+    waits = (Phase(2.0, Condition("after", 1.2)),)
+    lead = EpisodeAgent("a", "suv", Controller.SCRIPT, Pose(60.0, 0.0, 0.0), phases=waits)
+    timed = replace(lead, phases=(Phase(2.0, Condition("time", 1.2)),))
+    world = World([episode(ego(), one) for one in (lead, timed)], GRAPHS)
+    for _ in range(40):
+        world.step()
+        first, second = world.hashes()
+        assert first == second
+    assert world.array("phase")[:, 1].tolist() == [1, 1]
 
 
 def test_sleeping_traffic_wakes_near_the_ego() -> None:

@@ -148,10 +148,11 @@ class Condition:
 
     kind `ego_distance`: centre distance between the ego and actor number `actor` falls below `value` metres;
     `ego_speed`: the ego drives faster than `value` m/s; `travelled`: the actor itself has moved more than `value`
-    metres; `time`: `value` seconds since the episode began; `always`: at once.
+    metres; `time`: `value` seconds since the episode began; `after`: `value` seconds since the phase before it began
+    (the first phase: since the episode began); `always`: at once.
     """
 
-    kind: Literal["always", "ego_distance", "ego_speed", "travelled", "time"] = "always"
+    kind: Literal["always", "ego_distance", "ego_speed", "travelled", "time", "after"] = "always"
     value: float = 0.0
     actor: int = 0
 

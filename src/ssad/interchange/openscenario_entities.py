@@ -34,6 +34,7 @@ class Entity:
     route: tuple[Pose, ...] = ()
     path: tuple[Pose, ...] = ()
     phases: tuple[Phase, ...] = ()
+    event: str = ""  # that made the last of them
     rows: tuple[tuple[float, float, float, float], ...] = ()
     leaves: float = math.inf
     change: tuple[float, int, float] | None = None  # m from the start, lanes to the left, m that it takes

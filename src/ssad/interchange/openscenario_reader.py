@@ -277,7 +277,7 @@ class _Reader:
             self._lose(f"in event '{label}'", action)
             return
         entity = self.triggers.who(told)
-        when = self.triggers.condition(event, entity, label)
+        when = self._when(event, entity, label)
         if told.find("AddEntityAction") is not None:
             if not entity.rows and (when is None or when.kind != "always"):
                 self.lost[f"'{entity.name}' is there from the start, not from event '{label}' on"] += 1
@@ -292,23 +292,31 @@ class _Reader:
             self.lost[f"event '{label}' of the ego: the system under test drives it"] += 1
             return
         if told.find("SpeedAction") is not None:
-            when = self.triggers.condition(event, entity, label)
-            if when is None and entity.phases:
+            found = self.triggers.conditions(event, entity, label)
+            if found is None and entity.phases:
                 self.lost[f"event '{label}': when it begins is not known"] += 1
                 return
-            phase = Phase(self._speed(entity, told), Condition("always") if when is None else when)
-            entity.phases = (*entity.phases, phase)
+            *waits, last = found or (Condition("always"),)
+            before = entity.phases[-1].speed if entity.phases else min(entity.speed, MODELS[entity.model].max_speed)
+            waiting = (Phase(before, one) for one in waits)
+            entity.phases = (*entity.phases, *waiting, Phase(self._speed(entity, told), last))
+            entity.event = label
         elif told.tag == "RoutingAction":
-            when = self.triggers.condition(event, entity, label)
+            when = self._when(event, entity, label)
             times = {"always": 0.0, "time": when.value if when else 0.0}
             begins = times.get(when.kind) if when else None
             if begins is None and told.find("FollowTrajectoryAction//Timing") is None:
                 self.lost[f"the trigger of event '{label}': '{entity.name}' keeps that path from the start"] += 1
             self._routing(entity, told, begins)
         elif told.find("LaneChangeAction") is not None:
-            self._lane_change(entity, told, self.triggers.condition(event, entity, label), label)
+            self._lane_change(entity, told, self._when(event, entity, label), label)
         else:
             self._lose(f"in event '{label}'", action)
+
+    def _when(self, event: Element, entity: Entity, label: str) -> Condition | None:
+        """What a trigger waits for; None also where this is one thing after another."""
+        found = self.triggers.conditions(event, entity, label)
+        return found[0] if found is not None and len(found) == 1 else None
 
     def _lane_change(self, entity: Entity, action: Element, when: Condition | None, label: str) -> None:
         """A lane change whose place is known becomes part of the path; else it is lost."""
@@ -330,9 +338,9 @@ class _Reader:
         for group in act.iterfind("ManeuverGroup"):
             for ref in group.iterfind("Actors/EntityRef"):
                 entity = self.triggers.who(ref)
-                when = self.triggers.condition(act, entity, self.values.text(act, "name", "act"))
-                if when is not None and when.kind != "always" and not (when.kind == "time" and when.value <= 0.0):
-                    entity.phases = (Phase(min(entity.speed, 60.0), when), *entity.phases)
+                found = self.triggers.conditions(act, entity, self.values.text(act, "name", "act")) or ()
+                waits = (Phase(min(entity.speed, 60.0), when) for when in found if when != Condition("always"))
+                entity.phases = (*waits, *entity.phases)
 
     # ------------------------------------------------------------ what it makes
 

@@ -34,33 +34,45 @@ class Triggers:
             raise self.values.fail(element, f"there is no entity '{name}'")
         return self.entities[name]
 
-    def condition(self, event: Element, entity: Entity, label: str) -> Condition | None:
-        """The condition of the trigger of an event or act; None: it has none that has a counterpart."""
-        found: list[Condition] = []
-        left: list[str] = []
+    def conditions(self, event: Element, entity: Entity, label: str) -> tuple[Condition, ...] | None:
+        """What the trigger of an event or act waits for, one after the other; None: for nothing with a counterpart."""
+        found: list[tuple[Condition, ...]] = []
+        after: list[Condition] = []  # delays since the event before
+        left, ends = list[str](), 0
         for told in event.iterfind("StartTrigger/ConditionGroup/Condition"):
             inner = next((one for one in told.iter() if one.tag.endswith("Condition") and one.tag not in _OUTER), None)
             if inner is None:
                 raise self.values.fail(told, f"the condition of '{label}' is empty")
+            delay = max(self.values.number(told, "delay", 0.0), 0.0)
             if inner.tag == "StoryboardElementStateCondition":
                 state = self.values.text(inner, "state")
-                if state in ("runningState", "completeState", "startTransition"):
-                    continue  # phases come one after the other
-                left.append(f"{inner.tag} {state}")
-                continue
+                if state not in ("runningState", "completeState", "startTransition"):
+                    left.append(f"{inner.tag} {state}")
+                elif delay and self.values.text(inner, "storyboardElementRef") != entity.event:
+                    self.lost[f"the delay of the trigger of '{label}' after another event than the one before"] += 1
+                elif delay:
+                    after.append(Condition("after", delay))
+                    ends += state == "completeState"
+                continue  # phases come one after the other
             when = self._one(told, inner, entity)
             if when is None:
                 left.append(inner.tag)
-            elif when not in found:
-                found.append(when)
-            if told.get("delay", "0") not in ("0", "0.0") and self.values.number(told, "delay") > 0.0:
-                self.lost[f"the delay of the trigger of '{label}'"] += 1
-        real = [when for when in found if when.kind != "always"] or found
+                continue
+            if when.kind in ("always", "time") and delay:
+                when, delay = Condition("time", when.value + delay), 0.0
+            one = (when, Condition("after", delay)) if delay else (when,)
+            if one not in found:
+                found.append(one)
+        if after and ends == len(after):
+            self.lost[f"the delay of the trigger of '{label}' is counted from where the event before begins"] += 1
+        real = [one for one in found if one != (Condition("always"),)] or ([] if after else found)
         for tag in left:
             self.lost[f"{tag} of the trigger of '{label}'"] += 1
         if len(real) > 1:
             self.lost[f"all but the first of the {len(real)} conditions of the trigger of '{label}'"] += 1
-        return real[0] if real else None if left else Condition("always")
+        if real or after:
+            return (*after[:1], *(real[0] if real else ()))
+        return None if left else (Condition("always"),)
 
     def _one(self, told: Element, inner: Element, entity: Entity) -> Condition | None:
         rule = self.values.text(inner, "rule", "")

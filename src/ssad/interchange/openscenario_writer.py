@@ -268,9 +268,13 @@ class _Writer:
             # phases are latched, one after the other: an event waits for the one before it to run, or to be over
             for state in ("runningState", "completeState") if before else ("",):
                 group = _node(trigger, "ConditionGroup")
-                self._condition(group, f"{name} condition {k}", name, phase.when)
+                if phase.when.kind != "after":
+                    self._condition(group, f"{name} condition {k}", name, phase.when)
+                elif not before:
+                    _by_time(group, f"{name} condition {k}", phase.when.value)
                 if state:
-                    by = _node(_condition(group, f"{name} {k} after {k - 1}"), "ByValueCondition")
+                    delay = phase.when.value if phase.when.kind == "after" else 0.0
+                    by = _node(_condition(group, f"{name} {k} after {k - 1}", delay), "ByValueCondition")
                     _node(
                         by, "StoryboardElementStateCondition", storyboardElementType="event",
                         storyboardElementRef=before, state=state,
@@ -360,8 +364,8 @@ def _speed(action: Element, speed: float, shape: str, dimension: str, value: flo
     _node(_node(told, "SpeedActionTarget"), "AbsoluteTargetSpeed", value=float(speed))
 
 
-def _condition(group: Element, name: str) -> Element:
-    return _node(group, "Condition", name=name, delay=0.0, conditionEdge="none")
+def _condition(group: Element, name: str, delay: float = 0.0) -> Element:
+    return _node(group, "Condition", name=name, delay=float(delay), conditionEdge="none")
 
 
 def _by_time(group: Element, name: str, time: float) -> None:

@@ -513,7 +513,7 @@ class World:
 
     def hashes(self) -> list[str]:
         """One hash a scene over all that changes (but its place in the batch and bank)."""
-        arrays = [self.array(name) for name in self.names if name != "episode"]
+        arrays = {name: self.array(name) for name in self.names if name != "episode"}
         believes = self.array("seen.believes")
         rows = [self.array(f"seen.{name}") for name in _SEEN if name not in _OF_SCENES]
         kind, light = self.array("seen.kind"), self.array("seen.light")
@@ -522,8 +522,10 @@ class World:
         for b in range(self.batch):
             live = self._fixed["kind"][b] != AgentKind.NONE
             h = hashlib.sha256()
-            for a in arrays:
+            for name, a in arrays.items():
                 row = a[b]
+                if name == "since" and not row.any():
+                    continue  # no phase waits for another: hashes are those of before some could
                 # empty slots that only the batch's widest scene needs do not count
                 h.update(np.ascontiguousarray(row[live] if np.ndim(row) and len(row) == len(live) else row).tobytes())
             if believes[b]:

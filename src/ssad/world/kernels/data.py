@@ -26,6 +26,7 @@ class When(IntEnum):
     EGO_SPEED = 2
     TRAVELLED = 3
     TIME = 4
+    AFTER = 5
 
 
 class Presence(IntEnum):
@@ -119,6 +120,7 @@ class State:
     active: wp.array2d(dtype=wp.int32)  # [B, A] Presence
     progress: wp.array2d(dtype=wp.int32)  # [B, A] nearest route point, never goes back
     phase: wp.array2d(dtype=wp.int32)  # [B, A] phases begun
+    since: wp.array2d(dtype=wp.int32)  # [B, A] step at which the last of them began, if the next waits for it; else 0
     travelled: wp.array2d(dtype=wp.float32)  # [B, A] m
     halted: wp.array2d(dtype=wp.int32)  # [B, A] route point at whose stop sign it has stopped, -1 none
     stalled: wp.array2d(dtype=wp.int32)  # [B, A] 1: nose to nose with someone who goes first; it backs out

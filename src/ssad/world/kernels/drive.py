@@ -21,7 +21,7 @@ def idm_free(v: float, target: float) -> float:
 
 
 @wp.func
-def condition_holds(state: State, b: int, i: int, when: wp.vec3, time: float) -> bool:
+def condition_holds(state: State, b: int, i: int, when: wp.vec3, dt: float) -> bool:
     """Whether a phase may begin; when: `When`, value, agent."""
     kind = int(when[0])
     ok = kind == When.ALWAYS
@@ -34,7 +34,9 @@ def condition_holds(state: State, b: int, i: int, when: wp.vec3, time: float) ->
     elif kind == When.TRAVELLED:
         ok = state.travelled[b, i] > when[1]
     elif kind == When.TIME:
-        ok = time >= when[1] - 1.0e-4
+        ok = float(state.step[b]) * dt >= when[1] - 1.0e-4
+    elif kind == When.AFTER:
+        ok = float(state.step[b] - state.since[b, i]) * dt >= when[1] - 1.0e-4
     return ok
 
 
@@ -104,7 +106,6 @@ def drive_one(
     e = state.episode[b]
     m = bank.model[e, i]
     who = state.controller[b, i]
-    time = float(state.step[b]) * dt
     v = state.speed[b, i]
     if state.active[b, i] == Presence.ASLEEP:
         state.control[b, i] = wp.vec4(0.0, 1.0, 0.0, 0.0)
@@ -116,8 +117,11 @@ def drive_one(
         n = state.phase[b, i]
         go = int(1)
         while n < count and go == 1:
-            if condition_holds(state, b, i, bank.phase_when[e, i, n], time):
+            if condition_holds(state, b, i, bank.phase_when[e, i, n], dt):
                 n = n + 1
+                state.since[b, i] = 0
+                if n < count and int(bank.phase_when[e, i, n][0]) == When.AFTER:
+                    state.since[b, i] = state.step[b]
             else:
                 go = 0
         state.phase[b, i] = n
