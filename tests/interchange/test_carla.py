@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -30,7 +31,7 @@ from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
 from ssad.interchange import carla as adapter
 from ssad.interchange.carla import Carla
 from ssad.interchange.carla_sensors import Own, eyes_of
-from ssad.interchange.carla_server import Server
+from ssad.interchange.carla_server import WEATHERS, Server
 from ssad.metrics import episode_metrics
 from ssad.recording.closed_loop import asked_sensors
 from ssad.roads import load_town, town_signals
@@ -128,8 +129,12 @@ def test_reset_signals_and_settings(carla: ModuleType) -> None:
         shown = world._lights[names[signal]]._state
         assert shown.name.upper() == SignalState(state).name
     assert world._settings.synchronous_mode
+    assert world._weather == "ClearNoon"
     simulator.close()
     assert not world._settings.synchronous_mode
+    rain = replace(SERVER, weather="HardRainNoon")
+    Carla([episode], {episode.town: load_town(episode.town)}, server=rain).close()
+    assert carla.SERVERS["here", 2000]._weather == "HardRainNoon"
 
 
 def test_what_only_carla_feels_ends_the_episode(carla: ModuleType) -> None:
@@ -413,11 +418,13 @@ def test_a_batch_and_a_bad_address_are_refused(carla: ModuleType) -> None:
         "carla://a?sensors=lidar",
         "carla://a?eyes=carla",
         "carla://a?sensors=carla&traffic=mine",
+        "carla://a?weather=Snow",
     ):
         with pytest.raises(ConfigError, match=r"expected carla://HOST|there is no .*; there are sensors="):
             Server.of(address)
     both = Server.of("carla://a:3000/?sensors=carla&traffic=manager")
     assert both == Server("a", 3000, sensors="carla", traffic="manager")
+    assert Server.of("carla://a?weather=HardRainNoon").weather == "HardRainNoon"
     assert Server.of("carla://a.b:3000") == Server("a.b", 3000)
     assert Server.of("carla://[::1]") == Server("::1")
 
@@ -509,6 +516,14 @@ def _members(stubs: dict[str, ast.ClassDef], name: str) -> dict[str, list[ast.AS
         elif isinstance(node, ast.Assign):
             found |= {target.id: [node] for target in node.targets if isinstance(target, ast.Name)}
     return found
+
+
+@pytest.mark.slow
+def test_the_wheel_has_the_weathers() -> None:
+    _wheel()
+    code = "import carla; print(*(name for name in dir(carla.WeatherParameters) if name[0].isupper()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {*WEATHERS, "Default"} == set(done.stdout.split())
 
 
 def test_the_stand_in_has_nothing_that_the_wheel_has_not() -> None:

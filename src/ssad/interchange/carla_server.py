@@ -18,9 +18,17 @@ T = TypeVar("T")
 VERSION: Final = "0.9.16"
 PORT: Final = 2000
 _ADDRESS = re.compile(
-    r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?(\?(?P<more>[a-z=&]*))?$"
+    r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?(\?(?P<more>[A-Za-z=&]*))?$"
 )
-_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {"sensors": ("mirror", "carla"), "traffic": ("autopilot", "manager")}
+WEATHERS: Final = (
+    *(f"{kind}{hour}" for hour in ("Noon", "Sunset", "Night")
+      for kind in ("Clear", "Cloudy", "Wet", "WetCloudy", "SoftRain", "HardRain")),
+    "MidRainyNoon", "MidRainSunset", "MidRainyNight", "DustStorm",
+)  # fmt: skip
+"""Presets of `carla.WeatherParameters`."""
+_CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
+    "sensors": ("mirror", "carla"), "traffic": ("autopilot", "manager"), "weather": WEATHERS,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,7 @@ class Server:
         host: Name or address.
         port: Its first port.
         timeout: s that it may take for an answer; a map may take five times as long.
-        weather: Preset of `carla.WeatherParameters`.
+        weather: Of `WEATHERS`.
         sensors: Whose cameras and LiDARs drivers look through: SSAD's in the `mirror`, or `carla`'s own.
         traffic: Who drives the background traffic: SSAD's `autopilot`, or CARLA's Traffic `manager`.
     """
@@ -45,7 +53,11 @@ class Server:
 
     @staticmethod
     def of(address: str) -> Server:
-        """The server of an address carla://HOST[:PORT][?sensors=carla&traffic=manager]. ConfigError if it is none."""
+        """The server of an address such as carla://HOST:PORT?sensors=carla&traffic=manager&weather=HardRainNoon.
+
+        Raises:
+            ConfigError: It is none.
+        """
         found = _ADDRESS.match(address)
         port = int(found["port"] or PORT) if found else 0
         if found is None or not 0 < port < 65535:

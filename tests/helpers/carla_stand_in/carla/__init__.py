@@ -95,6 +95,7 @@ class OpendriveGenerationParameters:
 
 class WeatherParameters:
     ClearNoon = "ClearNoon"
+    HardRainNoon = "HardRainNoon"
 
 
 class TrafficLightState(IntEnum):
@@ -459,6 +460,7 @@ class World:
 
     def set_weather(self, weather: str) -> None:
         _remote("World.set_weather")
+        self._weather = weather
 
     def get_blueprint_library(self) -> BlueprintLibrary:
         _remote("World.get_blueprint_library")
