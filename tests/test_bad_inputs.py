@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from helpers.command import ssad
 
@@ -13,7 +15,7 @@ SCENE = "- name: a\n  type: Custom\n  town: ProvingGround\n  route: [{x: 217, y:
 ROUTE = "- name: a\n  type: Custom\n  town: ProvingGround\n  route: "
 FILES = {
     "empty.yaml": "", "list.yaml": "- 1\n", "tabs.yaml": "name: a\n\tkind: driving\n",
-    "twice.yaml": "name: a\nname: b\n",
+    "latin.yaml": b"name: caf\xe9\n", "twice.yaml": "name: a\nname: b\n",
     "nan.yaml": f"{SUITE}timeout_s: .nan\n",
     "less.yaml": f"{SUITE}repetitions: -3\n", "kinds.yaml": "kind: [driving]\n",
     "bomb.yaml": "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -26,6 +28,9 @@ FILES = {
     "mute.py": "class A:\n    def reset(self, episodes): ...\n", "boom.py": "raise ValueError('boom\\nagain')\n",
     "ends.py": "import sys\nsys.exit(0)\n",
     "wants.py": "class A:\n    def __init__(self, need): ...\n    def reset(self, e): ...\n    def act(self, v): ...\n",
+    "odd.py": "number = 3\ndef seven(): return 7\ndef trips(): raise ValueError('no\\nluck')\n"
+    "class Mute:\n    name, access = 'mute', 'white-box'\n",
+    "clear.png": cv2.imencode(".png", np.zeros((2, 2, 4), np.uint8))[1].tobytes(),
     "run/run.json": '{"identity": 1}', "torn/run.json": "no json", "picture.jpg": "no picture", "zero.png": "",
     "nus/v1.0-mini/sample_data.json": "[]", "folder/image_2/0.png": "no picture",
     "map.xodr": '<OpenDRIVE><road id="1"/></OpenDRIVE>',
@@ -60,6 +65,21 @@ CASES = (
     (f"{RUN} systems=[blind] --set scenarios=tank.yaml", "unknown model 'tank'; closest: "),
     (f"{RUN} systems=[blind] --set scenarios=back.yaml", "times must increase from row to row"),
     (f"{RUN} systems=[blind] --set scenarios=empty", "no scenario files (*.yaml) in this folder"),
+    ("run digital-quick --set attacks=[odd:number]", "attack 'odd:number', of type int, lacks name, access, perturb"),
+    (
+        "run digital-quick --set attacks=[odd:Mute]",
+        "attack 'odd:Mute', of type Mute, lacks perturb; it needs name, ",
+    ),
+    ("run digital-quick --set attacks=[odd:trips]", "attack 'odd:trips': making it failed: ValueError: no luck"),
+    (
+        "run digital-quick --set detectors=[odd:seven]",
+        "detector 'odd:seven', of type int, lacks task, classes",
+    ),
+    ("run digital-quick --set detectors=[odd:trips]", "making it failed: ValueError: no luck"),
+    ("run digital-quick --set 'attacks=[{name: pgd, norm: l7}]'", "attacks[0].norm: Input should be"),
+    ("run latin.yaml", "latin.yaml: not UTF-8 text (byte 9)"),
+    (f"{RUN} repetitions=1000000000", "less than or equal to 100000"),
+    (f"{RUN} a.b=3", "unknown key 'a'; closest: "),
     (f"{RUN} name=../../etc", "name: String should match pattern"),
     (f"{RUN} seed=1e400", "seed: Input should be a valid integer"),
     (f"{RUN} pictures=[nothing]", "pictures[0]: Input should be 'shifts' or 'camera'"),
@@ -69,6 +89,7 @@ CASES = (
     ("report picture.jpg", "not a results folder"),
     ("replay run x", "run/run.json: not what ssad run writes: no key 'suite'"),
     ("compare run run", "a run is compared with itself"),
+    ("shift clear.png sheet.png", "it has an alpha channel; save it as JPEG"),
     ("shift picture.jpg sheet.png", "picture.jpg: not a JPEG or PNG image"),
     ("shift zero.png sheet.png", "(the file is empty)"),
     ("shift folder folder", "which it would become a part of"),
@@ -81,8 +102,10 @@ CASES = (
     ("import map map.xodr", "road 1: <road> has no attribute 'length'"),
     ("import map entity.xodr", "refused: it declares a DTD"),
     ("import routes routes", "no JSON file with available_scenarios"),
+    ("export RightTurn/00 out --format wizard", "'--format': 'wizard' is not one of"),
     ("import openscenario scene.xosc out.yaml", "scene.xosc"),
     ("record out --towns Nowhere", "unknown town 'Nowhere'"),
+    ("train driver ppo --out picture.jpg", "picture.jpg: cannot write there"),
     ("train driver a2c", "unknown algorithm 'a2c'; closest: "),
 )
 
@@ -93,7 +116,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wrong")
     for name, text in FILES.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
+        (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     return folder
 
 

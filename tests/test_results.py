@@ -34,6 +34,14 @@ def test_results_have_the_lines_and_say_what_they_are(stored: ssad.Results) -> N
     assert stored.report.is_file()
 
 
+def test_brackets_of_names_and_settings_stay_in_the_table_of_the_terminal(tmp_path: Path) -> None:
+    header = {"suite": {"name": "s"}, "kind": "driving", "command": "ssad run s --set 'systems=[a,b]'"}
+    lines = [line | {"system": "m:A?x=[b]"} if line["system"] == "a" else line for line in driving_lines()]
+    told = str(ssad.load_results(write_run(tmp_path / "run", header, lines)))
+    assert told.startswith("s with systems a, b")
+    assert "m:A?x=[b]" in told
+
+
 def test_a_cell_is_found_by_the_start_of_its_key_and_one_without_a_trace_says_so(stored: ssad.Results) -> None:
     assert stored.find("a000")["key"] == "a000"
     with pytest.raises(ssad.SSADError, match="has no trace"):

@@ -195,6 +195,7 @@ def run_plan(
     from ssad.bench.run import run as run_cells
 
     if len(run_cells(plan, folder, resources, retry=retry, only=only)) == len(plan.cells):
+        resources.console.print(f"{plan.suite.name}: pictures and report", highlight=False)
         plan.kind.finish(plan, folder)
     write_report(folder)
     return load_results(folder)

@@ -155,7 +155,7 @@ def command_of(suite: SuiteBase, device: str | None = None) -> str:
         suite: What was run.
         device: Where it ran; None: left out, and what is there is taken.
     """
-    values = suite.model_dump(mode="json")
+    values, short = suite.model_dump(mode="json"), suite.model_dump(mode="json", exclude_defaults=True)
     origin = suite._origin or suite.name
     try:
         stock = load_suite(origin).model_dump(mode="json")
@@ -164,7 +164,7 @@ def command_of(suite: SuiteBase, device: str | None = None) -> str:
     words = ["ssad", "run", origin] + (["--device", device] if device else [])
     for key, value in values.items():
         if value != stock.get(key):
-            words += ["--set", f"{key}={_flow(value)}"]
+            words += ["--set", f"{key}={_flow(short.get(key, value))}"]
     return shlex.join(words)
 
 

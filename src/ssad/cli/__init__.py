@@ -140,6 +140,7 @@ def main() -> None:
             print(error.format_message())
             sys.exit(2)
         command = error.ctx.command_path if error.ctx is not None else "ssad"
-        print(f"error: {error.format_message()} (see: {command} --help)", file=sys.stderr)
+        told = error.format_message().replace("Value error, ", "")  # pydantic's
+        print(f"error: {told} (see: {command} --help)", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

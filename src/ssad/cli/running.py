@@ -143,7 +143,7 @@ def compare(
         told = f"{each.both} cells in both, {each.equal} of them equal to the last digit"
         console.print(told + f"; {len(each.verdicts)} with another outcome" if each.verdicts else told)
         if each.left_out:
-            console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}")
+            console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}", markup=False)
     print(f"comparison: {page}")
 
 

@@ -69,7 +69,7 @@ def _decode_png(data: bytes, name: str) -> U8:
             if colour in (0, 4):
                 raise FormatError(f"{name}: a greyscale image; three colour channels are needed")
             if colour == 6:
-                raise FormatError(f"{name}: it has an alpha channel; three colour channels are needed")
+                raise FormatError(f"{name}: it has an alpha channel; save it as JPEG, or as PNG without transparency")
         at, ended = end, kind == b"IEND"
     if not ended:
         raise FormatError(f"{name}: a truncated PNG: its end is missing")

@@ -11,13 +11,13 @@ import importlib
 import inspect
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from ssad.core.errors import EXTRA_OF, ConfigError, install_extra, missing_extra, unknown_name
+from ssad.core.errors import EXTRA_OF, ConfigError, SSADError, install_extra, missing_extra, unknown_name
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,35 @@ def check_arguments(kind: str, text: str, found: Any, *, made: bool = False) -> 
         inspect.signature(found).bind(**options)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{kind} '{text}': {error}") from None
+
+
+def make(kind: str, name: str, found: Any, options: Mapping[str, Any], needs: Sequence[str]) -> Any:
+    """Make what a user's module offers, and check that it has what it is needed for.
+
+    Args:
+        kind: Singular noun for messages.
+        name: What the user calls it.
+        found: What `resolve` found for it: a class or function that makes it, or the object itself.
+        options: Arguments of the class or function.
+        needs: Attributes and methods that it must have.
+
+    Returns:
+        The object.
+
+    Raises:
+        ConfigError: Its maker raises, or it lacks an attribute or a method.
+    """
+    try:
+        made = found(**options) if callable(found) else found
+    except SSADError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"{kind} '{name}': making it failed: {describe(error)}") from error
+    missing = [one for one in needs if not hasattr(made, one)]
+    if missing:
+        lacks = f"of type {type(made).__name__}, lacks {', '.join(missing)}"
+        raise ConfigError(f"{kind} '{name}', {lacks}; it needs {', '.join(needs)}")
+    return made
 
 
 def resolve(kind: str, table: Mapping[str, str], name: str) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ssad.core.registry import Reference, check_arguments, names, resolve
+from ssad.core.registry import Reference, check_arguments, make, names, resolve
 
 DETECTORS: dict[str, str] = {
     "fcos3d-light": "ssad.detectors.builders:fcos3d_light",
@@ -49,7 +49,7 @@ def make_detector(
     check_arguments("detector", name, build)
     name, options = reference.name, {**reference.options, **options}
     if name not in DETECTORS:
-        made = build(**options) if callable(build) else build
+        made = make("detector", name, build, options, ("task", "classes", "predict"))
         return made.to(device) if hasattr(made, "to") else made
     from ssad.core.checkpoints import fit_state, load_weights
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ssad.core import safeio
-from ssad.core.errors import StoreError
+from ssad.core.errors import FormatError, StoreError
 from ssad.core.jsonl import read_lines
 
 INCIDENTAL = (
@@ -60,7 +60,8 @@ class Run:
         """What the page is called: the suite's title, unless the run differs from what that says."""
         name = str(self.suite.get("name") or "SSAD")
         if self.changed and not any(one.startswith("title=") for one in self.changed):
-            return textwrap.shorten(f"{name} with {', '.join(self.changed)}", 100, placeholder=" ...")
+            told = "; ".join(_in_words(one) for one in self.changed)
+            return textwrap.shorten(f"{name} with {told}", 100, placeholder=" ...")
         return str(self.suite.get("title") or name)
 
     @cached_property
@@ -84,6 +85,17 @@ class Run:
     def failures(self) -> list[Mapping[str, Any]]:
         """Lines of cells that failed."""
         return [line for line in self.lines if line["status"] != "ok"]
+
+
+def _in_words(setting: str) -> str:
+    """KEY=VALUE as a reader would say it: what has a name is called by it, and lists have no brackets."""
+    key, _, text = setting.partition("=")
+    try:
+        value = safeio.parse_yaml(text)
+    except FormatError:
+        return f"{key} {text}"
+    every = value if isinstance(value, list) else [value]
+    return f"{key} {', '.join(str(one.get('name', one)) if isinstance(one, dict) else str(one) for one in every)}"
 
 
 def load_run(folder: Path | str) -> Run:

@@ -26,17 +26,17 @@ def summary(folder: Path | str) -> rich.table.Table:
     run = load_run(folder)
     table = kind_module(run.kind).summary(run)
     result = rich.table.Table(
-        title=run.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        title=escape(run.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
         padding=(0, 1, 0, 0),
     )  # fmt: skip
     for name in table.heads:
-        result.add_column(name.lower(), no_wrap=True)
+        result.add_column(escape(name.lower()), no_wrap=True)
     every = {head for row in table.rows for head in row.head}
     bare = Counter(MODULE.sub("", head) for head in every)
     shown = {head: short if bare[short := MODULE.sub("", head)] == 1 else head for head in ("", *every)}
     first, *others = table.columns
     for name in ("n", first, "", *others):
-        result.add_column(name, justify="right", min_width=4)
+        result.add_column(escape(name), justify="right", min_width=4)
     rows = [row for row in table.rows if not row.published]
     for before, row, after in zip([None, *rows], rows, [*rows[1:], None], strict=False):
         one, *rest = row.cells
@@ -45,7 +45,7 @@ def summary(folder: Path | str) -> rich.table.Table:
         average = row.head[0].startswith("Avg.")
         values = [str(one.n or ""), one.text, one.interval, *(cell.text for cell in rest)]
         result.add_row(
-            *(shown[head] for head in heads), *(escape(value) for value in values),
+            *(escape(text) for text in (*(shown[head] for head in heads), *values)),
             style="bold" if average else None,
             end_section=after is not None and after.head[0].startswith("Avg.") and not average,
         )  # fmt: skip
@@ -58,14 +58,14 @@ def summary(folder: Path | str) -> rich.table.Table:
 def comparison_table(table: Table) -> rich.table.Table:
     """A table of differences: the interval in a column of its own, leading columns that say nothing left out."""
     result = rich.table.Table(
-        title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        title=escape(table.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
         padding=(0, 1, 0, 0),
     )  # fmt: skip
     telling = [k for k in range(len(table.heads)) if len({row.head[k] for row in table.rows}) > 1]
     for k in telling:
-        result.add_column(table.heads[k].lower())
+        result.add_column(escape(table.heads[k].lower()))
     for name in (*table.columns, ""):
-        result.add_column(name, justify="right", no_wrap=True)
+        result.add_column(escape(name), justify="right", no_wrap=True)
     for row in table.rows:
         *values, difference, p = row.cells
         texts = [*(cell.text for cell in values), difference.text, p.text, difference.interval]

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from ssad.core import safeio
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.generators import Base, Proposal
@@ -136,6 +137,7 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     if plan.literal and learning.reward != "adversary":
         raise ConfigError(f"equation 6 as it is printed is no form of the reward {learning.reward}; leave one out")
     ego = make_system(plan.ego)
+    safeio.make_folder(plan.out)
     torch.set_num_threads(1)
     scenarios, graphs = natural_only(plan.scenarios)
     if not scenarios:

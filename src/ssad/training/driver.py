@@ -131,6 +131,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     """
     learning = find_learning(LEARNINGS, plan.algorithm, dict(plan.changes))
     require()
+    safeio.make_folder(plan.out)
     torch.set_num_threads(1)  # networks this small lose by a second thread
     reward = reward_of(learning.reward)
     scenarios, graphs = find_scenarios(plan.scenarios)

@@ -10,7 +10,7 @@ import inspect
 from typing import Any
 
 from ssad.core.errors import ConfigError
-from ssad.core.registry import names, resolve
+from ssad.core.registry import make, names, resolve
 from ssad.scenarios.static.digital.attack import Attack, Attacked, run_attack
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.objectives import OBJECTIVES, Aim, Objective, make_objective
@@ -52,8 +52,9 @@ def make_attack(name: str, **options: Any) -> Any:
         ConfigError: An option that it does not have, or a value that it refuses.
     """
     build = resolve("attack", ATTACKS, name)
+    needed = ("name", "access", "perturb")
     if not callable(build):
-        return build
+        return make("attack", name, build, {}, needed)
     known = inspect.signature(build).parameters
     open_ended = any(one.kind is one.VAR_KEYWORD for one in known.values())
     for option in options:
@@ -65,7 +66,7 @@ def make_attack(name: str, **options: Any) -> Any:
     missing = [option for option in needs(name) if option not in options]
     if missing:
         raise ConfigError(f"attack {name}: it needs {' and '.join(missing)}: make it in Python (docs/attacks.md)")
-    return build(**options)
+    return make("attack", name, build, options, needed)
 
 
 def needs(name: str) -> tuple[str, ...]:
