@@ -34,6 +34,9 @@ class Seer:
 
     def __init__(self, *, threshold=0.5):
         self.threshold = threshold
+
+    def predict(self, images, intrinsic=None, *, threshold=None):
+        raise NotImplementedError
 '''
 ENTRY_POINTS = """
 [ssad.systems]
