@@ -56,8 +56,8 @@ key has another future.
 * **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
   a mixture of the noise as it is (10 %, so that no weight exceeds 10), of moved ones, learned from the failures that
   splitting finds and then by the cross-entropy method, and of copies of these moved half as far. Learning counts
-  as work. Intervals are mid-p gamma limits of a compound Poisson sum, which hold also for few events of unlike weight;
-  n is the effective number.
+  as work. Intervals are gamma limits of a compound Poisson sum (Fay and Feuer), whose upper end leaves room for one
+  event more of the largest weight; n is the effective number.
 * Drivers must not remember anything between steps: those inside the world and learned policies do not.
 
 """

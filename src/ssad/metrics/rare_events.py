@@ -53,18 +53,21 @@ class RareEstimate:
 
 
 def weighted_limits(
-    total: npt.ArrayLike, square: npt.ArrayLike, most: npt.ArrayLike, n: npt.ArrayLike
+    total: npt.ArrayLike, square: npt.ArrayLike, most: npt.ArrayLike, n: npt.ArrayLike, *, unlike: bool = False
 ) -> tuple[F64, F64]:
     """95 % limits of a mean of n values that are 0 but for some rare events.
 
     The values of the events (1, or weights) are those of a compound Poisson process whose sum is close to a scaled
-    Poisson number; mid-p gamma limits of that. With equal values they are the mid-p limits of a Poisson mean.
+    Poisson number; gamma limits of that. Of equal values they are the mid-p limits of a Poisson mean. Of unlike ones
+    the upper limit leaves room for a whole event more of the largest value: a sum that lacks one of the few large
+    values is too small, and so is the variance that it shows.
 
     Args:
         total: [...] sum of the values.
         square: Sum of their squares.
         most: The largest value that one more event could have; for weights, the largest weight seen or possible.
         n: How many values there are, zeros included.
+        unlike: Whether the values of the events differ.
 
     Returns:
         Lower and upper limits of the mean.
@@ -82,20 +85,21 @@ def weighted_limits(
     safe, spread = np.where(some, total, 1.0), np.where(some, variance, 1.0)
     more, wider = total + most, variance + most**2
 
-    def beyond(x: F64) -> F64:
-        """Chance that the mid-p variable is at most x."""
+    def beyond(x: F64, room: float) -> F64:
+        """Chance that the gamma variable is at most x: without one event more, or for the share `room` with it."""
         lower = np.where(some, gammainc(safe**2 / spread, x * safe / spread), 1.0)
-        return np.asarray(0.5 * lower + 0.5 * gammainc(more**2 / wider, x * more / wider))
+        return np.asarray((1.0 - room) * lower + room * gammainc(more**2 / wider, x * more / wider))
 
-    def quantile(share: float) -> F64:
+    def quantile(share: float, room: float) -> F64:
         low, high = np.zeros(total.shape), more + 20.0 * np.sqrt(wider) + 20.0 * most
         for _ in range(80):
             middle = 0.5 * (low + high)
-            less = beyond(middle) < share
+            less = beyond(middle, room) < share
             low, high = np.where(less, middle, low), np.where(less, high, middle)
         return np.asarray(0.5 * (low + high))
 
-    return np.where(some, quantile(_TAIL), 0.0) / n, quantile(1.0 - _TAIL) / n
+    below, above = (0.0, 1.0) if unlike else (0.5, 0.5)
+    return np.where(some, quantile(_TAIL, below), 0.0) / n, quantile(1.0 - _TAIL, above) / n
 
 
 def weighted_estimate(values: F64, method: str, *, most: float, work: float, training: float = 0.0) -> RareEstimate:
@@ -110,7 +114,7 @@ def weighted_estimate(values: F64, method: str, *, most: float, work: float, tra
     """
     total, square = float(values.sum()), float((values**2).sum())
     largest = float(values.max()) if total > 0.0 else most
-    low, high = weighted_limits(total, square, largest, len(values))
+    low, high = weighted_limits(total, square, largest, len(values), unlike=True)
     events = int((values > 0.0).sum())
     effective = total**2 / square if square > 0.0 else 0.0
     return RareEstimate(

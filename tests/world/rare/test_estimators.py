@@ -87,7 +87,7 @@ def test_intervals_of_importance_sampling_hold(height: float, steps: int) -> Non
     walk = Walk(repeats * size, height, steps=steps)
     drawn = sample(walk, Proposal(np.array([0.1, 0.9]), push), generator("hold", height), episodes=repeats * size)
     values = np.where(drawn.failed, drawn.weight, 0.0).reshape(repeats, size)
-    low, high = weighted_limits(values.sum(1), (values**2).sum(1), values.max(1), size)
+    low, high = weighted_limits(values.sum(1), (values**2).sum(1), values.max(1), size, unlike=True)
     held = ((low <= truth) & (truth <= high)).mean()
     assert 0.93 <= held <= 0.975
     assert values.mean() == pytest.approx(truth, rel=0.05)
@@ -127,6 +127,23 @@ def test_limits_of_few_plain_events_are_those_of_a_poisson_mean() -> None:
             assert 1.0 - below(low, events) + 0.5 * seen == pytest.approx(0.025, rel=1e-3)
         else:
             assert low == 0.0
+
+
+def test_intervals_hold_for_few_weights_of_a_long_tail() -> None:
+    """Weights of which a few say much: mid-p limits miss on the lower side, those with room for one more do not."""
+    random, mean = generator("long tail"), 100.0
+    counts = random.poisson(mean, 4000)
+    rows = np.repeat(np.arange(4000), counts)
+    weight = random.lognormal(-0.72, 1.2, counts.sum())  # of mean 1
+    sums = [np.bincount(rows, weight**k, 4000) for k in (1, 2)]
+    largest = np.zeros(4000)
+    np.maximum.at(largest, rows, weight)
+    held = {}
+    for unlike in (False, True):
+        low, high = weighted_limits(*sums, largest, 1e7, unlike=unlike)
+        held[unlike] = ((low <= mean * 1e-7) & (mean * 1e-7 <= high)).mean()
+    assert held[False] < 0.93
+    assert 0.93 <= held[True] <= 0.97
 
 
 def test_intervals_hold_for_few_plain_events() -> None:
