@@ -25,7 +25,12 @@ MAIN = {
     "hard_braking": "hard braking",
 }  # fmt: skip
 DROPS = {"AP": "AP", "target_recall": "recall of the object that matters", "collision": "CR", "route_completion": "RC"}
-BOUNDED = ("AP", "target_recall", "believed", "route_completion")
+SIGNS = {
+    "sign_recall_5_20": "read from 5 to 20 m", "sign_recall_20_40": "read from 20 to 40 m",
+    "sign_read_at": "first read at, m", "stop_signs": "signs run",
+}  # fmt: skip
+BOUNDED = ("AP", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
+NAMED = 12  # points of the figure that have room for their names
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
 SIZE, MARGIN = 360, 46
 COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)", "texture": "var(--s3)",
@@ -47,15 +52,17 @@ def summary(run: Run) -> Table:
 
 def section(run: Run) -> tuple[str, Sequence[Table]]:
     """The page and its tables."""
-    tables = [main_table(run), drop_table(run), rank_table(run), cause_table(run)]
-    main, drop, rank, cause = tables
+    main, drop, rank, cause, signs = (
+        make(run) for make in (main_table, drop_table, rank_table, cause_table, sign_table)
+    )  # fmt: skip
+    tables = [main, drop, rank, cause, *([signs] if signs.rows else [])]
     failures = [
         ([line["system"], line["perturbation"], str(line["severity"]), line["cluster"]], line["reason"])
         for line in run.failures
     ]
     page = render(
-        "gap.html", run, main=main, drop=drop, rank=rank, cause=cause, plot=scatter(run), failures=failures,
-        sheets=sheets(run), systems=list(dict.fromkeys(c[0] for c in conditions(run))),
+        "gap.html", run, main=main, drop=drop, rank=rank, cause=cause, signs=signs, plot=scatter(run),
+        failures=failures, sheets=sheets(run), systems=list(dict.fromkeys(c[0] for c in conditions(run))),
     )  # fmt: skip
     return page, tables
 
@@ -145,6 +152,21 @@ def cause_table(run: Run) -> Table:
     return Table("causes", "Before a collision", heads, columns, tuple(rows), note)
 
 
+def sign_table(run: Run) -> Table:
+    """Stop signs, where drivers read them: from how far, and how many were run."""
+    rows = [
+        Row((system, perturbation, str(severity) if severity else ""), tuple(_cell(lines, name) for name in SIGNS))
+        for (system, perturbation, severity), lines in conditions(run).items()
+        if any((line.get("metrics") or {}).get("sign_recall") is not None for line in lines)
+    ]
+    note = (
+        "Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at 5 to "
+        "20 m. Signs run: a drive."
+    )
+    heads = ("System", "Perturbation", "Severity")
+    return Table("signs", "Stop signs that are read", heads, tuple(SIGNS.values()), tuple(rows), note)
+
+
 def scatter(run: Run) -> str:
     """Fall of AP against rise of CR, a point a perturbation, with intervals; as SVG text, "" without perturbations."""
     points = [(c, change(run, c, "AP"), change(run, c, "collision")) for c in conditions(run) if c[2]]
@@ -152,6 +174,9 @@ def scatter(run: Run) -> str:
     if not points:
         return ""
     family = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
+    # of many points those have names that are farthest from the line where both fall alike
+    apart = sorted(points, key=lambda one: -abs(one[2].mean + one[1].mean))
+    named = {condition for condition, *_ in apart[:NAMED]}
 
     def x(value: float) -> float:
         return MARGIN + SIZE * (min(max(value, -0.5), 1.0) + 0.5) / 1.5
@@ -181,7 +206,12 @@ def scatter(run: Run) -> str:
                 )
         tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
         parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="5" fill="{colour}"><title>{escape(tip)}</title></circle>')
-        parts.append(f'<text x="{at + 7:.1f}" y="{up - 6:.1f}">{escape(f"{name} {severity}")}</text>')
+        if (system, name, severity) in named:
+            parts.append(f'<text x="{at + 7:.1f}" y="{up - 6:.1f}">{escape(f"{name} {severity}")}</text>')
+    for row, kind in enumerate(dict.fromkeys(family.get(c[1], "") for c, _, _ in points)):
+        place, colour = 22 + 16 * row, COLOURS.get(kind, "var(--s3)")
+        parts.append(f'<circle cx="{MARGIN + SIZE + 16}" cy="{place}" r="5" fill="{colour}"/>')
+        parts.append(f'<text x="{MARGIN + SIZE + 26}" y="{place + 4}">{escape(kind)}</text>')
     parts.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
     parts.append(
         f'<text x="12" y="{SIZE / 2}" transform="rotate(-90 12 {SIZE / 2})" text-anchor="middle">CR gained</text>'
@@ -214,7 +244,7 @@ def sheets(run: Run) -> list[dict[str, str]]:
     return found
 
 
-def _values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
+def values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
     """A metric by drive: scenario and repetition."""
     found = {}
     for line in lines:
@@ -228,10 +258,10 @@ def _values(lines: Sequence[Line], name: str) -> dict[str, CaseValue]:
 
 
 def _cell(lines: Sequence[Line], name: str) -> Cell:
-    values = _values(lines, name).values()
+    found = values(lines, name).values()
     if name == "collision":
-        return Cell.of(estimate(values, "share"))
-    return Cell.of(estimate(values, "bounded" if name in BOUNDED else "mean"))
+        return Cell.of(estimate(found, "share"))
+    return Cell.of(estimate(found, "bounded" if name in BOUNDED else "mean"))
 
 
 def change(run: Run, condition: Condition, name: str) -> Cell:
@@ -239,4 +269,4 @@ def change(run: Run, condition: Condition, name: str) -> Cell:
     every = conditions(run)
     clean = every.get((condition[0], "none", 0), [])
     kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
-    return Cell.of(paired_difference(_values(every[condition], name), _values(clean, name), kind=kind))
+    return Cell.of(paired_difference(values(every[condition], name), values(clean, name), kind=kind))

@@ -1,0 +1,71 @@
+"""The page of the gap's results: what is stored of a run, which conditions are singled out, which drives show them."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.run_folder import write_run
+
+ROOT = Path(__file__).parents[1]
+DRIVES = 40
+
+
+def line(condition: tuple[str, int], drive: int, ap: float, *, crash: bool) -> dict[str, Any]:
+    name, severity = condition
+    return {
+        "key": f"{name}{severity}-{drive}", "system": "s", "perturbation": name, "severity": severity,
+        "family": "shift", "cluster": f"d{drive}", "group": "Twinford", "case": f"{name}{severity}{drive}",
+        "status": "ok", "reason": "",
+        "spec": {"repetition": 0}, "n": 1,
+        "metrics": {"AP": ap, "collision": crash, "route_completion": 1.0 - 0.5 * crash, "target_recall": ap},
+        "cause": {"cause": "missed", "unknown_s": 1.0} if crash else None,
+        "repaired": {"collision": False, "same": drive % 2 == 0} if crash else None,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> dict[str, Any]:
+    """The module, with a run: fog takes much AP and harms nobody, dirt little and harms many, rain both."""
+    lines = []
+    for name, severity, share, crashes in (("none", 0, 1.0, 1), ("fog", 5, 0.4, 1), ("dirt", 3, 0.95, 13),
+                                           ("rain", 5, 0.3, 9), ("snow", 1, 0.97, 3)):  # fmt: skip
+        for drive in range(DRIVES):
+            ap = share * (0.5 + 0.01 * drive)
+            lines.append(line((name, severity), drive, ap, crash=drive < crashes))
+    header = {"kind": "gap", "suite": {"kind": "gap", "name": "x", "sheets": 0}, "command": "ssad run x"}
+    write_run(tmp_path / "run", header, lines)
+    module = runpy.run_path(str(ROOT / "benchmarks" / "gap_page.py"))
+    module["keep"].__globals__["RESULTS"] = tmp_path / "stored"
+    module["keep"]("damage", tmp_path / "run")
+    return module
+
+
+def test_the_two_conditions_that_break_the_rule_are_singled_out(page: dict[str, Any]) -> None:
+    run = page["stored"]("damage")
+    assert page["harmless"](run) == ("s", "fog", 5)
+    assert page["harmful"](run) == ("s", "dirt", 3)
+    assert page["lost_share"](run, ("s", "fog", 5)) == pytest.approx(0.6)
+    told = page["picked"](run)
+    # most AP is lost where there was most; a collision that goes with its error comes first, d0 collides anyway
+    assert told[1:3] == ["fog5-39", "fog5-38"]
+    assert [int(key.partition("-")[2]) % 2 for key in told[4:]] == [1, 1]
+    assert "dirt3-0" not in told
+
+
+def test_the_page_is_made_of_what_is_stored(page: dict[str, Any], tmp_path: Path) -> None:
+    run = page["stored"]("damage")
+    text = "\n".join(page["page"]())
+    assert f"{5 * DRIVES} of {5 * DRIVES} drives" in text
+    assert "`fog` 5: 60% of the AP, CR +0.000" in text
+    assert "the interval does not lie inside ±0.03" in text  # 40 drives are too few for that
+    assert "`dirt` 3: 5% of the AP, CR +0.300" in text
+    assert "the interval excludes 0. Of its 13 collisions 6 go with" in text
+    assert "### Without perturbations" not in text
+    page["figure"](run, tmp_path / "gap.png")
+    assert (tmp_path / "gap.png").read_bytes()[:4] == b"\x89PNG"
+    stored = (tmp_path / "stored" / "damage.json").read_text()
+    assert json.loads(stored)["cells"] == 5 * DRIVES
