@@ -26,9 +26,10 @@ TABLES = (
 
 
 def keep(folder: Path) -> None:
-    """Copy what the page needs from the folder of a run that is complete."""
+    """Copy what the page needs from the folder of a run, and how many of its cells have run."""
     told = json.loads((folder / "run.json").read_text())
-    told.pop("cells", None)
+    told["planned"] = len(told.pop("cells"))
+    told["ran"] = len((folder / "results.jsonl").read_text().splitlines())
     for name in TABLES:
         (RESULTS / f"{name}.md").unlink(missing_ok=True)
         if (folder / "tables" / f"{name}.md").is_file():
@@ -76,14 +77,19 @@ def page() -> str:
         "`benchmarks/digital_page.py` makes this page from `benchmarks/results/digital`, which has the tables that one",
         "command wrote:",
         "```",
-        f"{about['command']} --device {versions['device']}",
+        about["command"] if " --device " in about["command"] else f"{about['command']} --device {versions['device']}",
         "```",
-        f"Data: {data['scenes']} drives of {data['seconds']:g} s each in {towns}, which were not used for training;",
+        f"Data: {data['scenes']} drives of {data['seconds']:g} s in each of {towns}, which were not used for training;",
         f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
         "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
         "",
     ]
+    if about["ran"] < about["planned"]:
+        missing = (
+            f"{about['planned'] - about['ran']} of its {about['planned']} cells have not run, points of the curves"
+        )
+        lines[-1:] = [f"{missing} over budget and steps: n/a below.", ""]
     if new := grown(about["suite"]):
         lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
     for name in (name for name in TABLES if (RESULTS / f"{name}.md").is_file()):

@@ -101,19 +101,20 @@ def shifts() -> list[str]:
 
 
 def beside() -> list[str]:
-    """The step beside the one before beliefs and lane changes: on a core in turn, on a GPU on other episodes."""
-    ratio, now, before = read("world-ratio"), read("world-h200"), read("world-h200-before")
-    rows = {row["batch"]: row["agent_steps_per_s"] for row in before["rows"]}
-    many = now["rows"][-1]
-    share = many["agent_steps_per_s"] / rows[many["batch"]]
+    """The step beside the one before beliefs and lane changes, in turn: on a core and on a GPU."""
+    ratio, gpu = read("world-ratio"), read("world-ratio-h200")
+    kernels = sorted(gpu["kernels_ms"].items(), key=lambda one: -one[1])
     return [
         "### Beside the step before beliefs and lane changes",
         "",
         "`benchmarks/world_ratio.py` measures against commit 2dc730f, which had neither, in turn on one core",
         f"({ratio['batch']:,} scenes, {ratio['rounds']} rounds): {ratio['ratio']:.2f} times its speed (middle half of",
-        f"the rounds {ratio['low']:.2f} to {ratio['high']:.2f}). On the H200 it is slower: {many['batch']:,} scenes",
-        f"make {share:.2f} times as many agent-steps/s as before, on a set that has since been chosen for crossing",
-        "traffic.",
+        f"the rounds {ratio['low']:.2f} to {ratio['high']:.2f}). On the {gpu['device']}, {gpu['batch']:,} scenes of",
+        f"the same traffic run at {gpu['ratio']:.2f} times its speed ({gpu['rounds']} rounds): a step takes",
+        f"{gpu['ms']:.2f} ms, {gpu['before_ms']:.2f} ms before. Its kernels, in ms:",
+        f"{', '.join(f'{k} {ms:.2f}' for k, ms in kernels)}.",
+        "`change_lanes` and `see` have come since. Without lane changes it would be",
+        f"{gpu['before_ms'] / (gpu['ms'] - gpu['kernels_ms']['change_lanes']):.2f} times the former speed.",
         "",
     ]
 
@@ -121,8 +122,8 @@ def beside() -> list[str]:
 def camera() -> list[str]:
     """Frames a second of the camera."""
     cpu, gpu = read("camera-cpu"), read("camera-h200")
-    loop, closed = read("camera-loop-cpu"), read("closed-loop-h200")
-    case = next(one for one in closed["cases"] if one["case"] == "fcos3d")
+    loop, many, closed = read("camera-loop-cpu"), read("camera-loop-h200"), read("closed-loop-h200")
+    case, flat = (next(one for one in closed["cases"] if one["case"] == name) for name in ("fcos3d", "yolo"))
     stages = sorted(case["share"].items(), key=lambda one: -one[1])
     return [
         "## Speed of the camera",
@@ -145,11 +146,15 @@ def camera() -> list[str]:
         f"In the closed loop (`--scenes`), a camera of 640 x 384 on each ego of {loop['scenes']} natural episodes at",
         f"10 Hz renders {loop['frames_per_s']:.0f} frames/s on one core. Two processes on two cores render",
         f"{2 * loop['frames_per_s']:.0f} frames/s, {int(loop['frames_per_s'] / 5)} cameras in real time.",
+        f"On {many['device']} {many['scenes']} episodes at once run at {many['times_real_time']:.2f} times real time,",
+        f"{many['frames_per_s']:.0f} frames/s.",
         "",
         f"With `benchmarks/closed_loop_speed.py`, {case['scenes']} scenes with {case['cameras']} cameras of",
         f"{' x '.join(map(str, case['picture']))} each, `{case['detector']}` behind them, run at",
         f"{case['times real time, all scenes at once']:.2f} times real time together on {closed['device']}. Shares",
         f"of the time: {', '.join(f'{stage} {share:.0%}' for stage, share in stages if share >= 0.01)}.",
+        f"{flat['scenes']} scenes with one camera and `{flat['detector']}` run at",
+        f"{flat['times real time, all scenes at once']:.2f} times real time.",
         "",
     ]
 

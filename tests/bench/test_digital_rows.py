@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -289,6 +290,18 @@ def test_the_radius_that_halves_a_score() -> None:
     assert halving([(0.0, 0.4), (2.0, 0.2)]) == 2.0
     for never in ([(0.0, 0.4), (5.0, 0.21)], [(0.0, 0.0), (5.0, 0.0)], [(0.0, 0.4)], []):
         assert math.isnan(halving(never))
+
+
+def test_no_line_is_drawn_over_a_radius_that_has_not_run(folder: Path, tmp_path: Path) -> None:
+    part = tmp_path / "part"
+    shutil.copytree(folder, part)
+    lines = (part / "results.jsonl").read_text().splitlines(keepends=True)
+    kept = [one for one in lines if (row := json.loads(one))["radius"] != 1.0 or row["detector"] != ONE]
+    assert len(kept) < len(lines)
+    (part / "results.jsonl").write_text("".join(kept))
+    (row,) = halving_table(load_digital_run(load_run(part))).rows
+    assert math.isnan(row.cells[0].mean)
+    assert row.cells[2].mean > 1
 
 
 def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:

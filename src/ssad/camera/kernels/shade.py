@@ -10,7 +10,7 @@ import warp as wp
 from ssad.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
 from ssad.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness, spot_of
 from ssad.camera.kernels.matter import Surface, textured
-from ssad.camera.kernels.raster import LAST
+from ssad.camera.kernels.raster import LAST, REGISTERS
 from ssad.camera.kernels.sky import Light, cloudy, sky, surroundings
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -542,7 +542,7 @@ def shade_pixel(
     out.depth[view, y, x] = far
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=REGISTERS)
 def shade(
     geometry: Geometry,
     drawn: Drawn,
