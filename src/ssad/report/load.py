@@ -94,8 +94,15 @@ def _in_words(setting: str) -> str:
         value = safeio.parse_yaml(text)
     except FormatError:
         return f"{key} {text}"
-    every = value if isinstance(value, list) else [value]
-    return f"{key} {', '.join(str(one.get('name', one)) if isinstance(one, dict) else str(one) for one in every)}"
+    return f"{key} {_spoken(value)}"
+
+
+def _spoken(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(str(one.get("name", _spoken(one))) if isinstance(one, dict) else str(one) for one in value)
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_spoken(one)}" for key, one in value.items())
+    return str(value)
 
 
 def load_run(folder: Path | str) -> Run:

@@ -101,9 +101,10 @@ def _gap(run: Run) -> list[str]:
             continue
         fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
         if not math.isnan(fall.mean) and not math.isnan(rise.mean):
+            few = "" if _known(fall) or _known(rise) else ", too few for intervals"
             found.append(
                 f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
-                f"{_sure(rise)}, in {rise.n} drives."
+                f"{_sure(rise)}, in {rise.n} drives{few}."
             )
     return found
 
@@ -167,10 +168,13 @@ def _million(value: float) -> str:
     return f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
 
 
+def _known(change: Cell) -> bool:
+    return change.method not in ("range", "none") and bool(change.interval)
+
+
 def _sure(change: Cell) -> str:
-    """A change with its interval; where there is none, it says so."""
-    known = change.method not in ("range", "none") and change.interval
-    return f"{change.mean:+.2f} ({change.interval if known else 'too few drives for an interval'})"
+    """A change with its interval, if there is one."""
+    return f"{change.mean:+.2f} {change.interval}" if _known(change) else f"{change.mean:+.2f}"
 
 
 VERDICTS: dict[str, Callable[[Run], list[str]]] = {

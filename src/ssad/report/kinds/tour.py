@@ -32,7 +32,12 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
             write_report(found.folder)
             table = replace(kind_module(found.kind).summary(found), name=name)
             tables.append(table)
-            part |= {"title": found.title, "table": table, "verdict": verdict(found), "command": found.command}
+            part |= {
+                "title": str(found.suite.get("title") or name),
+                "table": table,
+                "verdict": verdict(found),
+                "command": found.command,
+            }
             part["cells"] = f"{len(found.lines)} of {found.planned} cells"
             part["seconds"] = sum(float(line.get("wall_s") or 0.0) for line in found.lines)
         parts.append(part)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.errors import ConfigError, install_extra
 from ssad.core.generators import Base
 from ssad.core.seeding import seed32
 from ssad.core.types import F64
@@ -26,10 +25,8 @@ class CmaEs(BoxSearch):
     name = "cma-es"
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        try:
-            from cmaes import CMA
-        except ImportError:
-            raise ConfigError(f"generator cma-es needs the package cmaes; {install_extra('search')}") from None
+        from cmaes import CMA
+
         super().__init__(bases, seeds=seeds, budget=budget)
         self._search: list[Any] = [
             CMA(

@@ -16,7 +16,6 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from ssad.core.errors import ConfigError, install_extra
 from ssad.core.generators import Base, Outcome, Proposal
 from ssad.core.seeding import seed32
 from ssad.core.types import F64, EpisodeTrace
@@ -97,10 +96,8 @@ class MotionSearch(ABC):
     check = staticmethod(King.check)
 
     def __init__(self, bases: Sequence[Base], *, seeds: Sequence[int], budget: int) -> None:
-        try:
-            from cmaes import CMA
-        except ImportError:
-            raise ConfigError(f"generator {self.name} needs the package cmaes; {install_extra('search')}") from None
+        from cmaes import CMA
+
         self.bases = list(bases)
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._agents = [movers(base) for base in bases]
