@@ -31,6 +31,7 @@ SUITES = {
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
 }  # fmt: skip
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
+STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")  # of benchmarks/physical_speed.py
 OTHERS = ("margins", "transfer", "grid", "others", "effort")
 
 
@@ -106,6 +107,7 @@ def speed() -> list[str]:
         "| On | Shown | Pictures a step | Rendering, ms | Detector, ms | Share of rendering | Paper's budget, min |",
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
+    stages = []
     for path in sorted(RESULTS.glob("physical_speed*.json")):
         found = json.loads(path.read_text())
         for name, row in found["rows"].items():
@@ -114,6 +116,15 @@ def speed() -> list[str]:
                 f"| {found['device']} | {shown} | {found['batch']} | {row['render_ms']:.1f} | {row['detector_ms']:.1f} "
                 f"| {100 * row['share']:.0f} % | {row['paper_minutes']:.0f} |"
             )
+            if "stages_ms" in row:
+                times = " | ".join(f"{row['stages_ms'][stage]:.2f}" for stage in STAGES)
+                stages.append(f"| {found['device']} | {shown} | {times} |")
+    if stages:
+        lines += [
+            "", "Where it goes, ms a picture:", "",
+            "| On | Shown | Print | Light | Lens, sensor, JPEG | Detector, both ways | Back through these | "
+            "Back to the texture |", "|---|---|---|---|---|---|---|---|", *stages,
+        ]  # fmt: skip
     return [*lines, ""]
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.bodies import plain_bodies
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import ssad.recording.textured_clips as module
 from ssad.camera.render import render
@@ -118,6 +120,38 @@ def test_pictures_are_the_same_alone_and_together(folder: Path) -> None:
     slopes = [torch.autograd.grad((shown * weight).sum(), leaves) for shown in (alone, together)]
     for one, other in zip(*slopes, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
+
+
+class Counted(TorchDispatchMode):
+    """How many operations ran that are more than a view."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        shared = isinstance(found, torch.Tensor) and any(
+            isinstance(one, torch.Tensor) and one.untyped_storage().data_ptr() == found.untyped_storage().data_ptr()
+            for one in args
+        )
+        self.count += not shared
+        return found
+
+
+def test_a_further_picture_costs_few_operations(folder: Path) -> None:
+    """What bounds a step on a GPU is how many operations are started, not how large they are."""
+    ready = next(textured_clips(folder, LAYERS)).prepare(SIZES)
+    counts = []
+    for number in (1, 2, 6):
+        textures = {k: v.expand(number, *v.shape).clone().requires_grad_() for k, v in colours().items()}
+        draws = [torch.Generator().manual_seed(k) for k in range(number)]
+        Wearing.together([ready] * number, textures, draws)  # constants are made once
+        with Counted() as counted:
+            Wearing.together([ready] * number, textures, draws).sum().backward()
+        counts.append(counted.count)
+    assert counts[0] < 400, counts
+    assert counts[2] - counts[1] <= 4 * 8, counts
 
 
 def test_a_picture_on_the_road_lies_behind_the_target_and_not_on_it(folder: Path) -> None:

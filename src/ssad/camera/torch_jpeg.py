@@ -87,7 +87,7 @@ def quantisation(quality: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class _Pass:
-    """A one-dimensional integer DCT of libjpeg, applied to columns [8, N] of whole numbers as float64, exactly.
+    """A one-dimensional integer DCT of libjpeg, applied to columns [8, N] of whole numbers exactly.
 
     Attributes:
         inner: [K, 8]; what of the input is rounded down before it is used.
@@ -110,7 +110,7 @@ class _Pass:
 
 @dataclass(frozen=True, slots=True)
 class _Code:
-    """How blocks become steps and pixels again: all in float64, whose whole numbers are exact.
+    """How blocks become steps and pixels again, in `_exact`.
 
     Attributes:
         passes: Along rows and along columns of a block.
@@ -169,12 +169,20 @@ def _accurate_pass(*, first: bool) -> list[np.ndarray]:
     return [np.zeros((0, 8)), rows / 2**bits, np.zeros((8, 0)), bias]
 
 
+def _exact(device: torch.device, *, fast: bool) -> torch.dtype:
+    """In what all whole numbers of an encoder are exact: those of the fast DCT and of colours stay below 2^24.
+
+    A GPU may be told to take products of float32 with fewer bits.
+    """
+    return torch.float32 if fast and device.type == "cpu" else torch.float64
+
+
 @lru_cache(maxsize=16)
 def _code(quality: int, device: torch.device, *, fast: bool) -> _Code:
     """Made once for a quality where it is needed: small copies to a GPU cost more than what they are for."""
 
     def there(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float64, device=device)
+        return torch.as_tensor(np.ascontiguousarray(values), dtype=_exact(device, fast=fast), device=device)
 
     tables = np.stack(quantisation(quality), -1).astype(np.float64)  # vertical and horizontal frequency, plane
     if fast:
@@ -205,7 +213,7 @@ def _coded(bright: Tensor, colours: Tensor, quality: int, *, fast: bool) -> tupl
         plane.reshape(*plane.shape[:2], plane.shape[2] // 8, 8, -1, 8).permute(5, 3, 0, 1, 2, 4) for plane in planes
     ]
     count = [plane.numel() // 64 for plane in planes]
-    columns = torch.cat([one.reshape(8, 8, -1) for one in folded], 2).double() - 128.0
+    columns = torch.cat([one.reshape(8, 8, -1) for one in folded], 2).to(code.steps.dtype) - 128.0
     along, down = code.passes
     rows = along(columns.flatten(1)).reshape(8, 8, -1).transpose(0, 1)  # horizontal frequency, now second
     found = down(rows.reshape(8, -1)).reshape(64, -1)  # vertical, then horizontal frequency
@@ -324,8 +332,10 @@ def compressed(
     halved = subsampling == "420"
     image = image.clamp(0.0, 1.0)
     with torch.no_grad():
-        there, half, _ = _colour_weights(image.device, torch.float64)
-        planes = torch.floor(_mixed(there, torch.floor(image * 255 + (0.5 + TIE)).double()) + half).to(image.dtype)
+        exact = _exact(image.device, fast=True)
+        there, half, _ = _colour_weights(image.device, exact)
+        codes = torch.floor(image * 255 + (0.5 + TIE)).to(exact)
+        planes = torch.floor(_mixed(there, codes) + half).to(image.dtype)
         bright, colours = planes[:, :1], planes[:, 1:]
         if halved:
             # what is not there repeats the last mean of two rows, and the last column; back from it, both repeat the

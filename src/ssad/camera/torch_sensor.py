@@ -464,10 +464,10 @@ class Window:
 
         Args:
             developed: What `develop` gives.
-            picture: The pictures before, [B, 3, H, W].
+            picture: The pictures before, [B, 3, H, W]; uint8 as codes.
 
         Returns:
-            [B, 3, H, W]; differentiable in both.
+            [B, 3, H, W]; differentiable in both, but not in codes.
         """
         found: Tensor = _Paste.apply(developed, picture, self.changed, self.coded)
         return found
@@ -481,7 +481,7 @@ class _Paste(torch.autograd.Function):
         context: Any, developed: Tensor, picture: Tensor, changed: Sequence[Rectangle], coded: Sequence[Rectangle]
     ) -> Tensor:
         context.parts = parts = []
-        found = picture.clone()
+        found = picture.float().div_(255) if picture.dtype == torch.uint8 else picture.clone()
         for n, ((y, x), (rows, columns)) in enumerate(zip(changed, coded, strict=True)):
             inside = slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
             parts.append(((n, slice(None), slice(*y), slice(*x)), (n, slice(None), *inside)))

@@ -336,10 +336,9 @@ def _hull(view: View, pose: F64, size: tuple[float, float, float]) -> F64:
     """x1, y1, x2, y2 around all of a body's 3D box in a picture, whether it is seen or not, px."""
     corners = (UNIT_CORNERS + np.array([0.0, 0.0, 0.5])) * size
     turn = np.linalg.inv(view.pose) @ pose
-    camera = view.camera
-    return np.round(
-        hulls((corners @ turn[:3, :3].T + turn[:3, 3])[None], camera.intrinsic, (camera.width, camera.height))[0], 2
-    )
+    local, camera = corners @ turn[:3, :3].T + turn[:3, 3], view.camera
+    found = hulls(local[None], camera.intrinsic, (camera.width, camera.height))[0]
+    return np.asarray(np.round(found, 2))
 
 
 def record_clips(

@@ -190,7 +190,7 @@ class Wearing:
                 shape = one.part.shape[:2] if mosaic else one.part.shape
                 own[there] = torch.randn(shape, generator=draws, device=draws.device)[here]
         exposure = torch.tensor([one.exposure for one in pictures]).to(radiance)
-        before = torch.stack([one.before for one in pictures]).float().div_(255)
+        before = torch.stack([one.before for one in pictures])
         return window.paste(window.develop(radiance, exposure, sample), before)
 
 
