@@ -55,11 +55,25 @@ def test_differences_are_paired_by_name(tmp_path: Path):
     assert p.mean == pytest.approx(2 * 0.5**10)
     assert (found.both, found.equal, found.only, found.left_out) == (40, 30, (0, 0), ())
     assert found.changes == ("code: nothing → new",)
+    assert found.findings == (
+        f"a: CR 0.20 → 0.45 ({difference.text} {difference.interval}): more than chance alone makes.",
+    )
     assert found.verdicts[0] == f"a/{GROUPS[1]}/03: no collision before, collision now"
     assert len(found.verdicts) == 10
     assert found.groups is not None
     group = {row.head: row.cells for row in found.groups.rows}["a", GROUPS[1], "CR"]
     assert [cell.mean for cell in group[:3]] == [0.6, 1.0, pytest.approx(0.4)]
+
+
+def test_what_one_run_alone_measures_makes_no_cell_unequal_and_equal_runs_have_no_finding(tmp_path: Path):
+    first, second = driving_run(tmp_path / "one", hits=8), driving_run(tmp_path / "two", hits=8)
+    lines = [json.loads(line) for line in (second / "results.jsonl").read_text().splitlines()]
+    for line in lines:
+        line["metrics"] |= {"avoidable": 1.0, "time": None}
+    (second / "results.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (found,) = compare_runs([first, second])
+    assert (found.both, found.equal) == (40, 40)
+    assert found.findings == ("No difference is larger than chance alone makes.",)
 
 
 def test_a_failed_cell_is_no_pair_and_is_named(tmp_path: Path):

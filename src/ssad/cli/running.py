@@ -142,6 +142,8 @@ def compare(
         console.print(comparison_table(each.table))
         told = f"{each.both} cells in both, {each.equal} of them equal to the last digit"
         console.print(told + f"; {len(each.verdicts)} with another outcome" if each.verdicts else told)
+        for sentence in each.findings:
+            console.print(sentence, markup=False, highlight=False)
         if each.left_out:
             console.print(f"left out, since only one of them has it: {', '.join(each.left_out)}", markup=False)
     print(f"comparison: {page}")

@@ -60,7 +60,8 @@ class Comparison:
         groups: Differences in each group of scenarios; None where the metrics are scores.
         changes: What differs between the runs' headers, a line each.
         verdicts: Cells whose outcome changed, a line each.
-        equal: Cells whose metrics are equal to the last digit.
+        findings: What differs by more than chance, a sentence for each system or detector.
+        equal: Cells whose metrics are equal to the last digit, of those that both runs measure.
         both: Cells that both have.
         only: How many cells only the first has, and only the second.
         left_out: Systems or detectors that only one of them has.
@@ -72,6 +73,7 @@ class Comparison:
     groups: Table | None
     changes: tuple[str, ...]
     verdicts: tuple[str, ...]
+    findings: tuple[str, ...]
     equal: int
     both: int
     only: tuple[int, int]
@@ -149,7 +151,7 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
         shared = [name for name in own if name in other]
         both += len(shared)
         only = [only[0] + len(own) - len(shared), only[1] + len(other) - len(shared)]
-        equal += sum(_metrics(own[name]) == _metrics(other[name]) != {} for name in shared)
+        equal += sum(_equal(_metrics(own[name]), _metrics(other[name])) for name in shared)
         title = a if a == b else f"{a} → {b}"
         verdicts += [f"{title}/{name}: {told}" for name in shared if (told := _verdict(own[name], other[name]))]
         if shared:
@@ -170,9 +172,36 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
     left_out = {*first.subjects, *second.subjects} - {name for pair in pairs for name in pair}
     return Comparison(
         first, second, table, groups,
-        changes=tuple(_changes(first.run, second.run)), verdicts=tuple(verdicts), equal=equal, both=both,
-        only=(only[0], only[1]), left_out=tuple(sorted(left_out)),
+        changes=tuple(_changes(first.run, second.run)), verdicts=tuple(verdicts),
+        findings=tuple(_findings(table)), equal=equal, both=both, only=(only[0], only[1]),
+        left_out=tuple(sorted(left_out)),
     )  # fmt: skip
+
+
+def _findings(table: Table) -> Iterator[str]:
+    """Sentences about the differences that remain when as many are tested as the table has (Holm, 5 %)."""
+    tested = [row for row in table.rows if not math.isnan(row.cells[-1].mean)]
+    tested.sort(key=lambda row: row.cells[-1].mean)
+    told: dict[str, list[str]] = {}
+    for k, row in enumerate(tested):
+        before, now, difference, p = row.cells
+        if p.mean > 0.05 / (len(tested) - k):
+            break
+        what = " ".join(name for name in row.head[1:] if name != EVERYTHING)
+        change = f"{difference.text} {difference.interval}".strip()
+        told.setdefault(row.head[0], []).append(f"{what} {before.text} → {now.text} ({change})")
+    for subject, changes in told.items():
+        more = f" and {len(changes) - 4} more" if len(changes) > 4 else ""
+        yield f"{subject}: {', '.join(changes[:4])}{more}: more than chance alone makes."
+    if not tested:
+        yield "There is too little data to tell a difference from chance."
+    elif not told:
+        yield "No difference is larger than chance alone makes."
+
+
+def _equal(own: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    both = {name for name in own.keys() & other.keys() if own[name] is not None and other[name] is not None}
+    return bool(both) and all(own[name] == other[name] for name in both)
 
 
 def _heads(run: Run) -> tuple[str, str]:
