@@ -10,6 +10,9 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
+from ssad.report.kinds.gap import scatter, sign_table
+from ssad.report.load import load_run
+
 ROOT = Path(__file__).parents[1]
 DRIVES = 40
 
@@ -69,3 +72,23 @@ def test_the_page_is_made_of_what_is_stored(page: dict[str, Any], tmp_path: Path
     assert (tmp_path / "gap.png").read_bytes()[:4] == b"\x89PNG"
     stored = (tmp_path / "stored" / "damage.json").read_text()
     assert json.loads(stored)["cells"] == 5 * DRIVES
+
+
+def test_the_figure_of_a_run_names_points_where_there_is_room(page: dict[str, Any], tmp_path: Path) -> None:
+    picture = scatter(load_run(tmp_path / "run"))
+    assert picture.count("<circle") == 4 + 1  # a point a condition, and the legend of one family
+    for name in ("fog 5", "dirt 3", "rain 5"):
+        assert f">{name}</text>" in picture
+    assert "s, snow 1: AP -0.0" in picture  # told when hovered over
+
+
+def test_stop_signs_have_a_table_where_they_were_read(page: dict[str, Any], tmp_path: Path) -> None:
+    run = load_run(tmp_path / "run")
+    assert sign_table(run).rows == ()
+    for number, line_ in enumerate(run.lines):
+        if line_["perturbation"] == "fog":
+            line_["metrics"].update(sign_recall=0.5, sign_recall_5_20=float(number % 2), sign_recall_20_40=None)
+    (row,) = sign_table(run).rows
+    assert row.head == ("s", "fog", "5")
+    assert row.cells[0].mean == pytest.approx(0.5)
+    assert row.cells[1].text == "n/a"

@@ -23,11 +23,13 @@ from ssad.recording.live_attack import LiveAttack as PhysicalAttack
 from ssad.recording.loop_lights import FOUND, LIT, NIGHT, SHINE, light_version, shining
 from ssad.recording.loop_sensors import Onboard
 from ssad.recording.loop_shifts import LOOP_SHIFTS, ShiftedCamera
+from ssad.recording.loop_universal import universal
 from ssad.recording.target import class_of_target, parse_target
 from ssad.recording.texture_export import Print
 from ssad.scenarios.static.digital import ATTACKS, make_attack, needs
 from ssad.scenarios.static.digital.budget import Budget, px
 from ssad.scenarios.static.digital.live import LiveAttack
+from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.scenarios.static.faults import FAULTS, CameraFault
 from ssad.scenarios.static.physical import make_carrier
 from ssad.scenarios.static.physical.shipped import load_texture, shipped_textures
@@ -199,6 +201,8 @@ def perturbed(
             attack = make_attack(method, **({"steps": STEPS} if method in ("pgd", "cw", "momentum", "apgd") else {}))
             budget = Budget(px(RADII[severity - 1]))
             at_once = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
+            if isinstance(attack, UniversalFit):
+                attack = universal(attack, detector, camera, budget, device=onboard.device, batch=at_once)
             changes[channel] = LiveAttack(
                 attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=at_once
             )  # fmt: skip

@@ -30,7 +30,7 @@ SIGNS = {
     "sign_read_at": "first read at, m", "stop_signs": "signs run",
 }  # fmt: skip
 BOUNDED = ("AP", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
-NAMED = 12  # points of the figure that have room for their names
+ROOM = (110.0, 13.0)  # pixels of a name in the figure
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
 SIZE, MARGIN = 360, 46
 COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)", "texture": "var(--s3)",
@@ -174,28 +174,29 @@ def scatter(run: Run) -> str:
     if not points:
         return ""
     family = {line["perturbation"]: str(line.get("family", "")) for line in run.lines}
-    # of many points those have names that are farthest from the line where both fall alike
-    apart = sorted(points, key=lambda one: -abs(one[2].mean + one[1].mean))
-    named = {condition for condition, *_ in apart[:NAMED]}
+    left, right = _ends([-value for _, one, _ in points for value in (one.mean, one.low, one.high)])
+    low, top = _ends([value for *_, one in points for value in (one.mean, one.low, one.high)])
 
     def x(value: float) -> float:
-        return MARGIN + SIZE * (min(max(value, -0.5), 1.0) + 0.5) / 1.5
+        return MARGIN + SIZE * (min(max(value, left), right) - left) / (right - left)
 
     def y(value: float) -> float:
-        return 10 + SIZE * (1.0 - min(max(value, -1.0), 1.0)) / 2.0
+        return 10 + SIZE * (top - min(max(value, low), top)) / (top - low)
 
     parts = []
-    for share in (-0.5, 0.0, 0.5, 1.0):
+    for share in _ticks(left, right):
         strong = ' style="stroke-width:2"' if share == 0.0 else ""
         parts.append(f'<line x1="{x(share):.1f}" x2="{x(share):.1f}" y1="10" y2="{SIZE + 10}" class="grid"{strong}/>')
         parts.append(f'<text x="{x(share):.1f}" y="{SIZE + 26}" text-anchor="middle">{share:g}</text>')
-    for share in (-1.0, -0.5, 0.0, 0.5, 1.0):
+    for share in _ticks(low, top):
         strong = ' style="stroke-width:2"' if share == 0.0 else ""
         line = (
             f'<line x1="{MARGIN}" x2="{MARGIN + SIZE}" y1="{y(share):.1f}" y2="{y(share):.1f}" class="grid"{strong}/>'
         )
         parts.append(f'{line}<text x="{MARGIN - 6}" y="{y(share) + 4:.1f}" text-anchor="end">{share:g}</text>')
-    for (system, name, severity), fall, rise in points:
+    named: list[tuple[float, float]] = []
+    # of many points those get names first that are farthest from where both parts are hurt alike
+    for (system, name, severity), fall, rise in sorted(points, key=lambda one: -abs(one[2].mean + one[1].mean)):
         colour, at, up = COLOURS.get(family.get(name, ""), "var(--s3)"), x(-fall.mean), y(rise.mean)
         for one, two in (((x(-fall.high), up), (x(-fall.low), up)), ((at, y(rise.low)), (at, y(rise.high)))):
             if not any(math.isnan(v) for v in (*one, *two)):
@@ -205,13 +206,14 @@ def scatter(run: Run) -> str:
                     f'opacity=".5" {style}/>'
                 )
         tip = f"{system}, {name} {severity}: AP {fall.text}, CR {rise.text}, {rise.count}"
-        parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="5" fill="{colour}"><title>{escape(tip)}</title></circle>')
-        if (system, name, severity) in named:
+        parts.append(f'<circle cx="{at:.1f}" cy="{up:.1f}" r="4" fill="{colour}"><title>{escape(tip)}</title></circle>')
+        if all(abs(at - other) > ROOM[0] or abs(up - above) > ROOM[1] for other, above in named):
+            named.append((at, up))
             parts.append(f'<text x="{at + 7:.1f}" y="{up - 6:.1f}">{escape(f"{name} {severity}")}</text>')
     for row, kind in enumerate(dict.fromkeys(family.get(c[1], "") for c, _, _ in points)):
         place, colour = 22 + 16 * row, COLOURS.get(kind, "var(--s3)")
-        parts.append(f'<circle cx="{MARGIN + SIZE + 16}" cy="{place}" r="5" fill="{colour}"/>')
-        parts.append(f'<text x="{MARGIN + SIZE + 26}" y="{place + 4}">{escape(kind)}</text>')
+        parts.append(f'<circle cx="{MARGIN + SIZE + 64}" cy="{place}" r="5" fill="{colour}"/>')
+        parts.append(f'<text x="{MARGIN + SIZE + 74}" y="{place + 4}">{escape(kind)}</text>')
     parts.append(f'<text x="{MARGIN + SIZE / 2}" y="{SIZE + 44}" text-anchor="middle">AP lost</text>')
     parts.append(
         f'<text x="12" y="{SIZE / 2}" transform="rotate(-90 12 {SIZE / 2})" text-anchor="middle">CR gained</text>'
@@ -220,6 +222,19 @@ def scatter(run: Run) -> str:
     return (
         f'<svg viewBox="0 0 {SIZE + MARGIN + 140} {SIZE + 52}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
     )
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    """Ends of an axis in tenths, with 0 and some room; of intervals there may be none."""
+    known = [value for value in values if not math.isnan(value)]
+    low, high = max(min(*known, 0.0) - 0.05, -1.0), min(max(*known, 0.1) + 0.05, 1.0)
+    return math.floor(10.0 * low) / 10.0, math.ceil(10.0 * high) / 10.0
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Numbers along an axis, of which one is 0."""
+    step = 0.1 if high - low < 0.75 else 0.25
+    return [round(k * step, 2) for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
 
 
 def sheets(run: Run) -> list[dict[str, str]]:
