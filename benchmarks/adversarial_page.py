@@ -93,6 +93,8 @@ def tables(data: dict[str, Any]) -> list[str]:
             cells = [shown(cases(own, key), key) for key in COLUMNS]
             lines.append(f"| `{name}` | {len(own)} | {' | '.join(cells)} |")
         lines.append("")
+        if data["budget"] == data["keep"] == 1:
+            lines += [text for name in names if (line := by_motion(name, alive[name])) for text in (line, "")]
         if {"adv-ppo", "frea"} <= set(names):
             for key in ("avoided_by_reg157", "attributable"):
                 both = [cases(alive[name], key) for name in ("frea", "adv-ppo")]
@@ -103,6 +105,16 @@ def tables(data: dict[str, Any]) -> list[str]:
                 )
             lines.append("")
     return lines
+
+
+def by_motion(name: str, rows: list[dict[str, Any]]) -> str:
+    """What R157 avoids where the ego moves and where it stands, of one collision a base."""
+    key, parts = "avoided_by_reg157", []
+    for moving, what in ((1.0, "the ego moves"), (0.0, "it stands")):
+        own = cases([row for row in rows if row.get("moving") == moving], key)
+        if len(own) >= 5:
+            parts.append(f"{shown(own, key)} of the {len(own)} graded collisions in which {what}")
+    return f"`{name}`: R157 avoids {' and '.join(parts)}." if parts else ""
 
 
 def difference(first: dict[str, CaseValue], second: dict[str, CaseValue]) -> tuple[float, float, float]:

@@ -71,7 +71,8 @@ def page(found: dict[str, Any]) -> None:
     lines = ["| PPO's steps of the environment | a second | a second of processor time |", "|---|---:|---:|"]
     for name in ("ssad", "highway-env"):
         lines.append(f"| {name} | {found[name]['steps_per_s']:,.0f} | {found[name]['per_processor_s']:,.0f} |")
-    lines += ["", f"({found['cores']} cores, load {found['load']:.1f}: other processes ran beside it.)"]
+    busy = ": other processes ran beside it" if found["load"] > found["cores"] else ""
+    lines += ["", f"({found['cores']} cores, load {found['load']:.1f}{busy}.)"]
     if "adversary" in found:
         own = found["adversary"]
         lines.append(
@@ -111,6 +112,8 @@ def main() -> None:
     load = os.getloadavg()[0]
     print(f"{os.cpu_count()} cores, {torch.get_num_threads()} torch thread, load {load:.1f}")
     found: dict[str, Any] = {"cores": os.cpu_count(), "load": load}
+    if not args.adversary and args.json.is_file():
+        found |= {k: v for k, v in json.loads(args.json.read_text(encoding="utf-8")).items() if k == "adversary"}
     for name, values in rates.items():
         if values:
             wall, own = ([value[k] for value in values] for k in (0, 1))
