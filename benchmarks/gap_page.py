@@ -50,8 +50,9 @@ KEPT = (
     "system",
 )  # fmt: skip
 MEASURED = (
-    "AP", "recall", "target_recall", "believed", "phantoms", "collision", "route_completion", "min_ttc", "hard_braking",
-    "impact_speed", "HOTA", "stop_signs", "sign_recall", "sign_recall_5_20", "sign_recall_20_40", "sign_read_at",
+    "AP", "recall", "missed_burst", "distance_share", "target_recall", "believed", "phantoms", "collision",
+    "route_completion", "min_ttc", "hard_braking", "impact_speed", "HOTA", "stop_signs", "sign_recall",
+    "sign_recall_5_20", "sign_recall_20_40", "sign_read_at",
 )  # fmt: skip
 CEILING = "line-of-sight"
 NATURAL = ("Twinford", "Crossgate")  # groups of the sets of natural traffic
@@ -148,6 +149,19 @@ def benign_table(run: Run, title: str) -> Table:
     return Table("benign", title, ("System",), heads, tuple(rows))
 
 
+def failing_table(run: Run) -> Table:
+    """How detectors fail, in what a perfect one takes to fail alike."""
+    rows = []
+    for (system, name, _), lines in conditions(run).items():
+        if name == "none" and any(line["metrics"].get("recall") is not None for line in lines):
+            missed = _cell(lines, "recall", "bounded")
+            missed = replace(missed, mean=1.0 - missed.mean, low=1.0 - missed.high, high=1.0 - missed.low)
+            others = (_cell(lines, key, "mean") for key in ("missed_burst", "distance_share", "phantoms"))
+            rows.append(Row((system,), (missed, *others)))
+    heads = ("`missed`", "`burst`", "`noise`", "`phantoms`")
+    return Table("failing", "How detectors fail, as settings of a perfect one", ("System",), heads, tuple(rows))
+
+
 def against(lines: Sequence[Mapping[str, Any]], others: Sequence[Mapping[str, Any]], name: str) -> Cell:
     """What a metric is more than in the same drives of others."""
     kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
@@ -221,7 +235,7 @@ def _benign(run: Run, runs: Mapping[str, Run]) -> list[str]:
     for title, own in (("Natural traffic", natural), ("Pre-crash scenarios", crash)):
         if own.lines:
             lines += [_smaller(benign_table(own, title)), ""]
-    return [*lines, _smaller(cause_table(run))]
+    return [*lines, _smaller(failing_table(run)), "", _smaller(cause_table(run))]
 
 
 def _damages(run: Run, runs: Mapping[str, Run]) -> list[str]:

@@ -24,7 +24,8 @@ def line(condition: tuple[str, int], drive: int, ap: float, *, crash: bool) -> d
         "family": "shift", "cluster": f"d{drive}", "group": "Twinford", "case": f"{name}{severity}{drive}",
         "status": "ok", "reason": "",
         "spec": {"repetition": 0}, "n": 1,
-        "metrics": {"AP": ap, "collision": crash, "route_completion": 1.0 - 0.5 * crash, "target_recall": ap},
+        "metrics": {"AP": ap, "collision": crash, "route_completion": 1.0 - 0.5 * crash, "target_recall": ap,
+                    "recall": 0.7 + 0.2 * (drive % 2), "missed_burst": 2.0 + drive % 2, "phantoms": 0.1},
         "cause": {"cause": "missed", "unknown_s": 1.0} if crash else None,
         "repaired": {"collision": False, "same": drive % 2 == 0} if crash else None,
     }  # fmt: skip
@@ -72,6 +73,12 @@ def test_the_page_is_made_of_what_is_stored(page: dict[str, Any], tmp_path: Path
     assert (tmp_path / "gap.png").read_bytes()[:4] == b"\x89PNG"
     stored = (tmp_path / "stored" / "damage.json").read_text()
     assert json.loads(stored)["cells"] == 5 * DRIVES
+
+
+def test_how_a_detector_fails_is_told_as_settings(page: dict[str, Any]) -> None:
+    (row,) = page["failing_table"](page["stored"]("damage")).rows
+    assert [cell.text for cell in row.cells] == ["0.20", "2.50", "n/a", "0.10"]
+    assert row.cells[0].low < 0.2 < row.cells[0].high
 
 
 def test_the_figure_of_a_run_names_points_where_there_is_room(page: dict[str, Any], tmp_path: Path) -> None:

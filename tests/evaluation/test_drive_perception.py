@@ -198,3 +198,21 @@ def test_signs_are_read_from_how_far_and_where_they_stand() -> None:
     assert found["sign_read_at"] == pytest.approx(np.hypot(15.0, 3.0))
     nowhere = sign_metrics(trace, Perceived([], [], CAMERAS, looks), np.zeros((0, 2)))
     assert set(nowhere.values()) == {None}
+
+
+def test_how_a_detector_fails_is_what_a_perfect_one_takes_to_fail_alike() -> None:
+    bodies = ((0.0, 0.0, 0.0, 0.0), (20.0, 0.0, 0.0, 0.0), (12.0, 5.0, 0.0, 0.0))
+    trace = make_trace(STEPS, bodies)
+
+    def found(k: int) -> list[tuple[float, float]]:
+        """The first is missed for 3 looks and for 1, else told 5 % too far; the second is there at all looks."""
+        look = k // 2
+        return [(12.0, 5.0)] if look in {4, 5, 6, 10} else [(21.0, 0.0), (12.0, 5.0)]
+
+    metrics = component_metrics(trace, perceived(trace, found, lambda k: []), sure=0.3)
+    assert metrics["recall"] == pytest.approx(1.0 - 4 / 42)
+    assert metrics["missed_burst"] == pytest.approx(2.0)
+    assert metrics["distance_share"] == pytest.approx(np.sqrt(17 * 0.05**2 / (17 + 21)))
+    all_ = component_metrics(trace, perceived(trace, lambda k: [(20.0, 0.0), (12.0, 5.0)], lambda k: []), sure=0.3)
+    assert all_["missed_burst"] is None
+    assert all_["distance_share"] == pytest.approx(0.0, abs=1e-9)

@@ -161,15 +161,18 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
 
     Returns:
         AP: average precision of all kinds together, the mean of those within 0.5, 1, 2 and 4 m. recall: of the objects
-        in view. target_recall, and by band of distance: of the object that matters. distance_error: of that object
-        where it was found roughly, m. phantoms: objects a look that are not there. believed: share of the steps with
-        the object that matters in view in which it is believed where it is. switches: changes of its track. HOTA, MOTA
-        and IDF1: see `track_metrics`.
+        in view; missed_burst: looks in a row that one of them is missed, on average; distance_share: RMS error of the
+        distance of those that were found roughly, as a share of it. target_recall, and by band of distance: of the
+        object that matters. distance_error: of that object where it was found roughly, m. phantoms: objects a look
+        that are not there. believed: share of the steps with the object that matters in view in which it is believed
+        where it is. switches: changes of its track. HOTA, MOTA and IDF1: see `track_metrics`.
     """
     target = object_that_matters(trace)
     found_of: list[tuple[float, bool, float]] = []  # distance, found, error of the distance
     hits, there, phantoms, looks = 0, 0, 0, 0
     tables: list[tuple[F64, Bool, Objects | None]] = []
+    missed: list[Bool] = []
+    shares: list[F64] = []
     steps = _steps(trace, seen.looks)
     for (_, found), step, view in zip(seen.looks, steps, in_view(trace, steps, seen.cameras), strict=True):
         place = np.stack([trace.x[step], trace.y[step]], -1).astype(np.float64)
@@ -178,6 +181,11 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
         got = np.zeros((0, 2)) if found is None else found.place
         gap = np.linalg.norm(place[:, None] - got[None], axis=-1) if len(got) else np.full((len(place), 1), np.inf)
         nearest = gap.min(1)
+        missed.append(view & (nearest >= NEAR))
+        if rough := np.flatnonzero(view & (nearest < ROUGH)).tolist():
+            far = np.linalg.norm(place[rough] - place[0], axis=1)
+            told = np.linalg.norm(got[gap[rough].argmin(1)] - place[0], axis=1)
+            shares.append(told / far - 1.0)
         there, hits = there + int(view.sum()), hits + int((nearest[view] < NEAR).sum())
         if found is not None and len(got):
             others = trace.active[step].copy()
@@ -194,6 +202,8 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     metrics: dict[str, float | None] = {
         "AP": average_precision(tables),
         "recall": hits / there if there else None,
+        "missed_burst": _burst(missed),
+        "distance_share": float(np.sqrt(np.mean(np.concatenate(shares) ** 2))) if shares else None,
         "target_recall": _mean(rows[:, 1]),
         "distance_error": _mean(rows[np.isfinite(rows[:, 2]), 2]),
         "phantoms": phantoms / looks if looks else None,
@@ -201,6 +211,15 @@ def component_metrics(trace: EpisodeTrace, seen: Perceived, *, sure: float) -> d
     for low, high in BANDS:
         metrics[f"target_recall_{low:.0f}_{high:.0f}"] = _mean(rows[(rows[:, 0] >= low) & (rows[:, 0] < high), 1])
     return metrics | _belief_metrics(trace, seen, target) | track_metrics(trace, seen)
+
+
+def _burst(missed: Sequence[Bool]) -> float | None:
+    """Looks in a row that an object is missed, on average over all times that one is; `missed` [A] for each look."""
+    table = np.array(missed, bool)
+    if not table.any():
+        return None
+    begun = table & ~np.concatenate([np.zeros_like(table[:1]), table[:-1]])
+    return float(table.sum() / begun.sum())
 
 
 def track_metrics(trace: EpisodeTrace, seen: Perceived) -> dict[str, float | None]:

@@ -82,6 +82,8 @@ class Gap(ScenarioKind):
     columns = (
         Column("AP", "AP of all objects, on the drive's pictures", "", "higher"),
         Column("recall", "recall of the objects in view, within 2 m", "", "higher"),
+        Column("missed_burst", "looks in a row that an object in view is missed", "", "lower"),
+        Column("distance_share", "RMS error of the distances, as a share of them", "", "lower"),
         Column("target_recall", "recall of the object that matters", "", "higher"),
         *(
             Column(f"target_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
