@@ -48,6 +48,7 @@ def opened(path: Path) -> Any:
     return scenario
 
 
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow)])
 def test_files_are_valid_and_collide_where_bodies_do(every: int, tmp_path: Path) -> None:
     """The pre-crash scenarios, in which contacts are counted and do not end the episode, at every step."""
@@ -120,6 +121,7 @@ def others(scenario: Any) -> list[int]:
     return [obstacle.obstacle_id for obstacle in scenario.obstacles if obstacle.obstacle_id != EGO]
 
 
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("every", [8, pytest.param(1, marks=pytest.mark.slow)])
 def test_least_distance_is_that_of_crime(every: int, tmp_path: Path) -> None:
     """Its distance of closest encounter (DCE) leaves out the last step, and rounds to centimetres."""
