@@ -27,6 +27,7 @@ PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
     "physical": "ssad run physical --device cuda", "physical-gpu": "ssad run physical-gpu --device cuda",
     "physical-gpu-larkhill": "ssad run physical-gpu --device cuda",
+    "physical-gpu-larkhill-camouflage": "ssad run physical-gpu --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
 }  # fmt: skip

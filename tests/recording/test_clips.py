@@ -35,6 +35,7 @@ from ssad.recording.drives import make_drive
 from ssad.recording.nuscenes_recorder import drive
 from ssad.recording.scene_objects import SceneObjects
 from ssad.recording.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
+from ssad.recording.target_views import target_truth
 from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 from ssad.roads import load_town
 
@@ -227,6 +228,9 @@ def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, r
         assert y0 - 1 <= y
         assert x + w <= x1 + 1
         assert y + h <= y1 + 1
+        seen, whole = (target_truth(row, [thing], CLASSES, whole=chosen).box[0].tolist() for chosen in (False, True))
+        assert seen == pytest.approx([x, y, x + w, y + h], abs=1e-3)
+        assert whole == pytest.approx([x0, y0, x1, y1], abs=0.02), "all of it, as a 3D detector says it"
         if thing["visible"] == 1.0:
             assert w * h > 0.5 * (x1 - x0) * (y1 - y0)
 

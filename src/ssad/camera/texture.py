@@ -203,11 +203,12 @@ def joined(taps: Sequence[Taps], corners: Sequence[tuple[int, int]], width: int,
     """
     rows = sum(height * width for height, width in levels_of(taps[0].size))
     (high, wide), counts = part, [len(one.pixel) for one in taps]
-    starts = [((number * high - y) * wide - x, number * rows) for number, (y, x) in enumerate(corners)]
-    where = taps[0].pixel.device
-    moved = torch.tensor(starts).to(where).repeat_interleave(
-        torch.tensor(counts).to(where), 0, output_size=sum(counts)
-    )  # fmt: skip
+    starts = [
+        ((number * high - y) * wide - x, number * rows, count)
+        for number, ((y, x), count) in enumerate(zip(corners, counts, strict=True))
+    ]
+    table = torch.tensor(starts).to(taps[0].pixel.device)
+    moved = table[:, :2].repeat_interleave(table[:, 2], 0, output_size=sum(counts))
     pixel, index, weight, light = (
         torch.cat([getattr(one, name) for one in taps]) for name in ("pixel", "index", "weight", "light")
     )
