@@ -150,15 +150,19 @@ def benign_table(run: Run, title: str) -> Table:
 
 
 def failing_table(run: Run) -> Table:
-    """How detectors fail, in what a perfect one takes to fail alike."""
+    """How detectors fail, in what a perfect one takes to fail alike; what no line tells is left out."""
+    told = {
+        key: head
+        for key, head in (("missed_burst", "`burst`"), ("distance_share", "`noise`"), ("phantoms", "`phantoms`"))
+        if any(line["metrics"].get(key) is not None for line in run.lines)
+    }
     rows = []
     for (system, name, _), lines in conditions(run).items():
         if name == "none" and any(line["metrics"].get("recall") is not None for line in lines):
-            missed = _cell(lines, "recall", "bounded")
-            missed = replace(missed, mean=1.0 - missed.mean, low=1.0 - missed.high, high=1.0 - missed.low)
-            others = (_cell(lines, key, "mean") for key in ("missed_burst", "distance_share", "phantoms"))
-            rows.append(Row((system,), (missed, *others)))
-    heads = ("`missed`", "`burst`", "`noise`", "`phantoms`")
+            found = _cell(lines, "recall", "bounded")
+            missed = replace(found, mean=1.0 - found.mean, low=1.0 - found.high, high=1.0 - found.low)
+            rows.append(Row((system,), (missed, *(_cell(lines, key, "mean") for key in told))))
+    heads = ("`missed`", *told.values())
     return Table("failing", "How detectors fail, as settings of a perfect one", ("System",), heads, tuple(rows))
 
 
@@ -239,10 +243,14 @@ def _benign(run: Run, runs: Mapping[str, Run]) -> list[str]:
 
 
 def _damages(run: Run, runs: Mapping[str, Run]) -> list[str]:
-    under = [c for c in conditions(run) if c[2]]
+    every = conditions(run)
+    under = [c for c in every if c[2]]
+    most = max(map(len, every.values()))
+    short = [f"`{c[1]}` {c[2]}: {len(every[c])}" for c in under if len(every[c]) < most]
+    fewer = f" With fewer than {most} drives: {', '.join(short)}." if short else ""
     return [
         "### Damage to the component and to the system", "",
-        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.", "",
+        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer}", "",
         f"![Share of AP lost against rise of the collision rate]({FIGURE.name})", "", _smaller(rank_table(run)), "",
         *_examples(run), "", _smaller(drop_table(run)), "", _smaller(cause_table(run)),
     ]  # fmt: skip
@@ -256,7 +264,7 @@ def _examples(run: Run) -> list[str]:
         (harmful(run), "Of those that take a tenth of it at the most, the collision rate rises most under "),
     ):
         if condition is None:
-            lines.append(f"{what.partition(',')[0]} there is none.")
+            lines.append(f"* {what.partition(',')[0]} there is none.")
             continue
         rise = change(run, condition, "collision")
         if condition == harmless(run):
@@ -309,8 +317,12 @@ def _measured(run: Run) -> str:
 
 
 def _damage(run: Run, condition: Condition) -> str:
-    rise = change(run, condition, "collision")
-    return f"{lost_share(run, condition):.0%} of the AP, CR {rise.mean:+.3f} {rise.interval} ({rise.count})"
+    rise, driven, more = (change(run, condition, name) for name in ("collision", "route_completion", "phantoms"))
+    phantoms = "" if math.isnan(more.mean) else f", phantoms a look {more.mean:+.2f} {more.interval}"
+    return (
+        f"{lost_share(run, condition):.0%} of the AP{phantoms}, CR {rise.mean:+.3f} {rise.interval}, "
+        f"RC {driven.mean:+.3f} {driven.interval} ({rise.count})"
+    )
 
 
 def _smaller(table: Table) -> str:

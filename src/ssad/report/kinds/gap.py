@@ -24,7 +24,10 @@ MAIN = {
     "phantoms": "phantoms a look", "collision": "CR", "route_completion": "RC", "min_ttc": "least TTC, s",
     "hard_braking": "hard braking",
 }  # fmt: skip
-DROPS = {"AP": "AP", "target_recall": "recall of the object that matters", "collision": "CR", "route_completion": "RC"}
+DROPS = {
+    "AP": "AP", "target_recall": "recall of the object that matters", "phantoms": "phantoms a look", "collision": "CR",
+    "route_completion": "RC",
+}  # fmt: skip
 SIGNS = {
     "sign_recall_5_20": "read from 5 to 20 m", "sign_recall_20_40": "read from 20 to 40 m",
     "sign_read_at": "first read at, m", "stop_signs": "signs run",
