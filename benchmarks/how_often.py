@@ -112,7 +112,7 @@ def coverage(given: argparse.Namespace) -> None:
         if number % 20 == 19 or number == given.repeats - 1:
             data = {
                 "scenario": SCENARIO, "noise": vars(noise_of(given)), "repeats": number + 1, "share": given.share,
-                "each": given.each, "device": given.device,
+                "each": given.each, "device": given.device, "room": 1.0,
                 "training": training, "seconds": time.perf_counter() - began, "columns": COLUMNS,
                 "importance": rounded(sampling), "splitting": rounded(branching),
             }  # fmt: skip

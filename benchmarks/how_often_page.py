@@ -86,7 +86,7 @@ def estimates() -> list[dict[str, Any]]:
         data = json.loads(path.read_text(encoding="utf-8"))
         known = found.setdefault(data["noise"]["lapse"], data)
         if known is not data:
-            if any(known[key] != data[key] for key in ("noise", "share", "each", "scenario")):
+            if any(known.get(key) != data.get(key) for key in ("noise", "share", "each", "scenario", "room")):
                 raise ValueError(f"{path}: of another case, or of estimates of another size, than those beside it")
             for key in ("training", "importance", "splitting", "repeats", "seconds"):
                 known[key] += data[key]
@@ -165,6 +165,8 @@ def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
                 f"a half-width of 2 %, for which brute force needs about 10,000 collisions, it needs {long:,.0f} times "
                 "fewer agent-steps."
             )
+    if "room" not in data:
+        last += " These estimates are from before the upper limits left room for a whole event more: half of one then."
     return [*lines, "", last, ""]
 
 
