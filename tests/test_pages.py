@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[1]
         ("digital_page", "digital"),
         ("physical_page", "physical_results"),
         ("detector_accuracy", "accuracy"),
+        ("how_often_page", "how_often"),
     ],
 )
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
