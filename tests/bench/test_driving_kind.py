@@ -210,7 +210,7 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     asked, clock = [], iter([0.0, 8.0, 10.0, 11.0, 20.0, 22.0] * 2)
     monkeypatch.setattr(driving, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
     monkeypatch.setattr(
-        driving, "drive", lambda cells, *, device: (episodes, [trace_of("collision"), trace_of("route")])
+        driving, "drive", lambda cells, *, device: (episodes, [trace_of("collision"), trace_of("route")], {})
     )
     monkeypatch.setattr(driving, "save_trace", lambda path, trace: path.write_text(trace.end))
     monkeypatch.setattr(driving, "trace_hash", lambda trace: f"hash {trace.end}")
