@@ -1,7 +1,7 @@
-"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py [FOLDER [SMALL]]
+"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py [FOLDER]
 
 benchmarks/results/digital holds what a run wrote: tables/*.md of its folder, and run.json without its cells. With
-FOLDER they are copied from there first; from SMALL, a run with other settings, the table of small budgets alone.
+FOLDER they are copied from there first.
 """
 
 from __future__ import annotations
@@ -35,23 +35,6 @@ def keep(folder: Path) -> None:
         if (folder / "tables" / f"{name}.md").is_file():
             shutil.copy(folder / "tables" / f"{name}.md", RESULTS)
     (RESULTS / "run.json").write_text(json.dumps(told, indent=1) + "\n")
-
-
-def keep_small(folder: Path) -> None:
-    """Copy the table of small budgets from another run."""
-    (RESULTS / "small").mkdir(exist_ok=True)
-    shutil.copy(folder / "tables" / "halving.md", RESULTS / "small")
-    told = json.loads((folder / "run.json").read_text())
-    (RESULTS / "small" / "run.json").write_text(json.dumps({"command": told["command"]}, indent=1) + "\n")
-
-
-def small() -> list[str]:
-    """What the page says of that run."""
-    if not (RESULTS / "small" / "run.json").is_file():
-        return []
-    command = json.loads((RESULTS / "small" / "run.json").read_text())["command"]
-    table = (RESULTS / "small" / "halving.md").read_text().split("\n", 2)[2].strip()
-    return ["A smaller run, on other numbers of drives:", "```", command, "```", table, ""]
 
 
 def outdated() -> list[str]:
@@ -111,14 +94,10 @@ def page() -> str:
         lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
     for name in (name for name in TABLES if (RESULTS / f"{name}.md").is_file()):
         lines += [(RESULTS / f"{name}.md").read_text().strip(), ""]
-        if name == "halving":
-            lines += small()
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
     if sys.argv[1:]:
         keep(Path(sys.argv[1]))
-    if sys.argv[2:]:
-        keep_small(Path(sys.argv[2]))
     PAGE.write_text(page())
