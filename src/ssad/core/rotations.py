@@ -109,6 +109,15 @@ def upright_pose(x: float, y: float, yaw: float, z: float = 0.0) -> F64:
     return pose
 
 
+def upright_poses(place: F64) -> F64:
+    """Poses [N, 4, 4] of what stands upright at x, y, yaw [N, 3]."""
+    pose = np.tile(np.eye(4), (len(place), 1, 1))
+    cos, sin = np.cos(place[:, 2]), np.sin(place[:, 2])
+    pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = cos, -sin, sin, cos
+    pose[:, :2, 3] = place[:, :2]
+    return pose
+
+
 def wrap_angle(angle: npt.ArrayLike) -> Floats:
     """Angles brought into [-pi, pi)."""
     given = np.asarray(angle)

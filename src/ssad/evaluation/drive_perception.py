@@ -83,8 +83,10 @@ class Watcher:
                 for picture in list(told.pictures.values())[:1]:
                     self._keep(self._shots[told.scene], told.time, picture, self.every)
             return
-        for scene, time in zip(told.scene.tolist(), told.time.tolist(), strict=True):
-            self.known[scene].append((time, told.tracks.take(told.tracks.scene == scene)))
+        tracks = told.tracks.take(np.argsort(told.tracks.scene, kind="stable"))
+        ends = (np.searchsorted(tracks.scene, told.scene, side=side).tolist() for side in ("left", "right"))
+        for scene, time, begin, end in zip(told.scene.tolist(), told.time.tolist(), *ends, strict=True):
+            self.known[scene].append((time, tracks.take(slice(begin, end))))
 
     @staticmethod
     def _keep(shots: list[tuple[float, Any]], time: float, picture: Any, every: float) -> None:

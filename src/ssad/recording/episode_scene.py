@@ -19,7 +19,7 @@ from ssad.assets.mesh import Material, Mesh, merge, prism
 from ssad.assets.street import cached_street
 from ssad.camera.scene import Scene, Thing
 from ssad.core.lane_graph import LaneGraph, SignKind
-from ssad.core.rotations import upright_pose
+from ssad.core.rotations import upright_pose, upright_poses
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, I32, U8, Bool, Episode, EpisodeTrace, SignalState
 from ssad.recording.scene_objects import PHASES, STRIDE, Clear
@@ -153,6 +153,15 @@ class EpisodeScene:
         self.stop_signs = frozenset(n for n, sign in enumerate(found) if sign.kind == KINDS[SignKind.STOP])
         self._sign_poses = [upright_pose(*sign.pose) for sign in found]
         self._fixed = [merge([sign.plate, sign.post]) for sign in found] + [_lens(state) for state in LENSES]
+        heads = street.heads.astype(np.float64)
+        self._head_places = heads[:, :2]
+        self._lenses = [
+            {
+                state: Thing(len(found) + n, upright_pose(x, y, yaw, z + up) @ upright_pose(0.01, 0.0, 0.0))
+                for n, (state, up) in enumerate(LENSES.items())
+            }
+            for x, y, z, yaw in heads.tolist()
+        ]
         self._bodies: dict[object, int] = {}
         self._own: dict[object, Mesh] = {}
         self._scene: Scene | None = None
@@ -214,28 +223,26 @@ class EpisodeScene:
             without: Agent that is left out: who looks.
         """
         found = [Thing(n, self._sign_poses[n]) for n in looks.signs]
+        poses = upright_poses(moment.pose.astype(np.float64))
         for a, model in enumerate(looks.models):
             if moment.active[a] and a != without:
-                x, y, yaw = moment.pose[a].astype(np.float64).tolist()
                 phase = 0
                 if _cycles(model):
                     phase = int((moment.walked[a] + looks.strides[a]) / STRIDE * PHASES) % PHASES
                 mesh = self._bodies[model, looks.variants[a], phase]
-                found.append(Thing(mesh, upright_pose(x, y, yaw), looks.paints[a], a + 1))
+                found.append(Thing(mesh, poses[a], looks.paints[a], a + 1))
         return tuple(found)
 
     def lights(self, looks: Looks, moment: Moment, eye: F64) -> tuple[Thing, ...]:
         """The lit lenses of the signals near a place [2]; they belong to the street."""
         state = dict(zip(looks.signals.tolist(), moment.signal.tolist(), strict=True))
-        first = len(self._sign_poses)
-        found = []
-        heads = self.street.heads.astype(np.float64)
-        for signal, (x, y, z, yaw) in zip(self.street.head_signal.tolist(), heads.tolist(), strict=True):
-            lit = SignalState(state.get(signal, SignalState.OFF))
-            if lit in LENSES and np.hypot(x - eye[0], y - eye[1]) < SIGNALS_WITHIN:
-                pose = upright_pose(x, y, yaw, z + LENSES[lit]) @ upright_pose(0.01, 0.0, 0.0)
-                found.append(Thing(first + list(LENSES).index(lit), pose))
-        return tuple(found)
+        away = self._head_places - eye
+        near = np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) < SIGNALS_WITHIN).tolist()
+        lit = (
+            (k, SignalState(state.get(signal, SignalState.OFF)))
+            for k, signal in zip(near, self.street.head_signal[near].tolist(), strict=True)
+        )
+        return tuple(self._lenses[k][one] for k, one in lit if one in LENSES)
 
 
 def moments_of(trace: EpisodeTrace) -> list[Moment]:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
 from ssad.camera.rig import RIG, rig_camera
-from ssad.core.detections import Detections
+from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
+from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.core.rotations import upright_pose
-from ssad.core.types import AgentKind
+from ssad.core.types import F64, AgentKind
 from ssad.drivers.perceiving.eyes import boxes_of, projected
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import KINDS, SIZES, Objects, no_objects
@@ -31,11 +32,17 @@ def truth(*rows: tuple[float, float, float, AgentKind]) -> Belief:
     return Belief(pose, np.full((1, len(rows)), 3.0, np.float32), SIZES[kind, :2][None].astype(np.float32), kind[None])
 
 
+def lifted(found: Detections, camera: Camera, pose: F64, **settings: float) -> Objects:
+    """What was found in one picture, of scene 0."""
+    lifting = Lifting(**settings)  # type: ignore[arg-type]  # floats alone
+    return lift([found], camera, pose[None], np.zeros(1, np.int64), MMDET3D_CLASSES, settings=lifting)
+
+
 def seen(belief: Belief, channel: str = "CAM_FRONT") -> tuple[Detections, Objects]:
     camera = rig_camera(channel, 640)
     pose = upright_pose(*EGO) @ camera.to_ego
     found = projected(boxes_of(belief, 0, np.ones(belief.kind.shape[1], bool)), np.linalg.inv(pose), camera)
-    return found, lift(found, camera, pose, MMDET3D_CLASSES, settings=Lifting())
+    return found, lifted(found, camera, pose)
 
 
 def test_what_is_projected_comes_back_with_its_heading_size_and_speed() -> None:
@@ -74,7 +81,7 @@ def test_a_flat_box_is_lifted_by_the_road_under_it(turn: float, kind: AgentKind,
     found, _ = seen(belief)
     camera = rig_camera("CAM_FRONT", 640)
     pose = upright_pose(*EGO) @ camera.to_ego
-    flat = lift(replace(found, solid=None), camera, pose, MMDET3D_CLASSES, settings=Lifting(overhang=0.0))
+    flat = lifted(replace(found, solid=None), camera, pose, overhang=0.0)
     np.testing.assert_allclose(flat.place, belief.pose[0, :, :2], atol=0.35)
     if kind == AgentKind.CAR:
         np.testing.assert_allclose(np.abs(np.cos(flat.yaw - belief.pose[0, :, 2])), 1.0, atol=0.02)
@@ -85,7 +92,7 @@ def test_what_hangs_in_the_sky_stands_on_no_road() -> None:
     camera = rig_camera("CAM_FRONT", 640)
     pose = upright_pose(*EGO) @ camera.to_ego
     sky = replace(found, solid=None, box=torch.tensor([[300.0, 20.0, 340.0, 60.0]]))
-    assert len(lift(sky, camera, pose, MMDET3D_CLASSES, settings=Lifting())) == 0
+    assert len(lifted(sky, camera, pose)) == 0
 
 
 def test_places_are_less_sure_along_the_line_of_sight() -> None:
@@ -106,7 +113,7 @@ def test_what_is_not_finite_is_an_error_and_not_a_miss(field: str) -> None:
     else:
         found = replace(found, solid=replace(found.solid, centre=torch.full_like(found.solid.centre, torch.nan)))
     with pytest.raises(ConfigError, match="not finite"):
-        lift(found, rig_camera("CAM_FRONT", 640), np.eye(4), MMDET3D_CLASSES, settings=Lifting())
+        lifted(found, rig_camera("CAM_FRONT", 640), np.eye(4))
 
 
 def test_of_two_boxes_on_one_car_the_better_stays_and_people_beside_it_too() -> None:
@@ -121,3 +128,40 @@ def test_of_two_boxes_on_one_car_the_better_stays_and_people_beside_it_too() -> 
 
 def test_all_classes_that_matter_have_a_kind() -> None:
     assert all(name in KINDS for name in MMDET3D_CLASSES)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_many_pictures_at_once_give_to_the_bit_what_each_gives_alone(flat: bool) -> None:
+    draws, camera = np.random.default_rng(5), rig_camera("CAM_FRONT_LEFT", 640)
+    pictures, alone, poses = [], [], []
+    scenes = np.array([7, 2, 4, 9])
+    for count, scene in zip((5, 0, 1, 12), scenes.tolist(), strict=True):
+        found = random_detections(draws, count)
+        pictures.append(replace(found, solid=None) if flat else found)
+        poses.append(upright_pose(*draws.normal(size=3).tolist()) @ camera.to_ego)
+        one = lifted(pictures[-1], camera, poses[-1])
+        assert (np.diff(one.score) <= 0.0).all()
+        alone.append(replace(one, scene=np.full(len(one), scene)))
+    together = lift(pictures, camera, np.array(poses), scenes, MMDET3D_CLASSES, settings=Lifting())
+    assert len(together) > 5
+    for name in (field.name for field in fields(Objects)):
+        expected = getattr(Objects.joined(alone), name)
+        np.testing.assert_array_equal(getattr(together, name), expected, err_msg=name)
+    parts = [merged(one, 0.5) for one in sorted(alone, key=lambda one: one.scene[:1].tolist())]
+    fewer = merged(together, 0.5)
+    for name in (field.name for field in fields(Objects)):
+        np.testing.assert_array_equal(getattr(fewer, name), getattr(Objects.joined(parts), name), err_msg=name)
+
+
+def random_detections(draws: np.random.Generator, count: int) -> Detections:
+    """Boxes of all classes, crowded, before a camera."""
+    place = np.column_stack([draws.normal(0.0, 3.0, count), np.full(count, 1.0), draws.uniform(5.0, 25.0, count)])
+    size = draws.uniform(1.0, 5.0, (count, 3))
+    corner = draws.uniform(0.0, 300.0, (count, 2))
+    box = np.column_stack([corner, corner + draws.uniform(5.0, 200.0, (count, 2))])
+    tensor = torch.from_numpy
+    solid = Solids(
+        tensor(place), tensor(size), tensor(draws.uniform(-3.0, 3.0, count)), tensor(draws.normal(size=(count, 2))),
+        torch.zeros(count, dtype=torch.int64),
+    )  # fmt: skip
+    return Detections(tensor(draws.uniform(0.1, 1.0, count)), tensor(draws.integers(0, 10, count)), tensor(box), solid)

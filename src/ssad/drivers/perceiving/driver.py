@@ -18,7 +18,7 @@ import numpy as np
 from ssad.core.driving import Belief, Observation
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.core.rotations import upright_pose
+from ssad.core.rotations import upright_poses
 from ssad.core.types import F32, F64, I32, U8, Controller, Episode
 from ssad.drivers.perceiving.eyes import Eyes
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
@@ -173,25 +173,27 @@ class Perceiving:
 
     def _sightings(self, view: Observation, rows: I64, now: F64) -> list[Sighting]:
         """What is seen now in some rows."""
-        looked = self.eyes.look(view, rows)
+        looked, scenes = self.eyes.look(view, rows), view.scene[rows].astype(np.int64)
+        egos = upright_poses(view.pose[rows].astype(np.float64))
+        parts, blind, signs = [no_objects()], np.ones(len(rows), bool), [[np.zeros((0, 2))] for _ in rows]
+        for name, camera in self.eyes.cameras.items():
+            seen = np.array([k for k, one in enumerate(looked[name]) if one is not None], np.int64)
+            found, eyes = [one for one in looked[name] if one is not None], egos[seen] @ camera.to_ego
+            parts.append(lift(found, camera, eyes, scenes[seen], self.eyes.classes, settings=self.lifting))
+            blind[seen] = False
+            if self._signs is not None:
+                for k, one, at in zip(seen.tolist(), found, eyes, strict=True):
+                    signs[k].append(read_signs(one, camera, at, self.eyes.classes, score=self._signs.settings.score))
+        together = merged(Objects.joined(parts), self.lifting.merge)
         sightings = []
         for k, row in enumerate(rows.tolist()):
-            scene, parts, signs = int(view.scene[row]), [], [np.zeros((0, 2))]
-            ego = upright_pose(*view.pose[row].astype(np.float64).tolist())
-            for name, camera in self.eyes.cameras.items():
-                one = looked[name][k]
-                if one is not None:
-                    found = lift(one, camera, ego @ camera.to_ego, self.eyes.classes, settings=self.lifting)
-                    parts.append(replace(found, scene=np.full(len(found), scene)))
-                    if self._signs is not None:
-                        score, at = self._signs.settings.score, ego @ camera.to_ego
-                        signs.append(read_signs(one, camera, at, self.eyes.classes, score=score))
-            all_ = merged(Objects.joined(parts), self.lifting.merge) if parts else None
+            mine = slice(*np.searchsorted(together.scene, [scenes[k], scenes[k] + 1]))
+            all_ = None if blind[k] else together.take(mine)
             if self.repair is not None:
                 all_ = self.repair(view, row, all_ or no_objects(), self.eyes.cameras, self.lifting)
             shown = {} if self.watch is None else self._pictures(view, row)
-            read = None if self._signs is None else np.concatenate(signs)
-            sightings.append(Sighting(scene, float(now[row]), all_, shown, read, ego[:2, 3]))
+            read = None if self._signs is None else np.concatenate(signs[k])
+            sightings.append(Sighting(int(scenes[k]), float(now[row]), all_, shown, read, egos[k, :2, 3]))
             if self.watch is not None:
                 self.watch(sightings[-1])
         return sightings
@@ -203,7 +205,8 @@ class Perceiving:
     def _take_in(self, now: Mapping[int, float]) -> None:
         """Hand the tracker what has arrived, look by look; a look without any picture tells nothing."""
         ready = [s for s in self._waiting if s.scene in now and s.time + self.latency <= now[s.scene] + LATE]
-        self._waiting = [s for s in self._waiting if not any(s is one for one in ready)]
+        taken = {id(s) for s in ready}
+        self._waiting = [s for s in self._waiting if id(s) not in taken]
         while ready:
             first: dict[int, Sighting] = {}
             for sighting in ready:

@@ -55,17 +55,18 @@ def update(mean: F64, covariance: F64, place: F64, spread: F64) -> tuple[F64, F6
 
 
 def distance(mean: F64, covariance: F64, place: F64, spread: F64) -> F64:
-    """Squared Mahalanobis distances of points and measurements.
+    """Squared Mahalanobis distances of points and measurements, pair by pair.
 
     Args:
         mean: [N, 4].
         covariance: [N, 4, 4].
-        place: [M, 2].
-        spread: [M, 2, 2].
+        place: [N, 2].
+        spread: [N, 2, 2].
 
     Returns:
-        [N, M].
+        [N].
     """
-    apart = place[None] - mean[:, None, :2]
-    expected = covariance[:, None, :2, :2] + spread[None]
-    return np.asarray((apart * np.linalg.solve(expected, apart[..., None])[..., 0]).sum(-1))
+    x, y = (place - mean[:, :2]).T
+    expected = covariance[:, :2, :2] + spread
+    a, b, c = expected[:, 0, 0], 0.5 * (expected[:, 0, 1] + expected[:, 1, 0]), expected[:, 1, 1]
+    return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

@@ -8,8 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from ssad.core.boxes import camera_axes
 from ssad.core.detections import Detections
@@ -38,55 +42,59 @@ class Lifting:
     overhang: float = 0.9
 
 
-def lift(found: Detections, camera: Camera, pose: F64, classes: Sequence[str], *, settings: Lifting) -> Objects:
+def lift(
+    found: Sequence[Detections], camera: Camera, poses: F64, scenes: I64, classes: Sequence[str], *, settings: Lifting
+) -> Objects:
     """Objects in the world; classes that do not matter to a driver are left out.
 
     Args:
-        found: What was found in a picture.
+        found: What was found in each of n pictures of a camera.
         camera: The camera.
-        pose: Of the camera in the world when the picture was taken, [4, 4].
+        poses: Of the camera in the world when each picture was taken, [n, 4, 4].
+        scenes: [n] to which scene each picture belongs.
         classes: Names of the labels.
         settings: Settings.
 
     Returns:
-        The objects, best first, `scene` 0.
+        The objects, picture by picture, best first.
 
     Raises:
         ConfigError: The detector returned a number that is not finite, or a label that is none of its classes.
     """
-    score, label = (v.detach().cpu().numpy() for v in (found.score, found.label))
-    label = label.astype(np.int64)
+    if not found:
+        return no_objects()
+    score, label = _joined([one.score for one in found]), _joined([one.label for one in found]).astype(np.int64)
     _check(score, label, classes)
-    names = [classes[k] for k in label.tolist()]
-    kind = np.array([KINDS.get(name, 0) for name in names], np.int64)
+    kind = np.array([KINDS.get(name, 0) for name in classes], np.int64)[label]
     rows = np.flatnonzero(kind > 0)
     if not len(rows):
         return no_objects()
-    kind = kind[rows]
-    if found.solid is None:
-        box = found.box.detach().cpu().double().numpy()[rows]
+    picture = np.repeat(np.arange(len(found)), [len(one.score) for one in found])[rows]
+    kind, pose = kind[rows], poses[picture]
+    solids = [one.solid for one in found if one.solid is not None]
+    if len(solids) < len(found):
+        box = _joined([one.box for one in found]).astype(np.float64)[rows]
         _finite(box)
         place, yaw, known = _on_ground(box, kind, camera, pose, settings.overhang)
         size: F64 = SIZES[kind, :2]
         velocity: F64 = np.full((len(rows), 2), np.nan)
-        rows, kind, place, yaw = rows[known], kind[known], place[known], yaw[known]
-        size, velocity = size[known], velocity[known]
+        rows, kind, place, yaw, pose = rows[known], kind[known], place[known], yaw[known], pose[known]
+        size, velocity, picture = size[known], velocity[known], picture[known]
     else:
-        solid = found.solid
         centre, lhw, turn, speed = (
-            v.detach().cpu().double().numpy()[rows] for v in (solid.centre, solid.size_lhw, solid.yaw, solid.velocity)
+            _joined([getattr(one, name) for one in solids]).astype(np.float64)[rows]
+            for name in ("centre", "size_lhw", "yaw", "velocity")
         )
         _finite(centre, lhw, turn)
-        place = (centre @ pose[:3, :3].T + pose[:3, 3])[:, :2]
-        ahead = (pose[:3, :3] @ camera_axes(turn))[:, :, 0]
+        place = (_turned(pose, centre) + pose[:, :3, 3])[:, :2]
+        ahead = _turned(pose, camera_axes(turn)[:, :, 0])
         yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
         size = np.maximum(lhw[:, [0, 2]], 0.2)
-        velocity = (np.stack([speed[:, 0], np.zeros(len(rows)), speed[:, 1]], 1) @ pose[:3, :3].T)[:, :2]
+        velocity = _turned(pose, np.stack([speed[:, 0], np.zeros(len(rows)), speed[:, 1]], 1))[:, :2]
     spread, away = _spread(place, pose, settings)
-    near = away <= settings.reach
-    none = np.zeros(len(rows), np.int64)
-    found_here = Objects(none, place, spread, yaw, size, velocity, kind, score[rows].astype(np.float64)).take(near)
-    return found_here.take(np.argsort(-found_here.score, kind="stable"))
+    every = Objects(scenes[picture], place, spread, yaw, size, velocity, kind, score[rows].astype(np.float64))
+    order = np.lexsort((-every.score, picture))
+    return every.take(order[away[order] <= settings.reach])
 
 
 def merged(found: Objects, share: float) -> Objects:
@@ -95,18 +103,37 @@ def merged(found: Objects, share: float) -> Objects:
     Args:
         found: Objects of some scenes.
         share: See `Lifting.merge`.
+
+    Returns:
+        The others, scene by scene, best first.
     """
-    order = np.lexsort((-found.score, found.scene))
-    found = found.take(order)
-    large = np.isin(found.kind, LARGE)
+    found = found.take(np.lexsort((-found.score, found.scene)))
     keep = np.ones(len(found), bool)
-    for scene in np.unique(found.scene):
-        rows = np.flatnonzero((found.scene == scene) & large)
-        gap = np.linalg.norm(found.place[rows][:, None] - found.place[rows][None], axis=-1)
-        close = gap < share * np.maximum(found.size[rows, 0][:, None], found.size[rows, 0][None])
-        for k, row in enumerate(rows):
-            keep[row] = not (close[k, :k] & keep[rows[:k]]).any()
+    rows = np.flatnonzero(np.isin(found.kind, LARGE))
+    if len(rows):
+        # a table of the large objects, a line a scene
+        _, line, count = np.unique(found.scene[rows], return_inverse=True, return_counts=True)
+        slot = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+        shape = (len(count), int(count.max()))
+        place, length = np.zeros((*shape, 2)), np.zeros(shape)
+        place[line, slot], length[line, slot] = found.place[rows], found.size[rows, 0]
+        kept = np.zeros(shape, bool)
+        for k in range(shape[1]):
+            gap = np.linalg.norm(place[:, :k] - place[:, k, None], axis=-1)
+            close = gap < share * np.maximum(length[:, :k], length[:, k, None])
+            kept[:, k] = ~(close & kept[:, :k]).any(1)
+        keep[rows] = kept[line, slot]
     return found.take(keep)
+
+
+def _joined(parts: Sequence[Tensor]) -> npt.NDArray[Any]:
+    """Rows of all tensors, on the host."""
+    return torch.cat([part.detach() for part in parts]).cpu().numpy()
+
+
+def _turned(pose: F64, vector: F64) -> F64:
+    """Vectors [N, 3] turned by poses [N, 4, 4], each by itself: to the bit the same in any company."""
+    return np.asarray((pose[:, :3, :3] * vector[:, None, :]).sum(-1))
 
 
 def _check(score: F64, label: I64, classes: Sequence[str]) -> None:
@@ -121,8 +148,8 @@ def _finite(*arrays: F64) -> None:
 
 
 def _spread(place: F64, pose: F64, settings: Lifting) -> tuple[F64, F64]:
-    """Covariances [N, 2, 2] of places as seen from a camera, and distances [N]."""
-    line = place - pose[:2, 3]
+    """Covariances [N, 2, 2] of places as seen from cameras, and distances [N]."""
+    line = place - pose[:, :2, 3]
     away = np.linalg.norm(line, axis=1)
     one = line / np.maximum(away, 1e-6)[:, None]
     other = np.stack([-one[:, 1], one[:, 0]], 1)
@@ -139,11 +166,11 @@ def _on_ground(box: F64, kind: I64, camera: Camera, pose: F64, overhang: float) 
     its middle half a length behind what is seen; a wider one shows its side.
     """
     foot = np.stack([0.5 * (box[:, 0] + box[:, 2]), box[:, 3], np.ones(len(box))], 1)
-    ray = foot @ np.linalg.inv(camera.intrinsic).T @ pose[:3, :3].T
+    ray = _turned(pose[:, :3, :3] @ np.linalg.inv(camera.intrinsic), foot)
     down = -ray[:, 2]
     known = down > 1e-3
-    where = pose[:3, 3] + ray * (pose[2, 3] / np.where(known, down, 1.0))[:, None]
-    line = where[:, :2] - pose[:2, 3]
+    where = pose[:, :3, 3] + ray * (pose[:, 2, 3] / np.where(known, down, 1.0))[:, None]
+    line = where[:, :2] - pose[:, :2, 3]
     line = line / np.maximum(np.linalg.norm(line, axis=1), 1e-6)[:, None]
     length, width, height = SIZES[kind].T
     shape = (box[:, 2] - box[:, 0]) / np.maximum(box[:, 3] - box[:, 1], 1e-6)

@@ -55,8 +55,8 @@ class Objects:
     def __len__(self) -> int:
         return len(self.scene)
 
-    def take(self, index: npt.NDArray[Any]) -> Self:
-        """The rows that `index` (numbers or a mask) names."""
+    def take(self, index: npt.NDArray[Any] | slice) -> Self:
+        """The rows that `index` (numbers, a mask or a slice) names."""
         return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -55,7 +55,8 @@ class Repair:
         for camera in cameras.values():
             pose = ego @ camera.to_ego
             one = projected(boxes_of(truth, 0, only), np.asarray(np.linalg.inv(pose), np.float64), camera)
-            parts.append(lift(one, camera, pose, PerfectEyes.classes, settings=lifting))
+            scene = view.scene[[row]].astype(np.int64)
+            parts.append(lift([one], camera, pose[None], scene, PerfectEyes.classes, settings=lifting))
         seen = Objects.joined(parts).take(np.arange(min(1, sum(len(part) for part in parts))))
         if not len(seen):
             return found
@@ -63,4 +64,4 @@ class Repair:
         gap = np.linalg.norm(found.place[:, None] - places[None], axis=-1)
         gap[:, truth.kind[0] == 0] = np.inf
         own = (gap[:, agent] < AROUND) & (gap[:, agent] <= gap.min(1, initial=np.inf))
-        return Objects.joined([found.take(~own), replace(seen, scene=np.full(1, int(view.scene[row])))])
+        return Objects.joined([found.take(~own), seen])

@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
-from ssad.core.types import F64, I32, AgentKind, Bool
+from ssad.core.types import F64, I32, AgentKind
 from ssad.drivers.perceiving.kalman import distance, predict, update
 from ssad.drivers.perceiving.objects import I64, Objects
 
@@ -101,8 +101,8 @@ class Tracks:
     def __len__(self) -> int:
         return len(self.scene)
 
-    def take(self, index: npt.NDArray[Any]) -> Self:
-        """The rows that `index` (numbers or a mask) names."""
+    def take(self, index: npt.NDArray[Any] | slice) -> Self:
+        """The rows that `index` (numbers, a mask or a slice) names."""
         return type(self)(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def at(self, time: F64, density: float) -> Self:
@@ -174,8 +174,7 @@ class Tracker:
         looked = np.isfinite(when[self.tracks.scene])
         tracks = self.tracks.at(np.where(looked, when[self.tracks.scene], self.tracks.time), own.density)
         found = found.take(np.isfinite(when[found.scene]) & (found.score >= own.low))
-        pairs = [self._matched(tracks, found, int(scene)) for scene in np.sort(scenes)]
-        rows, hits = (np.concatenate([np.zeros(0, np.int64), *part]) for part in zip(*pairs, strict=True))
+        rows, hits = self._matched(tracks, found, np.sort(scenes))
         tracks = replace(tracks, missed=np.where(looked, tracks.missed + 1, tracks.missed))
         tracks = self._with_hits(tracks, rows, found.take(hits))
         left = np.setdiff1d(np.flatnonzero(found.score >= own.high), hits)
@@ -183,27 +182,38 @@ class Tracker:
         tracks = tracks.take(tracks.missed <= limit)
         self.tracks = _joined(tracks, self._begun(found.take(left), when))
 
-    def _matched(self, tracks: Tracks, found: Objects, scene: int) -> tuple[I64, I64]:
-        """Rows of tracks and of objects of a scene that belong together."""
+    def _matched(self, tracks: Tracks, found: Objects, scenes: I64) -> tuple[I64, I64]:
+        """Rows of tracks and of objects that belong together, scene by scene."""
         own = self.settings
-        rows, hits = np.flatnonzero(tracks.scene == scene), np.flatnonzero(found.scene == scene)
-        cost = distance(tracks.mean[rows], tracks.covariance[rows], found.place[hits], found.spread[hits])
-        cost += own.stranger * (tracks.kind[rows][:, None] != found.kind[hits])
-        high: Bool = found.score[hits] >= own.high
-        confirmed: Bool = tracks.hits[rows] >= own.confirm
-        free, open_ = np.ones(len(rows), bool), np.ones(len(hits), bool)
-        one: list[I64] = []
-        other: list[I64] = []
-        stages = ((confirmed, high), (confirmed & (tracks.missed[rows] == 0), ~high), (~confirmed, high))
-        for wanted, offered in stages:
-            r, h = np.flatnonzero(wanted & free), np.flatnonzero(offered & open_)
-            part = np.minimum(cost[np.ix_(r, h)], own.gate)
-            a, b = linear_sum_assignment(part)
-            good = part[a, b] < own.gate
-            one.append(r[a[good]])
-            other.append(h[b[good]])
-            free[one[-1]], open_[other[-1]] = False, False
-        return rows[np.concatenate(one)], hits[np.concatenate(other)]
+        rows, begin, count = _by_scene(tracks.scene, scenes)
+        hits, first, many = _by_scene(found.scene, scenes)
+        # all pairs of all scenes in one go, the pairs of a scene one after the other, track by track
+        size = count * many
+        line = np.repeat(np.arange(len(scenes)), size)
+        number = np.arange(len(line)) - np.repeat(np.cumsum(size) - size, size)
+        a, b = rows[begin[line] + number // many[line]], hits[first[line] + number % many[line]]
+        far = distance(tracks.mean[a], tracks.covariance[a], found.place[b], found.spread[b])
+        far = np.minimum(far + own.stranger * (tracks.kind[a] != found.kind[b]), own.gate)
+        confirmed, high = tracks.hits >= own.confirm, found.score >= own.high
+        stages = ((confirmed, high), (confirmed & (tracks.missed == 0), ~high), (~confirmed, high))
+        one: list[I64] = [np.zeros(0, np.int64)]
+        other: list[I64] = [np.zeros(0, np.int64)]
+        free, open_ = np.ones(len(tracks), bool), np.ones(len(found), bool)
+        at = 0
+        for k in np.flatnonzero(size).tolist():
+            r, h = rows[begin[k] : begin[k] + count[k]], hits[first[k] : first[k] + many[k]]
+            cost = far[at : at + size[k]].reshape(len(r), len(h))
+            at += int(size[k])
+            for wanted, offered in stages:
+                i, j = np.flatnonzero((wanted & free)[r]), np.flatnonzero((offered & open_)[h])
+                if len(i) and len(j):
+                    part = cost[i[:, None], j]
+                    m, n = linear_sum_assignment(part)
+                    good = part[m, n] < own.gate
+                    one.append(r[i[m[good]]])
+                    other.append(h[j[n[good]]])
+                    free[one[-1]], open_[other[-1]] = False, False
+        return np.concatenate(one), np.concatenate(other)
 
     def _with_hits(self, tracks: Tracks, rows: I64, hits: Objects) -> Tracks:
         """Tracks after their hits."""
@@ -275,6 +285,13 @@ def believed(tracks: Tracks, scenes: I32 | I64) -> Belief:
     speed[at, slot] = tracks.mean[:, 2] * np.cos(yaw) + tracks.mean[:, 3] * np.sin(yaw)
     size[at, slot], kind[at, slot] = tracks.size, tracks.kind
     return Belief(pose, speed, size, kind)
+
+
+def _by_scene(scene: I64, scenes: I64) -> tuple[I64, I64, I64]:
+    """Rows ordered by scene, and for each of some scenes where its rows begin in that order and how many they are."""
+    order = np.argsort(scene, kind="stable")
+    begin, end = (np.searchsorted(scene[order], scenes, side=side) for side in ("left", "right"))
+    return order, begin, end - begin
 
 
 def _looks(found: Objects) -> tuple[F64, F64, F64]:
