@@ -310,6 +310,8 @@ def test_nothing_is_wider_than_the_window_and_the_seek_bar_can_be_used(
     script = """<script>addEventListener("load", () => setTimeout(() => {
         const wide = [...document.querySelectorAll("body *")].filter(e => !e.closest(".scroll, svg")
             && e.getBoundingClientRect().right > innerWidth + 1).map(e => e.tagName + "." + e.className);
+        wide.push(...[...document.querySelectorAll(".plot circle, .plot text")].filter(e =>
+            e.getBoundingClientRect().right > innerWidth || e.getBoundingClientRect().left < 0).map(e => e.tagName));
         const seek = document.getElementById("seek").getBoundingClientRect();
         const number = document.querySelector("#results td b").getBoundingClientRect();
         tell({inner: innerWidth, wide, seek: [seek.width, seek.height], number: [number.right, number.bottom]});

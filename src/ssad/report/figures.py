@@ -8,7 +8,9 @@ from html import escape
 from ssad.report.episodes import DrivingRun
 from ssad.report.tables import Cell
 
-LABEL, WIDTH, STEP, GAP = 190, 520, 15, 12
+# names end at LABEL, the axis begins at LEFT and is WIDTH long: % of the figure's width, so that it fits any screen
+LABEL, LEFT, WIDTH = 44, 47, 48
+STEP, GAP = 15, 12  # px
 COLOURS = ("var(--s0)", "var(--s1)", "var(--s2)", "var(--s3)", "var(--s4)")
 
 
@@ -21,32 +23,32 @@ def interval_plot(run: DrivingRun, symbol: str = "CR") -> str:
         if not found:
             continue
         middle = y + STEP * len(found) / 2
-        parts.append(f'<text x="{LABEL - 12}" y="{middle + 4:.1f}" text-anchor="end">{escape(name)}</text>')
+        parts.append(f'<text x="{LABEL}%" y="{middle + 4:.1f}" text-anchor="end">{escape(name)}</text>')
         for system, cell in found:
             colour = COLOURS[run.systems.index(system) % len(COLOURS)]
             at = y + STEP / 2
             if cell.interval:
-                low, high = LABEL + WIDTH * cell.low, LABEL + WIDTH * cell.high
+                low, high = LEFT + WIDTH * cell.low, LEFT + WIDTH * cell.high
                 style = (
                     'stroke-width="1.5" stroke-dasharray="3 3"'
                     if cell.method == "range"
                     else 'stroke-width="3" stroke-linecap="round" opacity=".45"'
                 )
-                parts.append(f'<line x1="{low:.1f}" x2="{high:.1f}" y1="{at}" y2="{at}" stroke="{colour}" {style}/>')
+                parts.append(f'<line x1="{low:.2f}%" x2="{high:.2f}%" y1="{at}" y2="{at}" stroke="{colour}" {style}/>')
             if not math.isnan(cell.mean):
                 parts.append(
-                    f'<circle cx="{LABEL + WIDTH * cell.mean:.1f}" cy="{at}" r="5" fill="{colour}">'
+                    f'<circle cx="{LEFT + WIDTH * cell.mean:.2f}%" cy="{at}" r="5" fill="{colour}">'
                     f"<title>{escape(f'{system}: {cell.text}, {cell.tip}')}</title></circle>"
                 )
             y += STEP
         y += GAP
     height = y + 22
     grid = "".join(
-        f'<line x1="{LABEL + WIDTH * k / 4:.1f}" x2="{LABEL + WIDTH * k / 4:.1f}" y1="2" y2="{y - 6:.1f}" '
-        f'class="grid"/><text x="{LABEL + WIDTH * k / 4:.1f}" y="{y + 12:.1f}" text-anchor="middle">{k / 4:g}</text>'
+        f'<line x1="{LEFT + WIDTH * k / 4}%" x2="{LEFT + WIDTH * k / 4}%" y1="2" y2="{y - 6:.1f}" '
+        f'class="grid"/><text x="{LEFT + WIDTH * k / 4}%" y="{y + 12:.1f}" text-anchor="middle">{k / 4:g}</text>'
         for k in range(5)
     )
     return (
-        f'<svg viewBox="0 0 {LABEL + WIDTH + 24} {height:.0f}" role="img" '
+        f'<svg height="{height:.0f}" role="img" '
         f'aria-label="collision rate with 95 % intervals">{grid}{"".join(parts)}</svg>'
     )
