@@ -22,7 +22,7 @@ from ssad.world.kernels.data import (
     TurnRank,
 )
 from ssad.world.kernels.lanes import ASIDE, changes, indicates, on_oncoming_lane, way_at
-from ssad.world.kernels.shared import signal_state, wrap
+from ssad.world.kernels.shared import row, signal_state, wrap
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 
@@ -46,7 +46,7 @@ def light(
 @wp.func
 def keeps_route(roads: Roads, route: wp.vec2i, shift: wp.vec4, at: int, pose: wp.vec3) -> bool:
     """Whether somebody is where its route is, and goes its way."""
-    point = roads.path[route[0] + at]
+    point = row(roads.path, route[0] + at)
     p = wp.vec3(point[0], point[1], point[2])
     if changes(shift):
         p = way_at(roads, route[0], route[1], shift, float(at))
@@ -119,7 +119,7 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
         follows = keeps_route(roads, route, shift, at, pose)
     if follows:
         point = route[0] + at
-        rule = roads.rule[point]
+        rule = row(roads.rule, point)
         way = wp.vec4(wp.min(rule[1], rule[2]), rule[2], rule[3], roads.bend[point] + 0.5)
         signal = roads.path_signal[point]
         if changes(shift) and state.controller[b, i] == Controller.AUTOPILOT:

@@ -8,7 +8,7 @@ import warp as wp
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, Seen, State, When
 from ssad.world.kernels.lanes import changes, metres_left, way_slope
-from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, wrap
+from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
 
 @wp.func
@@ -45,7 +45,7 @@ def steer_on_route(bank: EpisodeArrays, roads: Roads, state: State, b: int, i: i
     """Steering in [-1, 1]: curvature of the route a moment ahead, corrected critically damped in distance."""
     route = bank.route[e, i]
     at = state.progress[b, i]
-    p = roads.path[route[0] + at]
+    p = row(roads.path, route[0] + at)
     pose = state.pose[b, i]
     c = wp.cos(p[2])
     s = wp.sin(p[2])

@@ -4,7 +4,7 @@ import warp as wp
 
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import End, EpisodeArrays, Presence, Roads, State
-from ssad.world.kernels.shared import lane_under, on_track, sign_line, track_at, wrap
+from ssad.world.kernels.shared import lane_under, on_track, row, sign_line, track_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
@@ -152,7 +152,7 @@ def move_one(
         last = wp.min(at + 12, route[1] - 1)
         k = at
         while k <= last:
-            p = roads.path[route[0] + k]
+            p = row(roads.path, route[0] + k)
             dx = pose[0] - p[0]
             dy = pose[1] - p[1]
             d2 = dx * dx + dy * dy

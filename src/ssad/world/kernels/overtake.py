@@ -11,7 +11,7 @@ import warp as wp
 from ssad.core.types import AgentKind, Controller
 from ssad.world.kernels.data import FAR, LEADERS, NO_LEADER, End, EpisodeArrays, Presence, Roads, Seen, State, Work
 from ssad.world.kernels.lanes import lanes_left, metres_left, on_oncoming_lane, way_frame
-from ssad.world.kernels.shared import boxes_touch, route_frame
+from ssad.world.kernels.shared import boxes_touch, route_frame, row
 from ssad.world.kernels.traffic import REGISTERS, idm_gap, line_ahead
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
@@ -288,7 +288,7 @@ def choose_lane(
     v = wp.max(state.speed[b, i], 0.0)
     top = state.aim[b, i][1]
     own = bank.body[bank.model[e, i]]
-    room = roads.beside[first]
+    room = row(roads.beside, first)
     shortest = 2.0 * RAMP_LEAST * own[0]
     ramp = wp.max(shortest, RAMP_TIME * v)
     back = wp.max(shortest, RAMP_TIME * top)

@@ -16,7 +16,7 @@ from ssad.world.kernels.data import (
     TurnRank,
     Work,
 )
-from ssad.world.kernels.shared import BRIDGE, boxes_touch, height_of, on_track, sign_line, signal_state, wrap
+from ssad.world.kernels.shared import BRIDGE, boxes_touch, height_of, on_track, row, sign_line, signal_state, wrap
 
 
 @wp.func
@@ -151,7 +151,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     for k in range(reach):
         n = mark + k
         if n < route[1]:
-            p = roads.path[route[0] + n]
+            p = row(roads.path, route[0] + n)
             if (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2]) > 0.0:
                 passed = n
     mark = passed
@@ -166,7 +166,7 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     least = FAR
     near = mark
     for k in range(wp.max(mark - 1, 0), wp.min(mark + 64, last) + 1):
-        p = roads.path[route[0] + k]
+        p = row(roads.path, route[0] + k)
         dx = pose[0] - p[0]
         dy = pose[1] - p[1]
         d2 = dx * dx + dy * dy
@@ -177,14 +177,14 @@ def record(bank: EpisodeArrays, roads: Roads, state: State, ego: Ego, agents: in
     ego.route_point[b] = near
 
     # red light: the tail crosses the stop line on red; a right turn after a stop is allowed
-    p = roads.path[route[0] + near]
+    p = row(roads.path, route[0] + near)
     c = wp.cos(p[2])
     s = wp.sin(p[2])
     left = -s * (pose[0] - p[0]) + c * (pose[1] - p[1])
     ran = int(0)
     back = near - int(body[0] + 1.0)
     if back >= 0 and wp.abs(left) < 4.0:
-        rule = roads.rule[route[0] + back]
+        rule = row(roads.rule, route[0] + back)
         index = roads.path_signal[route[0] + back]
         if index >= 0 and rule[1] <= wp.max(gone, 0.0) + 0.5 and rule[1] > -0.5:
             stopped_right = int(rule[3]) % int(TurnRank.YIELD) == TurnRank.RIGHT and state.waited[b, 0] >= 1.0

@@ -10,9 +10,23 @@ NO_LINE = wp.constant(1 << 30)
 BRIDGE = wp.constant(4.5)  # m between two roads of which one leads over the other
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 v = reinterpret_cast<const float4*>(rows.data)[k];
+    return wp::vec_t<4, wp::float32>(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[k];
+#endif
+""")
+def row(rows: wp.array(dtype=wp.vec4), k: int) -> wp.vec4:
+    """Row k of a contiguous array, on CUDA read at once and not number by number, which is what rows[k] does there."""
+
+
 @wp.func
 def wrap(angle: float) -> float:
     """Angle in (-pi, pi]."""
+    if wp.abs(angle) < 3.14:
+        return angle  # the same bits, and no division
     return angle - 6.283185307179586 * wp.floor((angle + 3.141592653589793) / 6.283185307179586)
 
 
@@ -22,8 +36,8 @@ def route_at(roads: Roads, first: int, count: int, u: float) -> wp.vec3:
     t = wp.clamp(u, 0.0, float(count - 1))
     i = wp.min(int(t), count - 2)
     f = t - float(i)
-    a = roads.path[first + i]
-    b = roads.path[first + i + 1]
+    a = row(roads.path, first + i)
+    b = row(roads.path, first + i + 1)
     return wp.vec3(a[0] + f * (b[0] - a[0]), a[1] + f * (b[1] - a[1]), a[2] + f * wrap(b[2] - a[2]))
 
 
@@ -33,8 +47,8 @@ def route_frame(roads: Roads, first: int, count: int, u: float) -> wp.vec4:
     t = wp.max(u, 0.0)
     i = wp.min(int(t), count - 2)
     f = t - float(i)
-    a = roads.path[first + i]
-    b = roads.path[first + i + 1]
+    a = row(roads.path, first + i)
+    b = row(roads.path, first + i + 1)
     dx = b[0] - a[0]
     dy = b[1] - a[1]
     r = 1.0 / wp.sqrt(wp.max(dx * dx + dy * dy, 1.0e-12))
@@ -70,8 +84,8 @@ def track_at(roads: Roads, track: wp.vec2i, time: float) -> wp.vec4:
             low = middle
         else:
             high = middle
-    p = roads.track[track[0] + low]
-    q = roads.track[track[0] + high]
+    p = row(roads.track, track[0] + low)
+    q = row(roads.track, track[0] + high)
     span = wp.max(q[0] - p[0], 1.0e-6)
     f = wp.clamp((time - p[0]) / span, 0.0, 1.0)
     yaw = p[3] + f * wrap(q[3] - p[3])
@@ -156,7 +170,7 @@ def lane_under(roads: Roads, town: int, x: float, y: float) -> wp.vec3:
     least = FAR
     for k in range(roads.cell_first[cell], roads.cell_first[cell + 1]):
         m = roads.cell_segment[k]
-        g = roads.segment[m]
+        g = row(roads.segment, m)
         dx = g[2] - g[0]
         dy = g[3] - g[1]
         px = x - g[0]

@@ -30,6 +30,7 @@ from ssad.world.kernels.shared import (
     BRIDGE,
     IDM_ACCEL,
     boxes_touch,
+    row,
     sign_line,
 )
 
@@ -122,7 +123,7 @@ def line_ahead(roads: Roads, first: int, part: float, half: float) -> float:
 
     first: the route point in the pool; part: metres beyond it; half: half length of the body.
     """
-    rule = roads.rule[first]
+    rule = row(roads.rule, first)
     return wp.min(rule[1], rule[2]) - part - half
 
 
@@ -334,11 +335,11 @@ def look_around(
         return
     at = state.progress[b, i]
     first = route[0] + at
-    rule = roads.rule[first]
+    rule = row(roads.rule, first)
     pose = state.pose[b, i]
     v = state.speed[b, i]
     own = bank.body[bank.model[e, i]]
-    p = roads.path[first]
+    p = row(roads.path, first)
     part = (pose[0] - p[0]) * wp.cos(p[2]) + (pose[1] - p[1]) * wp.sin(p[2])
     cap = wp.min(rule[0], roads.rule[wp.min(first + 2, route[0] + route[1] - 1)][0])
     shift = state.shift[b, i]
