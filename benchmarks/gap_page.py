@@ -4,7 +4,8 @@
     python benchmarks/gap_page.py --pick runs/gap-damage        # keys of drives worth a replay
 
 With folders that `ssad run benchmarks/gap-benign.yaml`, gap-damage.yaml and `ssad run gap-signs` wrote, what the page
-needs of them is stored first, in benchmarks/results/gap; without any, the page is made of what is stored. `confirm` is
+needs of them is stored first, in benchmarks/results/gap; without any, the page is made of what is stored. NAME+=DIR
+adds to what is stored: conditions that were driven in DIR take the place of the stored ones. `confirm` is
 gap-damage again on other drives, with the two conditions that were singled out; `speed`: of closed_loop_speed.py.
 
 `--pick` names, for the perturbation with AP halved whose collision rate surely moved least and for the one that brought
@@ -62,18 +63,24 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def keep(name: str, folder: Path) -> None:
-    """Store what the page needs of a run."""
-    run = load_run(folder)
+def keep(name: str, folder: Path, *, add: bool = False) -> None:
+    """Store what the page needs of a run, alone or with the conditions that are stored and were not driven in it."""
+    run, old = load_run(folder), stored(name) if add else None
     RESULTS.mkdir(parents=True, exist_ok=True)
     about = {key: value for key, value in run.header.items() if key != "cells"} | {"cells": run.planned}
+    about["runs"] = 1 + (old.header.get("runs", 1) if old else 0)
     (RESULTS / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
-    lines = []
+    again = set(map(_condition, run.lines))
+    lines = [json.dumps(line) for line in (old.lines if old else ()) if _condition(line) not in again]
     for line in run.lines:
         told = {key: line[key] for key in KEPT if line.get(key) is not None}
         told["metrics"] = {key: (line.get("metrics") or {}).get(key) for key in MEASURED}
         lines.append(json.dumps(told | {"spec": {"repetition": line["spec"].get("repetition", 0)}}))
     (RESULTS / f"{name}.jsonl.gz").write_bytes(gzip.compress("\n".join(lines).encode(), mtime=0))
+
+
+def _condition(line: Mapping[str, Any]) -> Condition:
+    return str(line["system"]), str(line["perturbation"]), int(line["severity"])
 
 
 def stored(name: str) -> Run | None:
@@ -310,8 +317,9 @@ def _measured(run: Run) -> str:
     failed = sum(line["status"] != "ok" for line in run.lines)
     drives = len({line["cluster"] for line in run.lines})
     device = (run.header.get("versions") or {}).get("device", "")
+    in_runs = f" in {runs} runs" if (runs := run.header.get("runs", 1)) > 1 else ""
     return (
-        f"`{run.command}`, {len(run.lines):,} of {run.planned:,} drives on {device or 'an unknown device'}"
+        f"`{run.command}`{in_runs}, {len(run.lines):,} of {run.planned:,} drives on {device or 'an unknown device'}"
         f"{f', {failed} of them failed' if failed else ''}, {drives} scenarios."
     )
 
@@ -358,11 +366,13 @@ def main() -> None:
 
     for given in args.runs:
         name, _, path = given.partition("=")
+        add = name.endswith("+")
+        name = name.removesuffix("+")
         if name == "speed":
             RESULTS.mkdir(parents=True, exist_ok=True)
             shutil.copy(path, RESULTS / "speed.json")
         elif name in RUNS:
-            keep(name, Path(path))
+            keep(name, Path(path), add=add)
         else:
             raise SystemExit(f"{given}: expected NAME=DIR with a name of {', '.join((*RUNS, 'speed'))}")
     damage = stored("damage")

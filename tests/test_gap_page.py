@@ -48,6 +48,26 @@ def page(tmp_path: Path) -> dict[str, Any]:
     return module
 
 
+def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
+    page: dict[str, Any], tmp_path: Path
+) -> None:
+    lines = [line(condition, 0, 0.25, crash=False) for condition in (("fog", 5), ("fog", 3))]
+    header = {"kind": "gap", "suite": {"kind": "gap", "name": "x", "sheets": 0}, "command": "ssad run x"}
+    write_run(tmp_path / "more", header, lines)
+    before = page["stored"]("damage")
+    page["keep"]("damage", tmp_path / "more", add=True)
+    after = page["stored"]("damage")
+    count = {
+        c: len([one for one in after.lines if page["_condition"](one) == c])
+        for c in map(page["_condition"], after.lines)
+    }
+    assert count == {("s", name, k): DRIVES for name, k in (("none", 0), ("dirt", 3), ("rain", 5), ("snow", 1))} | {
+        ("s", "fog", 5): 1, ("s", "fog", 3): 1
+    }  # fmt: skip
+    assert "in 2 runs" in page["_measured"](after)
+    assert "runs" not in page["_measured"](before).replace("ssad run", "")
+
+
 def test_the_two_conditions_that_break_the_rule_are_singled_out(page: dict[str, Any]) -> None:
     run = page["stored"]("damage")
     assert page["harmless"](run) == ("s", "fog", 5)
