@@ -29,6 +29,16 @@ def test_imports_are_listed() -> None:
     assert "safebench" in listed
 
 
+def test_the_maps_that_a_set_still_needs_are_named(
+    data_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSAD_HOME", str(tmp_path))
+    done = ssad("import", "routes", data_dir / "routes" / "frea")
+    assert done.stdout.splitlines()[1:] == [
+        "before they can run, import the maps of Town02, Town05: ssad import map FILE.xodr"
+    ]
+
+
 @pytest.mark.parametrize("every", [100, pytest.param(1, marks=pytest.mark.slow)])
 def test_safebench_and_natural_traffic(every: int, tmp_path: Path) -> None:
     """Each of SafeBench's eight hits the blind follower and is avoidable; the Autopilot copes with the traffic, in

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -70,6 +71,12 @@ def test_the_reader_finds_what_was_recorded(recorded: Path) -> None:
             else:
                 assert len(read_points(recorded / frame.filename)) > 3000
     assert {CATEGORY_TO_CLASS[c] for c in BODY_CATEGORIES.values()} == set(CLASSES)
+
+
+def test_a_scene_tells_its_town_and_weather_in_words(recorded: Path) -> None:
+    told = [row["description"] for row in json.loads((recorded / "v1.0-ssad" / "scene.json").read_text())]
+    words = r"\w+, sun \d+ degrees (above|below) the horizon, clouds \d+ %(, fog of 0\.\d+/m|, wet road \d+ %)?"
+    assert [text for text in told if not re.fullmatch(words, text)] == []
 
 
 def test_points_lie_in_the_boxes_as_counted_and_on_the_ground(recorded: Path) -> None:

@@ -376,6 +376,18 @@ def test_frea_has_150_scenarios(data_dir: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.data
+def test_routes_that_no_list_of_frea_names_come_in_too(data_dir: Path, tmp_path: Path) -> None:
+    """Its lists name 15 of the 28 routes of scenario 9."""
+    (tmp_path / "route").symlink_to(data_dir / "routes" / "frea" / "route")
+    (tmp_path / "scenario_type").mkdir()
+    entries = [{"data_id": k, "scenario_id": 9, "route_id": k, "parameters": None} for k in range(28)]
+    (tmp_path / "scenario_type" / "all.json").write_text(json.dumps(entries))
+    left_out: list[str] = []
+    assert len({s.route for s in import_routes(tmp_path, left_out=left_out)}) == 28
+    assert left_out == []
+
+
+@pytest.mark.data
 @pytest.mark.parametrize("name", ["safebench", "frea"])
 def test_every_imported_route_becomes_an_episode(data_dir: Path, carla_home: Path, name: str) -> None:
     # the ten repetitions of FREA's routes differ in the draw of traffic alone

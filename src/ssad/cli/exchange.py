@@ -74,6 +74,7 @@ def import_routes(
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
     from ssad.core.safeio import home
+    from ssad.roads import town_names
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
@@ -87,8 +88,10 @@ def import_routes(
     scenarios = read(folder, left_out=left_out)
     path = home() / "scenarios" / f"{label}.yaml"
     save_scenarios(path, scenarios)
-    towns = ", ".join(sorted({s.town for s in scenarios}))
-    print(f"set {label}: {len(scenarios)} scenarios on {towns}, written to {path}")
+    towns = sorted({s.town for s in scenarios})
+    print(f"set {label}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
+    if missing := [town for town in towns if town not in town_names()]:
+        print(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE.xodr")
     counted = Counter(re.sub(r": entry \d+", "", line) for line in left_out)
     for line, count in counted.items():
         print(f"left out or not read: {line}{f' ({count} entries)' if count > 1 else ''}")

@@ -119,6 +119,20 @@ def draw_weather(key: tuple[object, ...], kind: str = "") -> Weather:
     return found[kind or str(drawn)]
 
 
+def weather_words(weather: Weather) -> str:
+    """A weather as the description of a scene tells it, such as "sun 40 degrees above the horizon, clouds 35 %"."""
+    height = round(np.degrees(weather.sun_height))
+    told = [
+        f"sun {abs(height)} degrees {'below' if height < 0 else 'above'} the horizon",
+        f"clouds {weather.clouds:.0%}",
+    ]
+    if weather.fog:
+        told.append(f"fog of {weather.fog:.3f}/m")
+    if weather.wet:
+        told.append(f"wet road {weather.wet:.0%}")
+    return ", ".join(told).replace("%", " %")
+
+
 def depth_bytes(depth: Any) -> bytes:
     """A depth map [H, W] at a quarter of the resolution, 16-bit PNG: 64 a metre, 65535 for the sky."""
     small = np.asarray(depth, np.float64)[2::4, 2::4]
@@ -206,7 +220,7 @@ def _scene(recording: Recording, town: str, number: int) -> None:
                 samples.append({"time": moment_of(number, now), "sweep": moment.step, "boxes": boxes})
     part = {
         "name": name, "town": town, "drive": episode.key, "samples": samples, "frames": files.rows,
-        "weather": repr(weather), "sensors": _sensors(cameras),
+        "weather": weather_words(weather), "sensors": _sensors(cameras),
     }  # fmt: skip
     safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
 

@@ -113,7 +113,8 @@ def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str
             save_picture(folder / above, from_above(root, lidar, found))
         seconds = (scene.samples[place].timestamp - scene.samples[0].timestamp) / 1e6
         shown.append({"title": f"{seconds:.1f} s, {len(found)} boxes", "pictures": pictures, "above": above})
-    about = f"{scene.record.description} {len(scene.samples)} samples.".strip()
+    told = scene.record.description.rstrip(". ")
+    about = f"{told}. {len(scene.samples)} samples.".lstrip(". ")
     return {"name": scene.record.name, "about": about, "counts": counts.most_common(), "moments": shown}
 
 
