@@ -93,6 +93,7 @@ def test_a_dry_run_counts_cells_by_label_and_takes_rates_from_runs_beside_it(min
     assert "  one: 4\n  two: 4\n" in done.stdout
     assert "time: unknown" in done.stdout
     assert "disk: unknown" in done.stdout
+    assert "cells: 4, of which 0" in ssad(*words, "--only", "system=two").stdout
     lines = [line | {"wall_s": 30.0} for line in driving_lines()]
     header = {"suite": {"name": "s"}, "kind": "driving", "versions": {"device": "cpu"}}
     write_run(mine.parent / "runs" / "old", header, lines)

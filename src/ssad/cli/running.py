@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -73,9 +74,11 @@ def run(
     plan = make_plan(suite, settings or [], device=device)
     folder = out or Path("runs") / plan.suite.name
     if dry_run:
+        from ssad.bench.run import slice_of
         from ssad.cli.forecast import forecast
 
-        for line in forecast(plan, folder, Resources(workers, ray, plan.device), sample=sample):
+        part = replace(plan, cells=tuple(slice_of(plan, _wanted(only or []))))
+        for line in forecast(part, folder, Resources(workers, ray, plan.device), sample=sample):
             print(line)
         return
     try:
