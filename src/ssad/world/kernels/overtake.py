@@ -216,6 +216,7 @@ def way_is_clear(
         body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
         if boxes_touch(body, own[0] + 0.2, own[1] + 0.3, q, other[0], other[1]):
             clear = bool(False)
+            break
     return clear
 
 

@@ -131,17 +131,19 @@ def axis_gap(dx: float, dy: float, ax: float, ay: float, reach: float) -> float:
 
 
 @wp.func
-def boxes_touch(p: wp.vec3, pl: float, pw: float, q: wp.vec3, ql: float, qw: float) -> bool:
-    """Whether two oriented boxes (pose, half length, half width) overlap: separating-axis test."""
-    dx = q[0] - p[0]
-    dy = q[1] - p[1]
-    r = pl + pw + ql + qw
-    if dx * dx + dy * dy > r * r:
-        return False
-    pc = wp.cos(p[2])
-    ps = wp.sin(p[2])
-    qc = wp.cos(q[2])
-    qs = wp.sin(q[2])
+def frames_touch(
+    dx: float,
+    dy: float,
+    pc: float,
+    ps: float,
+    pl: float,
+    pw: float,
+    qc: float,
+    qs: float,
+    ql: float,
+    qw: float,
+) -> bool:
+    """Whether two boxes (unit heading, half length, half width) overlap, q's centre being at (dx, dy) from p's."""
     c = wp.abs(pc * qc + ps * qs)
     s = wp.abs(pc * qs - ps * qc)
     if axis_gap(dx, dy, pc, ps, pl + ql * c + qw * s) > 0.0:
@@ -151,6 +153,17 @@ def boxes_touch(p: wp.vec3, pl: float, pw: float, q: wp.vec3, ql: float, qw: flo
     if axis_gap(dx, dy, qc, qs, ql + pl * c + pw * s) > 0.0:
         return False
     return axis_gap(dx, dy, -qs, qc, qw + pl * s + pw * c) <= 0.0
+
+
+@wp.func
+def boxes_touch(p: wp.vec3, pl: float, pw: float, q: wp.vec3, ql: float, qw: float) -> bool:
+    """Whether two oriented boxes (pose, half length, half width) overlap: separating-axis test."""
+    dx = q[0] - p[0]
+    dy = q[1] - p[1]
+    r = pl + pw + ql + qw
+    if dx * dx + dy * dy > r * r:
+        return False
+    return frames_touch(dx, dy, wp.cos(p[2]), wp.sin(p[2]), pl, pw, wp.cos(q[2]), wp.sin(q[2]), ql, qw)
 
 
 @wp.func

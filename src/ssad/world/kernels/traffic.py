@@ -30,6 +30,7 @@ from ssad.world.kernels.shared import (
     BRIDGE,
     IDM_ACCEL,
     boxes_touch,
+    frames_touch,
     row,
     sign_line,
 )
@@ -111,9 +112,16 @@ def lead_gap(
         for k in range(14):
             u = float(k + 1)
             at = way_frame(roads, route[0], route[1], shift, u0 + u)
-            body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
-            if result[0] >= FAR and boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
-                result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
+            dx = q[0] - at[0]
+            dy = q[1] - at[1]
+            # a centimetre more than is asked, so that it never misses what the exact test finds
+            if frames_touch(
+                dx, dy, at[2], at[3], own[0] + 0.01, own[1] + 0.21, heading[0], heading[1], other[0], other[1]
+            ):
+                body = wp.vec3(at[0], at[1], wp.atan2(at[3], at[2]))
+                if boxes_touch(body, own[0], own[1] + 0.2, q, other[0], other[1]):
+                    result = wp.vec2(u - 1.0, seen.speed[b, j] * (heading[0] * at[2] + heading[1] * at[3]))
+                    break
     return result
 
 
