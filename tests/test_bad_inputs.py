@@ -79,6 +79,7 @@ CASES = (
     ("run digital-quick --set 'attacks=[{name: pgd, norm: l7}]'", "attacks[0].norm: Input should be"),
     ("run latin.yaml", "latin.yaml: not UTF-8 text (byte 9)"),
     (f"{RUN} repetitions=1000000000", "less than or equal to 100000"),
+    ("run precrash --only colour=red", "unknown field of cells 'colour'; closest: "),
     (f"{RUN} a.b=3", "unknown key 'a'; closest: "),
     (f"{RUN} name=../../etc", "name: String should match pattern"),
     (f"{RUN} seed=1e400", "seed: Input should be a valid integer"),

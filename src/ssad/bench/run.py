@@ -49,9 +49,9 @@ def run(
         SSADError: no worker can start, or data cannot be made.
     """
     resources = resources or Resources(device=plan.device)
+    chosen = slice_of(plan, only or {})  # a wrong name is told before there is a folder
     header, out = run_json(plan), Path(folder).resolve()
     with Store.open(folder, header, retry=retry) as store:
-        chosen = slice_of(plan, only or {})
         missing = sorted((c for c in chosen if c.key not in store.results), key=plan.kind.order)
         if missing:
             again = [cell for cell in missing if cell.key in store.retried]
