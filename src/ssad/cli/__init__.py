@@ -140,7 +140,7 @@ def main() -> None:
             print(error.format_message())
             sys.exit(2)
         command = error.ctx.command_path if error.ctx is not None else "ssad"
-        told = error.format_message().replace("Value error, ", "")  # pydantic's
+        told = " ".join(error.format_message().replace("Value error, ", "").split())  # pydantic's, and choices in lines
         print(f"error: {told} (see: {command} --help)", file=sys.stderr)
         sys.exit(2)
     sys.exit(code if isinstance(code, int) else 0)

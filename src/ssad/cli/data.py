@@ -145,7 +145,7 @@ def record(
     ] = "Twinford,Crossgate,Oldmarket,Larkhill",
     held_out: Annotated[str, typer.Option(help="Towns of the split val; all others are train.")] = "Oldmarket,Larkhill",
     scenes: Annotated[int, typer.Option(min=1, help="Scenes per town.")] = 2,
-    seconds: Annotated[float, typer.Option(min=0.5, help="Length of a scene, s.")] = 20.0,
+    seconds: Annotated[float, typer.Option(min=0.5, max=3600, help="Length of a scene, s.")] = 20.0,
     width: Annotated[int, typer.Option(min=64, help="Image width in pixels (16:9).")] = 1600,
     sweeps: Annotated[int, typer.Option(min=0, max=4, help="Frames between two keyframes.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,

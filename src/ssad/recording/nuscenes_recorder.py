@@ -94,8 +94,8 @@ class Recording:
         check_streets(self.streets)
         if not self.towns or self.scenes < 1:
             raise ConfigError("nothing to record: name a town, and one scene or more")
-        if self.width < 64 or self.width % 16 or not 0 <= self.sweeps < KEY or self.seconds < 0.5:
-            raise ConfigError("width: a multiple of 16 from 64; sweeps: 0 to 4; seconds: at least 0.5")
+        if self.width < 64 or self.width % 16 or not 0 <= self.sweeps < KEY or not 0.5 <= self.seconds <= 3600:
+            raise ConfigError("width: a multiple of 16 from 64; sweeps: 0 to 4; seconds: 0.5 to 3600")
 
     def identity(self) -> dict[str, Any]:
         """What decides the bytes."""

@@ -109,7 +109,8 @@ def load_run(folder: Path | str) -> Run:
     """Read run.json, results.jsonl and episodes.jsonl.
 
     Raises:
-        StoreError: the folder does not hold a run, the run has no result yet, or a line in the middle is broken.
+        StoreError: the folder does not hold a run, the run has no result yet, or a line is broken or no result of a
+            cell.
     """
     folder = Path(folder)
     if not (folder / "run.json").is_file():
@@ -118,6 +119,10 @@ def load_run(folder: Path | str) -> Run:
     lines = read_lines(folder / "results.jsonl")
     if not lines:
         raise StoreError(f"{folder}: the run has no results yet; run it again to go on")
+    for line in lines:
+        if not (isinstance(line["key"], str) and "status" in line):
+            told = f"the line with key {line['key']!r} is no result of a cell"
+            raise StoreError(f"{folder}/results.jsonl: {told}; remove it and run the suite again")
     order = {cell["key"]: k for k, cell in enumerate(header.get("cells", []))}
     lines.sort(key=lambda line: order.get(line["key"], len(order)))
     episodes = {line["key"]: line for line in read_lines(folder / "episodes.jsonl")}
