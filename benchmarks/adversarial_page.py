@@ -4,22 +4,26 @@
     python -m benchmarks.adversarial_page NAME=RUN,RUN ...  # keeps the records' metrics in benchmarks/results
     python -m benchmarks.adversarial_page                   # the tables anew from what is kept
 
-Each base scenario is a case; of natural traffic each route is a cluster. In brackets the 95 % interval.
+Each base scenario is a case; of natural traffic each route is a cluster. In brackets the 95 % interval. The run named
+`whole` is the suite as it is: its section is put into the page when it is kept, also if not all of it has run.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import sys
+from itertools import product
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ssad.core.seeding import generator
 from ssad.core.types import F64
-from ssad.metrics import CaseValue, estimate
+from ssad.metrics import CaseValue, estimate, paired_difference
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "adversarial"
@@ -32,6 +36,26 @@ COLUMNS = {
     "seconds": "CPU s a base",
 }  # fmt: skip
 """Metric of a record -> head of its column."""
+OF_ALL = (
+    "CR", "off_road", "hit_others", "moving", "impact_speed", "avoided_by_reg157", "avoided_by_cc", "avoided_by_rss",
+    "avoided_by_fsm", "avoided_by_limit", "attributable", "distinct", "within_limits", "realism", "seconds",
+)  # fmt: skip
+"""Columns of the tables of all generators, where bases have many rollouts."""
+HEADS = COLUMNS | {"CR": "CR within the budget", "distinct": "distinct"}
+SECTION = """### All generators
+`ssad run adversarial`, `python -m benchmarks.adversarial_page whole=runs/adversarial`. All meet the same bases \
+with the same budget and the same seeds. CR: share of the bases that the system survives in plain replay in which \
+a collision was found with the adversary on the road and in nobody else; less random's: over the bases that both \
+were tried on, paired. Who avoids a collision is told of those that were saved, three a base at most, and happen \
+again. "found" in the tables of transfer: how often another system collides in what was found against this one, \
+less how often it collides in the same bases.
+
+<!-- whole: begin -->
+<!-- whole: end -->
+
+"""
+WHOLE = "whole"
+BEFORE = "### Searches that learn against random points"
 WITH_LIMITS = ("CR", "avoided_by_reg157", "attributable")
 
 
@@ -42,24 +66,42 @@ def cluster(name: str) -> str:
 
 def keep(name: str, runs: list[Path]) -> None:
     """The metrics of the records of runs with the same settings, without what cannot be shown."""
-    rows = []
+    known = (*dict.fromkeys((*COLUMNS, *OF_ALL)), "applies", "survived")
+    rows: list[dict[str, Any]] = []
     for line in "".join((run / "results.jsonl").read_text(encoding="utf-8") for run in runs).splitlines():
         record = json.loads(line)
+        row = {"generator": record["generator"], "system": record["system"], "base": record["cluster"]}
         if record["status"] != "ok":
-            rows.append({"failed": record["reason"], "generator": record["generator"], "system": record["system"]})
+            rows.append(row | {"failed": record["reason"]})
             continue
-        metrics = {k: v for k, v in record["metrics"].items() if k in (*COLUMNS, "applies", "survived")}
-        short = {k: round(float(v), 4) for k, v in metrics.items() if v is not None}
-        rows.append({"generator": record["generator"], "system": record["system"],
-                     "base": record["cluster"], **short})  # fmt: skip
-    suites = [json.loads((run / "run.json").read_text(encoding="utf-8"))["suite"] for run in runs]
+        metrics = {k: float(v) for k, v in record["metrics"].items() if k in known and v is not None}
+        for other, hits in record.get("transfer", {}).items():
+            metrics[f"{other}: found"], metrics[f"{other}: base"] = hits["found"], hits["base"]
+        rows.append(row | {k: round(v, 3) for k, v in metrics.items()})
+    headers = [json.loads((run / "run.json").read_text(encoding="utf-8")) for run in runs]
+    suites = [header["suite"] for header in headers]
     about = {key: suites[0][key] for key in ("scenarios", "budget", "keep")}
     if any({key: suite[key] for key in about} != about for suite in suites):
         raise ValueError(f"{name}: runs of unlike settings")
     about["systems"] = list(dict.fromkeys(name for suite in suites for name in suite["systems"]))
+    about["planned"] = sum(len(header["cells"]) for header in headers)
+    about["columns"] = list(dict.fromkeys(key for row in rows for key in row))
+    about["rows"] = [[row.get(key) for key in about["columns"]] for row in rows]
+    text = json.dumps(about, separators=(",", ":")) + "\n"
     RESULTS.mkdir(parents=True, exist_ok=True)
-    path = RESULTS / f"{name}.json"
-    path.write_text(json.dumps(about | {"rows": rows}, separators=(",", ":")) + "\n", encoding="utf-8")
+    (RESULTS / f"{name}.json").unlink(missing_ok=True)
+    (RESULTS / f"{name}.json.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
+
+
+def stored(path: Path) -> dict[str, Any]:
+    """What was kept, its rows by column."""
+    data: dict[str, Any]
+    if path.suffix == ".json":
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return data
+    data = json.loads(gzip.decompress(path.read_bytes()))
+    rows = [dict(zip(data["columns"], row, strict=True)) for row in data["rows"]]
+    return data | {"rows": [{k: v for k, v in row.items() if v is not None} for row in rows]}
 
 
 def cases(rows: list[dict[str, Any]], key: str) -> dict[str, CaseValue]:
@@ -67,15 +109,15 @@ def cases(rows: list[dict[str, Any]], key: str) -> dict[str, CaseValue]:
     return {row["base"]: CaseValue(row[key], cluster(row["base"]), row["base"]) for row in rows if key in row}
 
 
-def shown(values: dict[str, CaseValue], key: str) -> str:
+def shown(values: dict[str, CaseValue], key: str, kind: Literal["share", "bounded"] = "bounded") -> str:
     """A mean, for some metrics with its interval and number of cases."""
     if not values:
         return ""
     mean = sum(case.value for case in values.values()) / len(values)
     if key not in WITH_LIMITS:
         return f"{mean:.2f}"
-    found = estimate(values.values(), "bounded")
-    return f"{found.mean:.2f} [{found.low:.2f}, {found.high:.2f}]"
+    found = estimate(values.values(), kind)
+    return f"{found.mean:.2f}" + (f" [{found.low:.2f}, {found.high:.2f}]" if isfinite(found.low) else "")
 
 
 def tables(data: dict[str, Any]) -> list[str]:
@@ -86,18 +128,17 @@ def tables(data: dict[str, Any]) -> list[str]:
         names = list(dict.fromkeys(row["generator"] for row in rows))
         lines += [f"`{system}`, {', '.join(data['scenarios'])}, {data['budget']} rollouts:", ""]
         lines += ["| | survived bases | " + " | ".join(COLUMNS.values()) + " |", "|---|---:|" + "---|" * len(COLUMNS)]
-        alive = {}
+        known = {}
         for name in names:
-            own = [row for row in rows if row["generator"] == name and row.get("survived") and row.get("applies")]
-            alive[name] = own
+            own = known[name] = alive(rows, name)
             cells = [shown(cases(own, key), key) for key in COLUMNS]
             lines.append(f"| `{name}` | {len(own)} | {' | '.join(cells)} |")
         lines.append("")
         if data["budget"] == data["keep"] == 1:
-            lines += [text for name in names if (line := by_motion(name, alive[name])) for text in (line, "")]
+            lines += [text for name in names if (line := by_motion(name, known[name])) for text in (line, "")]
         if {"adv-ppo", "frea"} <= set(names):
             for key in ("avoided_by_reg157", "attributable"):
-                both = [cases(alive[name], key) for name in ("frea", "adv-ppo")]
+                both = [cases(known[name], key) for name in ("frea", "adv-ppo")]
                 mean, low, high = difference(*both)
                 counts = " and ".join(f"{len(group)} collisions" for group in both)
                 lines.append(
@@ -105,6 +146,71 @@ def tables(data: dict[str, Any]) -> list[str]:
                 )
             lines.append("")
     return lines
+
+
+def whole_tables(data: dict[str, Any]) -> list[str]:
+    """Of the whole suite: a table for each system and kind of bases, and one of transfer."""
+    rows = [row for row in data["rows"] if "failed" not in row]
+    lines = []
+    if len(data["rows"]) < data["planned"]:
+        lines += [f"{len(data['rows']):,} of {data['planned']:,} searches have run; what is missing is not shown.", ""]
+    if len(rows) < len(data["rows"]):
+        lines += [f"{len(data['rows']) - len(rows)} searches failed.", ""]
+    for system, natural in product(data["systems"], (False, True)):
+        own = [row for row in rows if row["system"] == system and row["base"].startswith("natural") == natural]
+        if not own:
+            continue
+        tried = {row["base"]: row["survived"] for row in own}
+        lines += [
+            f"`{system}`, {'natural traffic' if natural else 'pre-crash scenarios'}, {data['budget']} rollouts; it "
+            f"survives {int(sum(tried.values()))} of {len(tried)} bases in plain replay:",
+            "",
+            f"| | bases | {HEADS[OF_ALL[0]]} | CR, less random's | {' | '.join(HEADS[key] for key in OF_ALL[1:])} |",
+            "|---|---:|" + "---|" * (len(OF_ALL) + 1),
+        ]
+        by_name = {name: alive(own, name) for name in dict.fromkeys(row["generator"] for row in own)}
+        usual = cases(by_name.get("random", []), "CR")
+        for name, group in by_name.items():
+            less = "" if name == "random" else paired(cases(group, "CR"), usual, "share")
+            shares = [shown(cases(group, key), key, "share" if key == "CR" else "bounded") for key in OF_ALL]
+            lines.append(f"| `{name}` | {len(group)} | {' | '.join([shares[0], less, *shares[1:]])} |")
+        lines += ["", *transfer(system, by_name)]
+    return lines
+
+
+def alive(rows: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """The searches of a generator that had something to change in a base that the system survives."""
+    return [row for row in rows if row["generator"] == name and row.get("survived") and row.get("applies")]
+
+
+def paired(first: dict[str, CaseValue], second: dict[str, CaseValue], kind: Literal["share", "mean"] = "mean") -> str:
+    """Difference over the cases that both have, with its interval."""
+    if not first.keys() & second.keys():
+        return ""
+    found = paired_difference(first, second, kind=kind)
+    return f"{found.mean:+.2f}" + (f" [{found.low:+.2f}, {found.high:+.2f}]" if isfinite(found.low) else "")
+
+
+def transfer(system: str, by_name: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """How often other systems collide in what was found, less how often in the bases."""
+    others = dict.fromkeys(
+        key.removesuffix(": found") for rows in by_name.values() for row in rows for key in row if key.endswith("found")
+    )
+    others.pop(system, None)
+    if not others:
+        return []
+    lines = [
+        f"Found against `{system}`, driven by others:",
+        "",
+        f"| | bases | {' | '.join(f'`{name}`' for name in others)} |",
+        "|---|---:|" + "---|" * len(others),
+    ]
+    for name, rows in by_name.items():
+        found = [row for row in rows if any(f"{other}: found" in row for other in others)]
+        if found:
+            shares = [paired(cases(found, f"{o}: found"), cases(found, f"{o}: base")) for o in others]
+            lines.append(f"| `{name}` | {len(found)} | {' | '.join(shares)} |")
+    return [*lines, ""]
 
 
 def by_motion(name: str, rows: list[dict[str, Any]]) -> str:
@@ -142,9 +248,12 @@ def main() -> None:
         name, _, runs = word.partition("=")
         keep(name, [Path(run) for run in runs.split(",")])
     whole = DOCUMENT.read_text(encoding="utf-8")
-    for path in sorted(RESULTS.glob("*.json")):
-        begin, end = f"<!-- {path.stem}: begin -->", f"<!-- {path.stem}: end -->"
-        lines = tables(json.loads(path.read_text(encoding="utf-8")))
+    for path in sorted(RESULTS.glob("*.json*")):
+        name = path.name.partition(".")[0]
+        begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+        lines = (whole_tables if name == WHOLE else tables)(stored(path))
+        if name == WHOLE and begin not in whole:
+            whole = whole.replace(BEFORE, SECTION + BEFORE)
         print("\n".join(lines))
         if begin in whole:
             before, _, rest = whole.partition(begin)

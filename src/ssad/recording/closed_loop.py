@@ -255,9 +255,17 @@ def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]
 
 def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
     """Who could have avoided the collision of a drive."""
-    from ssad.drivers import make_system
-    from ssad.drivers.careful.grade import grade_collision
+    return grades_of([(episode, trace)], device)[0]
 
-    made = [make_system(name) for name in policies_of(episode.scenario)]
+
+def grades_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> list[Grade]:
+    """Who could have avoided the collision of each drive; all are played side by side."""
+    from ssad.drivers import make_system
+    from ssad.drivers.careful.grade import grade_collisions
+
+    made = [
+        make_system(name) for name in dict.fromkeys(n for episode, _ in drives for n in policies_of(episode.scenario))
+    ]
     sensors = onboard_sensors(made, device)
-    return grade_collision(episode, town(episode.town), trace, device=device, policies=make_system, sensors=sensors)
+    known = [(episode, town(episode.town), trace) for episode, trace in drives]
+    return grade_collisions(known, device=device, policies=make_system, sensors=sensors)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -53,19 +54,26 @@ class Policy:
         Returns:
             [N, n]; the bits of a row do not depend on the others.
         """
-        x = torch.from_numpy(np.clip(rows, -_BOUND, _BOUND).astype(np.float32))
-        for number, (weight, bias) in enumerate(self.layers):
+        given = np.clip(rows, -_BOUND, _BOUND).astype(np.float32)
+        for number, (weight, bias) in enumerate(self._columns):
             # sums in a fixed order: a matrix product may take another one for another number of rows
-            total = bias.expand(len(x), -1)
-            for k in range(weight.shape[1]):
-                total = total + x[:, k : k + 1] * weight[:, k]
-            x = total if number + 1 == len(self.layers) else total.clamp(min=0.0)
+            total = np.tile(bias, (len(given), 1))
+            part = np.empty_like(total)
+            for k, column in enumerate(weight):
+                total += np.multiply(given[:, k : k + 1], column, out=part)
+            given = total if number + 1 == len(self.layers) else np.maximum(total, 0.0, out=total)
+        x = torch.from_numpy(given)
         if self.squash == "best":
             chosen: F32 = CHOICES[x.numpy().argmax(1)]
             return chosen
         x = x.double().tanh().float() if self.squash == "tanh" else x.clamp(-1.0, 1.0)
         found: F32 = x.numpy()
         return found
+
+    @cached_property
+    def _columns(self) -> tuple[tuple[F32, F32], ...]:
+        """Weight [in, out] and bias [out] of each layer."""
+        return tuple((np.ascontiguousarray(weight.numpy().T), bias.numpy()) for weight, bias in self.layers)
 
     def controls(self, rows: F32) -> F32:
         """Throttle, brake, steer and reverse [N, 4] from readings [N, width]."""
@@ -92,8 +100,11 @@ class PolicyDriver:
         """Nothing to forget."""
 
     def act(self, view: Observation) -> F32:
-        """Throttle, brake, steer and reverse [N, 4] from what its sensor shows."""
-        return self.policy.controls(view.readings[self.policy.observation])
+        """Throttle, brake, steer and reverse [N, 4] from what its sensor shows; 0 where the episode has ended."""
+        rows = view.readings[self.policy.observation]
+        out = np.zeros((len(rows), 4), np.float32)
+        out[~view.done] = self.policy.controls(rows[~view.done])
+        return out
 
 
 def load_policy(path: str | Path) -> Policy:

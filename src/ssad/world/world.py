@@ -463,7 +463,7 @@ class World:
             route=fixed["route"],
             progress=self.array("progress"),
             roads=self.bank.tables,
-            signals=lambda: signal_states(*self._lamps, time),
+            signals=lambda: self._signals(time),
             contact=self.array("ego.contact").astype(np.uint8),
             contact_agent=self.array("ego.contact_agent"),
             off_road=self.array("ego.off_road") != 0,
@@ -477,6 +477,15 @@ class World:
             stop_sign=self.array("ego.stop_sign").astype(np.uint8),
             note=self.array("note"),
         )
+
+    def _signals(self, time: npt.NDArray[np.float64]) -> U8:
+        """`SignalState` [B, S]: once for scenes that run one episode and are at the same step."""
+        key = self.array("step").astype(np.int64) * len(self.episodes) + self.array("episode")
+        _, first, same = np.unique(key, return_index=True, return_inverse=True)
+        program, forced, until = self._lamps
+        if 2 * len(first) > len(time):
+            return signal_states(program, forced, until, time)
+        return signal_states(program[first], forced[first], until[first], time[first])[same]
 
     def ended(self) -> npt.NDArray[np.int32]:
         """[B] `End`, index into ENDS."""

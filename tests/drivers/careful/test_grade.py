@@ -9,8 +9,9 @@ import pytest
 
 from ssad.core.types import Condition, Controller, Episode, EpisodeAgent, EpisodeTrace, Limits, Phase, Pose
 from ssad.drivers import make_system
-from ssad.drivers.careful.grade import Grade, grade_collision
-from ssad.drivers.careful.limit import OwnSide
+from ssad.drivers.careful import grade
+from ssad.drivers.careful.grade import Grade, grade_collision, grade_collisions
+from ssad.drivers.careful.limit import wrong_side
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode, line_route
@@ -95,8 +96,7 @@ def test_an_oncoming_car_in_the_own_lane_is_an_encounter_too() -> None:
 
 
 def test_the_own_side_of_the_road_ends_at_its_middle() -> None:
-    side = OwnSide(episode(ego()), GRAPHS["Straight"], [0.0])
-    assert side.wrong.tolist() == [False, True, False]
+    assert wrong_side(episode(ego()), GRAPHS["Straight"]).tolist() == [False, True, False]
 
 
 def test_a_grade_is_the_same_again_and_leaves_the_recorded_drive_as_it_was() -> None:
@@ -106,6 +106,26 @@ def test_a_grade_is_the_same_again_and_leaves_the_recorded_drive_as_it_was() -> 
     assert first == second
     short = replace(one, limits=Limits(max_steps=len(trace.x) - 1))
     assert grade_collision(short, GRAPHS["Straight"], trace).avoids == first.avoids
+
+
+def test_grades_do_not_depend_on_who_is_graded_beside(monkeypatch: pytest.MonkeyPatch) -> None:
+    van = EpisodeAgent("van", "van", Controller.NONE, Pose(56.6, -2.2, 0.0))
+    wall = [EpisodeAgent(f"b{k}", "truck", Controller.NONE, Pose(17.0, y, np.pi / 2)) for k, y in enumerate((-9, 0, 9))]
+    some = [episode(ego(speed=10.0), *others) for others in ([walker(8.0, 34.0)], wall, [walker(6.0, 26.0), van])]
+    # another town, whose name comes first: its lanes are counted before
+    graphs = [GRAPHS["Straight"]] * 3 + [replace(GRAPHS["Straight"], name="Another")]
+    some.append(replace(some[0], town="Another"))
+    drives = [
+        (one, graph, rollout(World([one], {graph.name: graph}), make_system("blind"))[0])
+        for one, graph in zip(some, graphs, strict=True)
+    ]
+    alone = [grade_collision(*drive) for drive in drives]
+    assert {one.verdict for one in alone} >= {"avoidable", "unavoidable"}
+    for scenes in (4096, 1):  # all in one world, one after another
+        monkeypatch.setattr(grade, "SCENES", scenes)
+        together = grade_collisions(drives)
+        assert [repr(one) for one in together] == [repr(one) for one in alone]  # NaN is not equal to itself
+    assert grade_collisions([]) == []
 
 
 def test_without_a_collision_there_is_nothing_to_grade() -> None:

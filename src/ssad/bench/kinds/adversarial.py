@@ -22,7 +22,7 @@ from ssad.core.traces import motion_hash, save_trace
 from ssad.core.types import Scenario
 from ssad.evaluation.found_collisions import AVOIDERS, collides, grades, refusal, saved_collisions, transfer
 from ssad.evaluation.search_scores import likeness, reference, summary
-from ssad.recording.closed_loop import grade_of, system_version, town
+from ssad.recording.closed_loop import grades_of, system_version, town
 
 
 class AdversarialSuite(ScenarioSuite):
@@ -204,10 +204,12 @@ class Adversarial(ScenarioKind):
         others = transfer(
             cells[0].spec["transfer"], [bases[k] for k in some], [made[k] for k in some], trials.device, seeds=seeds
         )
-        for k, moved in zip(some, others, strict=True):
-            hits = [one for one in (next(again) for _ in made[k]) if collides(one)]
-            metrics = {"replayed": len(hits) / len(made[k])}
-            if cells[k].spec["grade"]:
-                metrics |= grades([grade_of(one.episode, one.trace, trials.device).metrics() for one in hits], hits)
+        hits = [[one for one in (next(again) for _ in made[k]) if collides(one)] for k in some]
+        graded = cells[0].spec["grade"]
+        found = iter(grades_of([(one.episode, one.trace) for row in hits for one in row if graded], trials.device))
+        for k, row, moved in zip(some, hits, others, strict=True):
+            metrics = {"replayed": len(row) / len(made[k])}
+            if graded:
+                metrics |= grades([next(found).metrics() for _ in row], row)
             kept[k] = {"metrics": metrics, "transfer": moved}
         return kept

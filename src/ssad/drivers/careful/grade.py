@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -14,17 +14,20 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Bool, Episode, EpisodeTrace
 from ssad.drivers.belief import in_sight
 from ssad.drivers.careful.driver import REACH, Careful
-from ssad.drivers.careful.limit import Limit, OwnSide, limit_of, manoeuvres, takeovers
+from ssad.drivers.careful.limit import Evasions, Limit, OwnSide, limit_of, manoeuvres
 from ssad.drivers.careful.models import MODELS
-from ssad.drivers.careful.replay import Takeover, play
+from ssad.drivers.careful.replay import Ending, Takeover, play
 from ssad.metrics.criticality import ttc
 from ssad.metrics.driving import first_contact
 from ssad.world.world import World
 
 Verdict = Literal["avoidable", "limit", "unavoidable"]
+Drive = tuple[Episode, LaneGraph, EpisodeTrace]
+"""What was driven, its town, and how."""
 HORIZON = 4.0  # s: danger exists while both, going straight on at their speeds, would touch within it
 EARLIEST = 6.0  # s before the contact that danger is looked for
 FLICKER = 3  # steps that a danger may be gone for and yet be the same
+SCENES = 1024  # of one world, of those that try manoeuvres
 AFTER = 5.0  # s after the contact that somebody must stay clear for
 
 
@@ -62,28 +65,35 @@ class Grade:
 
 
 class _Onlooker:
-    """Follows the replay: is it the recorded drive, when was the other triggered, when in sight?"""
+    """Follows replays, a scene each: is it the recorded drive, when was the other triggered, when in sight?
 
-    def __init__(self, episode: Episode, trace: EpisodeTrace, agent: int) -> None:
-        self.trace, self.agent, self.step = trace, agent, 0
-        count = len(trace.x)
-        self.seen, self.triggered, self.same = np.zeros(count, bool), np.zeros(count, bool), np.ones(count, bool)
-        scripted = agent > 0 and bool(episode.agents[agent].phases)
-        self.scripted = scripted
+    Attributes:
+        seen, triggered, same: [B, T] of each scene and step; rows are as long as the longest drive.
+    """
+
+    def __init__(self, drives: Sequence[Drive], agents: Sequence[int]) -> None:
+        self.agents, self.step = np.asarray(agents), 0
+        self.poses = [np.stack([t.x, t.y, t.yaw], -1) for _, _, t in drives]
+        shape = len(drives), max(map(len, self.poses))
+        self.seen, self.triggered, self.same = np.zeros(shape, bool), np.zeros(shape, bool), np.ones(shape, bool)
+        scripts = [k > 0 and bool(one.agents[k].phases) for (one, _, _), k in zip(drives, agents, strict=True)]
+        self.scripted = np.array(scripts)
 
     def __call__(self, world: World) -> None:
         self.step += 1
         k = self.step
-        if k >= len(self.trace.x):
+        if k >= self.same.shape[1]:
             return
-        pose, n = world.array("pose")[0], len(self.trace.names)
-        recorded = np.stack([self.trace.x[k], self.trace.y[k], self.trace.yaw[k]], 1)
-        self.same[k] = self.same[k - 1] and bool((pose[:n] == recorded).all())
-        if self.scripted:
-            self.triggered[k] = world.array("phase")[0, self.agent] > 0
-        if self.agent > 0 and world.ended()[0] == 0:
-            belief = world.truth().rows([0])
-            self.seen[k] = in_sight(pose[:1, :2], belief, REACH)[0, self.agent]
+        pose, rows = world.array("pose"), np.arange(world.batch)
+        for b, recorded in enumerate(self.poses):
+            if k < len(recorded):
+                here = pose[b, : recorded.shape[1]]
+                self.same[b, k] = self.same[b, k - 1] and bool((here == recorded[k]).all())
+        self.triggered[:, k] = self.scripted & (world.array("phase")[rows, self.agents] > 0)
+        looks = (self.agents > 0) & (world.ended() == 0)
+        if looks.any():
+            sight = in_sight(pose[:, 0, :2], world.truth(), REACH)
+            self.seen[:, k] = looks & sight[rows, self.agents]
 
 
 def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool, seen: Bool) -> int:
@@ -131,7 +141,18 @@ def grade_collision(
     policies: Policies | None = None,
     sensors: Mapping[str, Sensor] | None = None,
 ) -> Grade:
-    """Grade the first collision of a drive in the world; the same every time.
+    """Grade the first collision of a drive in the world; see `grade_collisions`."""
+    return grade_collisions([(episode, graph, trace)], device=device, policies=policies, sensors=sensors)[0]
+
+
+def grade_collisions(
+    drives: Sequence[Drive],
+    *,
+    device: str = "cpu",
+    policies: Policies | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+) -> list[Grade]:
+    """Grade the first collision of each drive in the world, side by side; the same every time and in any company.
 
     The drive is played again from its recorded controls. At the moment that the danger begins, the ego is handed to
     each careful model, which keeps the speed that it finds (less in bends and for red lights) and knows only what it
@@ -139,34 +160,67 @@ def grade_collision(
     nobody until 5 s after the contact stays clear. All others do what the episode says, and react to the ego as ever.
 
     Args:
-        episode: What was driven; its ego as it was driven.
-        graph: Its town.
-        trace: How it was driven; it must hold a contact.
+        drives: What was driven, its ego as it was driven; its town; and how, which must hold a contact.
         device: Where the world computes.
-        policies: Makes the drivers that the episode names for others, as in `rollout`.
+        policies: Makes the drivers that the episodes name for others, as in `rollout`.
         sensors: What these ask for.
 
     Returns:
-        The grade.
+        The grades.
 
     Raises:
-        ValueError: The drive has no contact.
+        ValueError: A drive has no contact.
     """
-    contact, agent = first_contact(trace)
+    if not drives:
+        return []
     about: dict[str, Any] = {"device": device, "policies": policies, "sensors": sensors}
-    end = contact * trace.dt
-    watch = _Onlooker(episode, trace, agent)
-    play(episode, graph, trace, takeovers=[Takeover(Careful(), math.inf)], until=end, watch=watch, **about)
-    begin = danger_begins(trace, agent, contact, watch.triggered, watch.seen)
-    start = begin * trace.dt
-    careful = [Takeover(Careful(name, keep_speed=True), start) for name in MODELS]
-    hit = play(episode, graph, trace, takeovers=careful, until=end + AFTER, **about)
-    avoids = {name: not bool(hit[k]) for k, name in enumerate(MODELS)}
-    options = manoeuvres(episode, start, end)
-    side = OwnSide(episode, graph, [m.start for m in options])
-    hit = play(episode, graph, trace, takeovers=takeovers(options), until=end + AFTER, watch=side, **about)
-    limit = limit_of(options, ~hit & ~side.left, contact=end)
-    verdict: Verdict = "unavoidable" if limit.manoeuvre is None else "limit"
-    if any(avoids.values()):
-        verdict = "avoidable"
-    return Grade(verdict, avoids, start, end, agent, bool(watch.same[begin]), limit)
+    contacts = [first_contact(trace) for _, _, trace in drives]
+    ends = [step * trace.dt for (step, _), (_, _, trace) in zip(contacts, drives, strict=True)]
+    nobody = Takeover(Careful(), math.inf)
+    watch = _Onlooker(drives, [agent for _, agent in contacts])
+    play([Ending(*drive, [nobody], end) for drive, end in zip(drives, ends, strict=True)], watch=watch, **about)
+    begins = [
+        danger_begins(trace, agent, contact, watch.triggered[k, : len(trace.x)], watch.seen[k, : len(trace.x)])
+        for k, ((_, _, trace), (contact, agent)) in enumerate(zip(drives, contacts, strict=True))
+    ]
+    starts = [begin * trace.dt for begin, (_, _, trace) in zip(begins, drives, strict=True)]
+    models = [Careful(name, keep_speed=True) for name in MODELS]
+    hits = play(
+        [
+            Ending(*drive, [Takeover(model, start) for model in models], end + AFTER)
+            for drive, start, end in zip(drives, starts, ends, strict=True)
+        ],
+        **about,
+    )
+    limits = _limits(drives, starts, ends, about)
+    grades = []
+    for k, (hit, limit) in enumerate(zip(hits, limits, strict=True)):
+        avoids = {name: not bool(touched) for name, touched in zip(MODELS, hit, strict=True)}
+        verdict: Verdict = "unavoidable" if limit.manoeuvre is None else "limit"
+        if any(avoids.values()):
+            verdict = "avoidable"
+        exact = bool(watch.same[k, begins[k]])
+        grades.append(Grade(verdict, avoids, starts[k], ends[k], contacts[k][1], exact, limit))
+    return grades
+
+
+def _limits(
+    drives: Sequence[Drive], starts: Sequence[float], ends: Sequence[float], about: Mapping[str, Any]
+) -> list[Limit]:
+    """The kinematic limits, of as many drives side by side as fit into a world."""
+    tried = [manoeuvres(drive[0], start, end) for drive, start, end in zip(drives, starts, ends, strict=True)]
+    found: list[Limit] = []
+    while len(found) < len(drives):
+        first, size = len(found), np.cumsum([len(options) for options in tried[len(found) :]])
+        last = first + max(int((size <= SCENES).sum()), 1)
+        part = range(first, last)
+        options = [m for k in part for m in tried[k]]
+        hand = Evasions(options)
+        episodes = [drives[k][0] for k in part for _ in tried[k]]
+        side = OwnSide(episodes, {drives[k][1].name: drives[k][1] for k in part}, [m.start for m in options])
+        endings = [Ending(*drives[k], [Takeover(hand, m.start) for m in tried[k]], ends[k] + AFTER) for k in part]
+        hits = play(endings, watch=side, **about)
+        left = np.split(side.left, np.cumsum([len(hit) for hit in hits])[:-1])
+        for k, hit, gone in zip(part, hits, left, strict=True):
+            found.append(limit_of(tried[k], ~hit & ~gone, contact=ends[k]))
+    return found

@@ -7,7 +7,7 @@ side of it. Who knows the future could do it; the careful models tell what who d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Any
@@ -17,7 +17,6 @@ import numpy as np
 from ssad.core.driving import Observation
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, Bool, Episode
-from ssad.drivers.careful.replay import Takeover
 from ssad.drivers.careful.sight import Path
 from ssad.drivers.careful.steering import pursue
 from ssad.world.models import GRIP, model
@@ -81,13 +80,16 @@ class Evasions:
         """Take the manoeuvres of the scenes."""
         self.accel = np.array([m.accel for m in manoeuvres])
         self.aside = np.array([m.aside for m in manoeuvres])
+        self.power = self.wheel = np.zeros((len(manoeuvres), 2))
         self.begun = np.full(len(manoeuvres), np.nan)
         self.speed = np.zeros(len(manoeuvres))
         self.gone = np.zeros(len(manoeuvres))
 
     def reset(self, episodes: Sequence[Episode]) -> None:
         """Begin anew."""
-        self.body = model(episodes[0].agents[0].model)
+        bodies = [model(episode.agents[0].model) for episode in episodes]
+        self.power = np.array([(b.max_accel, b.max_brake) for b in bodies])
+        self.wheel = np.array([(b.wheelbase, b.max_steer) for b in bodies])
         self.begun[:] = np.nan
         self.gone[:] = 0.0
 
@@ -106,23 +108,35 @@ class Evasions:
         share = np.clip((self.gone[k] + ahead) / way, 0.0, 1.0)
         aim = self.begun[k] + (self.aside[k] - self.begun[k]) * share * share * (3.0 - 2.0 * share)
         self.gone[k] += np.maximum(speed, 0.0) * 0.1
-        steer = pursue(path, ahead, aside=aim, wheelbase=self.body.wheelbase, lock=self.body.max_steer)
+        power, wheel = self.power[k], self.wheel[k]
+        steer = pursue(path, ahead, aside=aim, wheelbase=wheel[:, 0], lock=wheel[:, 1])
         accel = np.where((self.accel[k] > 0) & (speed >= RISE * self.speed[k]), 0.0, self.accel[k])
-        out = np.stack([accel / self.body.max_accel, -accel / self.body.max_brake, steer], 1)
+        out = np.stack([accel / power[:, 0], -accel / power[:, 1], steer], 1)
         return np.clip(out, [0.0, 0.0, -1.0], 1.0).astype(np.float32)
 
 
 class OwnSide:
-    """Watches whether egos leave the road or cross to the other side of it, from their takeover on."""
+    """Watches whether egos leave the road or cross to the other side of it, from their takeover on.
 
-    def __init__(self, episode: Episode, graph: LaneGraph, starts: Sequence[float]) -> None:
-        route = episode.agents[0].route
-        assert route is not None
-        side = np.sign(graph.lane_id)
-        mine = {(int(graph.road[k]), int(side[k])) for k in np.unique(route.lane[route.lane >= 0])}
-        roads = {road for road, _ in mine}
-        pairs = list(zip(graph.road.tolist(), side.tolist(), strict=True))
-        self.wrong = np.array([road in roads and (road, s) not in mine for road, s in pairs]) & (graph.junction < 0)
+    Args:
+        episodes: Of the scenes.
+        graphs: Their towns by name.
+        starts: s of the takeovers.
+    """
+
+    def __init__(self, episodes: Sequence[Episode], graphs: Mapping[str, LaneGraph], starts: Sequence[float]) -> None:
+        # the world counts lanes over all its towns, in the order of their names
+        towns = sorted({episode.town for episode in episodes})
+        first = dict(zip(towns, np.cumsum([0, *(len(graphs[town].kind) for town in towns)]).tolist(), strict=False))
+        wrong: dict[int, Bool] = {}
+        for episode in episodes:
+            if id(episode) not in wrong:
+                wrong[id(episode)] = wrong_side(episode, graphs[episode.town])
+        self.wrong = np.zeros((len(episodes), max(map(len, wrong.values()))), bool)
+        for row, episode in zip(self.wrong, episodes, strict=True):
+            lanes = wrong[id(episode)]
+            row[: len(lanes)] = lanes
+        self.first = np.array([first[episode.town] for episode in episodes])
         self.start = np.array(starts)
         self.left = np.zeros(len(starts), bool)
 
@@ -130,8 +144,19 @@ class OwnSide:
         """After each step."""
         lane = world.array("lane")[:, 0]
         on = world.array("step") * world.dt > self.start + 1e-4
-        off = (lane < 0) | self.wrong[np.maximum(lane, 0)]
+        off = (lane < 0) | self.wrong[np.arange(len(lane)), np.maximum(lane - self.first, 0)]
         self.left |= on & off & (world.ended() == 0)
+
+
+def wrong_side(episode: Episode, graph: LaneGraph) -> Bool:
+    """Which lanes of a town are on the other side of the roads that the ego's route takes."""
+    route = episode.agents[0].route
+    assert route is not None
+    side = np.sign(graph.lane_id)
+    mine = {(int(graph.road[k]), int(side[k])) for k in np.unique(route.lane[route.lane >= 0])}
+    roads = {road for road, _ in mine}
+    pairs = list(zip(graph.road.tolist(), side.tolist(), strict=True))
+    return np.array([road in roads and (road, s) not in mine for road, s in pairs]) & (graph.junction < 0)
 
 
 def manoeuvres(episode: Episode, start: float, contact: float) -> list[Manoeuvre]:
@@ -140,12 +165,6 @@ def manoeuvres(episode: Episode, start: float, contact: float) -> list[Manoeuvre
     accels = [0.0, *(-b * min(body.max_brake, GRIP + 1.0) for b in BRAKES), *(p * body.max_accel for p in PULLS)]
     moments = sorted({round(float(t), 1) for t in np.linspace(start, max(contact - 0.1, start), MOMENTS)})
     return [Manoeuvre(t, a, aside) for t, a, aside in product(moments, accels, ASIDES)]
-
-
-def takeovers(options: Sequence[Manoeuvre]) -> list[Takeover]:
-    """A scene for each manoeuvre."""
-    hand = Evasions(options)
-    return [Takeover(hand, m.start) for m in options]
 
 
 def limit_of(options: Sequence[Manoeuvre], clear: Bool, *, contact: float) -> Limit:

@@ -1,4 +1,4 @@
-"""A recorded drive again, up to a moment at which others take the wheel: many endings of one encounter at once."""
+"""Recorded drives again, up to a moment at which others take the wheel: many endings of many encounters at once."""
 
 from __future__ import annotations
 
@@ -54,53 +54,73 @@ def recorded_controls(trace: EpisodeTrace) -> F32:
     return np.stack([trace.throttle, trace.brake, trace.steer, back], 1).astype(np.float32)
 
 
-def play(
-    episode: Episode,
-    graph: LaneGraph,
-    trace: EpisodeTrace,
-    *,
-    takeovers: Sequence[Takeover],
-    until: float,
-    device: str = "cpu",
-    policies: Policies | None = None,
-    sensors: Mapping[str, Sensor] | None = None,
-    watch: Callable[[World], None] | None = None,
-) -> Bool:
-    """Play the drive once for each takeover.
+@dataclass(frozen=True)
+class Ending:
+    """A drive that is played once for each takeover.
 
-    Everybody but the ego does what the episode says: scripts and traffic react to the new ego as they did to the old.
-
-    Args:
+    Attributes:
         episode: What was driven.
         graph: Its town.
         trace: How.
         takeovers: Who takes over, and when; a scene each.
         until: s at which all is stopped.
+    """
+
+    episode: Episode
+    graph: LaneGraph
+    trace: EpisodeTrace
+    takeovers: Sequence[Takeover]
+    until: float
+
+    @property
+    def steps(self) -> int:
+        """Steps until then."""
+        return round(self.until / self.trace.dt)
+
+
+def play(
+    endings: Sequence[Ending],
+    *,
+    device: str = "cpu",
+    policies: Policies | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    watch: Callable[[World], None] | None = None,
+) -> list[Bool]:
+    """Play drives side by side, each once for each of its takeovers; none depends on the others.
+
+    Everybody but the ego does what the episode says: scripts and traffic react to the new ego as they did to the old.
+
+    Args:
+        endings: What is played; the world's scenes are their takeovers, in order. A hand may take scenes of several.
         device: Where the world computes.
         policies: As for `rollout`.
         sensors: As for `rollout`.
         watch: Looks at the world after each step.
 
     Returns:
-        Of each scene, whether the ego touched anybody.
+        Of each scene of each drive, whether the ego touched anybody.
     """
-    steps = round(until / trace.dt)
-    limits = replace(episode.limits, max_steps=steps, max_time=1e6, max_distance=1e9, contact="end")
-    again, graphs = replace(episode, limits=limits), {episode.town: graph}
-    scenes = np.zeros(len(takeovers), np.int64)
-    world = World([again], graphs, assign=scenes, device=device, ego=Controller.EXTERNAL)
+    again = []
+    for one in endings:
+        limits = replace(one.episode.limits, max_steps=one.steps, max_time=1e6, max_distance=1e9, contact="end")
+        again.append(replace(one.episode, limits=limits))
+    count = [len(one.takeovers) for one in endings]
+    scenes = np.repeat(np.arange(len(endings)), count)
+    graphs = {one.episode.town: one.graph for one in endings}
+    world = World(again, graphs, assign=scenes, device=device, ego=Controller.EXTERNAL)
     loop = Loop(world, {}, policies=policies, sensors=sensors)
     loop.reset()
+    takeovers = [takeover for one in endings for takeover in one.takeovers]
     hands = list(dict.fromkeys(t.hand for t in takeovers))
     for hand in hands:
-        hand.reset([again] * len(takeovers))
+        hand.reset([again[k] for k in scenes])
     owner = np.array([hands.index(t.hand) for t in takeovers])
-    start = np.array([t.start for t in takeovers])
-    recorded = recorded_controls(trace)
+    start, dt = np.array([t.start for t in takeovers]), np.array([one.trace.dt for one in endings])[scenes]
+    recorded = [recorded_controls(one.trace) for one in endings]
     controls = np.zeros((world.batch, world.agents, 4), np.float32)
-    for step in range(steps):
-        controls[:, 0] = recorded[min(step + 1, len(recorded) - 1)]
-        taken = (step * trace.dt > start - 1e-4) & (world.ended() == End.RUNNING)
+    for step in range(max(one.steps for one in endings)):
+        controls[:, 0] = np.stack([own[min(step + 1, len(own) - 1)] for own in recorded])[scenes]
+        taken = (step * dt > start - 1e-4) & (world.ended() == End.RUNNING)
         for k, hand in enumerate(hands):
             mine = np.flatnonzero(taken & (owner == k))
             if len(mine):
@@ -115,4 +135,4 @@ def play(
             watch(world)
         if (world.ended() != End.RUNNING).all():
             break
-    return np.asarray(world.ended() == End.COLLISION)
+    return np.split(np.asarray(world.ended() == End.COLLISION), np.cumsum(count)[:-1])

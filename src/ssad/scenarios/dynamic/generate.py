@@ -45,7 +45,7 @@ SCENIC = "scenic:"
 """scenic:FILE.scenic is a generator that samples a Scenic program."""
 _PROGRAMS = {SCENIC: "ssad.interchange.scenic_programs:ScenicSearch"}
 BATCH = 8  # rollouts of a base side by side
-SCENES = 64  # episodes of one world
+SCENES = 256  # episodes of one world
 _STILL = 0.05  # m; who moves less in an episode is no adversary
 
 

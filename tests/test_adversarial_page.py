@@ -1,0 +1,54 @@
+"""Tables of docs/generators.md: of the whole suite, from records as a run writes them, also if not all has run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import adversarial_page
+
+
+def record(generator: str, base: str, hit: float, **more: Any) -> dict[str, Any]:
+    metrics = {"applies": True, "survived": True, "CR": hit, "off_road": 0.25, "realism": None}
+    told = {"generator": generator, "system": "autopilot", "cluster": base, "status": "ok", "reason": ""}
+    return told | {"metrics": metrics} | more
+
+
+def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, page = tmp_path / "run", tmp_path / "generators.md"
+    run.mkdir()
+    suite = {"scenarios": ["precrash"], "budget": 8, "keep": 3, "systems": ["autopilot"]}
+    (run / "run.json").write_text(json.dumps({"suite": suite, "cells": [{}] * 12}))
+    rows = [record(name, f"Case/{k}", float(name == "king" or k < 2), transfer={"ppo": {"found": 0.5, "base": 0.0}})
+            for name in ("random", "king") for k in range(5)]  # fmt: skip
+    rows[0]["metrics"]["survived"] = False
+    rows.append(record("king", "natural/Here_1/02", 1.0) | {"status": "failed", "reason": "no"})
+    (run / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    monkeypatch.setattr(adversarial_page, "RESULTS", tmp_path / "kept")
+    monkeypatch.setattr(adversarial_page, "DOCUMENT", page)
+    monkeypatch.setattr("sys.argv", ["adversarial_page", f"whole={run}"])
+    page.write_text(f"# Title\n\n{adversarial_page.BEFORE}\nothers\n")
+    adversarial_page.main()
+    text = page.read_text()
+    assert "11 of 12 searches have run" in text
+    assert "1 searches failed" in text
+    king = next(line for line in text.splitlines() if line.startswith("| `king` | 5 | 1.00 ["))
+    assert "| +0.75 [" in king, "over the four bases that random search was measured on, too"
+    assert "| `random` | 4 | +0.50" in text
+    assert text.endswith(f"{adversarial_page.BEFORE}\nothers\n")
+    monkeypatch.setattr("sys.argv", ["adversarial_page"])
+    adversarial_page.main()
+    assert page.read_text() == text
+
+
+def test_the_page_is_what_its_command_makes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    page = tmp_path / "generators.md"
+    before = adversarial_page.DOCUMENT.read_text(encoding="utf-8")
+    page.write_text(before, encoding="utf-8")
+    monkeypatch.setattr(adversarial_page, "DOCUMENT", page)
+    monkeypatch.setattr("sys.argv", ["adversarial_page"])
+    adversarial_page.main()
+    assert page.read_text(encoding="utf-8") == before
