@@ -15,7 +15,8 @@ import pytest
 from ssad.core.errors import FormatError
 from ssad.core.types import Pose
 from ssad.roads import load_graph
-from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios
+from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios, scenario_type
+from ssad.scenarios.dynamic.importer import _PARAMETERS
 
 ROUTE = (
     '<routes><route id="0" town="T"><waypoint x="0" y="10" yaw="0" z="0"/>'
@@ -99,7 +100,7 @@ BROKEN: list[tuple[dict[str, Any], Callable[[Path], None] | None, str]] = [
     (
         {"entries": [{"data_id": 0, "scenario_id": 5, "route_id": 3, "parameters": [1.0]}]},
         None,
-        "parameters of an entry are not read",
+        "parameters are read in lists human and random only",
     ),
     (
         {"entries": [{"data_id": 0, "scenario_id": 5, "route_id": 4}]},
@@ -436,7 +437,7 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
     (inside / "scenario_data").mkdir()
     (flat / "scenario_type").rename(inside / "config" / "scenario_type")
     (flat / "route").rename(inside / "scenario_data" / "route")
-    rows = [(0, 0, None), (5, 3, None), (5, 3, [0.5]), (5, 4, None)]
+    rows = [(0, 0, None), (5, 3, None), (5, 3, [0.5, 35]), (5, 3, None), (5, 4, None)]
     entries = [
         {"data_id": k, "scenario_id": number, "route_id": route, "parameters": told}
         for k, (number, route, told) in enumerate(rows)
@@ -447,7 +448,7 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
     assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
     assert [line.rpartition("/")[2] for line in left_out] == [
         "standard.json: entry 0: unknown scenario_id 0; known: 1 to 9",
-        "standard.json: entry 2: parameters of an entry are not read; set them to null",
+        "standard.json: entry 2: parameters are read in lists human and random only; set them to null",
         "scenario_05_route_04.xml: no such route file; standard.json asks for it",
     ]
     with pytest.raises(FormatError, match="unknown scenario_id 0"):
@@ -455,6 +456,34 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
     (inside / "scenario_data" / "route" / "scenario_05_routes" / "scenario_05_route_03.xml").write_text("<routes/>")
     with pytest.raises(FormatError, match="none of its routes can be read; the first: "):
         import_routes(tmp_path / "SafeBench", left_out=[])
+
+
+def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_stands_for(tmp_path: Path) -> None:
+    folder = make(tmp_path)
+    lists = folder / "scenario_type"
+    given = [[8, 31], [12.5, 39], [10, 99], [10], ["10", 35], [True, 35]]
+    rows = [
+        {"data_id": k, "scenario_folder": "human", "scenario_id": 5, "route_id": 3, "parameters": one}
+        for k, one in enumerate(given)
+    ]
+    (lists / "human.json").write_text(json.dumps(rows))
+    (lists / "advsim.json").write_text(json.dumps([row | {"parameters": "5.npy"} for row in rows]))
+    (plain,) = import_routes(folder, left_out=[])
+    assert plain.parameters == {}
+    left_out: list[str] = []
+    found = import_routes(lists / "human.json", left_out=left_out)
+    assert [s.parameters for s in found] == [
+        {"speed": 8.0, "trigger_distance": 31.0}, {"speed": 12.5, "trigger_distance": 39.0}
+    ]  # fmt: skip
+    assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
+    assert "entry 2: RedlightRunning: parameter trigger_distance: 99 is outside" in left_out[0]
+    assert ["parameters should be the numbers speed, trigger_distance" in line for line in left_out[1:]] == [True] * 3
+
+
+@pytest.mark.parametrize("number", range(1, 9))
+def test_every_parameter_of_a_list_is_one_of_its_scenario(number: int) -> None:
+    box = scenario_type(PRECRASH[number - 1]).box
+    assert set(_PARAMETERS[number]) <= set(box)
 
 
 def test_a_trigger_on_a_curve_is_found_on_the_route_through_its_town(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from ssad.core.types import F64, Scenario
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.generate import GENERATORS, generator_factory
+from ssad.scenarios.dynamic.sampling import sampling_ranges
 from ssad.scenarios.dynamic.search.bayesian import expected_improvement, predict
 from ssad.scenarios.dynamic.search.box import Box
 
@@ -118,3 +119,13 @@ def test_the_improvement_expected_is_that_of_many_draws() -> None:
     expected = np.maximum(draws - 2.5, 0.0).mean()
     found = expected_improvement(np.array([1.0]), np.array([2.0]), 2.5)
     assert found[0] == pytest.approx(expected, rel=0.02)
+
+
+def test_a_value_beyond_what_is_searched_is_kept_and_searches_begin_at_the_nearest() -> None:
+    (plain,) = load_scenarios("LaneChanging/00")
+    fast = dataclasses.replace(plain, parameters={"leader_speed": 18.0})  # searched: 8 to 16 m/s; allowed: up to 20
+    assert sampling_ranges(fast)["leader_speed"] == (16.5, 18.0)
+    box = Box.of(fast)
+    nominal = dict(zip(box.ranges, box.nominal(), strict=True))
+    assert nominal["leader_speed"] == 1.0
+    assert box.at(box.nominal()).parameters["leader_speed"] == 16.0

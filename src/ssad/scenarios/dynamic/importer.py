@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from ssad.core.errors import FormatError, SSADError
+from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import dotted, read_json, read_xml
 from ssad.core.types import Pose, Scenario
 from ssad.roads import load_town
 from ssad.roads.router import route_along
-from ssad.scenarios.dynamic.catalog import PRECRASH
+from ssad.scenarios.dynamic.catalog import PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
 
 NATURAL_ID = 9
@@ -53,9 +53,26 @@ _NAMES: dict[str, str] = {
     "Scenario9": "RightTurn",
     "Scenario10": "CrossingNegotiation",
 }
+_PARAMETERS: dict[int, tuple[str, ...]] = {
+    1: ("walker_speed", "trigger_distance", "start_distance"),
+    2: ("speed", "trigger_distance", "exit_distance"),
+    3: ("distance", "gap", "leader_speed", "neighbour_speed", "brake_after", "brake_speed", "trigger_distance"),
+    4: ("distance", "gap", "speed", "trigger_distance"),
+    **dict.fromkeys((5, 6, 7, 8), ("speed", "trigger_distance")),
+}
+"""What the numbers of an entry mean in SafeBench's lists `human` and `random`, by scenario id."""
 _NEAR = 2.0  # m between a trigger and the route
 _ALIGNED = math.radians(10.0)
 _SIDES = ("front", "left", "right")  # the order in which the leaderboard reads other actors
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One episode of a list: scenario id, route id, and the parameters that it gives."""
+
+    number: int
+    route: int
+    parameters: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -78,10 +95,11 @@ class _Road:
 
 
 def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[Scenario, ...]:
-    """All scenarios of a folder, in its order; of several lists in `scenario_type` the longest is taken.
+    """All scenarios of a folder, in its order; of several lists in `scenario_type` the longest without parameters.
 
     Args:
-        folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`.
+        folder: A SafeBench, FREA or leaderboard folder, a checkout of the first two, or one list in `scenario_type`,
+            such as SafeBench's human.json or random.json, whose entries have parameters of their own.
         left_out: Gets a line for each entry of a list that is broken, and the rest comes in; None: the first of them is
             an error.
 
@@ -95,16 +113,21 @@ def import_routes(folder: Path, *, left_out: list[str] | None = None) -> tuple[S
         raise FormatError(f"{folder}: no such folder")
     lists = sorted(path for place in _scenario_types(folder) for path in place.glob("*.json"))
     if lists:
-        found: dict[Path, tuple[list[tuple[int, int]], list[str]]] = {}
+        found: dict[Path, tuple[list[_Entry], list[str]]] = {}
         for path in lists:
             missing: list[str] = []
             found[path] = _read_list(path, None if left_out is None else missing), missing
-        longest = max(lists, key=lambda path: len(found[path][0]))
+        longest = max(lists, key=lambda path: _preferred(found[path][0]))
         entries, missing = found[longest]
         if left_out is not None:
             left_out += missing
         return _listed(_routes_of(longest.parent), entries, longest, left_out)
     return _leaderboard(folder)
+
+
+def _preferred(entries: Sequence[_Entry]) -> tuple[bool, int]:
+    """How much a list is what one expects: first one that leaves the parameters to the scenarios, then a long one."""
+    return bool(entries) and not any(entry.parameters for entry in entries), len(entries)
 
 
 def _scenario_types(folder: Path) -> list[Path]:
@@ -134,14 +157,14 @@ def _routes_of(lists: Path) -> Path:
 # ---------------------------------------------------------------- SafeBench, FREA
 
 
-def _read_list(path: Path, left_out: list[str] | None) -> list[tuple[int, int]]:
-    """(scenario id, route id) of each entry, in the order of data_id; what is no scenario of ours is left out."""
+def _read_list(path: Path, left_out: list[str] | None) -> list[_Entry]:
+    """The entries in the order of data_id; what is no scenario of ours is left out."""
     data = read_json(path)
     if not isinstance(data, list):
         raise FormatError(f"{path}: expected a list of episodes")
     if not data:
         raise FormatError(f"{path}: the list of episodes is empty")
-    rows = []
+    rows: list[tuple[int, _Entry]] = []
     for i, entry in enumerate(data):
         if not isinstance(entry, dict):
             raise FormatError(f"{path}: entry {i}: expected an object with scenario_id and route_id")
@@ -151,36 +174,54 @@ def _read_list(path: Path, left_out: list[str] | None) -> list[tuple[int, int]]:
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
                 raise FormatError(f"{path}: entry {i}: {key} should be a whole number, not {value!r}")
             ids.append(value)
-        trouble = ""
-        if ids[1] not in _TYPES:
-            trouble = f"{path}: entry {i}: unknown scenario_id {ids[1]}; known: 1 to {max(_TYPES)}"
-        elif entry.get("parameters") is not None:
-            trouble = f"{path}: entry {i}: parameters of an entry are not read; set them to null"
-        if trouble and left_out is None:
-            raise FormatError(trouble)
-        if trouble and left_out is not None:
+        try:
+            rows.append((ids[0], _Entry(ids[1], ids[2], _values(entry, ids[1]))))
+        except FormatError as error:
+            trouble = f"{path}: entry {i}: {error}"
+            if left_out is None:
+                raise FormatError(trouble) from None
             left_out.append(trouble)
-        if ids[1] in _TYPES:
-            rows.append(ids)
     rows.sort(key=lambda row: row[0])
-    return [(row[1], row[2]) for row in rows]
+    return [row[1] for row in rows]
 
 
-def _listed(
-    routes: Path, entries: Sequence[tuple[int, int]], listing: Path, left_out: list[str] | None
-) -> tuple[Scenario, ...]:
+def _values(entry: Mapping[str, Any], number: int) -> dict[str, float]:
+    """The parameters of an entry by name. FormatError: it is no scenario of ours, or they are unknown or not valid."""
+    if number not in _TYPES:
+        raise FormatError(f"unknown scenario_id {number}; known: 1 to {max(_TYPES)}")
+    given = entry.get("parameters")
+    if given is None:
+        return {}
+    names = _PARAMETERS.get(number, ())
+    if entry.get("scenario_folder") not in ("human", "random") or not names:
+        raise FormatError("parameters are read in lists human and random only; set them to null")
+    if (
+        not isinstance(given, list)
+        or len(given) != len(names)
+        or not all(isinstance(one, int | float) and not isinstance(one, bool) for one in given)
+    ):
+        raise FormatError(f"parameters should be the numbers {', '.join(names)}, not {given!r}")
+    values = {name: float(one) for name, one in zip(names, given, strict=True)}
+    try:
+        scenario_type(_TYPES[number]).values(values)
+    except ConfigError as error:
+        raise FormatError(str(error)) from None
+    return values
+
+
+def _listed(routes: Path, entries: Sequence[_Entry], listing: Path, left_out: list[str] | None) -> tuple[Scenario, ...]:
     """The scenarios of a list; repetitions of a route get seeds 0, 1, ..."""
     if not entries:
-        raise FormatError(f"{listing}: no entry of it can be read")
-    suite = "frea" if all(number == NATURAL_ID for number, _ in entries) else "safebench"
+        raise FormatError(f"{listing}: no entry of it can be read{f'; the first: {left_out[0]}' if left_out else ''}")
+    suite = "frea" if all(entry.number == NATURAL_ID for entry in entries) else "safebench"
     title = {"frea": "FREA", "safebench": "SafeBench"}[suite]
-    total = Counter(entries)
+    total = Counter((entry.number, entry.route) for entry in entries)
     done: Counter[tuple[int, int]] = Counter()
     cache: dict[tuple[int, int], Scenario | None] = {}
     events: dict[int, list[_Event]] = {}
     result = []
-    for number, route_id in entries:
-        key = (number, route_id)
+    for entry in entries:
+        key = number, route_id = entry.number, entry.route
         if key not in cache:
             try:
                 if number not in events:
@@ -205,7 +246,8 @@ def _listed(
         if total[key] > 1:
             name += f"/{repetition:02d}"
         source = f"{title} scenario {number} route {route_id:02d}"
-        result.append(replace(base, name=name, group=group, seed=repetition, source=source))
+        parameters = {**base.parameters, **entry.parameters}
+        result.append(replace(base, name=name, group=group, seed=repetition, source=source, parameters=parameters))
     if not result:
         assert left_out
         raise FormatError(f"{listing}: none of its routes can be read; the first: {left_out[0]}")

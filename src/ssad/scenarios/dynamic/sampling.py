@@ -29,7 +29,7 @@ def sampling_ranges(scenario: Scenario, *, spread: float = 1.0) -> dict[str, tup
 
     Returns:
         Name -> (least, greatest) of all that is drawn, in the unit of the parameter, and of `target_speed` in m/s;
-        never beyond what the parameter allows.
+        never beyond the range of the parameter or the scenario's own value.
 
     Raises:
         ConfigError: The spread is negative or not finite, or a parameter of the scenario is not valid.
@@ -39,7 +39,10 @@ def sampling_ranges(scenario: Scenario, *, spread: float = 1.0) -> dict[str, tup
     kind = scenario_type(scenario.type)
     value = kind.values(scenario.parameters)
     ranges = {
-        name: (max(parameter.low, value[name] - reach), min(parameter.high, value[name] + reach))
+        name: (
+            max(min(parameter.low, value[name]), value[name] - reach),
+            min(max(parameter.high, value[name]), value[name] + reach),
+        )
         for name, parameter in kind.box.items()
         if (reach := spread * parameter.spread) > 0.0
     }

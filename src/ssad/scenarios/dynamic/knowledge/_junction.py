@@ -39,7 +39,7 @@ def box(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
     return (
         Parameter(
             "trigger_distance", trigger_distance - 5.0, trigger_distance + 5.0, trigger_distance, "m",
-            "the car starts when the ego is this near to it", 2.0,
+            "the car starts when the ego is this near to it", 2.0, (trigger_distance - 6.0, trigger_distance + 6.0),
         ),
         Parameter(
             "speed", speed - 5.0, speed + 5.0, speed, "m/s",

@@ -23,13 +23,14 @@ class Parameter:
 
     Attributes:
         name: Key in `Scenario.parameters`.
-        low: Least value allowed, in `unit`.
-        high: Greatest value allowed, in `unit`.
+        low: Least value that is searched, in `unit`.
+        high: Greatest value that is searched, in `unit`.
         default: Value of a scenario that does not give one, in `unit`.
         unit: Unit of the values, "" for a plain number.
         doc: What the number means.
         spread: How far a repetition may draw the number from the scenario's own value at spread 1, in `unit`; 0: it
             is never drawn.
+        allowed: Least and greatest value that a scenario may have, in `unit`; None: `low` and `high`.
     """
 
     name: str
@@ -39,6 +40,12 @@ class Parameter:
     unit: str
     doc: str
     spread: float = 0.0
+    allowed: tuple[float, float] | None = None
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Least and greatest value that a scenario may have, in `unit`."""
+        return self.allowed or (self.low, self.high)
 
     def __post_init__(self) -> None:
         if not self.low <= self.default <= self.high:
@@ -55,10 +62,11 @@ class Parameter:
         Returns:
             A message, or None if the value is allowed.
         """
-        if math.isfinite(value) and self.low <= value <= self.high:
+        low, high = self.limits
+        if math.isfinite(value) and low <= value <= high:
             return None
         unit = f" {self.unit}" if self.unit else ""
-        return f"{value:g} is outside {self.low:g} to {self.high:g}{unit} ({self.doc})"
+        return f"{value:g} is outside {low:g} to {high:g}{unit} ({self.doc})"
 
 
 EGO_START: tuple[Parameter, ...] = (

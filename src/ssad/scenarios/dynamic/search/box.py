@@ -53,9 +53,10 @@ class Box:
         return len(self.ranges)
 
     def nominal(self) -> F64:
-        """The scenario's own values as a point of the unit cube."""
+        """The scenario's own values as a point of the unit cube; the nearest one where they lie beyond."""
         value = scenario_type(self.scenario.type).values(self.scenario.parameters)
-        return np.array([(value[name] - low) / (high - low) for name, (low, high) in self.ranges.items()])
+        shares: F64 = np.array([(value[name] - low) / (high - low) for name, (low, high) in self.ranges.items()])
+        return shares.clip(0.0, 1.0)
 
     def at(self, point: npt.ArrayLike) -> Scenario:
         """The scenario at a point of the unit cube; what lies outside is cut."""
