@@ -22,7 +22,7 @@ import ssad
 ROOT = Path(__file__).parents[1]
 TOP = ("ARCHITECTURE", "CONTRIBUTING", "CHANGELOG", "SECURITY")  # pages at the top of the repository, besides README
 PARTS = {
-    "Start": ("index", "install", "python", "notebooks/drive", "notebooks/perceive"),
+    "Start": ("index", "install", "concepts", "python", "notebooks/drive", "notebooks/perceive"),
     "Drive": ("loop", "drivers", "scenarios", "generators", "how_often", "careful", "gap"),
     "Perceive": ("detectors", "shifts", "attacks", "physical", "camera"),
     "What the numbers are": ("metrics", "results", "accuracy", "digital", "physical_results", "benchmarks"),
