@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,6 +53,7 @@ def store(folders: Sequence[Path], name: str | None = None) -> None:
     about["weights"] = {key: value for run in runs for key, value in run.header["weights"].items()}
     about["command"] = list(dict.fromkeys(run.command for run in runs))
     done = sum(line["status"] == "ok" for line in lines.values())
+    about["refused"] = Counter(line["reason"] for line in lines.values() if line["status"] != "ok")
     joined = replace(runs[0], header=about, lines=tuple(lines.values()), planned=len(cells))
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -88,12 +90,14 @@ def part(name: str) -> list[str]:
         "Weights: " + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items()) + ".",
         "",
     ]
-    done, cells = about.get("cells_done"), about.get("cells")
-    if done != cells:
+    done, cells, refused = about.get("cells_done"), about.get("cells"), about.get("refused", {})
+    for reason, count in refused.items():
+        lines += [f"> **{count} of {cells} cells were refused:** {reason}.", ""]
+    if done is not None and done + sum(refused.values()) != cells:
         lines += [f"> **The run was stopped: {done} of {cells} cells are there.** What is missing is n/a.", ""]
     tables = [*sorted(folder.glob(f"{FIRST}*.md")), *(folder / f"{other}.md" for other in OTHERS)]
     for table in tables:
-        if table.is_file():
+        if table.is_file() and table.read_text().count("\n| ") > 1:  # one is its head
             lines += [table.read_text().replace("## ", "### ", 1).strip(), ""]
     return lines
 

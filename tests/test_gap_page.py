@@ -64,6 +64,8 @@ def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
     assert count == {("s", name, k): DRIVES for name, k in (("none", 0), ("dirt", 3), ("rain", 5), ("snow", 1))} | {
         ("s", "fog", 5): 1, ("s", "fog", 3): 1
     }  # fmt: skip
+    part = page["change"](after, ("s", "fog", 5), "collision")
+    assert (part.n, part.failed) == (1, 0), "drives that a condition does not have have not failed"
     assert "in 2 runs" in page["_measured"](after)
     assert "runs" not in page["_measured"](before).replace("ssad run", "")
 

@@ -42,7 +42,8 @@ def write_sheets(attacks: TargetAttacks, table: TargetTable, cells: Cells) -> No
             (GRID, "from the front, the left, the rear and the right", SIDES, dict(trained[-1:])),
         ):
             path = folder / "pictures" / f"{view}-{pair.test.lower()}.jpg"
-            clips = TargetClips(folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}", 1)
+            recording = folder / "data" / f"{pair.test}{'-grid' if view == GRID else ''}"
+            clips = TargetClips(recording, 1, device=attacks.device)
             if chosen and not path.is_file() and (clips.folder / "annotations").is_dir():
                 save_picture(path, attacks.sheet(name, clips, textures=shown, sides=sides, clean=CLEAN))
             if path.is_file():

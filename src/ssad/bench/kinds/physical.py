@@ -137,7 +137,7 @@ class Physical(Kind):
             attacks_of(job).texture(TextureSpec.of_row(data))
 
     def result(self, cell: Cell, job: Job) -> dict[str, Any]:
-        """Scores in the town of the test. CellError: the detector does not find the clean car."""
+        """Scores in the town of the test. CellError: the detector does not find the clean target."""
         attacks, settings, detector = attacks_of(job), job.settings, cell.system
         light, grid, floor = cell.spec.get("light"), cell.fields["view"] == GRID, settings["floor"]
         draws = {"replicates": settings["replicates"], "seed": settings["seed"]}
@@ -152,9 +152,8 @@ class Physical(Kind):
         have = round(precision(clean) or 0.0, 6)
         if have < floor:
             when = f" ({light['hour']})" if light else ""
-            raise CellError(
-                f"{detector} finds the clean car{when} with AP50 {have:.3f}, which is less than the floor of {floor:g}"
-            )
+            found_at = f"{detector} finds the clean target{when} with AP50 {have:.3f}"
+            raise CellError(f"{found_at}, which is less than the floor of {floor:g}")
         if lit:
             spec = LightSpec.of_row(light or {})
             shown, about = attacks.under(lit, spec), partial(attacks.about_light, spec)

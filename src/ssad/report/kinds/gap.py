@@ -283,8 +283,11 @@ def _cell(lines: Sequence[Line], name: str) -> Cell:
 
 
 def change(run: Run, condition: Condition, name: str) -> Cell:
-    """What a condition changes in a metric against the same drives without it."""
+    """What a condition changes in a metric against the same drives without it.
+
+    Drives that the condition does not have, such as those without a car that could wear a texture, do not count.
+    """
     every = conditions(run)
-    clean = every.get((condition[0], "none", 0), [])
+    own, clean = values(every[condition], name), values(every.get((condition[0], "none", 0), []), name)
     kind: Literal["share", "mean"] = "share" if name == "collision" else "mean"
-    return Cell.of(paired_difference(values(every[condition], name), values(clean, name), kind=kind))
+    return Cell.of(paired_difference(own, {drive: clean[drive] for drive in own if drive in clean}, kind=kind))
