@@ -104,6 +104,7 @@ def beside() -> list[str]:
     """The step beside the one before beliefs and lane changes, in turn: on a core and on a GPU."""
     ratio, gpu = read("world-ratio"), read("world-ratio-h200")
     kernels = sorted(gpu["kernels_ms"].items(), key=lambda one: -one[1])
+    told = f"at commit {gpu['commit']}." if "commit" in gpu else "before roads were read row by row (commit 84ef36e)."
     return [
         "### Beside the step before beliefs and lane changes",
         "",
@@ -115,6 +116,7 @@ def beside() -> list[str]:
         f"{', '.join(f'{k} {ms:.2f}' for k, ms in kernels)}.",
         "`change_lanes` and `see` have come since. Without lane changes it would be",
         f"{gpu['before_ms'] / (gpu['ms'] - gpu['kernels_ms']['change_lanes']):.2f} times the former speed.",
+        f"The GPU was measured {told}",
         "",
     ]
 

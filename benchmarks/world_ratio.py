@@ -87,8 +87,15 @@ def measure(before: Path, *, batch: int, steps: int, rounds: int, device: str) -
     for process in pair:
         process.communicate()
     low, middle, high = statistics.quantiles(ratios, n=4)
-    about = {"device": device, "batch": batch, "steps": steps, "rounds": rounds}
+    about = {"device": device, "batch": batch, "steps": steps, "rounds": rounds, "commit": commit()}
     return {**about, "ratio": middle, "low": low, "high": high}
+
+
+def commit() -> str:
+    """Of this version; "unknown" outside a checkout."""
+    words = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    return told.stdout.strip() or "unknown"
 
 
 def main() -> None:
