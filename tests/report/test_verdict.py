@@ -99,5 +99,9 @@ def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: floa
     scores = {"": 0.5, "noise": noise, "pgd": 0.2}
     rows = [{"detector": "d", "attack": name, "metrics": {"mAP": value}} for name, value in scores.items()]
     assert said in told(tmp_path / "all", "digital", rows)
+    # noise that nothing survives, two scenes that are easier and a defence do not change what is said of the table
+    others = ({"attack": "noise", "row": False}, {"attack": "", "subset": 1}, {"attack": "pgd", "defence": "jpeg"})
+    more = [{"detector": "d", "metrics": {"mAP": 0.0}} | one for one in others]
+    assert told(tmp_path / "more", "digital", [*rows, *more]) == told(tmp_path / "all", "digital", rows)
     # before an attack has been run there is nothing to say of noise, and the page says that it is early
     assert told(tmp_path / "some", "digital", rows[:2], planned=3) == "Not finished: 2 of 3 cells have run."

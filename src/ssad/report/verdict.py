@@ -45,10 +45,14 @@ def _detection(run: Run) -> list[str]:
 
 
 def _digital(run: Run) -> list[str]:
-    """The mAP clean, under the strongest attack and under noise of the same size."""
+    """The mAP clean, under the strongest attack and under noise of the same size, by the rows of the main table.
+
+    Points of curves, of other budgets and on fewer scenes, and pictures made against others, are not compared.
+    """
     found = []
-    for detector, lines in _by(run, "detector").items():
-        scores = {str(line.get("attack") or ""): _metric(line, "mAP") for line in lines}
+    for detector, every in _by(run, "detector").items():
+        lines = [line for line in every if line.get("row", True) and not line.get("subset") and not line.get("defence")]
+        scores = {" on ".join(filter(None, map(line.get, ("attack", "loss")))): _metric(line, "mAP") for line in lines}
         noise = scores.pop("noise", math.nan)
         found.append(_worst(detector, "mAP", scores, "attack"))
         if found[-1] and not math.isnan(noise):
