@@ -42,6 +42,14 @@ def test_brackets_of_names_and_settings_stay_in_the_table_of_the_terminal(tmp_pa
     assert "m:A?x=[b]" in told
 
 
+def test_a_title_too_long_for_its_settings_names_what_is_other(tmp_path: Path) -> None:
+    sweeps = ",".join(f"{{name: pgd, radii: [{k}]}}" for k in range(30))
+    command = f"ssad run s --set 'sweeps=[{sweeps}]' --set batch=24 --set 'hardened=[a]'"
+    header = {"suite": {"name": "s", "title": "Attacks"}, "kind": "driving", "command": command}
+    run = ssad.load_results(write_run(tmp_path / "run", header, driving_lines()))
+    assert str(run).startswith("Attacks, with other sweeps, hardened")
+
+
 def test_a_cell_is_found_by_the_start_of_its_key_and_one_without_a_trace_says_so(stored: ssad.Results) -> None:
     assert stored.find("a000")["key"] == "a000"
     with pytest.raises(ssad.SSADError, match="has no trace"):

@@ -16,11 +16,13 @@ from ssad.core.errors import FormatError, StoreError
 from ssad.core.jsonl import read_lines
 
 INCIDENTAL = (
+    "batch",
     "chunk",
     "description",
     "name",
     "pictures",
     "reference",
+    "sheets",
     "timeout_s",
     "witness",
 )  # keys of suites that change no result
@@ -59,10 +61,14 @@ class Run:
     def title(self) -> str:
         """What the page is called: the suite's title, unless the run differs from what that says."""
         name = str(self.suite.get("name") or "SSAD")
-        if self.changed and not any(one.startswith("title=") for one in self.changed):
-            told = "; ".join(_in_words(one) for one in self.changed)
-            return textwrap.shorten(f"{name} with {told}", 100, placeholder=" ...")
-        return str(self.suite.get("title") or name)
+        title = str(self.suite.get("title") or name)
+        if not self.changed or any(one.startswith("title=") for one in self.changed):
+            return title
+        told = f"{name} with {'; '.join(_in_words(one) for one in self.changed)}"
+        if len(told) <= 100:
+            return told
+        keys = dict.fromkeys(one.partition("=")[0].replace("_", " ") for one in self.changed)
+        return textwrap.shorten(f"{title}, with other {', '.join(keys)}", 160, placeholder=" ...")
 
     @cached_property
     def changed(self) -> tuple[str, ...]:
