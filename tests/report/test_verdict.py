@@ -105,3 +105,14 @@ def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: floa
     assert told(tmp_path / "more", "digital", [*rows, *more]) == told(tmp_path / "all", "digital", rows)
     # before an attack has been run there is nothing to say of noise, and the page says that it is early
     assert told(tmp_path / "some", "digital", rows[:2], planned=3) == "Not finished: 2 of 3 cells have run."
+
+
+def test_what_harms_the_system_most_is_said_first(tmp_path: Path) -> None:
+    rows = [
+        {"system": "s", "perturbation": name, "severity": severity, "family": name, "cluster": f"d{k}", "case": f"d{k}",
+         "spec": {"repetition": 0}, "metrics": {"AP": ap, "collision": k < hits}}
+        for name, severity, ap, hits in (("none", 0, 0.5, 0), ("fog", 5, 0.1, 0), ("blackout", 5, 0.2, 6))
+        for k in range(12)
+    ]  # fmt: skip
+    said = told(tmp_path, "gap", rows)
+    assert said.index("s collided in 0 of 12") < said.index("blackout 5 changes") < said.index("fog 5 changes")

@@ -92,24 +92,26 @@ def _adversarial(run: Run) -> list[str]:
 
 
 def _gap(run: Run) -> list[str]:
-    """Each perceiving system beside its ceiling, and what its perturbations do to component and system."""
-    found = []
+    """Each perceiving system, and what its perturbations do to component and system: most to the system first."""
+    found: list[str] = []
     every = gap.conditions(run)
+    systems = list(dict.fromkeys(system for system, *_ in every))
+    told: dict[str, list[tuple[float, str]]] = {system: [] for system in systems}
     for system, perturbation, severity in every:
         lines = every[system, perturbation, severity]
         hits = sum(_metric(line, "collision") == 1.0 for line in lines)
         if not severity:
             part = _mean(_metric(line, "AP") for line in lines)
             sees = "" if math.isnan(part) else f" It found objects with an AP of {part:.2f} on the way."
-            found.append(f"{system} collided in {hits} of {len(lines)} drives.{sees}")
+            told[system].append((math.inf, f"{system} collided in {hits} of {len(lines)} drives.{sees}"))
             continue
         fall, rise = (gap.change(run, (system, perturbation, severity), name) for name in ("AP", "collision"))
         if not math.isnan(fall.mean) and not math.isnan(rise.mean):
             few = "" if _known(fall) or _known(rise) else ", too few for intervals"
-            found.append(
-                f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
-                f"{_sure(rise)}, in {rise.n} drives{few}."
-            )
+            said = f"{perturbation} {severity} changes the AP of {system} by {_sure(fall)} and its collision rate by "
+            told[system].append((abs(rise.mean), f"{said}{_sure(rise)}, in {rise.n} drives{few}."))
+    for system in systems:
+        found += [sentence for _, sentence in sorted(told[system], key=lambda one: -one[0])]
     return found
 
 
