@@ -94,6 +94,18 @@ def test_searches_of_one_system_share_a_sentence(tmp_path: Path) -> None:
     )
 
 
+def test_of_many_generators_the_best_are_named_beside_random_search(tmp_path: Path) -> None:
+    hits = {"random": 1, "grid": 0, "king": 4, "cat": 3, "l2c": 2}
+    rows = [
+        {"system": "autopilot", "generator": name, "metrics": {"survived": True, "CR": k < count}}
+        for name, count in hits.items() for k in range(4)
+    ]  # fmt: skip
+    rows += [{"system": "blind", "generator": "random", "metrics": {"survived": False, "CR": None}}]
+    said = told(tmp_path, "adversarial", rows)
+    assert "king in 4 of 4, cat in 3 of 4, l2c in 2 of 4, random in 1 of 4 (the best three of 5" in said
+    assert "blind survives none of its scenarios unchanged" in said
+
+
 @pytest.mark.parametrize(("noise", "said"), [(0.4, "what lies between is the attack's"), (0.1, "does no more than")])
 def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: float, said: str) -> None:
     scores = {"": 0.5, "noise": noise, "pgd": 0.2}

@@ -73,21 +73,29 @@ def _physical(run: Run) -> list[str]:
             if name and not math.isnan(score) and score >= best.get(control, (-1.0, ""))[0]:
                 best[control] = score, name
         if False in best:
-            found.append(f"{best[False][1]} hides {best[False][0]:.0%} of the cars from {detector}.")
+            found.append(f"{best[False][1]} hides {best[False][0]:.0%} of the targets from {detector}.")
         if True in best:
             found.append(f"The strongest control ({best[True][1]}) hides {best[True][0]:.0%}.")
     return found
 
 
 def _adversarial(run: Run) -> list[str]:
-    """Collisions that each generator finds, a sentence a system."""
+    """Collisions that generators find, a sentence a system; of many generators the best three and random search."""
     found = []
     for system, lines in _by(run, "system").items():
-        counts = []
+        counts: dict[str, tuple[int, int]] = {}
         for generator in dict.fromkeys(str(line.get("generator") or "") for line in lines):
             own = [line for line in lines if line.get("generator") == generator and _metric(line, "survived") == 1.0]
-            counts.append(f"{generator} in {sum(_metric(line, 'CR') == 1.0 for line in own)} of {len(own)}")
-        found.append(f"{system} is made to collide in scenarios that it survives unchanged: {', '.join(counts)}.")
+            if own:
+                counts[generator] = sum(_metric(line, "CR") == 1.0 for line in own), len(own)
+        if not counts:
+            found.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
+            continue
+        best = sorted(counts, key=lambda name: -counts[name][0] / counts[name][1])
+        shown = list(counts) if len(best) <= 4 else [*best[:3], *(["random"] if "random" in best[3:] else [])]
+        said = ", ".join(f"{name} in {counts[name][0]} of {counts[name][1]}" for name in shown)
+        more = f" (the best three of {len(best)}{', and random search' * (len(shown) > 3)})" if len(best) > 4 else ""
+        found.append(f"{system} is made to collide in scenarios that it survives unchanged: {said}{more}.")
     return found
 
 

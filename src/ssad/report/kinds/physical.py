@@ -211,7 +211,7 @@ def transfer_table(run: PhysicalRun) -> Table:
                     continue
                 cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
                 rows.append(Row((test, title_of(attack), source), tuple(cells)))
-    note = "AP50 in percent of the target; n/a where the detector does not find the clean car often enough."
+    note = "AP50 in percent of the target; n/a where the detector does not find the clean target often enough."
     heads = ("Town", "Attack", "Trained against")
     return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
 
