@@ -10,7 +10,7 @@ import numpy as np
 
 from ssad.core.driving import Belief
 from ssad.core.frames import Camera
-from ssad.core.rotations import upright_pose
+from ssad.core.rotations import upright_poses
 from ssad.core.types import F64, U8, AgentKind, Bool, EpisodeTrace
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.driver import Known, Sighting
@@ -123,7 +123,7 @@ def in_view(trace: EpisodeTrace, steps: Sequence[int], cameras: Mapping[str, Cam
     size = np.stack([trace.length, trace.width], -1)
     truth = Belief(pose.astype(np.float32), trace.speed[at], np.broadcast_to(size, (len(at), *size.shape)), kind)
     seen = in_sight(pose[:, 0, :2].astype(np.float32), truth, REACH)
-    egos = np.array([upright_pose(*one) for one in pose[:, 0].astype(np.float64).tolist()]).reshape(-1, 4, 4)
+    egos = upright_poses(pose[:, 0].astype(np.float64))
     ones = np.ones(kind.shape)
     places = np.stack([pose[..., 0], pose[..., 1], 0.8 * ones, ones], -1)
     inside = np.zeros(kind.shape, bool)
