@@ -10,6 +10,7 @@ import pickle
 import tempfile
 import threading
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -369,3 +370,18 @@ def test_plain_data() -> None:
         "a": [1, [0.5, None]], "3": {"b": None}, "c": "text", "d": 4, "e": None, "f": True,
     }  # fmt: skip
     assert type(safeio.plain(np.int64(4))) is int
+
+
+@pytest.mark.parametrize("write", [safeio.make_folder, lambda folder: safeio.write_atomic(folder / "a.png", b"x")])
+def test_what_a_kill_leaves_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], object]
+) -> None:
+    """As after a kill, nothing that was begun is taken away by the one who began it."""
+    (tmp_path / ".gitignore").write_text("mine")
+    with monkeypatch.context() as killed:
+        killed.setattr(Path, "unlink", lambda *_, **__: None)
+        killed.setattr(os, "replace", lambda *_: None)
+        write(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+    safeio.remove_unfinished(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [".gitignore"]

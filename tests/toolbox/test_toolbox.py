@@ -337,7 +337,7 @@ def test_leftovers_of_a_killed_run_are_removed(clean: Path, fog: Path, tmp_path:
     (root / ".unfinished").mkdir()
     (root / ".unfinished" / "123-abc").write_bytes(b"half")
     (root / VERSION / ".sample_annotation.transformed-12-0123abcd.tmp.json").write_bytes(b"half")
-    (root / "manifest" / ".probe-77").write_bytes(b"")
+    (root / "manifest" / ".probe-77-0123abcd.tmp").write_bytes(b"")
     materialise(options(clean, tmp_path / "o"), workers=0)
     assert tree(root) == tree(fog)
 

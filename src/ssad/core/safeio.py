@@ -411,7 +411,7 @@ def make_folder(path: str | Path) -> Path:
         StoreError: It cannot be made or written to.
     """
     folder = Path(path)
-    probe = folder / f".probe-{os.getpid()}"
+    probe = _temporary(folder / "probe")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
@@ -421,7 +421,12 @@ def make_folder(path: str | Path) -> Path:
     return folder
 
 
-_TEMPORARY = re.compile(r"\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?")  # see `atomic_path`
+_TEMPORARY = re.compile(r"\..+-\d+-[0-9a-f]{8}\.tmp(\.\w+)?")  # what `_temporary` gives
+
+
+def _temporary(path: Path) -> Path:
+    """A name beside a path that no other process or thread takes, and that `remove_unfinished` knows."""
+    return path.with_name(f".{path.stem}-{os.getpid()}-{os.urandom(4).hex()}.tmp{path.suffix}")
 
 
 @contextlib.contextmanager
@@ -432,7 +437,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         StoreError: The file cannot be written.
     """
     target = Path(path)
-    temporary = target.with_name(f".{target.stem}-{os.getpid()}-{os.urandom(4).hex()}.tmp{target.suffix}")
+    temporary = _temporary(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -447,7 +452,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed processes left of `atomic_path` in a folder; not in those below it."""
+    """Remove what killed processes left of `atomic_path` and `make_folder` in a folder; not in those below it."""
     for path in folder.glob(".*") if folder.is_dir() else ():
         if _TEMPORARY.fullmatch(path.name):
             path.unlink(missing_ok=True)

@@ -148,8 +148,6 @@ def _clear(root: Path, version: str) -> None:
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
     for folder in (root.parent, root, root / FOLDER, root / version):
         safeio.remove_unfinished(folder)
-        for path in folder.glob(".probe-*"):
-            path.unlink(missing_ok=True)
 
 
 def _finish(
