@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 from helpers import other_dice, own_kind
+from helpers.killing import STOPS, kill_9, started_by, wait_until_ended
 from helpers.own_kind import DiceSuite
 from rich.console import Console
 
@@ -224,9 +225,10 @@ def test_a_kind_of_ones_own_gets_a_report_for_nothing(tmp_path: Path) -> None:
         kind_of("helpers.own_kind:DiceSuite")
 
 
-def start(folder: Path, count: int) -> subprocess.Popen[bytes]:
-    """A run in a process of its own."""
-    code = (
+def start(folder: Path, count: int, stop_at: int | None = None) -> subprocess.Popen[bytes]:
+    """A run in a process of its own; it stands still once so many cells are there, to be killed."""
+    code = f"stop_at = {stop_at}\n{STOPS}" if stop_at is not None else ""
+    code += (
         # a shell that runs this in the background has told its children to ignore Ctrl-C
         "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from helpers.own_kind import Dice, DiceSuite\nfrom ssad.bench.kind import Resources\n"
@@ -249,15 +251,13 @@ def kill_and_resume(folder: Path, count: int, kills: int, seed: int) -> int:
     random_moments = random.Random(seed)
     hit = 0
     for _ in range(kills):
-        process = start(folder, count)
+        process = start(folder, count, count - 5)
         before = size(folder)
         while process.poll() is None and size(folder) == before:  # until it has done something
             time.sleep(0.001)
         time.sleep(random_moments.uniform(0, 0.05))
-        hit += process.poll() is None
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert start(folder, count).wait(timeout=120) == 0
+        hit += kill_9(process)
+    assert start(folder, count).wait(timeout=500) == 0
     return hit
 
 
@@ -283,23 +283,18 @@ def test_kill_9_at_20_moments(tmp_path: Path) -> None:
 
 
 def test_workers_end_with_the_run_and_ctrl_c_leaves_a_folder_to_go_on_with(tmp_path: Path) -> None:
-    process = start(tmp_path, 40)
+    process = start(tmp_path, 40, 35)
     while size(tmp_path) == 0 and process.poll() is None:
         time.sleep(0.01)
-    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, check=False)
-    children = [int(pid) for pid in listed.stdout.split()]
-    assert children
+    workers = started_by(process.pid)
+    assert workers
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=10) != 0
-    for _ in range(100):
-        if not any(Path(f"/proc/{pid}").exists() for pid in children):
-            break
-        time.sleep(0.05)
-    else:
-        pytest.fail("a worker outlived its run")
+    process.send_signal(signal.SIGCONT)
+    assert process.wait(timeout=120) != 0
+    wait_until_ended(workers)
     done = len(read_lines(tmp_path / "results.jsonl"))
     assert 0 < done < 40
-    assert start(tmp_path, 40).wait(timeout=60) == 0
+    assert start(tmp_path, 40).wait(timeout=500) == 0
     assert len(table(tmp_path)) == 40
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.command import ssad
+from helpers.killing import STOPS, kill_9, wait_until_stopped
 
 from ssad.core.images import read_image, save_picture
 from ssad.toolbox.picture_folder import camera_of
@@ -88,17 +86,13 @@ def test_a_killed_run_goes_on_and_workers_change_no_byte(tmp_path: Path) -> None
         picture = draws.integers(0, 256, (360, 640, 3), dtype=np.uint8)
         save_picture(source / f"{number:02d}.{'png' if number % 2 else 'jpg'}", picture)
     words = ("shift", source, tmp_path / "out", "--shifts", "snow,gaussian", "--severity", "random", "--workers", "2")
-    run = subprocess.Popen(
-        [sys.executable, "-m", "ssad", *words], start_new_session=True, stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    program = f"stop_at = 5\n{STOPS}\nfrom ssad.cli import main\nmain()"
+    run = subprocess.Popen([sys.executable, "-c", program, *words], stdout=subprocess.DEVNULL)
+    wait_until_stopped(run)
+    assert kill_9(run)
     lines = tmp_path / "out" / "results.jsonl"
-    while run.poll() is None and not (lines.exists() and lines.read_bytes().count(b"\n") >= 5):
-        time.sleep(0.005)
-    os.killpg(run.pid, signal.SIGKILL)
-    run.wait()
-    kept = [json.loads(line)["key"] for line in lines.read_text().splitlines(keepends=True) if line.endswith("\n")]
-    assert 5 <= len(kept) < 32
+    kept = [json.loads(line)["key"] for line in lines.read_text().splitlines()]
+    assert len(kept) == 5
     before = {key: (tmp_path / "out" / key).stat().st_ino for key in kept}
     (tmp_path / "out" / "snow-random" / ".06-1-6662ce8e.tmp.jpg").write_bytes(b"half a picture")  # as a kill leaves it
     assert ssad(*words).returncode == 0
