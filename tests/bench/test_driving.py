@@ -44,7 +44,7 @@ class Wicked:
         if "VehiclePassing" in self.deeds:
             return np.full((len(view.speed), 3), np.nan)
         if "RightTurn" in self.deeds:
-            time.sleep(60)
+            time.sleep(1e6)
         return np.tile(np.float32([0.3, 0, 0]), (len(view.speed), 1))
 """
 
@@ -143,8 +143,10 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     names = ["StraightObstacle", "LaneChanging", "VehiclePassing", "TurningObstacle", "RightTurn"]
-    chosen = suite(systems=["wicked_system:Wicked"], scenarios=[f"{n}/00" for n in names], timeout_s=2)
-    records = {r["group"]: r for r in go(tmp_path / "run", chosen, workers=1)}
+    records, system = {}, ["wicked_system:Wicked"]
+    for folder, some, limit in (("run", names[:4], 120), ("hanging", names[4:], 2)):  # the good one must have enough
+        chosen = suite(systems=system, scenarios=[f"{n}/00" for n in some], timeout_s=limit)
+        records |= {r["group"]: r for r in go(tmp_path / folder, chosen, workers=1)}
     assert [records[n]["status"] for n in names] == ["failed", "crashed", "failed", "ok", "timeout"]
     assert "ValueError: cannot see" in records["StraightObstacle"]["reason"]
     assert "wicked_system.py:12" in records["StraightObstacle"]["reason"]
@@ -153,7 +155,7 @@ def test_what_a_system_does_wrong_is_a_record(tmp_path: Path, monkeypatch: pytes
     console = Console(file=io.StringIO(), width=100)
     console.print(summary(tmp_path / "run"))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "4 of 5 cells failed and count" in shown
+    assert "3 of 4 cells failed and count" in shown
     with pytest.raises(StoreError, match="left no trace: failed"):
         replay(tmp_path / "run", "wicked_system:Wicked/StraightObstacle/00")
 

@@ -28,7 +28,7 @@ from ssad.bench.run import read_plan, run
 from ssad.bench.suite import kind_of, load_suite
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.jsonl import read_lines
-from ssad.jobs.local import WORKER_MEMORY
+from ssad.jobs.local import WORKER_MEMORY, Worker
 from ssad.report import write_report
 
 TESTS = Path(__file__).resolve().parent.parent
@@ -80,13 +80,13 @@ BAD = {
     "liar": ("failed", "other cells"), "object": ("failed", "not plain data"), "nan": ("failed", "not plain data"),
     "memory": ("crashed", "out of memory: it held"),
 }  # fmt: skip
-HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 1.5 s"))
+HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 5 s"))
 
 
 def check_bad_cells(folder: Path, workers: int | None, ray: str | None = None) -> None:
     """Only what hangs has little time: all else must have enough on a machine that is busy."""
     good = ["a", "b", "c", "d"]
-    for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 1.5)):
+    for name, deeds, batch, timeout_s in (("bad", BAD, 6, 60.0), ("hanging", HANGING, 1, 5.0)):
         suite = dice([*good[:2], *deeds, *good[2:]], chunk=batch, timeout_s=timeout_s)
         records = go(suite, folder / name, workers, ray=ray, kind=other_dice.LyingDice)
         found = {r["number"]: r for r in records}
@@ -106,15 +106,21 @@ def test_a_bad_cell_costs_only_itself(tmp_path: Path, workers: int, monkeypatch:
 
 
 def test_what_a_kind_imports_costs_no_cell_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a busy machine, good cells ran into their time-out, each the first of a new worker."""
+    """On a busy machine, good cells ran into their time-out, each the first of a new worker. All clocks are one."""
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "late_dice.py").write_text(
-        "import sys, time\nfrom helpers.own_kind import Dice\n\n\nclass Late(Dice):\n    pass\n\n\n"
-        "time.sleep(2.0 * sys.argv[0].endswith('worker.py'))\n"
+        "import sys, time\nfrom pathlib import Path\nfrom helpers.own_kind import Dice\n\n\n"
+        "class Late(Dice):\n    pass\n\n\n"
+        "if sys.argv[0].endswith('worker.py'):\n"
+        "    Path(__file__).with_name('imported').write_text(repr(time.monotonic()))\n"
     )
+    given = []
+    give = Worker.give
+    monkeypatch.setattr(Worker, "give", lambda worker, task: given.append(time.monotonic()) or give(worker, task))
     plan = importlib.import_module("late_dice").Late().plan(dice(["a"]))
     (record,) = run(plan, tmp_path / "run", Resources(1, console=Console(file=io.StringIO())))
-    assert (record["status"], record["wall_s"] < 2.0) == ("ok", True)
+    assert record["status"] == "ok"
+    assert float((tmp_path / "imported").read_text()) < given[0], "before the time of the first cell began"
 
 
 @pytest.mark.slow
@@ -131,7 +137,7 @@ def test_on_ray_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_shared_work_is_done_once_and_a_bad_system_fails_alone(tmp_path: Path, workers: int) -> None:
     """Five numbers that five systems share; one dies, one hangs, one raises: after two of its cells it is given up."""
     numbers = [f"n-{i}" for i in range(5)]
-    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=1.5)
+    suite = dice(numbers, systems=["fair", "die", "hang", "raise", "loaded"], timeout_s=5.0)
     plan = other_dice.SharedDice().plan(suite)
     records = run(plan, tmp_path, Resources(workers, console=Console(file=io.StringIO())))
     status = {name: {r["status"] for r in records if r["system"] == name} for name in suite.systems}

@@ -56,7 +56,7 @@ def test_official_toolkit_reads_the_same(tmp_path: Path, kind: str) -> None:
         pytest.skip("set SSAD_DEVKIT_PYTHON to a Python that has nuscenes-devkit 1.2.0")
     root = make_tiny(tmp_path, samples=6, sweeps=2, size=(64, 36)) if kind == "tiny" else make_wild(tmp_path)
     done = subprocess.run(
-        [interpreter, str(LOADER), str(root), "v1.0-mini"], capture_output=True, text=True, check=False, timeout=300
+        [interpreter, str(LOADER), str(root), "v1.0-mini"], capture_output=True, text=True, check=False, timeout=550
     )
     assert done.returncode == 0, done.stderr
     theirs = json.loads(done.stdout)

@@ -35,5 +35,5 @@ def ssad_process(*words: str, cwd: Path | None = None, **environment: str) -> Co
     """Run as a user does: in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "ssad", *words],
-        capture_output=True, text=True, check=False, cwd=cwd, env=os.environ | environment, timeout=300,
+        capture_output=True, text=True, check=False, cwd=cwd, env=os.environ | environment, timeout=550,
     )  # fmt: skip

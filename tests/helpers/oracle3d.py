@@ -87,6 +87,7 @@ class Deadly(Oracle):
         held = []
         while True:
             held.append(bytearray(b"x" * (64 << 20)))
+            time.sleep(0.05)  # not faster than a busy parent looks at it
 
 
 def build_dying() -> Deadly:
