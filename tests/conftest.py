@@ -5,7 +5,9 @@ from __future__ import annotations
 import fcntl
 import gc
 import os
+import random
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 import pytest
 from helpers.sharing import Shared
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 # One thread a process: as many as there are cores in each of several test workers only wait for each other. The
 # libraries read this when they are first imported, and child processes inherit it.
@@ -20,8 +23,14 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPE
     os.environ.setdefault(_name, "1")
 
 # The same cases in every run and on every machine, however slow it is: what is drawn anew cannot hold a release up.
-settings.register_profile("same", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile(
+    "same", deadline=None, derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)  # fmt: skip
 settings.load_profile("same")
+# Hypothesis also tries the numbers and words that it finds in our modules: in those that happen to be imported, which
+# is another set in each test worker.
+setattr(providers, "_get_local_constants", lambda: providers._local_constants)  # noqa: B010
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -45,6 +54,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.get_closest_marker("slow"):
             item.add_marker(skip)
+
+
+def pytest_runtest_setup() -> None:
+    """What a test draws, and the weights that it begins with, do not depend on the tests before it in this process."""
+    random.seed(0)
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import FormatError
@@ -22,7 +22,7 @@ def flat(path: Path, kind: Any, **options: Any) -> list[Any]:
     return [record for block in stream(path, kind, **options) for record in block]
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, deadline=None)
 @given(rows=records, block=st.integers(1, 80), indent=st.sampled_from([None, 0, 1]), ascii_only=st.booleans())
 def test_equal_to_a_whole_parse(tmp_path: Path, rows: Any, block: int, indent: int | None, ascii_only: bool) -> None:
     path = tmp_path / "visibility.json"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import FormatError, StoreError
@@ -213,7 +213,7 @@ def test_no_tables_after_an_error(tmp_path: Path) -> None:
         NuScenesWriter(tmp_path / "file", VERSION)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, deadline=None)
 @given(
     steps=st.lists(st.integers(0, 30), min_size=1, max_size=8, unique=True),
     seen=st.lists(st.sets(st.integers(0, 7)), min_size=1, max_size=4),

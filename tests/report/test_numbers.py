@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from helpers.metric_traces import make_trace
 from helpers.run_folder import DRIVING_HEADER, driving_line, driving_lines, write_run
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -119,7 +119,7 @@ def test_rows_of_four_clusters_show_their_range(tmp_path: Path) -> None:
 LINES = driving_lines()[:40] + driving_lines()[64:76] + driving_lines()[-1:]
 
 
-@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, deadline=None)
 @given(st.lists(st.integers(0, len(LINES) - 1), min_size=1, max_size=60))
 def test_copies_change_no_table(tmp_path: Path, copies: list[int]) -> None:
     plain = tmp_path / "plain"

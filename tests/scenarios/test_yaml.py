@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
@@ -82,7 +82,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     )
 
 
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None)
 @given(st.lists(scenarios(), min_size=1, max_size=3, unique_by=lambda s: s.name))
 def test_round_trip(tmp_path: Path, several: list[Scenario]) -> None:
     path = tmp_path / "several.yaml"
