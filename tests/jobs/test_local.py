@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from helpers.clock import Clock, stopped
+from helpers.descriptors import open_files
 
 from ssad.core.errors import ConfigError, SSADError
 from ssad.jobs import local
@@ -26,10 +27,6 @@ GIB = 1 << 30
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return stopped(monkeypatch, local)
-
-
-def open_files() -> list[str]:
-    return sorted(os.listdir("/proc/self/fd"))
 
 
 @pytest.fixture

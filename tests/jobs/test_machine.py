@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 
 import pytest
+from helpers.descriptors import open_files
 
 from ssad.core.errors import ConfigError
 from ssad.jobs import machine
@@ -78,10 +79,10 @@ def test_without_a_driver_warp_starts_without_a_word(
     warp: FakeWarp, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     has_driver(monkeypatch, False)
-    before = sorted(os.listdir("/proc/self/fd"))
+    before = open_files()
     quiet_warp()
     assert warp.started == 1
-    assert sorted(os.listdir("/proc/self/fd")) == before, "nothing is left open"
+    assert open_files() == before, "nothing is left open"
     os.write(2, b"afterwards\n")
     assert capfd.readouterr().err == "afterwards\n"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.descriptors import open_files
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
@@ -134,10 +135,6 @@ def test_results_without_run_json(tmp_path: Path) -> None:
         Store.open(tmp_path, RUN)
     with pytest.raises(StoreError, match="not a results folder"):
         read_run(tmp_path)
-
-
-def open_files() -> list[str]:
-    return sorted(os.listdir("/proc/self/fd"))
 
 
 def test_nothing_is_left_open(tmp_path: Path) -> None:
