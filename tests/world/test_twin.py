@@ -99,6 +99,34 @@ def test_gradients_of_a_whole_motion_equal_finite_differences() -> None:
     assert (gradient[:40, :3, 2].abs() > 1e-3).all()  # steering early moves the end
 
 
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_gradients_hold_where_limits_cut(substeps: int) -> None:
+    """Brakes to a standstill, wheels that lag behind, sliding, reverse; at places with a single slope."""
+    names = ["car", "truck", "bicycle", "walker", "barrier"]
+    bodies, draws = bodies_of(names, dtype=torch.float64), np.random.default_rng(substeps)
+    values = torch.from_numpy(controls(7, len(names)))
+    initial = start(len(names), np.array([9.0, 6.0, 3.0, 1.0, 0.0]), torch.float64)
+    weight = torch.from_numpy(draws.standard_normal((STEPS + 1, len(names), 3)))
+
+    def goal(at: torch.Tensor) -> torch.Tensor:
+        states = unroll(initial, at, bodies, dt=0.25, substeps=substeps)
+        return (states.pose * weight).sum() + (states.speed + states.wheel).mul(weight[..., 0]).sum()
+
+    asked = values.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(goal(asked), asked)
+    checked = 0
+    for place in zip(*(draws.integers(n, size=120).tolist() for n in (STEPS, len(names), 3)), strict=True):
+        slopes = []
+        for change in (-1e-6, 1e-6):
+            beside = values.clone()
+            beside[place] += change
+            slopes.append(float(goal(beside) - goal(values)) / change)
+        if slopes[0] == pytest.approx(slopes[1], rel=1e-3, abs=1e-3):
+            assert float(gradient[place]) == pytest.approx(sum(slopes) / 2, rel=2e-3, abs=2e-3), place
+            checked += abs(float(gradient[place])) > 0.01
+    assert checked > 30
+
+
 @settings(max_examples=200, deadline=None)
 @given(first=BOX, second=BOX)
 def test_gap_of_boxes_is_their_distance_and_below_zero_where_they_overlap(first: tuple, second: tuple) -> None:

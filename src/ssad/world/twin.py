@@ -109,23 +109,8 @@ def advance(
     Raises:
         ConfigError: dt is not above 0, or substeps is below 1.
     """
-    if not dt > 0.0 or substeps < 1:
-        raise ConfigError(f"a step needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
-    throttle, brake = control[..., 0].clamp(0.0, 1.0), control[..., 1].clamp(0.0, 1.0)
-    driven = _bicycle(state, throttle, brake, control, bodies, dt / substeps, substeps)
-    # half of the work for nothing where nobody walks
-    walkers = bool(bodies.walker.any())
-    walked = _walk(state, throttle, control[..., 2].clamp(-1.0, 1.0), bodies, dt) if walkers else driven
-    # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
-    drives = (bodies.max_speed > 0.0) & ((state.speed != 0.0) | (control[..., 0] > 0.0))
-    parts = []
-    for old, of_vehicle, of_walker in zip(state, driven, walked, strict=True):
-        walker, moves = (
-            mask[..., None] if old.ndim > state.speed.ndim else mask for mask in (bodies.walker, drives)
-        )  # fmt: skip
-        moved = torch.where(moves, of_vehicle, old)
-        parts.append(torch.where(walker, of_walker, moved) if walkers else moved)
-    return MotionState(*parts)
+    after = unroll(state, control[None], bodies, dt=dt, substeps=substeps)
+    return MotionState(*(part[-1] for part in after))
 
 
 def unroll(
@@ -142,11 +127,24 @@ def unroll(
 
     Returns:
         States [T + 1, ...], the first is the start.
+
+    Raises:
+        ConfigError: See `advance`.
     """
-    states = [state]
-    for control in controls:
-        states.append(advance(states[-1], control, bodies, dt=dt, substeps=substeps))
-    return MotionState(*(torch.stack(_alike(*parts)) for parts in zip(*states, strict=True)))
+    if not dt > 0.0 or substeps < 1:
+        raise ConfigError(f"a step needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
+    shape = np.broadcast_shapes(state.speed.shape, bodies.max_speed.shape, controls.shape[1:-1])
+    state = MotionState(state.pose.expand(*shape, 3), state.speed.expand(shape), state.wheel.expand(shape))
+    driven = _drive(state, controls, bodies, dt / substeps, substeps)
+    if not bool(bodies.walker.any()):  # half of the work for nothing where nobody walks
+        return driven
+    walked = _walk(state, controls, bodies, dt)
+    walker = bodies.walker
+    return MotionState(
+        torch.where(walker[..., None], walked.pose, driven.pose),
+        torch.where(walker, walked.speed, driven.speed),
+        torch.where(walker, walked.wheel, driven.wheel),
+    )
 
 
 def box_gap(first: Tensor, second: Tensor) -> Tensor:
@@ -215,43 +213,103 @@ class RoadField:
         return found
 
 
-def _bicycle(  # noqa: PLR0917
-    state: MotionState, throttle: Tensor, brake: Tensor, control: Tensor, bodies: Bodies, h: float, substeps: int
-) -> MotionState:
-    """The kinematic bicycle; see `ssad.world.kernels.motion.bicycle`."""
-    (x, y, yaw), v, wheel = state.pose.unbind(-1), state.speed, state.wheel
-    aim = control[..., 2].clamp(-1.0, 1.0) * bodies.max_steer
-    turn = bodies.max_steer * (h / STEER_TIME)
-    push = torch.where(control[..., 3] > 0.5, -throttle, throttle) * bodies.max_accel * h
-    drag = brake * bodies.max_brake * h
-    least = torch.full_like(bodies.max_speed, -REVERSE_SPEED)
-    for _ in range(substeps):
-        wheel = wheel + torch.minimum(torch.maximum(aim - wheel, -turn), turn)
-        before = v
-        v = v + push
-        v = torch.where(v > 0.0, (v - drag).clamp_min(0.0), (v + drag).clamp_max(0.0))
-        v = torch.minimum(torch.maximum(v, least), bodies.max_speed)
-        mean = 0.5 * (before + v)
-        slip = torch.atan(0.5 * torch.tan(wheel))
-        rate = mean * torch.sin(slip) * 2.0 / bodies.wheelbase
-        cut = GRIP / mean.abs().clamp_min(1e-3)
-        rate = torch.minimum(torch.maximum(rate, -cut), cut)
-        heading = yaw + slip + 0.5 * rate * h
-        x = x + mean * torch.cos(heading) * h
-        y = y + mean * torch.sin(heading) * h
-        yaw = yaw + rate * h
-    return MotionState(torch.stack(_alike(x, y, _wrapped(yaw)), -1), v, wheel)
+def _drive(state: MotionState, controls: Tensor, bodies: Bodies, h: float, substeps: int) -> MotionState:
+    """The kinematic bicycle; see `ssad.world.kernels.motion.bicycle`.
+
+    Only speeds and wheels go step by step: places and headings are sums over time of what follows from these.
+    """
+    controls = controls.repeat_interleave(substeps, 0) if substeps > 1 else controls
+    throttle, brake = controls[..., 0].clamp(0.0, 1.0), controls[..., 1].clamp(0.0, 1.0)
+    able = bodies.max_speed > 0.0
+    push = torch.where(controls[..., 3] > 0.5, -throttle, throttle) * bodies.max_accel * h
+    speed = _speeds(state.speed, torch.where(able, push, 0.0), brake * bodies.max_brake * h, bodies)
+    # a vehicle that stands without throttle keeps its wheels where they are; what cannot move stays
+    drives = able & ((controls[..., 0] > 0.0) | (speed[:-1:substeps] != 0.0).repeat_interleave(substeps, 0))
+    aim = controls[..., 2].clamp(-1.0, 1.0) * bodies.max_steer
+    wheel = _wheels(state.wheel, aim, bodies.max_steer * (h / STEER_TIME), drives)
+    mean = torch.where(able, 0.5 * (speed[:-1] + speed[1:]), 0.0)
+    slip = torch.atan(0.5 * torch.tan(wheel[1:]))
+    cut = GRIP / mean.abs().clamp_min(1e-3)
+    rate = mean * torch.sin(slip) * 2.0 / bodies.wheelbase
+    rate = torch.minimum(torch.maximum(rate, -cut), cut)
+    x, y, yaw = state.pose.unbind(-1)
+    yaws = _summed(yaw, rate * h)
+    heading = yaws[:-1] + slip + 0.5 * rate * h
+    xs, ys = _summed(x, mean * torch.cos(heading) * h), _summed(y, mean * torch.sin(heading) * h)
+    pose = torch.stack([xs, ys, _wrapped(yaws)], -1)
+    return MotionState(pose[::substeps], speed[::substeps], wheel[::substeps])
 
 
-def _walk(state: MotionState, throttle: Tensor, steer: Tensor, bodies: Bodies, dt: float) -> MotionState:
+def _speeds(start: Tensor, push: Tensor, drag: Tensor, bodies: Bodies) -> Tensor:
+    """Speeds [T + 1, ...] under changes [T, ...] by the engine, and by brakes, which stop and do not turn back."""
+    able = bodies.max_speed > 0.0
+    most, least = bodies.max_speed, torch.full_like(bodies.max_speed, -REVERSE_SPEED)
+    with torch.no_grad():
+        values = [start]
+        for pushing, dragging in zip(push, drag, strict=True):
+            pushed = values[-1] + pushing
+            value = torch.minimum(torch.maximum(pushed - pushed.clamp(-dragging, dragging), least), most)
+            values.append(torch.where(able, value, values[-1]))
+        speed = torch.stack(values)
+        pushed = speed[:-1] + push
+        rolls = (pushed.abs() > drag) & (speed[1:] > least) & (speed[1:] < most)
+        sign = pushed.sign()
+    own = torch.where(rolls & able, push - sign * drag, 0.0)
+    return _recursive(speed, rolls | ~able, start, own)
+
+
+def _wheels(start: Tensor, aim: Tensor, turn: Tensor, drives: Tensor) -> Tensor:
+    """Angles [T + 1, ...] of wheels that turn towards an aim [T, ...] by at most `turn` a step, while it drives."""
+    with torch.no_grad():
+        turns, values = torch.where(drives, turn, 0.0), [start]
+        for aims, most in zip(aim, turns, strict=True):
+            values.append(values[-1] + (aims - values[-1]).clamp(-most, most))
+        wheel = torch.stack(values)
+        ahead = aim - wheel[:-1]
+        there = drives & (ahead.abs() <= turn)
+    return _recursive(wheel, ~there, start, torch.where(there, aim, torch.where(drives, ahead.sign() * turn, 0.0)))
+
+
+class _Recursion(torch.autograd.Function):
+    """Known values of v[t + 1] = v[t] + own[t] where `keeps`, else own[t]: a node for all steps, not some for each."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, keeps: Tensor, start: Tensor, own: Tensor) -> Tensor:
+        ctx.save_for_backward(keeps)
+        return values.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[None, None, Tensor, Tensor]:
+        keeps = ctx.saved_tensors[0].to(slopes[0].dtype)
+        found = [slopes[0][-1]]
+        for slope, keep in zip(slopes[0][:-1].flip(0), keeps.flip(0), strict=True):
+            found.append(torch.addcmul(slope, keep, found[-1]))
+        back = torch.stack(found).flip(0)
+        return None, None, back[0], back[1:]
+
+
+def _recursive(values: Tensor, keeps: Tensor, start: Tensor, own: Tensor) -> Tensor:
+    return _Recursion.apply(values, keeps, start, own)  # type: ignore[no-any-return]
+
+
+def _walk(state: MotionState, controls: Tensor, bodies: Bodies, dt: float) -> MotionState:
     """It turns, then goes straight ahead; the speed follows the wanted one as fast as the model can."""
-    (x, y, yaw), speed = state.pose.unbind(-1), state.speed
-    yaw = _wrapped(yaw + steer * (WALKER_RATE * dt))
+    wanted = controls[..., 0].clamp(0.0, 1.0) * bodies.max_speed
     change = bodies.max_accel * dt
-    after = speed + torch.minimum(torch.maximum(throttle * bodies.max_speed - speed, -change), change)
-    go = 0.5 * (speed + after) * dt
-    pose = torch.stack(_alike(x + go * torch.cos(yaw), y + go * torch.sin(yaw), yaw), -1)
-    return MotionState(pose, after, state.wheel)
+    speeds = [state.speed]
+    for aim in wanted:
+        speeds.append(speeds[-1] + (aim - speeds[-1]).clamp(-change, change))
+    speed = torch.stack(speeds)
+    x, y, yaw = state.pose.unbind(-1)
+    yaws = _summed(yaw, controls[..., 2].clamp(-1.0, 1.0) * (WALKER_RATE * dt))
+    go = 0.5 * (speed[:-1] + speed[1:]) * dt
+    xs, ys = _summed(x, go * torch.cos(yaws[1:])), _summed(y, go * torch.sin(yaws[1:]))
+    return MotionState(torch.stack([xs, ys, _wrapped(yaws)], -1), speed, state.wheel.expand_as(speed))
+
+
+def _summed(start: Tensor, changes: Tensor) -> Tensor:
+    """Values [T + 1, ...] that start somewhere and change [T, ...]."""
+    return torch.cat([start[None], changes]).cumsum(0)
 
 
 def _alike(*tensors: Tensor) -> list[Tensor]:

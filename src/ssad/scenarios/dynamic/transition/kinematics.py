@@ -81,7 +81,7 @@ class King:
         self._frozen = [frozen(base.episode, base.trace) for base in bases]
         self._agents = [adversaries(base) for base in bases]
         self._motion = [sampled(base.trace) for base in bases]
-        self._recorded = [self._as_recorded(k) for k in range(len(self.bases))]
+        self._recorded = self._as_recorded()
         self._road = raster_of(
             [base.graph for base in bases],
             [
@@ -147,15 +147,18 @@ class King:
             change[:, 0] += 0.1  # who stands without throttle has no gradient
         return _Chain(base, agent, change, self._motion[base][0])
 
-    def _as_recorded(self, base: int) -> dict[int, tuple[MotionState, Tensor]]:
-        """Start and controls [T, 4] with which the twin repeats what each of the adversaries did."""
-        agents, trace = self._agents[base], self.bases[base].trace
-        bodies = bodies_of([trace.models[a] for a in agents], dtype=torch.float64)
-        motion = torch.from_numpy(self._motion[base][agents])
-        speed = torch.from_numpy(trace.speed[0, agents].astype(np.float64))
+    def _as_recorded(self) -> list[dict[int, tuple[MotionState, Tensor]]]:
+        """Start and controls [T, 4] with which the twin repeats what each of the adversaries of each base did."""
+        who = [(k, agent) for k, agents in enumerate(self._agents) for agent in agents]
+        bodies = bodies_of([self.bases[k].trace.models[agent] for k, agent in who], dtype=torch.float64)
+        motion = torch.from_numpy(np.stack([self._motion[k][agent] for k, agent in who]))
+        speed = torch.tensor([float(self.bases[k].trace.speed[0, agent]) for k, agent in who], dtype=torch.float64)
         start = MotionState(motion[:, 0, :3], speed, torch.zeros_like(speed))
         controls = tracked(start, motion[..., :3].transpose(0, 1), bodies)
-        return {agent: (MotionState(*(part[i] for part in start)), controls[:, i]) for i, agent in enumerate(agents)}
+        found: list[dict[int, tuple[MotionState, Tensor]]] = [{} for _ in self.bases]
+        for i, (k, agent) in enumerate(who):
+            found[k][agent] = MotionState(*(part[i] for part in start)), controls[:, i]
+        return found
 
     def _optimise(self, chains: Sequence[_Chain]) -> F64:
         """Improves the chains' controls, and returns the poses [N, T + 1, 3] that they lead to."""
@@ -168,19 +171,28 @@ class King:
         weight = torch.tensor([c.weight for c in chains], dtype=torch.float64)
         place = torch.tensor([c.base for c in chains])
         change = torch.from_numpy(np.stack([c.change for c in chains])).requires_grad_()
-        adam = torch.optim.Adam([change], lr=RATE, betas=BETAS)
-        for _ in range(ITERATIONS):
-            adam.zero_grad()
+
+        def moved() -> MotionState:
             states = unroll(start, _controls(told, change), bodies, dt=STEP, substeps=1)
-            cost = self._cost(states, bodies, ego=ego, others=others, weight=weight, place=place)
+            sound = change.isfinite().all(-1).all(-1) & states.pose.isfinite().all(-1).all(0)
+            if not bool(sound.all()):
+                bad = self.bases[chains[int((~sound).nonzero()[0])].base].scenario.name
+                raise ConfigError(f"generator king: the optimisation diverged in {bad} (a motion that is not finite)")
+            return states
+
+        first, second = torch.zeros_like(change), torch.zeros_like(change)
+        for step in range(1, ITERATIONS + 1):
+            cost = self._cost(moved(), bodies, ego=ego, others=others, weight=weight, place=place)
             cost = cost + EFFORT * change.square().mean((1, 2))
-            if not bool(torch.isfinite(cost).all()):
-                bad = self.bases[chains[int((~torch.isfinite(cost)).nonzero()[0])].base].scenario.name
-                raise ConfigError(f"generator king: the optimisation diverged in {bad} (a cost that is not finite)")
-            cost.sum().backward()  # type: ignore[no-untyped-call]
-            adam.step()
+            (slope,) = torch.autograd.grad(cost.sum(), change)
+            # Adam; that of torch.optim imports torch's compiler first, which takes 4 s
+            with torch.no_grad():
+                first.lerp_(slope, 1.0 - BETAS[0])
+                second.lerp_(slope.square(), 1.0 - BETAS[1])
+                size = (second / (1.0 - BETAS[1] ** step)).sqrt() + 1e-8
+                change -= RATE / (1.0 - BETAS[0] ** step) * first / size
         with torch.no_grad():
-            states = unroll(start, _controls(told, change), bodies, dt=STEP, substeps=1)
+            states = moved()
         for chain, values in zip(chains, change.detach().numpy(), strict=True):
             chain.change = values.copy()
         return states.pose.transpose(0, 1).numpy()
@@ -272,11 +284,9 @@ def tracked(start: MotionState, poses: Tensor, bodies: Bodies) -> Tensor:
 
 def _controls(told: Tensor, change: Tensor) -> Tensor:
     """Controls [T, N, 4]: those told, and what is added to effort and steering, linear between knots [N, K, 2]."""
-    at = torch.arange(STEPS) / KNOT
-    low = at.floor().long()
-    share = (at - low)[:, None, None]
-    knots = change.transpose(0, 1)
-    added = knots[low] + share * (knots[low + 1] - knots[low])
+    times, knots = torch.arange(STEPS)[:, None] / KNOT, torch.arange(change.shape[1])
+    share = (1.0 - (times - knots).abs()).clamp_min(0.0).to(change.dtype)
+    added = torch.einsum("tk,nkc->tnc", share, change)
     effort = told[..., 0] - told[..., 1] + added[..., 0]
     steer = told[..., 2] + added[..., 1]
     return torch.stack([effort.clamp(0.0, 1.0), (-effort).clamp(0.0, 1.0), steer.clamp(-1.0, 1.0), told[..., 3]], -1)
