@@ -12,6 +12,7 @@ from ssad.core.detections import Assignment, Detections, Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES
 from ssad.core.protocols import Detector
+from ssad.core.seeding import seed32
 from ssad.detectors.check_cases import BATCH, CheckCase, modules_of, usual_threshold
 from ssad.detectors.check_geometry import check_boxes, check_places, check_solids
 from ssad.detectors.check_gradients import check_loss_signs, check_slopes, check_small_changes
@@ -69,7 +70,10 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
         _check_refusals,
     ):  # fmt: skip
         told = len(trial.faults)
-        with trial.guarded(part.__name__.strip("_").removeprefix("check_").replace("_", " ")):
+        name = part.__name__.strip("_").removeprefix("check_").replace("_", " ")
+        with trial.guarded(name), torch.random.fork_rng(devices=[]):
+            # not the state that a caller left: where he has seeded with 0, a detector that does so too changes nothing
+            torch.default_generator.manual_seed(seed32("check_detector", name))
             part(trial)
         yield from trial.faults[told:]
 
