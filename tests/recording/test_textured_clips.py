@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,7 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
 
 
 def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.rmtree(folder / KEPT, ignore_errors=True)  # what other tests had rendered
     first = list(textured_clips(folder, LAYERS))
     kept = sorted((folder / KEPT).rglob("*.npz"))
     assert len(kept) == 1

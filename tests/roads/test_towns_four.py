@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable
+from dataclasses import fields
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -76,7 +77,8 @@ def test_the_shipped_file_is_small_and_what_the_code_writes(name: str, tmp_path:
     path = tmp_path / f"{name}.xodr"
     path.write_text(text, encoding="utf-8")
     new, old = bake(path, name), town(name)
-    for key, value in vars(old).items():
+    for key in (field.name for field in fields(old)):  # not what other tests have made it work out
+        value = getattr(old, key)
         if key == "name":
             continue
         assert getattr(new, key).shape == value.shape, key

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 
 import numpy as np
 import pytest
@@ -24,12 +25,20 @@ def base() -> Base:
 
 
 @pytest.fixture(scope="module")
-def cat(base: Base) -> Cat:
+def untouched(base: Base) -> Cat:
     patch = pytest.MonkeyPatch()
     patch.setattr(trajectory, "EPISODES", 4)
     traffic.cache_clear()
     made = Cat([base], seeds=[1], budget=8)
     patch.undo()
+    return made
+
+
+@pytest.fixture
+def cat(untouched: Cat) -> Cat:
+    """One that a test may ask: nothing is taken from those of the other tests."""
+    made = copy(untouched)
+    made._left, made._egos = [[*left] for left in untouched._left], [copy(egos) for egos in untouched._egos]
     return made
 
 
