@@ -9,6 +9,8 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ssad.core.errors import ConfigError
 from ssad.core.safeio import Document, Location, dotted
 from ssad.core.types import Actor, Condition, Limits, Phase, Pose, Scenario, SignalPlan, TrafficPlan
@@ -227,11 +229,13 @@ def _trajectory(actor: Actor, place: Location) -> Iterator[tuple[tuple[str | int
         yield here, "an actor with a trajectory has neither phases nor a path"
     if max(abs(a - b) for a, b in zip(rows[0][1:], dataclasses.astuple(actor.pose), strict=True)) > 0.01:
         yield (*place, "pose"), "differs from the first row of the trajectory"
-    for j, (time, x, y, yaw) in enumerate(rows):
-        if not _finite(Pose(x, y, yaw)):
-            yield (*here, j), f"beyond {_MAX_COORDINATE:g} m or not a number"
-        if not (rows[j - 1][0] if j else -1.0e6) < time < 1.0e6:
-            yield (*here, j, 0), "times must increase from row to row"
+    values = np.array(rows, np.float64)
+    time = values[:, 0]
+    # false for what is no number
+    for j in np.flatnonzero(~(np.abs(values[:, 1:]) <= _MAX_COORDINATE).all(1)).tolist():
+        yield (*here, j), f"beyond {_MAX_COORDINATE:g} m or not a number"
+    for j in np.flatnonzero(~((time > np.append(-1.0e6, time[:-1])) & (time < 1.0e6))).tolist():
+        yield (*here, j, 0), "times must increase from row to row"
 
 
 def _policy(actor: Actor, place: Location, fastest: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -260,7 +264,12 @@ def scenario_data(scenario: Scenario) -> dict[str, Any]:
     return data
 
 
+_AS_THEY_ARE = (float, int, str, bool, type(None))
+
+
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):  # nearly all of a scenario with trajectories are rows of numbers
+        return [v if type(v) in _AS_THEY_ARE else _plain(v) for v in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         result = {}
         for f in dataclasses.fields(value):
@@ -273,8 +282,6 @@ def _plain(value: Any) -> Any:
         return result
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(v) for v in value]
     if isinstance(value, float):
         return float(value)  # a numpy scalar would not be written as a plain number
     return value
