@@ -2,6 +2,7 @@
 
     ssad run adversarial --out RUN ...
     python -m benchmarks.adversarial_page NAME=RUN,RUN ...  # keeps the records' metrics in benchmarks/results
+    python -m benchmarks.adversarial_page NAME+=RUN ...     # adds them to what is kept; what ran again replaces it
     python -m benchmarks.adversarial_page                   # the tables anew from what is kept
 
 Each base scenario is a case; of natural traffic each route is a cluster. In brackets the 95 % interval. The run named
@@ -64,8 +65,11 @@ def cluster(name: str) -> str:
     return re.sub(r"^(natural[\w-]*/\w+)/\d+$", r"\1", name)
 
 
-def keep(name: str, runs: list[Path]) -> None:
-    """The metrics of the records of runs with the same settings, without what cannot be shown."""
+def keep(name: str, runs: list[Path], *, add: bool = False) -> None:
+    """The metrics of the records of runs with the same settings, without what cannot be shown.
+
+    add: To those that are kept, in place of those of the same searches.
+    """
     known = (*dict.fromkeys((*COLUMNS, *OF_ALL)), "applies", "survived")
     rows: list[dict[str, Any]] = []
     for line in "".join((run / "results.jsonl").read_text(encoding="utf-8") for run in runs).splitlines():
@@ -85,6 +89,15 @@ def keep(name: str, runs: list[Path]) -> None:
         raise ValueError(f"{name}: runs of unlike settings")
     about["systems"] = list(dict.fromkeys(name for suite in suites for name in suite["systems"]))
     about["planned"] = sum(len(header["cells"]) for header in headers)
+    if add:
+        before = stored(next(RESULTS.glob(f"{name}.json*")))
+        if any(before[key] != about[key] for key in ("scenarios", "budget", "keep")):
+            raise ValueError(f"{name}: the runs are of other settings than what is kept")
+        about["systems"] = list(dict.fromkeys([*before["systems"], *about["systems"]]))
+        about["planned"] = before["planned"]
+        rows = list(
+            {tuple(row[k] for k in ("generator", "system", "base")): row for row in before["rows"] + rows}.values()
+        )
     about["columns"] = list(dict.fromkeys(key for row in rows for key in row))
     about["rows"] = [[row.get(key) for key in about["columns"]] for row in rows]
     text = json.dumps(about, separators=(",", ":")) + "\n"
@@ -246,7 +259,7 @@ def main() -> None:
     """Keep what is given, and write all tables that are kept and have a place."""
     for word in sys.argv[1:]:
         name, _, runs = word.partition("=")
-        keep(name, [Path(run) for run in runs.split(",")])
+        keep(name.removesuffix("+"), [Path(run) for run in runs.split(",")], add=name.endswith("+"))
     whole = DOCUMENT.read_text(encoding="utf-8")
     for path in sorted(RESULTS.glob("*.json*")):
         name = path.name.partition(".")[0]

@@ -20,7 +20,7 @@ def record(generator: str, base: str, hit: float, **more: Any) -> dict[str, Any]
 def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, page = tmp_path / "run", tmp_path / "generators.md"
     run.mkdir()
-    suite = {"scenarios": ["precrash"], "budget": 8, "keep": 3, "systems": ["autopilot"]}
+    suite = {"scenarios": ["precrash"], "budget": 8, "keep": 3, "systems": ["autopilot", "ppo"]}
     (run / "run.json").write_text(json.dumps({"suite": suite, "cells": [{}] * 12}))
     rows = [record(name, f"Case/{k}", float(name == "king" or k < 2), transfer={"ppo": {"found": 0.5, "base": 0.0}})
             for name in ("random", "king") for k in range(5)]  # fmt: skip
@@ -42,6 +42,18 @@ def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("sys.argv", ["adversarial_page"])
     adversarial_page.main()
     assert page.read_text() == text
+    # what ran again or later is added
+    later = [record("random", "Case/0", 0.0), record("grid", "Case/0", 0.0) | {"system": "ppo"}]
+    (run / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in later))
+    monkeypatch.setattr("sys.argv", ["adversarial_page", f"whole+={run}"])
+    adversarial_page.main()
+    text = page.read_text()
+    assert "| `random` | 5 | 0.20 [" in text, "1 of 5 bases now, since the first is survived"
+    assert "`ppo`, pre-crash scenarios" in text
+    assert "searches have run" not in text
+    (run / "run.json").write_text(json.dumps({"suite": suite | {"budget": 16}, "cells": [{}]}))
+    with pytest.raises(ValueError, match="other settings"):
+        adversarial_page.main()
 
 
 def test_the_page_is_what_its_command_makes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
