@@ -99,7 +99,10 @@ def drop_table(run: Run) -> Table:
         for system, perturbation, severity in conditions(run)
         if severity
     ]
-    note = "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation."
+    note = (
+        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. a to b: the range of the "
+        "drives, where too few of them differ for an interval."
+    )
     heads = ("System", "Perturbation", "Severity")
     return Table("changes", "What a perturbation changes", heads, tuple(DROPS.values()), tuple(rows), note)
 
