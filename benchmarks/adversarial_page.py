@@ -45,11 +45,12 @@ OF_ALL = (
 HEADS = COLUMNS | {"CR": "CR within the budget", "distinct": "distinct"}
 SECTION = """### All generators
 `ssad run adversarial`, `python -m benchmarks.adversarial_page whole=runs/adversarial`. All meet the same bases \
-with the same budget and the same seeds. CR: share of the bases that the system survives in plain replay in which \
-a collision was found with the adversary on the road and in nobody else; less random's: over the bases that both \
-were tried on, paired. Who avoids a collision is told of those that were saved, three a base at most, and happen \
-again. "found" in the tables of transfer: how often another system collides in what was found against this one, \
-less how often it collides in the same bases.
+with the same budget and the same seeds. CR: share of the bases that the system survives in plain replay in \
+which a collision was found with the adversary on the road and in nobody else; less random's: over the bases \
+that both were tried on, paired. Who avoids a collision is told of those that were saved, three a base at most, \
+and happen again. `adv-ppo`, `frea` and `adv-ddpg` have one rollout a base. "found" in the tables of transfer: \
+how often another system collides in what was found against this one, less how often it collides in the same \
+bases.
 
 <!-- whole: begin -->
 <!-- whole: end -->
@@ -162,9 +163,10 @@ def tables(data: dict[str, Any]) -> list[str]:
 
 
 def whole_tables(data: dict[str, Any]) -> list[str]:
-    """Of the whole suite: a table for each system and kind of bases, and one of transfer."""
+    """Of the whole suite: in words; then a table for each system and kind of bases, and one of transfer."""
     rows = [row for row in data["rows"] if "failed" not in row]
-    lines = []
+    lines: list[str] = []
+    said: list[str] = []
     if len(data["rows"]) < data["planned"]:
         lines += [f"{len(data['rows']):,} of {data['planned']:,} searches have run; what is missing is not shown.", ""]
     if len(rows) < len(data["rows"]):
@@ -183,12 +185,51 @@ def whole_tables(data: dict[str, Any]) -> list[str]:
         ]
         by_name = {name: alive(own, name) for name in dict.fromkeys(row["generator"] for row in own)}
         usual = cases(by_name.get("random", []), "CR")
+        said.append(verdict(f"`{system}`, {'natural traffic' if natural else 'pre-crash scenarios'}", by_name, usual))
         for name, group in by_name.items():
             less = "" if name == "random" else paired(cases(group, "CR"), usual, "share")
             shares = [shown(cases(group, key), key, "share" if key == "CR" else "bounded") for key in OF_ALL]
             lines.append(f"| `{name}` | {len(group)} | {' | '.join([shares[0], less, *shares[1:]])} |")
         lines += ["", *transfer(system, by_name)]
-    return lines
+    return [*(text for text in said if text), "", *lines]
+
+
+def verdict(where: str, by_name: dict[str, list[dict[str, Any]]], usual: dict[str, CaseValue]) -> str:
+    """What the table of a system and a kind of bases says, in words; nothing if there is nothing to search."""
+    shares = {name: sum(own) / len(own) for name, rows in by_name.items() if (own := hits(rows))}
+    if not any(shares.values()) or "random" not in shares:
+        return ""
+    groups: dict[str, list[str]] = {"More": [], "Less": [], "No difference that is sure": []}
+    for name in sorted(shares, key=lambda name: -shares[name]):
+        both = {base: case for base, case in cases(by_name[name], "CR").items() if base in usual}
+        if name == "random" or not both:
+            continue
+        found = paired_difference(both, usual, kind="share")
+        sure = found.method == "beta" and found.low * found.high > 0.0
+        group = ("More" if found.mean > 0.0 else "Less") if sure else "No difference that is sure"
+        groups[group].append(f"`{name}` {shares[name]:.2f}")
+    parts = [f" {group}: {', '.join(names)}." for group, names in groups.items() if names]
+    first = f"* {where}: random search finds a collision in {shares['random']:.2f} of the bases."
+    return f"{first}{''.join(parts)} {careful(by_name, shares)}".rstrip()
+
+
+def hits(rows: list[dict[str, Any]]) -> list[float]:
+    """Of each base, whether a collision was found."""
+    return [row["CR"] for row in rows if "CR" in row]
+
+
+def careful(by_name: dict[str, list[dict[str, Any]]], shares: dict[str, float]) -> str:
+    """Who avoids what random search and the generator that finds most have found."""
+    best = max(shares, key=lambda name: shares[name])
+    parts = []
+    for name in dict.fromkeys(("random", best)):
+        avoided, ways = (cases(by_name[name], key) for key in ("avoided_by_reg157", "avoided_by_limit"))
+        moving = cases(by_name[name], "moving")
+        if len(avoided) >= 5 and ways and moving:
+            mean = [sum(case.value for case in group.values()) / len(group) for group in (avoided, ways, moving)]
+            parts.append(f"{mean[0]:.2f} of `{name}`'s collisions ({mean[1]:.2f} by some manoeuvre; "
+                         f"the ego moves in {mean[2]:.2f})")  # fmt: skip
+    return f"The careful driver of UN Regulation 157 avoids {' and '.join(parts)}." if parts else ""
 
 
 def alive(rows: list[dict[str, Any]], name: str) -> list[dict[str, Any]]:
