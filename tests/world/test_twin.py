@@ -127,6 +127,32 @@ def test_gradients_hold_where_limits_cut(substeps: int) -> None:
     assert checked > 30
 
 
+@pytest.mark.parametrize("names", [["car", "truck", "bicycle"], ["car", "walker", "barrier"]])
+def test_one_control_moves_many_agents_and_many_states_share_their_bodies(names: list[str]) -> None:
+    bodies = bodies_of(names, dtype=torch.float64)
+    one = torch.from_numpy(controls(4, 3))
+    initial = start(3, np.array([4.0, 1.0, 0.0]), torch.float64)
+    many = MotionState(*(torch.stack([part, part + 0.5]) for part in initial))
+    for own in (one[:, 0], one[:, :1], one[:, None, :1]):  # all do the same
+        whole = own.reshape(STEPS, 1, 1, 4).expand(STEPS, 2, 3, 4)
+        for found, told in zip(unroll(many, own, bodies), unroll(many, whole, bodies), strict=True):
+            assert torch.equal(found, told)
+    shared = unroll(many, one, bodies)  # what each does, in two scenes
+    for scene in range(2):
+        alone = unroll(MotionState(*(part[scene] for part in many)), one, bodies)
+        assert all(torch.equal(found[:, scene], told) for found, told in zip(shared, alone, strict=True))
+    assert advance(many, one[0, 0], bodies).speed.shape == (2, 3)
+
+
+@pytest.mark.parametrize(("brake", "slope"), [(0.0, 0.4), (0.5, 0.025)])
+def test_a_speed_from_a_standstill_lasts_unless_it_is_braked(brake: float, slope: float) -> None:
+    bodies = bodies_of(["car"], dtype=torch.float64)
+    speed = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    initial = MotionState(torch.zeros(1, 3, dtype=torch.float64), speed, torch.zeros(1, dtype=torch.float64))
+    end = unroll(initial, torch.tensor([[[0.0, brake, 0.0, 0.0]]] * 4, dtype=torch.float64), bodies).pose[-1, 0, 0]
+    assert float(torch.autograd.grad(end, speed)[0]) == pytest.approx(slope)
+
+
 @settings(max_examples=200, deadline=None)
 @given(first=BOX, second=BOX)
 def test_gap_of_boxes_is_their_distance_and_below_zero_where_they_overlap(first: tuple, second: tuple) -> None:

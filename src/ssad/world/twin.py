@@ -99,7 +99,7 @@ def advance(
         control: [..., 4] throttle, brake in [0, 1], steer in [-1, 1] (left positive), reverse (above 0.5: yes); for a
             walker the throttle is the wanted speed over the top speed, and steer how fast it turns. What lies
             outside is cut, and has no gradient.
-        bodies: Of the agents; broadcast against their shape.
+        bodies: Of the agents; state, control and bodies are broadcast against one another.
         dt: Length of the step, s.
         substeps: Parts in which the bicycle is integrated.
 
@@ -121,7 +121,7 @@ def unroll(
     Args:
         state: At the start.
         controls: [T, ..., 4], see `advance`.
-        bodies: Of the agents.
+        bodies: Of the agents; state, controls and bodies are broadcast against one another.
         dt: Length of a step, s.
         substeps: Parts of a step.
 
@@ -135,6 +135,8 @@ def unroll(
         raise ConfigError(f"a step needs dt > 0 and substeps >= 1, not {dt} and {substeps}")
     shape = np.broadcast_shapes(state.speed.shape, bodies.max_speed.shape, controls.shape[1:-1])
     state = MotionState(state.pose.expand(*shape, 3), state.speed.expand(shape), state.wheel.expand(shape))
+    steps, *own, width = controls.shape
+    controls = controls.reshape(steps, *[1] * (len(shape) - len(own)), *own, width).expand(steps, *shape, width)
     driven = _drive(state, controls, bodies, dt / substeps, substeps)
     if not bool(bodies.walker.any()):  # half of the work for nothing where nobody walks
         return driven
@@ -255,7 +257,8 @@ def _speeds(start: Tensor, push: Tensor, drag: Tensor, bodies: Bodies) -> Tensor
         rolls = (pushed.abs() > drag) & (speed[1:] > least) & (speed[1:] < most)
         sign = pushed.sign()
     own = torch.where(rolls & able, push - sign * drag, 0.0)
-    return _recursive(speed, rolls | ~able, start, own)
+    coasts = (pushed == 0.0) & (drag == 0.0)  # from a standstill: any speed would last
+    return _recursive(speed, rolls | coasts | ~able, start, own)
 
 
 def _wheels(start: Tensor, aim: Tensor, turn: Tensor, drives: Tensor) -> Tensor:
