@@ -100,8 +100,8 @@ def drop_table(run: Run) -> Table:
         if severity
     ]
     note = (
-        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. a to b: the range of the "
-        "drives, where too few of them differ for an interval."
+        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. a to b: the range of "
+        "the drives, where too few of them differ for an interval."
     )
     heads = ("System", "Perturbation", "Severity")
     return Table("changes", "What a perturbation changes", heads, tuple(DROPS.values()), tuple(rows), note)
