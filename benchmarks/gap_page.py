@@ -67,15 +67,17 @@ def keep(name: str, folder: Path, *, add: bool = False) -> None:
     """Store what the page needs of a run, alone or with the conditions that are stored and were not driven in it."""
     run, old = load_run(folder), stored(name) if add else None
     RESULTS.mkdir(parents=True, exist_ok=True)
-    about = {key: value for key, value in run.header.items() if key != "cells"} | {"cells": run.planned}
-    about["runs"] = 1 + (old.header.get("runs", 1) if old else 0)
-    (RESULTS / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
     again = set(map(_condition, run.lines))
     lines = [json.dumps(line) for line in (old.lines if old else ()) if _condition(line) not in again]
     for line in run.lines:
         told = {key: line[key] for key in KEPT if line.get(key) is not None}
         told["metrics"] = {key: (line.get("metrics") or {}).get(key) for key in MEASURED}
         lines.append(json.dumps(told | {"spec": {"repetition": line["spec"].get("repetition", 0)}}))
+    about = {key: value for key, value in run.header.items() if key != "cells"}
+    # slices of one suite have all its cells planned; of unlike suites nobody knows more than was driven
+    about["cells"] = max(run.planned, old.planned if old else 0, len(lines))
+    about["runs"] = 1 + (old.header.get("runs", 1) if old else 0)
+    (RESULTS / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
     (RESULTS / f"{name}.jsonl.gz").write_bytes(gzip.compress("\n".join(lines).encode(), mtime=0))
 
 

@@ -66,7 +66,7 @@ def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
     }  # fmt: skip
     part = page["change"](after, ("s", "fog", 5), "collision")
     assert (part.n, part.failed) == (1, 0), "drives that a condition does not have have not failed"
-    assert "in 2 runs" in page["_measured"](after)
+    assert f"in 2 runs, {4 * DRIVES + 2} of {5 * DRIVES} drives" in page["_measured"](after)
     assert "runs" not in page["_measured"](before).replace("ssad run", "")
 
 
