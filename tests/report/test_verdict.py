@@ -128,3 +128,58 @@ def test_what_harms_the_system_most_is_said_first(tmp_path: Path) -> None:
     ]  # fmt: skip
     said = told(tmp_path, "gap", rows)
     assert said.index("s collided in 0 of 12") < said.index("blackout 5 changes") < said.index("fog 5 changes")
+
+
+def texture(attack: str, hidden: float | None, **more: Any) -> dict[str, Any]:
+    """A line of kind physical."""
+    about = {"carrier": "paint", "test": "Oldmarket", "train": "Twinford", "view": "drive", "source": ""}
+    return {"detector": "d", "attack": attack, "metrics": {"ASR_25": hidden}} | about | more
+
+
+def test_what_learns_nothing_is_no_attack_however_much_it_hides(tmp_path: Path) -> None:
+    rows = [texture("clean", None), texture("noise", 0.4), texture("random", 0.1), texture("das", 0.2)]
+    assert told(tmp_path / "paint", "physical", rows) == (
+        "das hides 20% of the targets from d. The strongest control (noise) hides 40%."
+    )
+    lights = [texture(name, share, carrier="light, night") for name, share in (("random laser", 0.4), ("laser", 0.2))]
+    assert told(tmp_path / "light", "physical", lights) == (
+        "laser hides 20% of the targets from d. The strongest control (random laser) hides 40%."
+    )
+    assert told(tmp_path / "only", "physical", rows[:3]) == "See the table."
+
+
+def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) -> None:
+    rows = [
+        texture("das", 0.9), texture("grey", 0.0), texture("das", 0.6, test="Larkhill"),
+        texture("grey", 0.5, test="Larkhill"), texture("grey", 0.7, view="grid"), texture("grey", 0.3, carrier="patch"),
+    ]  # fmt: skip
+    assert told(tmp_path, "physical", rows) == (
+        "das hides 90% of the targets from d in Oldmarket. The strongest control (grey) hides 0%."
+    )
+
+
+def test_of_rows_of_one_attack_the_strongest_counts_beside_noise_of_its_size(tmp_path: Path) -> None:
+    rows = [
+        {"detector": "d", "attack": attack, "loss": None, "norm": norm, "radius": radius, "metrics": {"mAP": score}}
+        for attack, norm, radius, score in (
+            (None, None, 0.0, 0.5), ("noise", "linf", 5.0, 0.45), ("noise", "l2", 900.0, 0.2),
+            ("pgd", "linf", 5.0, 0.3), ("pgd", "l2", 900.0, 0.4),
+        )
+    ]  # fmt: skip
+    said = told(tmp_path / "many", "digital", rows)
+    assert "costs most is pgd, which leaves 30%" in said
+    assert "leaves d an mAP of 45%: what lies between is the attack's" in said
+    harmless = told(tmp_path / "none", "digital", [rows[0], rows[3] | {"metrics": {"mAP": 0.6}}])
+    assert harmless == "d: mAP 50% clean; no attack takes any of it."
+
+
+def test_what_failed_counts_as_in_the_tables(tmp_path: Path) -> None:
+    failed = {"status": "failed", "reason": "hung", "metrics": {}}
+    drives = [{"system": "s", "metrics": {"collision": True, "route_completion": 0.5}}, {"system": "s"} | failed]
+    said = told(tmp_path / "drives", "driving", drives)
+    assert said == "s collided in 1 of 2 drives and completed 50% of its routes."
+    assert told(tmp_path / "none", "driving", drives[1:]) == "s collided in 0 of 1 drives."
+    alive = {"system": "s", "generator": "king", "metrics": {"survived": True, "CR": False}}
+    said = told(tmp_path / "searches", "adversarial", [alive, alive, {"system": "s", "generator": "king"} | failed])
+    assert said == "No generator makes s collide in scenarios that it survives unchanged: king in 0 of 3 (1 failed)."
+    assert told(tmp_path / "dead", "adversarial", [{"system": "s", "generator": "king"} | failed]) == "See the table."

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ssad.metrics import CaseValue, estimate
-from ssad.report.kinds import gap
+from ssad.report.kinds import gap, physical
 from ssad.report.load import Run
 from ssad.report.tables import Cell
 
@@ -24,12 +24,13 @@ def verdict(run: Run) -> list[str]:
 
 
 def _driving(run: Run) -> list[str]:
-    """Collisions and routes of each system."""
+    """Collisions and routes of each system; drives that failed count, as in the tables."""
     found = []
-    for system, lines in _by(run, "system").items():
-        hit = [bool(_metric(line, "collision")) for line in lines]
+    for system, lines in _by(run, "system", failed=True).items():
+        hits = sum(_metric(line, "collision") == 1.0 for line in lines)
         done = _mean(_metric(line, "route_completion") for line in lines)
-        found.append(f"{system} collided in {sum(hit)} of {len(hit)} drives and completed {done:.0%} of its routes.")
+        routes = "" if math.isnan(done) else f" and completed {done:.0%} of its routes"
+        found.append(f"{system} collided in {hits} of {len(lines)} drives{routes}.")
     return found
 
 
@@ -52,51 +53,81 @@ def _digital(run: Run) -> list[str]:
     found = []
     for detector, every in _by(run, "detector").items():
         lines = [line for line in every if line.get("row", True) and not line.get("subset") and not line.get("defence")]
-        scores = {" on ".join(filter(None, map(line.get, ("attack", "loss")))): _metric(line, "mAP") for line in lines}
-        noise = scores.pop("noise", math.nan)
-        found.append(_worst(detector, "mAP", scores, "attack"))
+        clean = [_metric(line, "mAP") for line in lines if (line.get("attack") or "clean") == "clean"]
+        attacks = [line for line in lines if (line.get("attack") or "clean") not in ("clean", "noise")]
+        attacks = [line for line in attacks if not math.isnan(_metric(line, "mAP"))]
+        if not clean or not attacks:
+            continue
+        best = min(attacks, key=lambda line: _metric(line, "mAP"))
+        lowest, name = _metric(best, "mAP"), " on ".join(filter(None, map(best.get, ("attack", "loss"))))
+        found.append(_worst(detector, "mAP", {"": clean[0], name: lowest}, "attack"))
+        size = [best.get(key) for key in ("norm", "radius")]
+        alike = [
+            line
+            for line in lines
+            if line.get("attack") == "noise" and [line.get(k) for k in ("norm", "radius")] == size
+        ]
+        noise = min((_metric(line, "mAP") for line in alike), default=math.nan)
         if found[-1] and not math.isnan(noise):
-            lowest = min(value for name, value in scores.items() if name not in ("", "clean") and not math.isnan(value))
             told = "what lies between is the attack's" if lowest < noise else "the attack does no more than that"
             found.append(f"Random noise of the same size leaves {detector} an mAP of {noise:.0%}: {told}.")
     return found
 
 
 def _physical(run: Run) -> list[str]:
-    """Share of the targets that the best attack and the best control hide."""
+    """Share of the targets that the best attack hides as they drive, and the best control of its carrier there."""
     found = []
-    for detector, lines in _by(run, "detector").items():
-        best: dict[bool, tuple[float, str]] = {}
-        for line in lines:
-            score, name = _metric(line, "ASR_25"), str(line.get("attack") or "")
-            control = name in ("random", "grey") or "shuffled" in name
-            if name and not math.isnan(score) and score >= best.get(control, (-1.0, ""))[0]:
-                best[control] = score, name
-        if False in best:
-            found.append(f"{best[False][1]} hides {best[False][0]:.0%} of the targets from {detector}.")
-        if True in best:
-            found.append(f"The strongest control ({best[True][1]}) hides {best[True][0]:.0%}.")
+    for detector, every in _by(run, "detector").items():
+        lines = [line for line in every if line.get("view", "drive") == "drive" and not math.isnan(_hidden(line))]
+        attacks = [line for line in lines if not physical.is_control(line["attack"])]
+        if not attacks:
+            continue
+        best = max(attacks, key=_hidden)
+        town = f" in {best['test']}" if len({line["test"] for line in lines}) > 1 else ""
+        found.append(f"{best['attack']} hides {_hidden(best):.0%} of the targets from {detector}{town}.")
+        alike = [
+            line for line in lines if all(line[key] == best[key] for key in ("test", "carrier"))
+            and physical.learns_nothing(line["attack"], best["attack"])
+        ]  # fmt: skip
+        if alike:
+            control = max(alike, key=_hidden)
+            found.append(f"The strongest control ({control['attack']}) hides {_hidden(control):.0%}.")
     return found
+
+
+def _hidden(line: Line) -> float:
+    return _metric(line, "ASR_25")
 
 
 def _adversarial(run: Run) -> list[str]:
-    """Collisions that generators find, a sentence a system; of many generators the best three and random search."""
+    """Collisions that generators find, a sentence a system; of many generators the best three and random search.
+
+    Searches that failed count, as in the tables.
+    """
     found = []
-    for system, lines in _by(run, "system").items():
-        counts: dict[str, tuple[int, int]] = {}
+    for system, lines in _by(run, "system", failed=True).items():
+        counts: dict[str, tuple[int, int, int]] = {}
         for generator in dict.fromkeys(str(line.get("generator") or "") for line in lines):
-            own = [line for line in lines if line.get("generator") == generator and _metric(line, "survived") == 1.0]
-            if own:
-                counts[generator] = sum(_metric(line, "CR") == 1.0 for line in own), len(own)
+            own = [line for line in lines if line.get("generator") == generator]
+            alive = sum(_metric(line, "survived") == 1.0 for line in own)
+            if alive:
+                failed = sum(line["status"] != "ok" for line in own)
+                counts[generator] = sum(_metric(line, "CR") == 1.0 for line in own), alive + failed, failed
         if not counts:
-            found.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
+            if any(line["status"] == "ok" for line in lines):
+                found.append(f"{system} survives none of its scenarios unchanged: there is nothing to find.")
             continue
         best = sorted(counts, key=lambda name: -counts[name][0] / counts[name][1])
         shown = list(counts) if len(best) <= 4 else [*best[:3], *(["random"] if "random" in best[3:] else [])]
-        said = ", ".join(f"{name} in {counts[name][0]} of {counts[name][1]}" for name in shown)
+        said = ", ".join(_found_in(name, *counts[name]) for name in shown)
         more = f" (the best three of {len(best)}{', and random search' * (len(shown) > 3)})" if len(best) > 4 else ""
-        found.append(f"{system} is made to collide in scenarios that it survives unchanged: {said}{more}.")
+        what = f"{system} is made to collide" if counts[best[0]][0] else f"No generator makes {system} collide"
+        found.append(f"{what} in scenarios that it survives unchanged: {said}{more}.")
     return found
+
+
+def _found_in(generator: str, hits: int, tried: int, failed: int) -> str:
+    return f"{generator} in {hits} of {tried}{f' ({failed} failed)' if failed else ''}"
 
 
 def _gap(run: Run) -> list[str]:
@@ -205,13 +236,15 @@ def _worst(who: str, metric: str, scores: Mapping[str, float], what: str) -> str
     if not others or math.isnan(clean):
         return ""
     name = min(others, key=lambda one: others[one])
+    if others[name] >= clean:
+        return f"{who}: {metric} {clean:.0%} clean; no {what} takes any of it."
     return f"{who}: {metric} {clean:.0%} clean; the {what} that costs most is {name}, which leaves {others[name]:.0%}."
 
 
-def _by(run: Run, field: str) -> dict[str, list[Line]]:
+def _by(run: Run, field: str, *, failed: bool = False) -> dict[str, list[Line]]:
     found: dict[str, list[Line]] = {}
     for line in run.lines:
-        if line["status"] == "ok":
+        if line["status"] == "ok" or failed:
             found.setdefault(str(line.get(field) or ""), []).append(line)
     return found
 

@@ -172,7 +172,7 @@ def margin_table(run: PhysicalRun) -> Table:
             own = score(run.lines(test, "drive", detector, attack), "AP50")
             controls = {
                 other: score(run.lines(test, "drive", detector, other), "AP50") for other in run.attacks
-                if other[1] == carrier and _learns_nothing(other[0], name)
+                if other[1] == carrier and learns_nothing(other[0], name)
             }  # fmt: skip
             measured = {other: cell for other, cell in controls.items() if not math.isnan(cell.mean)}
             if math.isnan(own.mean) or not measured:
@@ -189,7 +189,12 @@ def margin_table(run: PhysicalRun) -> Table:
     return Table("margins", "Attacks against controls", heads, ("attack", "control", "margin"), tuple(rows), note)
 
 
-def _learns_nothing(control: str, attack: str) -> bool:
+def is_control(name: str) -> bool:
+    """Whether a row such as "shuffled das" or "random laser" has learned nothing."""
+    return name.split(maxsplit=1)[0] in CONTROLS
+
+
+def learns_nothing(control: str, attack: str) -> bool:
     """Whether it is a control of an attack; of a light ("random laser") only of its own kind."""
     first, _, rest = control.partition(" ")
     return first in CONTROLS and (first != "random" or rest in ("", attack))
