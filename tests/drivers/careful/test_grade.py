@@ -108,6 +108,12 @@ def test_a_grade_is_the_same_again_and_leaves_the_recorded_drive_as_it_was() -> 
     assert grade_collision(short, GRAPHS["Straight"], trace).avoids == first.avoids
 
 
+def test_a_town_may_be_known_by_the_path_of_its_map() -> None:
+    one = episode(ego(speed=10.0), walker(8.0, 34.0))
+    named = grade_collision(one, GRAPHS["Straight"], trace := drive(one))
+    assert grade_collision(replace(one, town="maps/Straight.xodr"), GRAPHS["Straight"], trace) == named
+
+
 def test_grades_do_not_depend_on_who_is_graded_beside(monkeypatch: pytest.MonkeyPatch) -> None:
     van = EpisodeAgent("van", "van", Controller.NONE, Pose(56.6, -2.2, 0.0))
     wall = [EpisodeAgent(f"b{k}", "truck", Controller.NONE, Pose(17.0, y, np.pi / 2)) for k, y in enumerate((-9, 0, 9))]

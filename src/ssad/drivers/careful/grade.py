@@ -217,7 +217,7 @@ def _limits(
         options = [m for k in part for m in tried[k]]
         hand = Evasions(options)
         episodes = [drives[k][0] for k in part for _ in tried[k]]
-        side = OwnSide(episodes, {drives[k][1].name: drives[k][1] for k in part}, [m.start for m in options])
+        side = OwnSide(episodes, {drives[k][0].town: drives[k][1] for k in part}, [m.start for m in options])
         endings = [Ending(*drives[k], [Takeover(hand, m.start) for m in tried[k]], ends[k] + AFTER) for k in part]
         hits = play(endings, watch=side, **about)
         left = np.split(side.left, np.cumsum([len(hit) for hit in hits])[:-1])
