@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,10 @@ from ssad.bench.kinds.how_often import HowOften, HowOftenSuite
 from ssad.bench.suite import load_suite
 from ssad.core.errors import ConfigError
 from ssad.core.jsonl import read_lines
+from ssad.drivers import make_system
+from ssad.evaluation.failure_rate import ChanceEpisode
+from ssad.roads import load_town
+from ssad.scenarios.dynamic import build_episode, load_scenarios
 
 SMALL = ["episodes=1200", "particles=60", "repeats=8", "batch=200", "noise.lapse=0.3"]
 
@@ -50,6 +55,13 @@ def test_a_collision_that_is_kept_is_driven_again_to_the_bit(tmp_path: Path) -> 
     again = kind.replay(plan, cell, record, folder)
     assert again.difference is None
     assert again.trace.end == "collision"
+
+
+def test_a_town_may_be_named_by_the_path_of_its_map() -> None:
+    (scenario,) = load_scenarios("lane-traffic/05")
+    graph = load_town(scenario.town)
+    episode = build_episode(replace(scenario, town="maps/own.xodr"), graph, seed=0)
+    assert ChanceEpisode(episode, graph, make_system("autopilot"), {}, "cpu", 0).world(2).batch == 2
 
 
 def test_bad_suites_are_refused(tmp_path: Path) -> None:

@@ -42,6 +42,15 @@ def natural() -> Base:
     return trials("autopilot").base(scenario, load_town(scenario.town), seed=3)
 
 
+def test_a_town_may_be_named_by_the_path_of_its_map(bases: list[Base]) -> None:
+    first = bases[0]
+    scenario = dataclasses.replace(first.scenario, town="maps/own.xodr")
+    base = trials().base(scenario, first.graph, seed=3)
+    assert np.array_equal(base.trace.x, first.trace.x)
+    told = [trials().run([(one, Proposal(one.scenario))])[0] for one in (base, first)]
+    assert told[0].danger == told[1].danger
+
+
 class Counting(Trials):
     """Trials that say how many rollouts they have driven."""
 

@@ -45,7 +45,7 @@ class ChanceEpisode:
         from ssad.world.world import World
 
         noise = Noise(**self.noise, stretches=9)
-        graphs = {self.graph.name: self.graph}
+        graphs = {self.episode.town: self.graph}
         if keys:
             return Told([self.episode], graphs, keys=keys, means=means, device=self.device, noise=noise)
         order = np.zeros(rows, np.int64)

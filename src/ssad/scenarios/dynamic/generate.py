@@ -108,7 +108,7 @@ class Trials:
         for start in range(0, len(scenarios), SCENES):
             part = scenarios[start : start + SCENES]
             episodes = [build_episode(scenario, graph, seed=seed) for scenario, graph, seed in part]
-            traces, _ = self._drive(episodes, {graph.name: graph for _, graph, _ in part}, {})
+            traces, _ = self._drive(episodes, {scenario.town: graph for scenario, graph, _ in part}, {})
             rows = zip(episodes, part, traces, strict=True)
             found += [Base(episode, graph, trace) for episode, (_, graph, _), trace in rows]
         return found
@@ -129,7 +129,7 @@ class Trials:
             for start in range(0, len(members), SCENES):
                 part = members[start : start + SCENES]
                 drivers = proposals[part[0][0]][1].drivers
-                graphs = {proposals[k][0].graph.name: proposals[k][0].graph for k, _ in part}
+                graphs = {episode.town: proposals[k][0].graph for k, episode in part}
                 traces, taken = self._drive([episode for _, episode in part], graphs, drivers)
                 for (k, episode), trace, had in zip(part, traces, taken, strict=True):
                     base, proposal = proposals[k]
