@@ -90,8 +90,8 @@ def keep(name: str, runs: list[Path], *, add: bool = False) -> None:
         raise ValueError(f"{name}: runs of unlike settings")
     about["systems"] = list(dict.fromkeys(name for suite in suites for name in suite["systems"]))
     about["planned"] = sum(len(header["cells"]) for header in headers)
-    if add:
-        before = stored(next(RESULTS.glob(f"{name}.json*")))
+    if add and (kept := next(RESULTS.glob(f"{name}.json*"), None)):
+        before = stored(kept)
         if any(before[key] != about[key] for key in ("scenarios", "budget", "keep")):
             raise ValueError(f"{name}: the runs are of other settings than what is kept")
         about["systems"] = list(dict.fromkeys([*before["systems"], *about["systems"]]))

@@ -29,7 +29,7 @@ def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: p
     (run / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     monkeypatch.setattr(adversarial_page, "RESULTS", tmp_path / "kept")
     monkeypatch.setattr(adversarial_page, "DOCUMENT", page)
-    monkeypatch.setattr("sys.argv", ["adversarial_page", f"whole={run}"])
+    monkeypatch.setattr("sys.argv", ["adversarial_page", f"whole+={run}"])  # to nothing, at first
     page.write_text(f"# Title\n\n{adversarial_page.BEFORE}\nothers\n")
     adversarial_page.main()
     text = page.read_text()
