@@ -11,7 +11,7 @@ import pytest
 
 from ssad.report import write_report
 from ssad.report.heatmap import HeatMap, heat_maps
-from ssad.report.kinds.physical import PhysicalRun, grid_table, main_table, margin_table, transfer_table
+from ssad.report.kinds.physical import PhysicalRun, grid_table, main_table, margin_table, tiles, transfer_table
 from ssad.report.load import load_run
 from ssad.report.paper import PHYSICAL
 
@@ -81,6 +81,19 @@ def test_a_margin_is_between_the_ends_of_the_intervals(folder: Path) -> None:
     assert rows["Adv. Patch"].cells[2].mean == pytest.approx(90.0 - 65.0)
     assert rows["DAS"].head[3] == "shuffled DAS", "the control that hides the target best"
     assert rows["DAS"].cells[2].mean == pytest.approx(45.0 - 53.0), "inside the intervals, so below 0"
+
+
+def test_the_first_screen_shows_the_clean_pictures_of_the_hour_of_the_strongest_light(folder: Path) -> None:
+    lines = [
+        line("clean", "light, night", 0.3), line("clean", "light, noon", 0.9), line("shadow", "light, noon", 0.2),
+        line("laser", "light, night, watts 10.0", 0.25),
+    ]  # fmt: skip
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    (tile,) = tiles(PhysicalRun(load_run(folder)))
+    assert (tile["worst"], tile["clean"].mean, tile["left"].mean) == ("shadow, noon", 90.0, 20.0)
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines[:2] + lines[3:]))
+    (tile,) = tiles(PhysicalRun(load_run(folder)))
+    assert (tile["clean"].mean, tile["left"].mean) == (30.0, 25.0)
 
 
 def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -> None:

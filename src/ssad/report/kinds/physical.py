@@ -333,7 +333,12 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
             if attack[0] != "clean" and attack[0].split()[0] not in CONTROLS and not math.isnan(cell.mean)
         }  # fmt: skip
         worst = min(trained, key=lambda attack: trained[attack].mean, default=None)
-        clean = next((cell for attack, cell in scores.items() if attack[0] == "clean"), Cell(math.nan))
+        carrier = worst[1] if worst else ""
+        # of lights the clean pictures of their hour
+        clean = next(
+            (cell for (name, own), cell in scores.items() if name == "clean" and f"{carrier}, ".startswith(f"{own}, ")),
+            next((cell for (name, _), cell in scores.items() if name == "clean"), Cell(math.nan)),
+        )
         found.append(
             {"name": detector, "town": test, "clean": clean,
              "worst": title_of(worst) if worst else "none has run", "left": trained[worst] if worst else Cell(math.nan)}
