@@ -118,8 +118,13 @@ def test_stop_signs_have_a_table_where_they_were_read(page: dict[str, Any], tmp_
     assert sign_table(run).rows == ()
     for number, line_ in enumerate(run.lines):
         if line_["perturbation"] == "fog":
-            line_["metrics"].update(sign_recall=0.5, sign_recall_5_20=float(number % 2), sign_recall_20_40=None)
+            line_["metrics"].update(
+                sign_recall=0.5, sign_recall_5_20=float(number % 2), sign_recall_20_40=None, stop_signs=1.0
+            )
+        elif line_["perturbation"] == "none":
+            line_["metrics"]["stop_signs"] = 0.25
     (row,) = sign_table(run).rows
     assert row.head == ("s", "fog", "5")
     assert row.cells[0].mean == pytest.approx(0.5)
     assert row.cells[1].text == "n/a"
+    assert (row.cells[3].mean, row.cells[4].mean) == (1.0, 0.75)
