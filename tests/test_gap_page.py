@@ -127,4 +127,4 @@ def test_stop_signs_have_a_table_where_they_were_read(page: dict[str, Any], tmp_
     assert row.head == ("s", "fog", "5")
     assert row.cells[0].mean == pytest.approx(0.5)
     assert row.cells[1].text == "n/a"
-    assert (row.cells[3].mean, row.cells[4].mean) == (1.0, 0.75)
+    assert (row.cells[3].text, row.cells[4].text) == ("1.00", "0.75")
