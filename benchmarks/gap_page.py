@@ -77,8 +77,15 @@ def keep(name: str, folder: Path, *, add: bool = False) -> None:
     # slices of one suite have all its cells planned; of unlike suites nobody knows more than was driven
     about["cells"] = max(run.planned, old.planned if old else 0, len(lines))
     about["runs"] = 1 + (old.header.get("runs", 1) if old else 0)
+    about["devices"] = list(dict.fromkeys([*(_devices(old) if old else ()), *_devices(run)]))
+    about["command"] = (old or run).command
     (RESULTS / f"{name}.json").write_text(json.dumps(about, indent=1) + "\n")
     (RESULTS / f"{name}.jsonl.gz").write_bytes(gzip.compress("\n".join(lines).encode(), mtime=0))
+
+
+def _devices(run: Run) -> list[str]:
+    """What a run, or those that are stored together, were driven on."""
+    return run.header.get("devices") or [(run.header.get("versions") or {}).get("device") or "an unknown device"]
 
 
 def _condition(line: Mapping[str, Any]) -> Condition:
@@ -318,10 +325,9 @@ def _measured(run: Run) -> str:
     """What was run, on what, and how much of it."""
     failed = sum(line["status"] != "ok" for line in run.lines)
     drives = len({line["cluster"] for line in run.lines})
-    device = (run.header.get("versions") or {}).get("device", "")
     in_runs = f" in {runs} runs" if (runs := run.header.get("runs", 1)) > 1 else ""
     return (
-        f"`{run.command}`{in_runs}, {len(run.lines):,} of {run.planned:,} drives on {device or 'an unknown device'}"
+        f"`{run.command}`{in_runs}, {len(run.lines):,} of {run.planned:,} drives on {' and '.join(_devices(run))}"
         f"{f', {failed} of them failed' if failed else ''}, {drives} scenarios."
     )
 

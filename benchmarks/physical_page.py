@@ -31,7 +31,7 @@ SUITES = {
     "physical-gpu-larkhill-camouflage": "ssad run physical-gpu --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
-    "physical-judges": "ssad run benchmarks/physical-judges.yaml",
+    **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "judges")},
 }  # fmt: skip
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")  # of benchmarks/physical_speed.py

@@ -52,7 +52,8 @@ def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
     page: dict[str, Any], tmp_path: Path
 ) -> None:
     lines = [line(condition, 0, 0.25, crash=False) for condition in (("fog", 5), ("fog", 3))]
-    header = {"kind": "gap", "suite": {"kind": "gap", "name": "x", "sheets": 0}, "command": "ssad run x"}
+    suite = {"kind": "gap", "name": "x", "sheets": 0}
+    header = {"kind": "gap", "suite": suite, "command": "ssad run x --later", "versions": {"device": "cpu"}}
     write_run(tmp_path / "more", header, lines)
     before = page["stored"]("damage")
     page["keep"]("damage", tmp_path / "more", add=True)
@@ -67,6 +68,8 @@ def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
     part = page["change"](after, ("s", "fog", 5), "collision")
     assert (part.n, part.failed) == (1, 0), "drives that a condition does not have have not failed"
     assert f"in 2 runs, {4 * DRIVES + 2} of {5 * DRIVES} drives" in page["_measured"](after)
+    assert "drives on an unknown device and cpu" in page["_measured"](after)
+    assert after.command == before.command
     assert "runs" not in page["_measured"](before).replace("ssad run", "")
 
 
