@@ -110,8 +110,12 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
 
 
 def test_transfer_and_the_worst_cell(folder: Path) -> None:
+    with (folder / "results.jsonl").open("a") as file:
+        file.write(json.dumps(line("clean", "", 0.91, detector="fcos3d-light")) + "\n")
     run = PhysicalRun(load_run(folder))
-    (moved,) = transfer_table(run).rows
+    usual, moved = transfer_table(run).rows
+    assert usual.head == ("Oldmarket", "clean", "")
+    assert [cell.text for cell in usual.cells] == ["99.00", "91.00"]
     assert moved.head == ("Oldmarket", "DAS", "yolov5n")
     assert [cell.text for cell in moved.cells] == ["48.00", "88.00"]
     clean, das = grid_table(run).rows

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 from ssad.report.artefacts import pictures
@@ -206,16 +207,17 @@ def lower(cell: Cell) -> float:
 
 
 def transfer_table(run: PhysicalRun) -> Table:
-    """Textures trained against one detector, shown to all."""
+    """Textures trained against one detector, shown to all; beside them the clean target and controls."""
+    sources = dict.fromkeys([*run.detectors, *(shown[2] for *_, shown in run.records)])
     rows = []
     for _, test in run.pairs:
-        for attack in run.attacks:
-            for source in run.detectors:
-                found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
-                if sum(bool(lines) for lines in found) < 2:
-                    continue
+        own = []
+        for attack, source in product(run.attacks, ("", *(name for name in sources if name))):
+            found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
+            if sum(bool(lines) for lines in found) >= 2:
                 cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
-                rows.append(Row((test, title_of(attack), source), tuple(cells)))
+                own.append(Row((test, title_of(attack), source), tuple(cells)))
+        rows += own if any(row.head[2] for row in own) else []
     note = "AP50 in percent of the target; n/a where the detector does not find the clean target often enough."
     heads = ("Town", "Attack", "Trained against")
     return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
