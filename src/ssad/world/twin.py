@@ -126,7 +126,7 @@ def unroll(
         substeps: Parts of a step.
 
     Returns:
-        States [T + 1, ...], the first is the start.
+        States [T + 1, ...], the first is the start; all yaws in [-pi, pi).
 
     Raises:
         ConfigError: See `advance`.
@@ -274,7 +274,7 @@ def _wheels(start: Tensor, aim: Tensor, turn: Tensor, drives: Tensor) -> Tensor:
 
 
 class _Recursion(torch.autograd.Function):
-    """Known values of v[t + 1] = v[t] + own[t] where `keeps`, else own[t]: a node for all steps, not some for each."""
+    """Known values of v[t + 1] = v[t] + own[t] where `keeps`, else own[t]: one node of the graph for all steps."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, keeps: Tensor, start: Tensor, own: Tensor) -> Tensor:

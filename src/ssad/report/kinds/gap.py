@@ -100,8 +100,8 @@ def drop_table(run: Run) -> Table:
         if severity
     ]
     note = (
-        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. a to b: the range of "
-        "the drives, where too few of them differ for an interval."
+        "Perturbed less clean, in the same drives: below 0 it is lower under the perturbation. Without brackets: the "
+        "range over the drives, where too few of them differ for an interval."
     )
     heads = ("System", "Perturbation", "Severity")
     return Table("changes", "What a perturbation changes", heads, tuple(DROPS.values()), tuple(rows), note)
@@ -173,7 +173,7 @@ def sign_table(run: Run) -> Table:
     ]
     note = (
         "Of the looks with a stop sign of the way ahead, those in which it was read; attacks on signs are made at 5 to "
-        "20 m. Signs run: a drive; more than clean: than by the same driver in the same drives without it."
+        "20 m. Signs run: a drive. More than clean: the rise against the same drives without the perturbation."
     )
     heads = ("System", "Perturbation", "Severity")
     columns = (*SIGNS.values(), "more than clean")

@@ -208,11 +208,11 @@ def lower(cell: Cell) -> float:
 
 def transfer_table(run: PhysicalRun) -> Table:
     """Textures trained against one detector, shown to all; beside them the clean target and controls."""
-    sources = dict.fromkeys([*run.detectors, *(shown[2] for *_, shown in run.records)])
+    sources = list(dict.fromkeys(["", *run.detectors, *(shown[2] for *_, shown in run.records)]))
     rows = []
     for _, test in run.pairs:
         own = []
-        for attack, source in product(run.attacks, ("", *(name for name in sources if name))):
+        for attack, source in product(run.attacks, sources):
             found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
             if sum(bool(lines) for lines in found) >= 2:
                 cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
