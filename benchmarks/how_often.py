@@ -97,7 +97,8 @@ def coverage(given: argparse.Namespace) -> None:
     training: list[float] = []
     branching: list[list[float]] = []
     began = time.perf_counter()
-    process = make_process(min(given.each, 16384), noise_of(given), device=given.device)
+    most = 16_384 if given.device == "cpu" else 65_536
+    process = make_process(min(given.each, most), noise_of(given), device=given.device)
     for number in range(given.repeats):
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training

@@ -20,7 +20,7 @@ from ssad.jobs.machine import quiet_warp
 from ssad.world.belief import Lanes, check, complete, lanes_of, rested
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import see
-from ssad.world.kernels.data import HORIZON, Ego, Presence, Seen, State, Work, array_types
+from ssad.world.kernels.data import BLOCK, HORIZON, Ego, Presence, Seen, State, Work, array_types
 from ssad.world.kernels.drive import drive
 from ssad.world.kernels.motion import move
 from ssad.world.kernels.noise import calm, chance
@@ -184,7 +184,9 @@ class World:
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """A recorded launch: its arguments are packed once."""
-        return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+        # `meet` is the faster in larger blocks; its module would be compiled twice if `sight` had others
+        block = None if self.device == "cpu" or kernel in (sight, meet) else BLOCK
+        return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block, record_cmd=True)
 
     def _assign(self, order: npt.NDArray[np.int32]) -> None:
         self.put("episode", order)

@@ -83,6 +83,53 @@ def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
     return wp.vec3(x, y, yaw)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    float4* to = reinterpret_cast<float4*>(poses.data + at);
+    to[0] = make_float4(p.c[0], p.c[1], p.c[2], q.c[0]);
+    to[1] = make_float4(q.c[1], q.c[2], r.c[0], r.c[1]);
+    to[2] = make_float4(r.c[2], s.c[0], s.c[1], s.c[2]);
+#else
+    poses.data[at] = p;
+    poses.data[at + 1] = q;
+    poses.data[at + 2] = r;
+    poses.data[at + 3] = s;
+#endif
+""")
+def put_four(poses: wp.array3d(dtype=wp.vec3), at: int, p: wp.vec3, q: wp.vec3, r: wp.vec3, s: wp.vec3):
+    """Four neighbours of a contiguous array, from a number on that four divides; on CUDA written in three pieces."""
+
+
+@wp.func
+def ahead_at(
+    roads: Roads,
+    route: wp.vec2i,
+    shift: wp.vec4,
+    at: int,
+    pose: wp.vec3,
+    follows: bool,
+    known: float,
+    curvature: float,
+    ahead: float,
+) -> wp.vec3:
+    """Where somebody is after `ahead` metres."""
+    q = pose
+    if not follows:
+        q = turned(pose, ahead, curvature)
+    else:
+        q = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
+        over = float(at) + ahead - known
+        if over > 0.0:
+            q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
+    return q
+
+
+@wp.func
+def around(box: wp.vec4, q: wp.vec3) -> wp.vec4:
+    """A box that holds a place, too."""
+    return wp.vec4(wp.min(box[0], q[0]), wp.min(box[1], q[1]), wp.max(box[2], q[0]), wp.max(box[3], q[1]))
+
+
 @wp.func
 def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int, i: int, dt: float):
     """Fill an agent's own row."""
@@ -130,8 +177,8 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
     goes = speed
     if follows and relied == 1 and way[1] < body[0] - 1.0:
         goes = wp.max(speed, CLEARING)  # whoever stands in a junction is expected to leave it
-    low = wp.vec2(pose[0], pose[1])
-    high = low
+    box = wp.vec4(pose[0], pose[1], pose[0], pose[1])
+    place = (b * seen.forecast.shape[1] + i) * HORIZON
     if wp.abs(goes) > 0.1:
         known = float(0.0)
         curvature = float(0.0)
@@ -141,23 +188,18 @@ def look_at(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, b: int,
             curvature = wrap(pose[2] - state.previous[b, i][2]) / (speed * dt)
             if wp.abs(curvature) > STRAIGHT_TURN:
                 way[3] = 0.36 * wp.abs(goes) * STRIDE * float(HORIZON)  # no quarter of a turn leaves its chord further
-        for k in range(HORIZON):
-            ahead = goes * STRIDE * float(k + 1)
-            q = pose
-            if not follows:
-                q = turned(pose, ahead, curvature)
-            else:
-                q = way_at(roads, route[0], route[1], shift, wp.min(float(at) + ahead, known))
-                over = float(at) + ahead - known
-                if over > 0.0:
-                    q = wp.vec3(q[0] + over * wp.cos(q[2]), q[1] + over * wp.sin(q[2]), q[2])
-            seen.forecast[b, i, k] = q
-            low = wp.vec2(wp.min(low[0], q[0]), wp.min(low[1], q[1]))
-            high = wp.vec2(wp.max(high[0], q[0]), wp.max(high[1], q[1]))
+        for k in range(0, HORIZON, 4):
+            d = goes * STRIDE
+            p = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 1))
+            q = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 2))
+            r = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 3))
+            s = ahead_at(roads, route, shift, at, pose, follows, known, curvature, d * float(k + 4))
+            put_four(seen.forecast, place + k, p, q, r, s)
+            box = around(around(around(around(box, p), q), r), s)
     else:
-        for k in range(HORIZON):
-            seen.forecast[b, i, k] = pose
-    seen.span[b, i] = wp.vec4(low[0], low[1], high[0], high[1])
+        for k in range(0, HORIZON, 4):
+            put_four(seen.forecast, place + k, pose, pose, pose, pose)
+    seen.span[b, i] = box
     seen.way[b, i] = way
     seen.signal[b, i] = signal
     seen.change[b, i] = change

@@ -6,7 +6,7 @@ The Autopilot is the background traffic and the ego baseline alike; how it react
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import FAR, End, EpisodeArrays, Presence, Roads, Seen, State, When
+from ssad.world.kernels.data import FAR, REGISTERS, End, EpisodeArrays, Presence, Roads, Seen, State, When
 from ssad.world.kernels.lanes import changes, metres_left, way_slope
 from ssad.world.kernels.shared import IDM_ACCEL, boxes_touch, row, wrap
 
@@ -187,7 +187,7 @@ def drive_one(
             state.waited[b, i] = 0.0
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS)
 def drive(bank: EpisodeArrays, roads: Roads, state: State, seen: Seen, agents: int, rows: int, threads: int, dt: float):
     """Controls of every agent that is not external, from the state of all at the start of the step."""
     b, first = wp.tid()

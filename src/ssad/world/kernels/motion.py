@@ -3,7 +3,7 @@
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import End, EpisodeArrays, Presence, Roads, State
+from ssad.world.kernels.data import REGISTERS_OF_MOTION, End, EpisodeArrays, Presence, Roads, State
 from ssad.world.kernels.shared import lane_under, on_track, row, sign_line, track_at, wrap
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE
 
@@ -174,7 +174,7 @@ def move_one(
     state.lateral[b, i] = wp.vec2(under[1], under[2])
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, cuda_max_registers=REGISTERS_OF_MOTION)
 def move(
     bank: EpisodeArrays,
     roads: Roads,

@@ -9,10 +9,22 @@ left again while there is room behind who stands. A queue is not passed.
 import warp as wp
 
 from ssad.core.types import AgentKind, Controller
-from ssad.world.kernels.data import FAR, LEADERS, NO_LEADER, End, EpisodeArrays, Presence, Roads, Seen, State, Work
+from ssad.world.kernels.data import (
+    FAR,
+    LEADERS,
+    NO_LEADER,
+    REGISTERS,
+    End,
+    EpisodeArrays,
+    Presence,
+    Roads,
+    Seen,
+    State,
+    Work,
+)
 from ssad.world.kernels.lanes import lanes_left, metres_left, on_oncoming_lane, way_frame
 from ssad.world.kernels.shared import boxes_touch, route_frame, row
-from ssad.world.kernels.traffic import REGISTERS, idm_gap, line_ahead
+from ssad.world.kernels.traffic import idm_gap, line_ahead
 
 wp.set_module_options({"max_unroll": 0})  # see `traffic`
 

@@ -14,6 +14,7 @@ from ssad.world.kernels.data import (
     HORIZON,
     LEADERS,
     NO_LEADER,
+    REGISTERS,
     STRIDE,
     End,
     EpisodeArrays,
@@ -37,7 +38,6 @@ from ssad.world.kernels.shared import (
 
 # unrolled, they take half as long again to compile, are no faster on a CPU, and half as fast on a GPU (H200)
 wp.set_module_options({"max_unroll": 0})
-REGISTERS = 64  # a CUDA thread's, at most: then more threads are resident, and the step takes 14 % less (H200)
 
 IDM_BRAKE = wp.constant(3.0)
 IDM_HEADWAY = wp.constant(1.2)
