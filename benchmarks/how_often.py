@@ -97,13 +97,13 @@ def coverage(given: argparse.Namespace) -> None:
     training: list[float] = []
     branching: list[list[float]] = []
     began = time.perf_counter()
-    most = 16_384 if given.device == "cpu" else 65_536
-    process = make_process(min(given.each, most), noise_of(given), device=given.device)
+    batches = -(-given.each // (16_384 if given.device == "cpu" else 65_536))
+    process = make_process(-(-given.each // batches), noise_of(given), device=given.device)
     for number in range(given.repeats):
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
             pupil = make_process(1000, noise_of(given), device="cpu")  # it branches on the host
-            proposal = learn(pupil, random, components=2, rounds=2, episodes=2000, defence=given.defence)
+            proposal = learn(pupil, random, components=8, rounds=2, episodes=4000, defence=given.defence)
             training.append(pupil.work())
         found, _ = importance(process, proposal, random, episodes=given.each, training=training[-1])
         sampling.append([found.probability, found.low, found.high, found.effective, found.work])

@@ -14,6 +14,7 @@ from typing import Any
 
 from ssad.core.images import read_image
 from ssad.core.safeio import make_folder
+from ssad.recording.target import class_of_target, parse_target
 from ssad.report.kinds.physical import PhysicalRun, margin_table, title_of
 from ssad.report.load import load_run
 from ssad.scenarios.static.physical.shipped import SHIPPED, TextureCard, save_texture
@@ -37,8 +38,10 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             print(f"{title} in {line['test']} is not stronger than the controls: left out")
             continue
         spec, pair, around = line["spec"], line["spec"]["pair"], line["spec"]["around"]
+        sort = class_of_target(parse_target(suite["target"]))
+        place = f"{suite['behind']:g} m behind" if sort == "car" else f"of a {sort.replace('_', ' ')}"
         data = (
-            f"{pair['train_images']} pictures of drives in {pair['train']}, {suite['behind']:g} m behind"
+            f"{pair['train_images']} pictures of drives in {pair['train']}, {place}"
             f"{f', and {around} from all around' if around else ''}; metrics: "
             f"{pair['test_images']} in {pair['test']}; suite {suite['name']}, seed {suite['seed']}"
         )
@@ -47,7 +50,9 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             suite["target"], data, f"ssad run {suite['name']}", int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
         )  # fmt: skip
-        name = f"{line['attack'].replace(', ', '-').replace(' ', '-')}-{line['source']}-{pair['train'].lower()}"
+        made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
+        attack = line["attack"].replace(", ", "-").replace(" ", "-")
+        name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"
         found[name] = (line, card)
     make_folder(SHIPPED)
     for name, (line, card) in found.items():

@@ -42,12 +42,14 @@ GREY_SIGN: Final = "grey-sign"
 TEXTURE: Final = "texture"
 LIGHT: Final = "light"
 WEAR: Final = "wear-"
+ATTACK: Final = "attack-"
 TARGET: Final = "sedan"
 BESIDE: Final = 12.0  # m from a way within which its signs stand
 SHARES: Final = (1.0, 0.9, 0.8, 0.7, 0.6)  # sizes of a patch that are tried, of the one that was trained
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that attacks may move a pixel by, by severity
 AT_ONCE, AT_ONCE_GPU = 8, 24  # pictures that are attacked at once; other processes may share the GPU's memory
-STEPS: Final = 2  # gradient steps a picture; an attacker in the loop has no time for more
+STEPPED: Final = ("pgd", "cw", "momentum", "apgd")  # attacks whose steps a picture a name may say, as in attack-pgd-2
+STEPS: Final = 5  # of those whose name says nothing: on YOLOv5n two steps of 16 code values change nothing, five do
 
 
 @lru_cache(maxsize=1)
@@ -56,7 +58,7 @@ def perturbation_names() -> Mapping[str, str]:
     attacks = [name for name in ATTACKS if not needs(name)]
     return MappingProxyType({
         NONE: "none", **dict.fromkeys(FAULTS, "fault"), **dict.fromkeys(LOOP_SHIFTS, "shift"),
-        **dict.fromkeys((f"attack-{name}" for name in attacks), "attack"),
+        **dict.fromkeys((f"{ATTACK}{name}" for name in attacks), "attack"),
         **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
         **dict.fromkeys(LIT, LIGHT),
     })  # fmt: skip
@@ -73,9 +75,19 @@ def family_of(name: str) -> str:
         shining(name)
         return LIGHT
     names = perturbation_names()
-    if name not in names:
+    plain = ATTACK + method_of(name)[0] if name.startswith(ATTACK) else name
+    if plain not in names:
         raise unknown_name("perturbation", name, names)
-    return names[name]
+    return names[plain]
+
+
+def method_of(name: str) -> tuple[str, dict[str, int]]:
+    """An attack's name in `ATTACKS` and its options: attack-pgd, attack-pgd-2 (two gradient steps a picture)."""
+    method = name.removeprefix(ATTACK)
+    stem, _, steps = method.rpartition("-")
+    if stem in STEPPED and steps.isdecimal() and int(steps):
+        return stem, {"steps": int(steps)}
+    return method, {"steps": STEPS} if method in STEPPED else {}
 
 
 def has_severities(name: str) -> bool:
@@ -197,8 +209,8 @@ def perturbed(
         elif family == "fault":
             changes[channel] = CameraFault(name, severity)
         elif family == "attack":
-            method = name.removeprefix("attack-")
-            attack = make_attack(method, **({"steps": STEPS} if method in ("pgd", "cw", "momentum", "apgd") else {}))
+            method, options = method_of(name)
+            attack = make_attack(method, **options)
             budget = Budget(px(RADII[severity - 1]))
             at_once = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
             if isinstance(attack, UniversalFit):

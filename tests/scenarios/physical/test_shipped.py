@@ -13,7 +13,7 @@ from ssad.bench.kinds.physical import Physical, PhysicalSuite
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import read_image, save_picture
 from ssad.core.types import U8
-from ssad.recording.target import TargetCar
+from ssad.recording.target import parse_target
 from ssad.scenarios.static.physical import TextureSpec, make_carrier
 from ssad.scenarios.static.physical.kept import TextureFolder
 from ssad.scenarios.static.physical.shipped import (
@@ -65,7 +65,9 @@ def test_what_is_shipped_is_whole() -> None:
         assert 0.0 <= float(colour.min()) <= float(colour.max()) <= 1.0
         assert card.command.startswith("ssad run"), name
         assert card.metrics["AP50"] < 0.9, name
-        assert make_carrier(card.carrier, card.options).on(TargetCar().mesh()).size == tuple(colour.shape[1:]), name
+        assert make_carrier(card.carrier, card.options).on(parse_target(card.target).mesh()).size == tuple(
+            colour.shape[1:]
+        ), name
 
 
 def suite(entry: dict[str, object]) -> PhysicalSuite:

@@ -99,7 +99,7 @@ def learn(
     rounds: int = 2,
     episodes: int = 1000,
     defence: float = 0.1,
-    shrink: float = 20.0,
+    shrink: float = 60.0,
 ) -> Proposal:
     """Learn a proposal: from the failures that splitting finds, then by the cross-entropy method from weighted ones.
 
@@ -113,7 +113,8 @@ def learn(
         rounds: Of the cross-entropy method.
         episodes: Of each round.
         defence: Share of the process as it is.
-        shrink: Steps of no movement that are added to what is learned from, so that few episodes move little.
+        shrink: Steps of no movement that are added to what is learned from, so that few episodes move little. With few,
+            failures that need less than those learned from come seldom, and then weigh much.
     """
     found = splitting(process, random, repeats=1)
     best = process.score()
