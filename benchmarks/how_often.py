@@ -103,7 +103,7 @@ def coverage(given: argparse.Namespace) -> None:
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
             pupil = make_process(1000, noise_of(given), device="cpu")  # it branches on the host
-            proposal = learn(pupil, random, components=8, rounds=2, episodes=4000, defence=given.defence)
+            proposal = learn(pupil, random, episodes=3000, defence=given.defence)
             training.append(pupil.work())
         found, _ = importance(process, proposal, random, episodes=given.each, training=training[-1])
         sampling.append([found.probability, found.low, found.high, found.effective, found.work])

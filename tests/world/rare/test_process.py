@@ -9,7 +9,7 @@ import pytest
 
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
-from ssad.core.types import Controller, End
+from ssad.core.types import F64, Controller, End
 from ssad.drivers import make_system
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
@@ -68,6 +68,35 @@ def test_weights_of_a_proposal_average_1_and_sums_are_those_of_what_was_drawn() 
     rest = drawn.total - drawn.count * np.vstack([np.zeros(rows.width), means])[drawn.component]
     spread = (rest**2 / drawn.count).mean(axis=0)
     assert np.abs(spread - 1.0).max() < 0.25
+
+
+def test_what_is_moved_later_moves_the_processes_as_much_then() -> None:
+    """The processes are linear in their normal numbers, so with equal keys the difference is exact."""
+    noise = replace(NOISE, stretches=5)
+
+    def drift(rows: WorldProcess, means: F64) -> F64:
+        """[steps, A, 2] of one episode."""
+        rows.reset(np.array([3], np.uint64))
+        rows.push(means[None])
+        seen = []
+        for _ in range(35):
+            rows.step()
+            seen.append(rows.world.array("noise.drift")[0].copy())
+        return np.array(seen)
+
+    rows = process(1, noise)
+    means = np.zeros((3, 5))
+    means[0] = 2.0, 0.5, 0.0, 0.0, 0.0
+    means[1] = -1.0, 0.0, 0.3, 0.0, 0.0
+    plain, moved = drift(rows, np.zeros(15)), drift(rows, means.ravel())
+    late = rows.later(means.ravel())
+    assert late.shape == (3, 15)
+    for by, copy in enumerate(late, 1):
+        after = drift(rows, copy) - plain
+        # as after the first step: one that is `by` stretches later; and from there on the same
+        np.testing.assert_allclose(after[10 * by :], (moved - plain)[: 35 - 10 * by], atol=1e-5)
+        assert np.abs(after[: 10 * (by - 1) + 1]).max() < 1e-6
+    assert process(1, replace(NOISE, stretches=2)).later(np.ones(6)).shape == (0, 6)
 
 
 def test_the_score_rises_towards_a_collision() -> None:

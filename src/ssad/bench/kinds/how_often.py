@@ -53,7 +53,7 @@ class HowOftenSuite(ScenarioSuite):
     episodes: int = Field(default=4000, ge=10)
     particles: int = Field(default=200, ge=10, le=100_000)
     repeats: int = Field(default=10, ge=1, le=1000)
-    components: int = Field(default=2, ge=1, le=20)
+    components: int = Field(default=4, ge=1, le=20)
     batch: int = Field(default=500, ge=1, le=1 << 21)
 
 

@@ -2,13 +2,15 @@
 
 The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
 means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
-the cross-entropy method, from those of each round's episodes, each with its weight. Copies that are moved half as far
-stand between both: failures that need less than most would else be drawn by the defence alone, hardly ever, and weigh
-as much as all others together. The weights are exact, since the likelihood ratio of moved normal numbers needs only
-their sums.
+the cross-entropy method, from those of all rounds' episodes, each with its weight among all that was drawn. Two kinds
+of copies cover failures that are too rare to be learned from, would be drawn by the defence alone, hardly ever, and
+weigh as much as all others together: what is moved half as far, for failures that need less than most, and what is
+moved some time later (`Process.later`), for those that come later than most. The weights are exact, since the
+likelihood ratio of moved normal numbers needs only their sums.
 
-Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Rubinstein and
-Kroese, "The Cross-Entropy Method" (2004).
+Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Veach and Guibas,
+"Optimally combining sampling techniques" (1995), the weights of several rounds together; Rubinstein and Kroese, "The
+Cross-Entropy Method" (2004).
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from ssad.world.noise import Keys
 from ssad.world.rare.brute import draw_keys, run
 from ssad.world.rare.process import Process
 from ssad.world.rare.splitting import splitting
+
+LATER = 0.2  # share of what is moved later
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,17 @@ class Proposal:
         """The same with a copy of each moved component that is moved half as far; the two share its share."""
         share = np.concatenate([self.share[:1], 0.5 * self.share[1:], 0.5 * self.share[1:]])
         return Proposal(share, np.vstack([0.5 * self.means, self.means]))
+
+    def with_later(self, process: Process) -> Proposal:
+        """The same with copies of its two most frequent moved components that begin later, where a process has them."""
+        most = 1 + np.argsort(-self.share[1:])[:2]
+        copies = [process.later(self.means[k - 1]) for k in most]
+        share = np.concatenate([np.full(len(c), self.share[k]) for c, k in zip(copies, most, strict=True)])
+        if not share.any():
+            return self
+        kept = 1.0 - LATER / (1.0 - self.share[0])
+        share = np.concatenate([self.share[:1], kept * self.share[1:], LATER * share / share.sum()])
+        return Proposal(share, np.vstack([self.means, *copies]))
 
     def log_ratios(self, total: F64, count: F64) -> F64:
         """[n, K] log of each moved component's likelihood over that of the process as it is."""
@@ -95,11 +110,11 @@ def learn(
     process: Process,
     random: np.random.Generator,
     *,
-    components: int = 2,
+    components: int = 4,
     rounds: int = 2,
     episodes: int = 1000,
     defence: float = 0.1,
-    shrink: float = 60.0,
+    shrink: float = 20.0,
 ) -> Proposal:
     """Learn a proposal: from the failures that splitting finds, then by the cross-entropy method from weighted ones.
 
@@ -109,26 +124,32 @@ def learn(
     Args:
         process: The process; its batch is the number of splitting's particles.
         random: Source of chance.
-        components: Moved components that are learned, so that several ways to fail can be; see also `Proposal.spread`.
+        components: Moved components that are learned, so that several ways to fail can be; more are made of them, see
+            `Proposal.with_later` and `Proposal.spread`.
         rounds: Of the cross-entropy method.
         episodes: Of each round.
         defence: Share of the process as it is.
-        shrink: Steps of no movement that are added to what is learned from, so that few episodes move little. With few,
-            failures that need less than those learned from come seldom, and then weigh much.
+        shrink: Steps of no movement that are added to what is learned from, so that few episodes move little.
     """
     found = splitting(process, random, repeats=1)
     best = process.score()
     chosen = found.failed if found.failed.any() else best >= np.quantile(best, 0.9)
     total, count = (values[chosen] for values in process.totals())
     weight = np.ones(len(total))
+    drawn: list[tuple[Proposal, Sample]] = []
     for number in range(rounds + 1):
-        proposal = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
+        fitted = _fit(total, count, weight, random, components=components, defence=defence, shrink=shrink)
+        proposal = fitted.with_later(process)
         if number == rounds:
             break
-        drawn = sample(process, proposal, random, episodes=episodes)
-        if drawn.failed.sum() < 10:
+        drawn.append((proposal, sample(process, proposal, random, episodes=episodes)))
+        parts = [(s.total[s.failed], s.count[s.failed]) for _, s in drawn]
+        if sum(len(part) for part, _ in parts) < 10:
             break  # too few to learn more from
-        total, count, weight = (v[drawn.failed] for v in (drawn.total, drawn.count, drawn.weight))
+        total, count = (np.concatenate(column) for column in zip(*parts, strict=True))
+        # as if all had been drawn from the mixture of all rounds' proposals
+        size = np.array([len(s.keys) for _, s in drawn], float)
+        weight = 1.0 / sum(n / p.weights(total, count) for n, (p, _) in zip(size / size.sum(), drawn, strict=True))
         # few episodes must not decide alone
         weight = np.minimum(weight, 10.0 * weight.mean())
     return proposal.spread()

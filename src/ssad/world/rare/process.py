@@ -57,6 +57,9 @@ class Process(Protocol):
     def push(self, means: F64) -> None:
         """Move the means of the normal numbers of each row, [B, D]: those of a group of steps, agent and kind alike."""
 
+    def later(self, means: F64) -> F64:
+        """[M, D] what does the same as moved means [D] some time later, for several times; none where there is none."""
+
     def totals(self) -> tuple[F64, F64]:
         """Sums of the normal numbers so far as they were used, and how many they are, both [B, D]."""
 
@@ -163,6 +166,20 @@ class WorldProcess:
         push[:, self._used] = means
         self.world.put("noise.push", push)
         self._pushed = True
+
+    def later(self, means: F64) -> F64:
+        """The same by 1, 2, ... stretches later: what a moved start does, the stretch before it does then."""
+        number, length = self.noise.stretches, self.noise.stretch
+        full = np.zeros((max(number - 2, 0), *self._used.shape))
+        one = np.zeros(self._used.shape)
+        one[self._used] = means
+        keep = np.exp(-self.world.dt / np.array([self.noise.accel_time, self.noise.choice_time]))
+        # by how much a stretch whose means are moved by 1 moves the process at its end
+        gain = np.sqrt(1.0 - keep**2) * (1.0 - keep**length) / (1.0 - keep)
+        for by in range(1, number - 1):
+            full[by - 1, :, by] = one[:, 0] / gain
+            full[by - 1, :, by + 1 :] = one[:, 1 : number - by]
+        return full[:, self._used]
 
     def totals(self) -> tuple[F64, F64]:
         """Sums of the normal numbers and how many they are."""
