@@ -127,8 +127,13 @@ def harmless(run: Run) -> Condition | None:
 
 
 def harmful(run: Run) -> Condition | None:
-    """Of the conditions with a small fall of AP, the one with the largest rise of the collision rate."""
-    mild = [c for c in conditions(run) if c[2] and lost_share(run, c) <= SMALL]
+    """Of the conditions with a small fall of AP, the one with the largest rise of the collision rate.
+
+    One that was stopped before half of its drives says little, and is left out.
+    """
+    every = conditions(run)
+    most = max(map(len, every.values()), default=0)
+    mild = [c for c, lines in every.items() if c[2] and len(lines) > most / 2 and lost_share(run, c) <= SMALL]
     return max(mild, key=lambda c: change(run, c, "collision").mean, default=None)
 
 

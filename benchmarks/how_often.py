@@ -97,13 +97,14 @@ def coverage(given: argparse.Namespace) -> None:
     training: list[float] = []
     branching: list[list[float]] = []
     began = time.perf_counter()
+    learning: dict[str, Any] = {"components": 4, "rounds": 2, "episodes": 3000, "defence": given.defence}
     batches = -(-given.each // (16_384 if given.device == "cpu" else 65_536))
     process = make_process(-(-given.each // batches), noise_of(given), device=given.device)
     for number in range(given.repeats):
         random = generator("how often", "importance", given.lapse, given.seed, number)
         if number % given.share == 0:  # a proposal serves so many estimates, each of which counts its whole training
             pupil = make_process(1000, noise_of(given), device="cpu")  # it branches on the host
-            proposal = learn(pupil, random, episodes=3000, defence=given.defence)
+            proposal = learn(pupil, random, **learning)
             training.append(pupil.work())
         found, _ = importance(process, proposal, random, episodes=given.each, training=training[-1])
         sampling.append([found.probability, found.low, found.high, found.effective, found.work])
@@ -113,7 +114,7 @@ def coverage(given: argparse.Namespace) -> None:
         if number % 20 == 19 or number == given.repeats - 1:
             data = {
                 "scenario": SCENARIO, "noise": vars(noise_of(given)), "repeats": number + 1, "share": given.share,
-                "each": given.each, "device": given.device, "room": 1.0,
+                "each": given.each, "device": given.device, "room": 1.0, "learning": learning,
                 "training": training, "seconds": time.perf_counter() - began, "columns": COLUMNS,
                 "importance": rounded(sampling), "splitting": rounded(branching),
             }  # fmt: skip

@@ -55,9 +55,10 @@ key has another future.
   from independent repeats (Student's, with room for skew), at least 8 of them.
 * **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
   a mixture of the noise as it is (10 %, so that no weight exceeds 10), of moved ones, learned from the failures that
-  splitting finds and then by the cross-entropy method, and of copies of these moved half as far. Learning counts
-  as work. Intervals are gamma limits of a compound Poisson sum (Fay and Feuer), whose upper end leaves room for one
-  event more of the largest weight; n is the effective number.
+  splitting finds and then by the cross-entropy method from those of all its rounds, of copies of these that begin
+  later, and of copies moved half as far. Failures that no component covers come hardly ever, and then weigh as much as
+  all others together. Learning counts as work. Intervals are gamma limits of a compound Poisson sum (Fay and Feuer),
+  whose upper end leaves room for one event more of the largest weight; n is the effective number.
 * Drivers must not remember anything between steps: those inside the world and learned policies do not.
 
 """
@@ -86,7 +87,9 @@ def estimates() -> list[dict[str, Any]]:
         data = json.loads(path.read_text(encoding="utf-8"))
         known = found.setdefault(data["noise"]["lapse"], data)
         if known is not data:
-            if any(known.get(key) != data.get(key) for key in ("noise", "share", "each", "scenario", "room")):
+            if any(
+                known.get(key) != data.get(key) for key in ("noise", "share", "each", "scenario", "room", "learning")
+            ):
                 raise ValueError(f"{path}: of another case, or of estimates of another size, than those beside it")
             for key in ("training", "importance", "splitting", "repeats", "seconds"):
                 known[key] += data[key]
@@ -166,6 +169,10 @@ def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
             )
     if "room" not in data:
         last += " These estimates are from before the upper limits left room for a whole event more: half of one then."
+    if "learning" not in data:
+        last += (
+            " They are of an earlier learning: two components, from the failures of the last round alone, no copies."
+        )
     return [*lines, "", last, ""]
 
 

@@ -104,6 +104,7 @@ def beside() -> list[str]:
     """The step beside the one before beliefs and lane changes, in turn: on a core and on a GPU."""
     ratio, gpu = read("world-ratio"), read("world-ratio-h200")
     parts = read("world-h200")[f"parts_us_B{gpu['batch']}"]
+    step = sum(us for name, us in parts.items() if name != "look")  # which is no part of what the two are compared by
     return [
         "### Beside the step before beliefs and lane changes",
         "",
@@ -112,7 +113,7 @@ def beside() -> list[str]:
         f"speed (middle half of the rounds {ratio['low']:.2f} to {ratio['high']:.2f}). On the {gpu['device']}",
         f"({gpu['batch']:,} scenes, {gpu['rounds']} rounds, commit {gpu['commit']}): {gpu['ratio']:.2f} times",
         f"({gpu['low']:.2f} to {gpu['high']:.2f}); of the step, lane changes take",
-        f"{parts['change_lanes'] / sum(parts.values()):.0%}. Agent-steps a second of the tables above do not tell the",
+        f"{parts['change_lanes'] / step:.0%}. Agent-steps a second of the tables above do not tell the",
         "two apart: the traffic of natural junctions has changed, too.",
         "",
     ]

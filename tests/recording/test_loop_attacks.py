@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.core.errors import UnknownNameError
+from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.frames import Camera
 from ssad.recording.loop_perturbations import STEPS, family_of, perturbed
 from ssad.recording.loop_sensors import Onboard
@@ -32,11 +32,17 @@ def test_a_name_says_how_many_gradient_steps_a_picture_takes(name: str, steps: i
 
 
 @pytest.mark.parametrize(
-    "name", ["attack-pgd-0", "attack-fgsm-3", "attack-pgd-", "attack-pgd--2", "attack-2", "wear-2"]
+    "name",
+    ["attack-pgd-0", "attack-pgd-05", "attack-pgd-1000", "attack-pgd-\u0665", "attack-fgsm-3", "attack-pgd-", "wear-2"],
 )
 def test_other_names_with_numbers_are_unknown(name: str) -> None:
     with pytest.raises(UnknownNameError, match=name):
         family_of(name)
+
+
+def test_an_attack_that_cannot_take_so_few_steps_is_refused_before_anything_runs() -> None:
+    with pytest.raises(ConfigError, match="apgd: steps must be 2 or more"):
+        family_of("attack-apgd-1")
 
 
 def test_pgd_hides_more_than_noise_of_its_size() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -69,23 +70,32 @@ def family_of(name: str) -> str:
 
     Raises:
         UnknownNameError: There is no such perturbation.
+        ConfigError: An attack cannot take so few steps.
         FormatError: There is no exported light in its folder.
     """
     if name.startswith(FOUND):
         shining(name)
         return LIGHT
     names = perturbation_names()
-    plain = ATTACK + method_of(name)[0] if name.startswith(ATTACK) else name
+    plain = plain_name(name)
     if plain not in names:
         raise unknown_name("perturbation", name, names)
+    if plain != name:
+        method, options = method_of(name)
+        make_attack(method, **options)  # it may want more steps
     return names[plain]
+
+
+def plain_name(name: str) -> str:
+    """Of a perturbation without the steps of an attack: attack-pgd for attack-pgd-2."""
+    return ATTACK + method_of(name)[0] if name.startswith(ATTACK) else name
 
 
 def method_of(name: str) -> tuple[str, dict[str, int]]:
     """An attack's name in `ATTACKS` and its options: attack-pgd, attack-pgd-2 (two gradient steps a picture)."""
     method = name.removeprefix(ATTACK)
     stem, _, steps = method.rpartition("-")
-    if stem in STEPPED and steps.isdecimal() and int(steps):
+    if stem in STEPPED and re.fullmatch("[1-9][0-9]{0,2}", steps):
         return stem, {"steps": int(steps)}
     return method, {"steps": STEPS} if method in STEPPED else {}
 

@@ -14,7 +14,7 @@ from ssad.drivers import make_system
 from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
-from ssad.world.rare.importance import Proposal, sample
+from ssad.world.rare.importance import LATER, Proposal, sample
 from ssad.world.rare.process import WorldProcess, closeness
 from ssad.world.rare.splitting import keys_of, splitting
 from ssad.world.rollout import Loop
@@ -72,7 +72,7 @@ def test_weights_of_a_proposal_average_1_and_sums_are_those_of_what_was_drawn() 
 
 def test_what_is_moved_later_moves_the_processes_as_much_then() -> None:
     """The processes are linear in their normal numbers, so with equal keys the difference is exact."""
-    noise = replace(NOISE, stretches=5)
+    noise = replace(NOISE, stretches=9)  # as long as the episode
 
     def drift(rows: WorldProcess, means: F64) -> F64:
         """[steps, A, 2] of one episode."""
@@ -85,18 +85,41 @@ def test_what_is_moved_later_moves_the_processes_as_much_then() -> None:
         return np.array(seen)
 
     rows = process(1, noise)
-    means = np.zeros((3, 5))
-    means[0] = 2.0, 0.5, 0.0, 0.0, 0.0
-    means[1] = -1.0, 0.0, 0.3, 0.0, 0.0
-    plain, moved = drift(rows, np.zeros(15)), drift(rows, means.ravel())
+    means = np.zeros((3, 9))
+    means[0, :2] = 2.0, 0.5
+    means[1, :3] = -1.0, 0.0, 0.3
+    plain, moved = drift(rows, np.zeros(27)), drift(rows, means.ravel())
     late = rows.later(means.ravel())
-    assert late.shape == (3, 15)
-    for by, copy in enumerate(late, 1):
+    assert late.shape == (7, 27)
+    for by, copy in enumerate(late[:3], 1):
         after = drift(rows, copy) - plain
         # as after the first step: one that is `by` stretches later; and from there on the same
         np.testing.assert_allclose(after[10 * by :], (moved - plain)[: 35 - 10 * by], atol=1e-5)
         assert np.abs(after[: 10 * (by - 1) + 1]).max() < 1e-6
     assert process(1, replace(NOISE, stretches=2)).later(np.ones(6)).shape == (0, 6)
+    # a last stretch that goes on is not moved; what never forgets has no start that could be made up for
+    late = process(1, replace(NOISE, stretches=4, accel_time=np.inf)).later(np.ones(12)).reshape(2, 3, 4)
+    assert (late[..., -1] == 0.0).all()
+    assert (late[0, 0, 1:3] > 0.0).all()
+    assert (late[0, 1:, 1] == 0.0).all()
+    assert (late[0, 1:, 2] == 1.0).all()
+
+
+@pytest.mark.parametrize("defence", [0.1, 0.9])
+def test_copies_that_begin_later_leave_weights_exact(defence: float) -> None:
+    rows = process(400)
+    share = np.array([defence, 0.6 * (1.0 - defence), 0.4 * (1.0 - defence)])
+    plain = Proposal(share, generator("late").normal(0.0, 0.15, (2, rows.width)))
+    found = plain.with_later(rows).spread()
+    assert found.share.sum() == pytest.approx(1.0)
+    assert (found.share >= 0.0).all()
+    assert len(found.share) == 1 + 2 * (2 + 2 * 1)
+    assert found.share[[3, 4, 7, 8]].sum() == pytest.approx(min(LATER, 0.5 * (1.0 - defence)))
+    drawn = sample(rows, found, generator("wl"), episodes=1200)
+    assert drawn.weight.mean() == pytest.approx(1.0, abs=4.0 * drawn.weight.std() / np.sqrt(len(drawn.weight)))
+    assert drawn.weight.max() <= 1.0 / defence + 1e-9
+    nothing = Proposal(np.ones(1), np.zeros((0, rows.width)))
+    assert nothing.with_later(rows) is nothing
 
 
 def test_the_score_rises_towards_a_collision() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,6 +17,8 @@ from ssad.metrics.rank import family_correlation
 from ssad.report.load import Run
 from ssad.report.pages import render
 from ssad.report.tables import METHODS, Cell, Row, Table
+
+STEPS = re.compile(r"^(attack-.*)-[0-9]+$")  # attack-pgd-2 is of the family attack-pgd
 
 Line = Mapping[str, Any]
 Condition = tuple[str, str, int]
@@ -113,7 +116,7 @@ def rank_table(run: Run) -> Table:
     perturbed = [condition for condition in conditions(run) if condition[2]]
     for system in dict.fromkeys(condition[0] for condition in perturbed):
         own = [condition for condition in perturbed if condition[0] == system]
-        families = [condition[1] for condition in own]
+        families = [STEPS.sub(r"\1", condition[1]) for condition in own]
         for part in ("AP", "target_recall"):
             lost = [-change(run, c, part).mean for c in own]
             cells = []
@@ -123,8 +126,8 @@ def rank_table(run: Run) -> Table:
             rows.append(Row((system, DROPS[part], f"{len(own)} in {len(set(families))}"), tuple(cells)))
     note = (
         "Spearman's rank correlation over perturbations of what the component loses and what the system loses; 95 % "
-        "interval by a bootstrap over the families of perturbations (all severities of one are one family), from five "
-        "families on. n/a: one of the two does not vary."
+        "interval by a bootstrap over the families of perturbations (all severities of one are one family, and "
+        "so are all step counts of an attack), from five families on. n/a: one of the two does not vary."
     )
     heads = ("System", "Lost by the component", "Perturbations in families")
     return Table("rank", "Does the component's damage tell the system's?", heads, ("CR", "RC"), tuple(rows), note)

@@ -27,7 +27,7 @@ from ssad.world.rare.brute import draw_keys, run
 from ssad.world.rare.process import Process
 from ssad.world.rare.splitting import splitting
 
-LATER = 0.2  # share of what is moved later
+LATER = 0.2  # share of the copies that begin later
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,20 @@ class Proposal:
         return Proposal(share, np.vstack([0.5 * self.means, self.means]))
 
     def with_later(self, process: Process) -> Proposal:
-        """The same with copies of its two most frequent moved components that begin later, where a process has them."""
+        """The same with copies that begin later (`Process.later`) of its two moved components of the largest shares.
+
+        The copies get the share `LATER`, or half of what is moved if that is less. Where nothing is moved, or the
+        process has no later times, nothing changes.
+        """
+        moved = 1.0 - float(self.share[0])
         most = 1 + np.argsort(-self.share[1:])[:2]
         copies = [process.later(self.means[k - 1]) for k in most]
-        share = np.concatenate([np.full(len(c), self.share[k]) for c, k in zip(copies, most, strict=True)])
-        if not share.any():
+        weight = np.repeat(self.share[most], [len(one) for one in copies])
+        if not weight.any():
             return self
-        kept = 1.0 - LATER / (1.0 - self.share[0])
-        share = np.concatenate([self.share[:1], kept * self.share[1:], LATER * share / share.sum()])
+        later = min(LATER, 0.5 * moved)
+        kept = (1.0 - later / moved) * self.share[1:]
+        share = np.concatenate([self.share[:1], kept, later * weight / weight.sum()])
         return Proposal(share, np.vstack([self.means, *copies]))
 
     def log_ratios(self, total: F64, count: F64) -> F64:

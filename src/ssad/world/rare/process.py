@@ -17,6 +17,7 @@ from ssad.world.rollout import Loop
 from ssad.world.world import World
 
 _HARD = 8.0  # m/s^2
+_LEAST_GAIN = 0.3  # of a stretch: less, and making up for a start would move its means by more than three times that
 Rows = npt.NDArray[np.intp]
 
 
@@ -58,7 +59,10 @@ class Process(Protocol):
         """Move the means of the normal numbers of each row, [B, D]: those of a group of steps, agent and kind alike."""
 
     def later(self, means: F64) -> F64:
-        """[M, D] what does the same as moved means [D] some time later, for several times; none where there is none."""
+        """[M, D] means that do at M later times what means [D] do from the start; M is 0 where there is no such time.
+
+        They need not do exactly the same: estimates are right for any, and better for good ones.
+        """
 
     def totals(self) -> tuple[F64, F64]:
         """Sums of the normal numbers so far as they were used, and how many they are, both [B, D]."""
@@ -168,17 +172,25 @@ class WorldProcess:
         self._pushed = True
 
     def later(self, means: F64) -> F64:
-        """The same by 1, 2, ... stretches later: what a moved start does, the stretch before it does then."""
+        """[M, D] copies that begin 1, 2, ... stretches later than means [D].
+
+        Stretch s of a copy that begins k later is moved as stretch s - k of the original. What the first step moves,
+        where processes begin, the stretch before the shifted ones makes up for: at its end they are as far from 0.
+        A last stretch that goes on for longer than the others is not moved.
+        """
         number, length = self.noise.stretches, self.noise.stretch
         full = np.zeros((max(number - 2, 0), *self._used.shape))
         one = np.zeros(self._used.shape)
         one[self._used] = means
         keep = np.exp(-self.world.dt / np.array([self.noise.accel_time, self.noise.choice_time]))
-        # by how much a stretch whose means are moved by 1 moves the process at its end
-        gain = np.sqrt(1.0 - keep**2) * (1.0 - keep**length) / (1.0 - keep)
+        # by how much a stretch whose means are moved by 1 moves the process at its end; one that hardly forgets cannot
+        gain = np.sqrt(1.0 - keep**2) * (keep ** np.arange(length)[:, None]).sum(axis=0)
+        start = np.divide(one[:, 0], gain, out=np.zeros_like(one[:, 0]), where=gain > _LEAST_GAIN)
         for by in range(1, number - 1):
-            full[by - 1, :, by] = one[:, 0] / gain
+            full[by - 1, :, by] = start
             full[by - 1, :, by + 1 :] = one[:, 1 : number - by]
+        if self.steps > 1 + length * (number - 1):
+            full[:, :, -1] = 0.0
         return full[:, self._used]
 
     def totals(self) -> tuple[F64, F64]:
