@@ -120,20 +120,35 @@ def lost_share(run: Run, condition: Condition) -> float:
     return 1.0 - after / before if before else math.nan
 
 
+def mostly_driven(run: Run) -> list[Condition]:
+    """The perturbed conditions of which more than half of the drives are there: fewer single nothing out."""
+    every = conditions(run)
+    most = max(map(len, every.values()), default=0)
+    return [c for c, lines in every.items() if c[2] and len(lines) > most / 2]
+
+
+def fewer(run: Run) -> str:
+    """A sentence on the perturbed conditions that lack drives; "" if none does."""
+    every = conditions(run)
+    most = max(map(len, every.values()), default=0)
+    several = len({c[0] for c in every if c[2]}) > 1
+    short = [
+        f"`{c[1]}` {c[2]}{f' ({c[0]})' if several else ''}: {len(lines)}"
+        for c, lines in every.items()
+        if c[2] and len(lines) < most
+    ]
+    return f" With fewer than {most} drives: {', '.join(short)}." if short else ""
+
+
 def harmless(run: Run) -> Condition | None:
     """Of the conditions that halve AP, the one whose collision rate surely moved least; None: there is none."""
-    halving = [c for c in conditions(run) if c[2] and lost_share(run, c) >= HALVED]
+    halving = [c for c in mostly_driven(run) if lost_share(run, c) >= HALVED]
     return min(halving, key=lambda c: _most(change(run, c, "collision")), default=None)
 
 
 def harmful(run: Run) -> Condition | None:
-    """Of the conditions with a small fall of AP, the one with the largest rise of the collision rate.
-
-    One that was stopped before half of its drives says little, and is left out.
-    """
-    every = conditions(run)
-    most = max(map(len, every.values()), default=0)
-    mild = [c for c, lines in every.items() if c[2] and len(lines) > most / 2 and lost_share(run, c) <= SMALL]
+    """Of the conditions with a small fall of AP, the one with the largest rise of the collision rate."""
+    mild = [c for c in mostly_driven(run) if lost_share(run, c) <= SMALL]
     return max(mild, key=lambda c: change(run, c, "collision").mean, default=None)
 
 
@@ -266,12 +281,9 @@ def _benign(run: Run, runs: Mapping[str, Run]) -> list[str]:
 def _damages(run: Run, runs: Mapping[str, Run]) -> list[str]:
     every = conditions(run)
     under = [c for c in every if c[2]]
-    most = max(map(len, every.values()))
-    short = [f"`{c[1]}` {c[2]}: {len(every[c])}" for c in under if len(every[c]) < most]
-    fewer = f" With fewer than {most} drives: {', '.join(short)}." if short else ""
     return [
         "### Damage to the component and to the system", "",
-        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer}", "",
+        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer(run)}", "",
         f"![Share of AP lost against rise of the collision rate]({FIGURE.name})", "", _smaller(rank_table(run)), "",
         *_examples(run), "", _smaller(drop_table(run)), "", _smaller(cause_table(run)),
     ]  # fmt: skip
@@ -306,7 +318,7 @@ def _confirmed(run: Run, runs: Mapping[str, Run]) -> list[str]:
 
 
 def _signs(run: Run, runs: Mapping[str, Run]) -> list[str]:
-    return ["### Stop signs that are read", "", _measured(run), "", _smaller(sign_table(run))]
+    return ["### Stop signs that are read", "", _measured(run) + fewer(run), "", _smaller(sign_table(run))]
 
 
 def _speed() -> list[str]:

@@ -56,9 +56,9 @@ key has another future.
 * **Importance sampling** moves the means of the normal numbers behind the noise, by stretches of time. The proposal is
   a mixture of the noise as it is (10 %, so that no weight exceeds 10), of moved ones, learned from the failures that
   splitting finds and then by the cross-entropy method from those of all its rounds, of copies of these that begin
-  later, and of copies moved half as far. Failures that no component covers come hardly ever, and then weigh as much as
-  all others together. Learning counts as work. Intervals are gamma limits of a compound Poisson sum (Fay and Feuer),
-  whose upper end leaves room for one event more of the largest weight; n is the effective number.
+  later, and of copies moved half as far. A failure that no component covers is drawn very seldom, and then its weight
+  exceeds that of all others together. Learning counts as work. Intervals are gamma limits of a compound Poisson sum
+  (Fay and Feuer), whose upper end leaves room for one event more of the largest weight; n is the effective number.
 * Drivers must not remember anything between steps: those inside the world and learned policies do not.
 
 """

@@ -104,7 +104,7 @@ def beside() -> list[str]:
     """The step beside the one before beliefs and lane changes, in turn: on a core and on a GPU."""
     ratio, gpu = read("world-ratio"), read("world-ratio-h200")
     parts = read("world-h200")[f"parts_us_B{gpu['batch']}"]
-    step = sum(us for name, us in parts.items() if name != "look")  # which is no part of what the two are compared by
+    step = sum(us for name, us in parts.items() if name != "look")  # world_ratio steps without it
     return [
         "### Beside the step before beliefs and lane changes",
         "",

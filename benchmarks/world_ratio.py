@@ -87,8 +87,15 @@ def measure(before: Path, *, batch: int, steps: int, rounds: int, device: str) -
     for process in pair:
         process.communicate()
     low, middle, high = statistics.quantiles(ratios, n=4)
-    about = {"device": device, "batch": batch, "steps": steps, "rounds": rounds, "commit": commit()}
+    about = {"device": name_of(device), "batch": batch, "steps": steps, "rounds": rounds, "commit": commit()}
     return {**about, "ratio": middle, "low": low, "high": high}
+
+
+def name_of(device: str) -> str:
+    """Of a GPU as it calls itself."""
+    import warp
+
+    return device if device == "cpu" else str(warp.get_device(device).name)
 
 
 def commit() -> str:

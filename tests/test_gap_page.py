@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,21 @@ def test_the_two_conditions_that_break_the_rule_are_singled_out(page: dict[str, 
     assert told[1:3] == ["fog5-39", "fog5-38"]
     assert [int(key.partition("-")[2]) % 2 for key in told[4:]] == [1, 1]
     assert "dirt3-0" not in told
+
+
+def test_conditions_that_were_stopped_early_are_named_and_single_nothing_out(page: dict[str, Any]) -> None:
+    run = page["stored"]("damage")
+    assert page["fewer"](run) == ""
+    kept: dict[str, int] = {"dirt": DRIVES // 2, "fog": DRIVES // 2}
+    lines = []
+    for one in run.lines:
+        kept[one["perturbation"]] = kept.get(one["perturbation"], DRIVES) - 1
+        if kept[one["perturbation"]] >= 0:
+            lines.append(one)
+    cut = replace(run, lines=tuple(lines))
+    assert page["fewer"](cut) == f" With fewer than {DRIVES} drives: `fog` 5: {DRIVES // 2}, `dirt` 3: {DRIVES // 2}."
+    assert {c[1] for c in page["mostly_driven"](cut)} == {"snow", "rain"}
+    assert page["harmful"](cut) != page["harmful"](run)
 
 
 def test_the_page_is_made_of_what_is_stored(page: dict[str, Any], tmp_path: Path) -> None:

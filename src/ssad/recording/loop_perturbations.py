@@ -49,8 +49,8 @@ BESIDE: Final = 12.0  # m from a way within which its signs stand
 SHARES: Final = (1.0, 0.9, 0.8, 0.7, 0.6)  # sizes of a patch that are tried, of the one that was trained
 RADII: Final = (1.0, 2.0, 4.0, 8.0, 16.0)  # code values that attacks may move a pixel by, by severity
 AT_ONCE, AT_ONCE_GPU = 8, 24  # pictures that are attacked at once; other processes may share the GPU's memory
-STEPPED: Final = ("pgd", "cw", "momentum", "apgd")  # attacks whose steps a picture a name may say, as in attack-pgd-2
-STEPS: Final = 5  # of those whose name says nothing: on YOLOv5n two steps of 16 code values change nothing, five do
+STEPPED: Final = ("pgd", "cw", "momentum", "apgd")  # attacks whose name may end in their steps a picture
+STEPS: Final = 5  # where it does not; docs/gap.md: two steps of 16 code values change nothing on YOLOv5n
 
 
 @lru_cache(maxsize=1)
@@ -77,18 +77,13 @@ def family_of(name: str) -> str:
         shining(name)
         return LIGHT
     names = perturbation_names()
-    plain = plain_name(name)
-    if plain not in names:
+    if name in names:
+        return names[name]
+    method, options = method_of(name)
+    if f"{ATTACK}{method}" not in names or not name.startswith(ATTACK):
         raise unknown_name("perturbation", name, names)
-    if plain != name:
-        method, options = method_of(name)
-        make_attack(method, **options)  # it may want more steps
-    return names[plain]
-
-
-def plain_name(name: str) -> str:
-    """Of a perturbation without the steps of an attack: attack-pgd for attack-pgd-2."""
-    return ATTACK + method_of(name)[0] if name.startswith(ATTACK) else name
+    make_attack(method, **options)  # it may want more steps
+    return names[f"{ATTACK}{method}"]
 
 
 def method_of(name: str) -> tuple[str, dict[str, int]]:

@@ -184,7 +184,7 @@ class World:
 
     def launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> Any:
         """A recorded launch: its arguments are packed once."""
-        # `meet` is the faster in larger blocks; its module would be compiled twice if `sight` had others
+        # `meet` is faster in blocks of 256, the default; `sight` is in the same module, which is compiled for one size
         block = None if self.device == "cpu" or kernel in (sight, meet) else BLOCK
         return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block, record_cmd=True)
 

@@ -97,7 +97,7 @@ def turned(pose: wp.vec3, distance: float, curvature: float) -> wp.vec3:
 #endif
 """)
 def put_four(poses: wp.array3d(dtype=wp.vec3), at: int, p: wp.vec3, q: wp.vec3, r: wp.vec3, s: wp.vec3):
-    """Four neighbours of a contiguous array, from a number on that four divides; on CUDA written in three pieces."""
+    """Write four poses at flat index `at`, a multiple of 4, of a contiguous array; on CUDA in stores of 16 bytes."""
 
 
 @wp.func

@@ -3,10 +3,10 @@
 The proposal is a mixture: the process as it is (the defence, which bounds every weight), and copies of it in which the
 means of the normal numbers are moved. They are learned from failures: first from those that splitting finds, then, by
 the cross-entropy method, from those of all rounds' episodes, each with its weight among all that was drawn. Two kinds
-of copies cover failures that are too rare to be learned from, would be drawn by the defence alone, hardly ever, and
-weigh as much as all others together: what is moved half as far, for failures that need less than most, and what is
-moved some time later (`Process.later`), for those that come later than most. The weights are exact, since the
-likelihood ratio of moved normal numbers needs only their sums.
+of copies cover failures that are too rare to be learned from: what is moved half as far, for failures that need less
+than most, and what is moved some time later (`Process.later`), for those that come later than most. Without the copies
+such a failure is drawn very seldom, and then its weight exceeds that of all others together. The weights are exact,
+since the likelihood ratio of moved normal numbers needs only their sums.
 
 Source: Owen and Zhou, "Safe and effective importance sampling" (2000), the mixture and its weights; Veach and Guibas,
 "Optimally combining sampling techniques" (1995), the weights of several rounds together; Rubinstein and Kroese, "The

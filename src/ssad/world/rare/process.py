@@ -17,7 +17,7 @@ from ssad.world.rollout import Loop
 from ssad.world.world import World
 
 _HARD = 8.0  # m/s^2
-_LEAST_GAIN = 0.3  # of a stretch: less, and making up for a start would move its means by more than three times that
+_LEAST_GAIN = 0.3  # with less, a stretch would need more than 3 times the movement of a start to make up for it
 Rows = npt.NDArray[np.intp]
 
 

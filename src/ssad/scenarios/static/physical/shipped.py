@@ -31,7 +31,7 @@ class TextureCard:
         options: Of the carrier.
         source: The detector that was attacked.
         weights: Hash of that detector's weights.
-        target: The car, as for `ssad record --target`.
+        target: What wears it, as for `ssad record --target`.
         data: What it was trained on.
         command: Command that reproduces it.
         epochs: Of the training.
