@@ -131,12 +131,13 @@ def coverage(data: dict[str, Any], brutes: list[dict[str, Any]]) -> list[str]:
     truth, named = pooled, "the mean of all estimates of importance sampling"
     if best is not None and best["events"] >= 5000:
         truth, named = best["probability"], "brute force"
+    place = f" --device {data['device']}" if data.get("device", "cpu") != "cpu" else ""
     steps = best["work"] / best["episodes"] if best else float("nan")
     beside = f"; brute force: {best['probability']:.4g} ({best['low']:.3g} to {best['high']:.3g})" if best else ""
     lines = [
         f"### Lapses {data['noise']['lapse']:.1%} of the time: near {10 ** round(math.log10(pooled)):.0e}",
         f"`python -m benchmarks.how_often coverage --lapse {data['noise']['lapse']:g} --repeats {data['repeats']} "
-        f"--share {data['share']} --each {data['each']}`: every estimate has its own {data['each']:,} episodes; "
+        f"--share {data['share']} --each {data['each']}{place}`: every estimate has its own {data['each']:,} episodes; "
         f"{data['share']} of importance sampling share a proposal, of which each counts the whole training. An "
         f"interval holds if it contains {named} ({truth:.4g}{beside}). What brute force would need is "
         "1.96^2 (1 - p) / (p h^2) episodes for the half-width h, relative to p, that the estimates have in the mean.",
