@@ -141,7 +141,7 @@ def record(
     context: typer.Context,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for the dataset.")],
     towns: Annotated[
-        str, typer.Option(help="Comma-separated towns (see: ssad list towns).")
+        str, typer.Option(help="Comma-separated towns (see: ssad list towns; also Random0, Random1, ...).")
     ] = "Twinford,Crossgate,Oldmarket,Larkhill",
     held_out: Annotated[str, typer.Option(help="Towns of the split val; all others are train.")] = "Oldmarket,Larkhill",
     scenes: Annotated[int, typer.Option(min=1, help="Scenes per town.")] = 2,

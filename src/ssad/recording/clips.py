@@ -13,7 +13,7 @@ from ssad.core.errors import ConfigError, unknown_name
 from ssad.recording.drives import check_streets
 from ssad.recording.nuscenes_recorder import HELD_OUT, WEATHERS
 from ssad.recording.target import Target, TargetSign, TargetWalker
-from ssad.roads import town_names
+from ssad.roads import is_town
 
 AZIMUTHS: Final = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)  # of an orbit, degrees
 ELEVATIONS: Final = (0.0, 15.0, 30.0)
@@ -56,7 +56,7 @@ class Clips:
 
     def __post_init__(self) -> None:
         for town in (*(t for t, _ in self.images), *self.held_out):
-            if town not in town_names():
+            if not is_town(town):
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
         check_streets(self.streets)
         if not self.images or self.mode not in ("drive", "orbit"):

@@ -43,7 +43,7 @@ from ssad.jobs.pool import Pool, open_pool, run_all
 from ssad.jobs.store import locked
 from ssad.recording.drives import check_streets, drive_street, make_drive
 from ssad.recording.scene_objects import PlacedObject, SceneObjects, place_objects
-from ssad.roads import load_town, town_names
+from ssad.roads import is_town, load_town
 
 TOWNS: Final = ("Twinford", "Crossgate", "Oldmarket", "Larkhill")
 HELD_OUT: Final = ("Oldmarket", "Larkhill")
@@ -89,7 +89,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         for town in self.towns:
-            if town not in town_names():
+            if not is_town(town):
                 raise ConfigError(f"unknown town '{town}' (see: ssad list towns)")
         check_streets(self.streets)
         if not self.towns or self.scenes < 1:

@@ -2,7 +2,7 @@
 
 from ssad.core.lane_graph import LaneGraph, Marking, load_graph, save_graph
 from ssad.roads.bake import bake, import_map
-from ssad.roads.library import load_town, town_names, town_signals, town_xodr
+from ssad.roads.library import is_town, load_town, town_names, town_signals, town_xodr
 from ssad.roads.query import LaneQuery, Nearest
 from ssad.roads.router import random_route, route_along
 
@@ -13,6 +13,7 @@ __all__ = [
     "Nearest",
     "bake",
     "import_map",
+    "is_town",
     "load_graph",
     "load_town",
     "random_route",

@@ -11,6 +11,7 @@ from ssad.core.errors import MapError, unknown_name
 from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.safeio import home, read_text
 from ssad.roads.bake import bake
+from ssad.roads.random_towns import RANDOM, write_random_town
 from ssad.roads.signals import signal_names
 from ssad.roads.xodr import MAX_BYTES, read_network
 
@@ -25,6 +26,11 @@ def town_names() -> dict[str, str]:
     return found
 
 
+def is_town(name: str) -> bool:
+    """Whether this is the name of a town: one of `town_names`, or Random and a number (see `random_town`)."""
+    return name in town_names() or RANDOM.fullmatch(name) is not None
+
+
 def load_town(name: str) -> LaneGraph:
     """The lane graph of a town: its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
 
@@ -36,6 +42,8 @@ def load_town(name: str) -> LaneGraph:
     path = home() / "towns" / f"{name}.npz" if Path(name).name == name else Path(name)
     if path.suffix == ".npz" and path.is_file():
         return _stored(str(path), path.stat().st_mtime_ns)
+    if RANDOM.fullmatch(name):
+        return _random(name)
     if Path(name).suffix == ".xodr":
         return bake(Path(name))
     if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
@@ -53,6 +61,8 @@ def town_xodr(name: str) -> str:
 
     if name in BUILT_IN:
         return generate_town(name)
+    if RANDOM.fullmatch(name):
+        return write_random_town(name)
     plain = Path(name).name == name and Path(name).suffix != ".xodr"
     path = home() / "towns" / f"{name}.xodr" if plain else Path(name).with_suffix(".xodr")
     if not path.is_file():
@@ -75,6 +85,14 @@ def _built_in(name: str) -> LaneGraph:
         return load_graph(path)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
+def _random(name: str) -> LaneGraph:
+    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
+        path = Path(folder) / f"{name}.xodr"
+        path.write_text(write_random_town(name), encoding="utf-8")
+        return bake(path, name)
+
+
+@lru_cache(maxsize=64)
 def _stored(path: str, changed: int) -> LaneGraph:
     return load_graph(path)
