@@ -25,6 +25,7 @@ from ssad.core.checkpoints import (
     load_weights,
     read_card,
     save_weights,
+    start_from,
 )
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import MIB
@@ -473,6 +474,20 @@ def test_fitting_is_strict_and_says_why() -> None:
     )
     assert "holds int8 numbers" in refused(state | {"head.weight": state["head.weight"].to(torch.int8)})
     assert "missing" in refused({})
+
+
+def test_layers_of_another_shape_or_name_start_fresh() -> None:
+    state, module = dict(toy().state_dict()), Toy(classes=80)
+    fresh = dict(module.head.state_dict(prefix="head.", keep_vars=False))
+    wanted = {k: fresh[k].clone() if k in fresh else v for k, v in state.items()}
+    assert start_from(module, state | {"other.weight": torch.zeros(2)}, "w.pth") == ["head.weight", "head.bias"]
+    assert same(dict(module.state_dict()), wanted)
+    assert start_from(toy(), state, "w.pth") == []
+    few = {k: v for k, v in state.items() if "head" in k}
+    with pytest.raises(FormatError, match="these are not the weights of"):
+        start_from(Toy(), few, "w.pth")
+    with pytest.raises(FormatError, match="NaN or infinite"):
+        start_from(Toy(), state | {"head.bias": torch.full_like(state["head.bias"], torch.nan)}, "w.pth")
 
 
 def test_counters_of_steps_may_be_missing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lens, lively, perfect, some_truth
+from helpers.mono3d import TINY, TINY_PGD, TINY_PGD_VECTORS, TINY_VECTORS, lens, lively, perfect, some_truth
 from torch import Tensor
 
 from ssad.core.detections import Assignment, Dense, Solids, Truth
@@ -16,20 +16,23 @@ from ssad.detectors.mono3d.detector import Mono3D
 FCOS = {"cls", "offset", "depth", "size", "rotsin", "velo", "dir", "attr", "centerness"}
 PGD = FCOS | {"bbox2d", "consistency"}
 BOTH = pytest.mark.parametrize("config", [TINY, TINY_PGD], ids=["fcos3d", "pgd"])
+ALL = [TINY, TINY_PGD, TINY_VECTORS, TINY_PGD_VECTORS]
+NAMES = ["fcos3d", "pgd", "vectors", "pgd, vectors"]
 
 
 VIRTUAL = 400 / 1.2  # the lens of `some_truth` has 1.2 times this focal length
 
 
 @pytest.mark.parametrize(
-    "config", [TINY, TINY_PGD, replace(TINY, virtual_focal=VIRTUAL), replace(TINY_PGD, virtual_focal=VIRTUAL)],
-    ids=["fcos3d", "pgd", "fcos3d, other lens", "pgd, other lens"],
+    "config", [*ALL, replace(TINY, virtual_focal=VIRTUAL), replace(TINY_PGD, virtual_focal=VIRTUAL)],
+    ids=[*NAMES, "fcos3d, other lens", "pgd, other lens"],
 )  # fmt: skip
 def test_the_truth_costs_nothing(config: Mono3DConfig) -> None:
     detector = Mono3D(config).double()
     dense, assignment = perfect(detector, some_truth(), (225, 400))
     found = detector.losses(dense, assignment)
-    assert set(found) == (PGD if config.pgd else FCOS)
+    names = PGD if config.pgd else FCOS
+    assert set(found) == (names if config.heading == "bins" else names - {"rotsin", "dir"} | {"heading"})
     for name in set(found) - {"centerness"}:
         assert float(found[name]) == pytest.approx(0.0, abs=1e-9), name
     near = assignment.extra["centreness"][assignment.label >= 0].clamp(1e-9, 1 - 1e-9)
@@ -86,6 +89,17 @@ def test_yaw_is_compared_by_the_sine_of_the_difference(told: tuple[Mono3D, Dense
         assert float(detector.losses(nudge(dense, 6, by), assignment)["rotsin"]) == pytest.approx(wanted, abs=1e-9)
 
 
+def test_vectors_of_the_yaw_are_compared_by_smooth_l1() -> None:
+    detector = Mono3D(replace(TINY_VECTORS, code_weights=(1, 1, 0.2, 1, 1, 1, 0.5, 0.05, 0.05))).double()
+    dense, assignment = perfect(detector, some_truth(), (225, 400))
+    vectors = [m.clone() for m in dense.maps["dir_cls_preds"]]
+    for m in vectors:
+        m[:, 0] += 0.05
+        m[:, 3] -= 0.8
+    found = detector.losses(replace(dense, maps={**dense.maps, "dir_cls_preds": vectors}), assignment)
+    assert float(found["heading"]) == pytest.approx(0.5 * (0.05**2 * 4.5 + 0.8 - 1 / 18))
+
+
 def test_pgd_compares_the_fused_depth() -> None:
     detector = Mono3D(TINY_PGD).double()
     dense, assignment = perfect(detector, some_truth(), (225, 400))
@@ -98,7 +112,7 @@ def test_pgd_compares_the_fused_depth() -> None:
     assert wider["bbox2d"] > 0
 
 
-@BOTH
+@pytest.mark.parametrize("config", ALL, ids=NAMES)
 @pytest.mark.parametrize("resized", [False, True])
 def test_sums_over_a_batch(config: Mono3DConfig, resized: bool) -> None:
     """Batch: over all positives; image: as if alone; and no image's losses depend on the others."""

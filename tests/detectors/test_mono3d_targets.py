@@ -5,13 +5,24 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lens, perfect, some_truth, truth_of
+from helpers.mono3d import TINY, TINY_PGD, TINY_PGD_VECTORS, TINY_VECTORS, lens, perfect, some_truth, truth_of
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.detectors.mono3d.config import FCOS3D, Mono3DConfig
-from ssad.detectors.mono3d.decode import Places, corners, places_of, project, unproject
+from ssad.detectors.mono3d.decode import (
+    Places,
+    corners,
+    global_yaw,
+    places_of,
+    project,
+    unproject,
+    vectors_of_yaw,
+    yaw_of_vectors,
+)
 from ssad.detectors.mono3d.detector import Mono3D
 from ssad.detectors.mono3d.targets import assign
 
@@ -138,8 +149,8 @@ RESIZED = replace(TINY, input_width=600, virtual_focal=500.0)
 
 @pytest.mark.parametrize(
     "config",
-    [TINY, TINY_PGD, RESIZED, replace(TINY_PGD, input_width=300, virtual_focal=500.0)],
-    ids=["fcos3d", "pgd", "resized", "pgd resized"],
+    [TINY, TINY_PGD, RESIZED, replace(TINY_PGD, input_width=300, virtual_focal=500.0), TINY_VECTORS, TINY_PGD_VECTORS],
+    ids=["fcos3d", "pgd", "resized", "pgd resized", "vectors", "pgd vectors"],
 )
 @pytest.mark.parametrize("seed", [0, 1])
 def test_maps_that_say_the_truth_decode_to_it(config: Mono3DConfig, seed: int) -> None:
@@ -167,8 +178,9 @@ def test_maps_that_say_the_truth_decode_to_it(config: Mono3DConfig, seed: int) -
     assert len(found.label) == len(owners)  # neighbouring places say the same, and one stays
 
 
-def test_yaw_comes_back_from_all_around() -> None:
-    detector = Mono3D(TINY).double()
+@pytest.mark.parametrize("config", [TINY, TINY_VECTORS], ids=["bins", "vectors"])
+def test_yaw_comes_back_from_all_around(config: Mono3DConfig) -> None:
+    detector = Mono3D(config).double()
     size = torch.tensor([2.0, 1.5, 1.0], dtype=torch.float64).expand(3, 3)
     centre = torch.tensor([[-6.0, 0.3, 15], [0.5, 0, 15], [6, -0.3, 16]], dtype=torch.float64)
     for first in torch.linspace(-math.pi, -math.pi / 3, 5, dtype=torch.float64):
@@ -179,6 +191,31 @@ def test_yaw_comes_back_from_all_around() -> None:
         assert found.label.tolist() == [0, 1, 2]
         for said, true in zip(found.solid.yaw.tolist(), yaw.tolist(), strict=True):
             assert math.remainder(said - true, 2 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+@given(
+    st.floats(-10.0, 10.0), st.floats(0.1, 5.0), st.floats(0.1, 5.0), st.floats(-0.9, 0.9), st.floats(-0.9, 0.9),
+)  # fmt: skip
+def test_yaw_of_vectors_has_no_border(yaw: float, length: float, length2: float, off: float, off2: float) -> None:
+    """The axis errs by half of what the second pair errs, and any error below a quarter turn leaves the side."""
+    true = torch.tensor(yaw, dtype=torch.float64)
+    one, two = vectors_of_yaw(true + off)[:2] * length, vectors_of_yaw(true + off2 / 2)[2:] * length2
+    said = float(yaw_of_vectors(torch.cat([one, two])))
+    assert math.remainder(said - yaw, 2 * math.pi) == pytest.approx(off2 / 2, abs=1e-9)
+    assert -math.pi / 2 <= said <= 3 * math.pi / 2
+    back = vectors_of_yaw(true + math.pi)  # seen from behind, with the same axis
+    assert back[2:].tolist() == pytest.approx(vectors_of_yaw(true)[2:].tolist())
+
+
+def test_a_bin_turns_what_lies_beside_its_border_and_vectors_do_not() -> None:
+    """A yaw 2 degrees beyond the border whose bin is told for the other side comes out turned by half a turn."""
+    border, lens_here = FCOS3D.dir_offset, lens()
+    true, said = border + 0.035, torch.tensor(border - 0.035, dtype=torch.float64)
+    u = lens_here[0, 2]
+    wrong = global_yaw(said, torch.tensor(0), u, lens_here, offset=border)
+    assert abs(math.remainder(float(wrong) - true, 2 * math.pi)) > 3.0
+    whole = global_yaw(yaw_of_vectors(vectors_of_yaw(said)), None, u, lens_here, offset=border)
+    assert abs(math.remainder(float(whole) - true, 2 * math.pi)) < 0.08
 
 
 def test_corners_are_half_the_diagonal_from_the_centre() -> None:

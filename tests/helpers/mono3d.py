@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from ssad.core.detections import Assignment, Dense, Solids, Truth
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import FCOS3D, PGD_DET, Mono3DConfig
-from ssad.detectors.mono3d.decode import corners, hull, project
+from ssad.detectors.mono3d.decode import corners, hull, project, vectors_of_yaw
 from ssad.detectors.mono3d.detector import Mono3D
 
 TINY = replace(FCOS3D, name="tiny", trunk=18, width=8, channels=32, strides=(8, 16, 32), ranges=(48.0, 96.0, 1e8))
 TINY_PGD = replace(TINY, name="tiny-pgd", pgd=True, threshold=0.01, code_weights=PGD_DET.code_weights)
+TINY_VECTORS, TINY_PGD_VECTORS = (replace(c, heading="vectors") for c in (TINY, TINY_PGD))
 
 
 def lens(focal: float = 400.0, size: tuple[int, int] = (225, 400)) -> Tensor:
@@ -67,7 +68,8 @@ def lively(config: Mono3DConfig, *, seed: int = 0, double: bool = False) -> Mono
             fill(part.running_mean, 0.1)
             part.running_var.data.copy_(0.5 + torch.rand(part.running_var.shape, generator=draws))
     head = detector.bbox_head
-    for last in (head.conv_cls, head.conv_dir_cls, head.conv_attr, head.conv_centerness, *head.conv_regs):
+    turns = (head.conv_dir_cls,) if config.heading == "bins" else ()
+    for last in (head.conv_cls, *turns, head.conv_attr, head.conv_centerness, *head.conv_regs):
         fill(last.weight, 0.2)
     if config.pgd:
         fill(head.conv_depth_cls.weight, 0.2)
@@ -91,12 +93,14 @@ def perfect(detector: Mono3D, truth: Truth, size: tuple[int, int]) -> tuple[Dens
     reg[:, 9:] *= stride[:, None]
     turned = (reg[:, 6] - config.dir_offset) % (2 * math.pi)
     direction = 60.0 * nn.functional.one_hot((turned >= math.pi).long(), 2) - 30.0
+    if config.heading == "vectors":
+        direction = vectors_of_yaw(reg[:, 6])
     logit = torch.full((len(label), 10), -30.0, dtype=torch.float64)
     logit[owned, label[owned]] = 30.0
     attribute = 60.0 * nn.functional.one_hot(found.extra["attribute"][0], 9) - 30.0
     centreness = torch.logit(found.extra["centreness"][0].clamp(1e-9, 1 - 1e-9))
     rows = {
-        "cls_scores": logit, "bbox_preds": reg[:, : sum(config.groups)], "dir_cls_preds": direction,
+        "cls_scores": logit, "bbox_preds": reg[:, : 13 if config.pgd else 9], "dir_cls_preds": direction,
         "attr_preds": attribute, "centernesses": centreness[:, None],
     }  # fmt: skip
     if config.pgd:

@@ -380,6 +380,29 @@ def fit_state(module: nn.Module, state: Mapping[str, Tensor], where: str | Path)
             own[key].copy_(value)
 
 
+def start_from(module: nn.Module, state: Mapping[str, Tensor], where: str | Path) -> list[str]:
+    """Copy the weights that fit into a module, to train it on; layers of another shape or name stay fresh.
+
+    Args:
+        module: The module, with fresh weights.
+        state: Tensors by name.
+        where: Where they come from, for messages.
+
+    Returns:
+        Names of the weights that stay fresh.
+
+    Raises:
+        FormatError: Fewer than four fifths of the module's weights are there, or values are NaN or infinite.
+    """
+    own = module.state_dict()
+    shared = {key: value for key, value in state.items() if key in own and own[key].shape == value.shape}
+    if len(shared) < 0.8 * len(own):
+        fit_state(module, state, where)  # says what differs
+    else:
+        fit_state(module, {**own, **shared}, where)
+    return [key for key in own if key not in shared and not key.endswith(COUNTER)]
+
+
 def _listed(what: str, keys: list[str], others: Iterable[str]) -> str:
     if not keys:
         return ""

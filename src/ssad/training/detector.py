@@ -19,7 +19,7 @@ from torch import distributed
 from torch.multiprocessing.spawn import ProcessRaisedException, spawn
 
 from ssad.core import errors, safeio
-from ssad.core.checkpoints import Card, fit_state, hash_state, load_weights, save_weights
+from ssad.core.checkpoints import Card, hash_state, load_weights, save_weights, start_from
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
@@ -49,7 +49,7 @@ class Plan:
         split: Split to train on.
         val: Split to validate on.
         changes: Changed values of the recipe.
-        weights: First weights; None: fresh ones.
+        weights: First weights; None: fresh ones. Layers of another shape start fresh.
         device: auto, cpu or cuda.
         gpus: How many GPUs to train on.
         seconds: Time limit, s; None: none.
@@ -190,9 +190,11 @@ def _worker(rank: int, plan: Plan, recipe: Recipe, port: int, backend: str) -> N
 def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> None:
     """Data, detector, training, weights. What can be wrong is looked at before pictures are read."""
     items, options = _items(plan, three=recipe.three)
-    detector = make_detector(recipe.detector, weights="random", device="cpu", **options)
+    detector = make_detector(recipe.detector, weights="random", device="cpu", **options | recipe.options)
     if plan.weights is not None:
-        fit_state(detector, load_weights(plan.weights), str(plan.weights))
+        fresh = start_from(detector, load_weights(plan.weights), str(plan.weights))
+        if fresh:
+            say(f"{plan.weights}: {len(fresh)} weights do not fit and start fresh: {', '.join(fresh)}")
     about = digest("training", share.world, hash_state(detector.state_dict()), _hash_items(items))[:16]
     last = read_last(plan.out / LAST, recipe, about)
     validate = _validation(plan, device, three=recipe.three)

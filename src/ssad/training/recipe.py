@@ -59,6 +59,8 @@ class Recipe:
         radius: Adversarial training: every picture is attacked by PGD on the training losses within this L-infinity
             radius (code values of 0..255); 0: none.
         attack_steps: Gradient steps of these attacks.
+        options: Of the detector's builder, such as heading: vectors; `make_detector` needs them again to load the
+            weights.
         seed: Of all random draws.
     """
 
@@ -91,6 +93,7 @@ class Recipe:
     validate: Whole = 5
     radius: Least = 0.0
     attack_steps: Whole = 1
+    options: dict[str, Any] = field(default_factory=dict)
     seed: FromNone = 0
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ Sources: Wang et al., FCOS3D (ICCVW 2021); Wang et al., PGD (CoRL 2021); mmdetec
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from ssad.core.errors import ConfigError
 
@@ -63,6 +64,11 @@ class Mono3DConfig:
             the optical axis), so that the line where an object meets the ground tells its distance for any lens.
         radius: Radius of centre sampling, in strides.
         dir_offset: Offset of the yaw's direction bins, rad.
+        heading: How the yaw is told. "bins": a number that holds up to half a turn, and a bin of half a turn that says
+            which half, as in the source. Beside the border of the bins (at `dir_offset` and half a turn on) the bin is
+            a guess that turns the box round, and the number has a seam somewhere. "vectors": cosine and sine of the
+            yaw and of twice the yaw, which have neither: the second pair tells the axis, even of what looks alike from
+            both ends, the first which way along it.
     """
 
     name: str
@@ -92,6 +98,7 @@ class Mono3DConfig:
     rays: bool = False
     radius: float = 1.5
     dir_offset: float = 0.7854
+    heading: Literal["bins", "vectors"] = "bins"
 
     def __post_init__(self) -> None:
         if self.trunk not in (18, 50, 101):
@@ -102,13 +109,16 @@ class Mono3DConfig:
             raise ConfigError(f"{self.name}: strides are 8, 16, 32 and may go on to 64 and 128, not {self.strides}")
         if self.pgd and self.start is not None:
             raise ConfigError(f"{self.name}: PGD starts from its own mean depth and sizes; leave start out")
+        if self.heading not in {"bins", "vectors"}:
+            raise ConfigError(f"{self.name}: heading '{self.heading}'; choose bins or vectors")
         if self.input_width is not None and self.input_width < 64:
             raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
 
     @property
     def groups(self) -> tuple[int, ...]:
         """Channels of each part of the regression: offset, depth, size, yaw, velocity (, 2D box)."""
-        return (2, 1, 3, 1, 2, 4) if self.pgd else (2, 1, 3, 1, 2)
+        yaw = 1 if self.heading == "bins" else 4
+        return (2, 1, 3, yaw, 2, 4) if self.pgd else (2, 1, 3, yaw, 2)
 
 
 _PGD_WEIGHTS = (1, 1, 0.2, 1, 1, 1, 1, 0.05, 0.05, 0.2, 0.2, 0.2, 0.2)

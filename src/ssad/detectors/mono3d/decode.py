@@ -17,7 +17,7 @@ class Flat:
     Attributes:
         logit: Class logits [B, P, 10].
         reg: Regression [B, P, 9 or 13]; see `Head.forward`.
-        direction: Logits of the direction bins [B, P, 2].
+        direction: Logits of the direction bins [B, P, 2], or the vectors of the yaw [B, P, 4].
         attribute: Logits of the attributes [B, P, 9].
         centreness: Logits [B, P].
         bins: Logits of the depth bins [B, P, 6]; None without them.
@@ -103,11 +103,30 @@ def project(points: Tensor, lens: Tensor, *, near: float | None = NEAR) -> Tenso
     return flat[..., :2] / depth.clamp_min(near)
 
 
-def global_yaw(local: Tensor, direction: Tensor, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
-    """Yaw from the regressed one (mod pi), the direction bin [...] and the column u of the centre; lens [..., 3, 3].
+def vectors_of_yaw(yaw: Tensor) -> Tensor:
+    """Cosine and sine of the yaw and of twice the yaw [..., 4]."""
+    return torch.stack([yaw.cos(), yaw.sin(), (2 * yaw).cos(), (2 * yaw).sin()], -1)
 
-    The viewing angle is taken from the focal length along x, as in the source.
+
+def yaw_of_vectors(vectors: Tensor, dim: int = -1) -> Tensor:
+    """Yaw (-pi/2 to 3 pi/2) from cosine and sine of it and of twice it, which need not be of length 1, along `dim`.
+
+    The second pair tells the axis, the first which way along it.
     """
+    cos, sin, cos2, sin2 = vectors.unbind(dim)
+    axis = torch.atan2(sin2, cos2) / 2
+    back = axis.cos() * cos + axis.sin() * sin < 0
+    return axis + torch.pi * back.to(axis.dtype)
+
+
+def global_yaw(local: Tensor, direction: Tensor | None, u: Tensor, lens: Tensor, *, offset: float) -> Tensor:
+    """Yaw from the regressed one, the direction bin [...] and the column u of the centre; lens [..., 3, 3].
+
+    With a bin, the regressed yaw holds up to half a turn; without (None), it is whole. The viewing angle is taken from
+    the focal length along x, as in the source.
+    """
+    if direction is None:
+        return local + ray_angle(u, lens)
     turned = local - offset
     turned = turned - (turned / torch.pi).floor() * torch.pi
     return turned + offset + torch.pi * direction.to(local.dtype) + ray_angle(u, lens)

@@ -315,7 +315,7 @@ class Mono3D(nn.Module):
         own = lens if image is None else lens[image]
         depth = self._depth(flat, own)
         centre = unproject(torch.cat([centre2d, depth[..., None]], -1), lens, image)
-        direction = flat.direction.argmax(-1)
+        direction = flat.direction.argmax(-1) if self.config.heading == "bins" else None
         yaw = global_yaw(flat.reg[..., 6], direction, centre2d[..., 0], own, offset=self.config.dir_offset)
         return centre, flat.reg[..., 3:6], yaw
 

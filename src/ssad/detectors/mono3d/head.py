@@ -14,6 +14,7 @@ from torch.nn import functional
 from ssad.core.nuscenes_names import MMDET3D_ATTRIBUTES, MMDET3D_CLASSES
 from ssad.detectors.mono3d.backbone import DeformConv
 from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
+from ssad.detectors.mono3d.decode import yaw_of_vectors
 
 BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
 
@@ -121,8 +122,9 @@ class Head(nn.Module):
             nn.ModuleList([] if k == 4 else [Unit(c, c)]) for k in range(len(config.groups))
         )
         self.conv_regs = nn.ModuleList(_last(c, size) for size in config.groups)
-        self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
-        self.conv_dir_cls = _last(c, 2, rare=True)
+        if config.heading == "bins":
+            self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
+            self.conv_dir_cls = _last(c, 2, rare=True)
         self.conv_attr_prev = nn.ModuleList([Unit(c, c)])
         self.conv_attr = _last(c, len(MMDET3D_ATTRIBUTES), rare=True)
         narrow = max(c // 4, 32)
@@ -154,7 +156,9 @@ class Head(nn.Module):
 
         Returns:
             cls_scores [B, 10, h, w]; bbox_preds [B, 9 or 13, h, w] (offset in pixels, depth m, size m, yaw, velocity,
-            2D distances in pixels); dir_cls_preds; attr_preds; centernesses; and for PGD depth_cls_preds.
+            2D distances in pixels); dir_cls_preds: logits of the two bins, or with "vectors" cosine and sine of the
+            yaw and of twice the yaw, from which bbox_preds has its yaw [B, 2 or 4, h, w]; attr_preds; centernesses;
+            and for PGD depth_cls_preds.
         """
         found: dict[str, list[Tensor]] = {}
         for level, x in enumerate(maps):
@@ -175,10 +179,14 @@ class Head(nn.Module):
             for unit in prev.children():
                 value = unit(value)
             parts.append(_full(last(value)))
+        if self.config.heading == "bins":
+            direction = _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes)))
+        else:
+            direction, parts[3] = parts[3], yaw_of_vectors(parts[3], 1)[:, None]
         found = {
             "cls_scores": logit,
             "bbox_preds": self._decode(level, parts, logit, lens),
-            "dir_cls_preds": _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes))),
+            "dir_cls_preds": direction,
             "attr_preds": _full(self.conv_attr(self.conv_attr_prev[0](kinds))),
             "centernesses": _full(self.conv_centerness(self.conv_centerness_prev[0](boxes))),
         }

@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from ssad.core.detections import Assignment
 from ssad.detectors.mono3d.config import Mono3DConfig
-from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject
+from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject, vectors_of_yaw
 
 BETA = 1.0 / 9.0  # of smooth L1
 Reduction = Literal["batch", "image"]
@@ -35,7 +35,8 @@ def losses(
         reduction: "batch": over all images; "image": each image's own.
 
     Returns:
-        cls, offset, depth, size, rotsin, velo, dir, attr, centerness, and for PGD bbox2d and consistency.
+        cls, offset, depth, size, rotsin, velo, dir, attr, centerness, and for PGD bbox2d and consistency; where the yaw
+        is told by vectors, heading in place of rotsin and dir.
     """
     label = assignment.label
     image, place = (label >= 0).nonzero(as_tuple=True)
@@ -59,14 +60,19 @@ def losses(
     found["offset"] = smooth(reg[:, :2] / stride[:, None], target[:, :2], 0)
     found["depth"] = smooth((depth / unit)[:, None], (target[:, 2] / unit)[:, None], 2)
     found["size"] = smooth(reg[:, 3:6], target[:, 3:6], 3)
-    said, true = reg[:, 6], target[:, 6]
-    found["rotsin"] = smooth((said.sin() * true.cos())[:, None], (said.cos() * true.sin())[:, None], 6)
     moved, known = target[:, 7:9], target[:, 7:9].isfinite()
     found["velo"] = smooth(torch.where(known, reg[:, 7:9], 0.0), torch.where(known, moved, 0.0), 7)
-    turned = true - config.dir_offset
-    turned = turned - (turned / (2 * torch.pi)).floor() * 2 * torch.pi
-    side = (turned / torch.pi).floor().long().clamp(0, 1)
-    found["dir"] = total.mean(functional.cross_entropy(flat.direction[image, place], side, reduction="none"))
+    true, direction = target[:, 6], flat.direction[image, place]
+    if config.heading == "vectors":
+        off = functional.smooth_l1_loss(direction, vectors_of_yaw(true), beta=BETA, reduction="none")
+        found["heading"] = total.mean(off.sum(1) * weights[6])
+    else:
+        said = reg[:, 6]
+        found["rotsin"] = smooth((said.sin() * true.cos())[:, None], (said.cos() * true.sin())[:, None], 6)
+        turned = true - config.dir_offset
+        turned = turned - (turned / (2 * torch.pi)).floor() * 2 * torch.pi
+        side = (turned / torch.pi).floor().long().clamp(0, 1)
+        found["dir"] = total.mean(functional.cross_entropy(direction, side, reduction="none"))
     kind = functional.cross_entropy(
         flat.attribute[image, place], assignment.extra["attribute"][image, place], reduction="none"
     )
@@ -75,9 +81,9 @@ def losses(
     found["centerness"] = total.mean(centre)
     if config.pgd:
         found["bbox2d"] = smooth(reg[:, 9:] / stride[:, None], target[:, 9:], 9)
-        direction = flat.direction[image, place].argmax(-1)
+        bin_of = direction.argmax(-1) if config.heading == "bins" else None
         each = _consistency(
-            config, places.xy[place], reg, depth=depth, direction=direction, target=target, stride=stride,
+            config, places.xy[place], reg, depth=depth, direction=bin_of, target=target, stride=stride,
             lens=lens[image],
         )  # fmt: skip
         found["consistency"] = total.mean(each * weights[9:].mean())
@@ -85,8 +91,8 @@ def losses(
 
 
 def _consistency(
-    config: Mono3DConfig, xy: Tensor, reg: Tensor, *, depth: Tensor, direction: Tensor, target: Tensor, stride: Tensor,
-    lens: Tensor,
+    config: Mono3DConfig, xy: Tensor, reg: Tensor, *, depth: Tensor, direction: Tensor | None, target: Tensor,
+    stride: Tensor, lens: Tensor,
 ) -> Tensor:  # fmt: skip
     """1 - GIoU [M] of the 2D box with the hull of the projected corners of the 3D box.
 
@@ -98,7 +104,9 @@ def _consistency(
     centre2d = xy - reg[:, :2]
     centre = unproject(torch.cat([centre2d, depth[:, None]], 1), lens)
     centre = torch.cat([centre[:, :2], target[:, 2:3]], 1)
-    yaw = global_yaw(reg[:, 6], direction, centre2d[:, 0], lens, offset=config.dir_offset)
+    # vectors have a loss that is smooth everywhere; the angle between them is steep where they are short
+    local = reg[:, 6] if direction is not None else reg[:, 6].detach()
+    yaw = global_yaw(local, direction, centre2d[:, 0], lens, offset=config.dir_offset)
     shown = hull(project(corners(centre, reg[:, 3:6], yaw), lens[:, None], near=None))
     return 1 - _generalised_iou(shown, torch.cat([xy - reg[:, 9:11], xy + reg[:, 11:13]], 1))
 
