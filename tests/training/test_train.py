@@ -136,6 +136,8 @@ def test_what_is_missing_is_said_before_anything_is_read(
         (replace(deep, split="mini_train"), "mini_train"),
         (replace(deep, data=(tmp_path / "nowhere",)), "nowhere"),
         (replace(flat, gpus=2), "--gpus 2"),
+        (replace(deep, changes=(("options", {"depth": 50}),)), "fcos3d-light: no option 'depth'; there are before, "),
+        (replace(flat, changes=(("options", {"depth": 50}),)), "unexpected keyword argument 'depth'"),
     ):
         with pytest.raises((ConfigError, FormatError), match=words) as error:
             list(run_training(plan, say=lambda line: None))

@@ -74,7 +74,7 @@ def import_routes(
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
     from ssad.core.safeio import home
-    from ssad.roads import town_names
+    from ssad.roads import is_town
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
@@ -90,7 +90,7 @@ def import_routes(
     save_scenarios(path, scenarios)
     towns = sorted({s.town for s in scenarios})
     print(f"set {label}: {len(scenarios)} scenarios on {', '.join(towns)}, written to {path}")
-    if missing := [town for town in towns if town not in town_names()]:
+    if missing := [town for town in towns if not is_town(town)]:
         print(f"before they can run, import the maps of {', '.join(missing)}: ssad import map FILE.xodr")
     counted = Counter(re.sub(r": entry \d+", "", line) for line in left_out)
     for line, count in counted.items():

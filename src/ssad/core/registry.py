@@ -98,7 +98,9 @@ def split_weights(text: str) -> tuple[str, str]:
     return (name, file) if equals and "?" not in name else (text, "")
 
 
-def check_arguments(kind: str, text: str, found: Any, *, made: bool = False) -> None:
+def check_arguments(
+    kind: str, text: str, found: Any, *, made: bool = False, more: Mapping[str, Any] | None = None
+) -> None:
     """Check that what a reference names takes its arguments, without calling it.
 
     Args:
@@ -106,11 +108,12 @@ def check_arguments(kind: str, text: str, found: Any, *, made: bool = False) -> 
         text: The reference.
         found: What `resolve` found for it.
         made: Whether a class is called with these arguments alone, so that it must need no others.
+        more: Arguments beside those of the reference.
 
     Raises:
         ConfigError: It takes no such arguments, or needs more.
     """
-    options = Reference.of(text).options
+    options = {**Reference.of(text).options, **(more or {})}
     if not options and not (made and isinstance(found, type)):
         return
     if not callable(found):

@@ -46,7 +46,7 @@ def make_detector(
     """
     reference = Reference.of(name)
     build = resolve("detector", DETECTORS, reference.name)
-    check_arguments("detector", name, build)
+    check_arguments("detector", name, build, more=options)
     name, options = reference.name, {**reference.options, **options}
     if name not in DETECTORS:
         made = make("detector", name, build, options, ("task", "classes", "predict"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from ssad.detectors.mono3d.config import FCOS3D, FCOS3D_LIGHT
@@ -11,4 +10,4 @@ from ssad.detectors.mono3d.detector import Mono3D
 
 def fcos3d(*, light: bool = False, seed: int = 0, **options: Any) -> Mono3D:
     """FCOS3D with fresh weights; options: values of `Mono3DConfig`."""
-    return Mono3D(replace(FCOS3D_LIGHT if light else FCOS3D, **options), seed=seed)
+    return Mono3D((FCOS3D_LIGHT if light else FCOS3D).changed(options), seed=seed)

@@ -6,7 +6,6 @@ depth between objects is in no release, nor here.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from ssad.detectors.mono3d.config import PGD_DET, PGD_DET_LIGHT
@@ -15,4 +14,4 @@ from ssad.detectors.mono3d.detector import Mono3D
 
 def pgd_det(*, light: bool = False, seed: int = 0, **options: Any) -> Mono3D:
     """PGD-Det with fresh weights; options: values of `Mono3DConfig`."""
-    return Mono3D(replace(PGD_DET_LIGHT if light else PGD_DET, **options), seed=seed)
+    return Mono3D((PGD_DET_LIGHT if light else PGD_DET).changed(options), seed=seed)

@@ -26,7 +26,7 @@ from ssad.interchange.commonroad_writer import benchmark_map
 from ssad.interchange.commonroad_xml import STEP, VERSION, Texts, own_values
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import plan_of, scenario_name
-from ssad.roads import load_town, route_along, town_names
+from ssad.roads import is_town, load_town, route_along, town_names
 from ssad.roads.query import nearest_all
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import Place, lane_path
@@ -124,10 +124,10 @@ class _Reader:
         """The file's lanes, the town that it takes place in, whether that is known, and its name."""
         lanes = read_lanes(self.root, self.texts, town, self.lost)
         if map_name is not None:
-            known = map_name in town_names()
+            known = is_town(map_name)
             graph = load_town(map_name)
             return lanes, (graph if known else replace(graph, name=town)), known, (map_name if known else town)
-        if self.own.get("town") in town_names():
+        if is_town(self.own.get("town", "")):
             graph = load_town(self.own["town"])
             if _alike(graph, lanes.graph):
                 return lanes, graph, True, graph.name

@@ -21,7 +21,7 @@ from ssad.core.types import F64, Actor, Limits, Pose, Scenario, SignalPlan
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
-from ssad.roads import load_town, route_along, town_names
+from ssad.roads import is_town, load_town, route_along
 from ssad.roads.paths import graph_of_paths
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.frozen import Rows, told_rows
@@ -201,13 +201,13 @@ def _town(
 ) -> tuple[LaneGraph, bool]:
     """The town of a drive, and whether it can be loaded by its name."""
     if map_name is not None:
-        known = map_name in town_names()
+        known = is_town(map_name)
         graph = load_town(map_name)
         return (graph if known else replace(graph, name=town)), known
     if _ours(scene):
         assert scene.log is not None
         for told in (scene.log.location, scene.record.description.partition(",")[0]):
-            if told in town_names():
+            if is_town(told):
                 return load_town(told), True
     paths, speeds = [way[:, 1:3]], [_fastest(way)]
     for track in tracks:

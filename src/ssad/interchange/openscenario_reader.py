@@ -27,7 +27,7 @@ from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_places import Places, Values
 from ssad.interchange.openscenario_triggers import Triggers
 from ssad.interchange.scenario_parts import plan_of, scenario_name
-from ssad.roads import load_town, route_along, town_names, town_signals
+from ssad.roads import is_town, load_town, route_along, town_signals
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import lane_path, shifted
 from ssad.scenarios.dynamic.schema import MAX_SPEED
@@ -77,7 +77,7 @@ def read_openscenario(path: Path, *, map_name: str | None = None) -> Imported:
             raise FormatError(f"{path}: RoadNetwork: names no LogicFile; say which town it is with --map")
         told = Values(str(path), root).text(logic, "filepath")
         town = Path(told.replace("\\", "/")).stem
-        if town not in town_names():
+        if not is_town(town):
             raise FormatError(
                 f"{path}: its map is '{told[:80]}', and there is no town '{town[:80]}'; import the map first "
                 "(ssad import map FILE.xodr), or say which town it is with --map"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -97,19 +98,26 @@ def proving_ground() -> Town:
     return Town("ProvingGround", tuple(streets), signalled=(*inner, (a, low), (b, high), (high, a), (low, b)))
 
 
-def _shift(a: Point, b: Point, *, lead: float) -> tuple[Point, ...]:
+def shifted(a: Point, b: Point, *, lead: float, aside: float = 0.0) -> tuple[Point, ...]:
     """Points of a street from a to b that leaves and arrives along one axis and crosses over between.
 
-    lead: m from each end to where it turns. The axis is that of the longer side.
+    Args:
+        a: Where it begins, m.
+        b: Where it ends, m.
+        lead: From each end to where it turns, m. The axis is that of the longer side.
+        aside: How far to the left of the straight way from a to b it is in the middle, m; 0: no point is added there.
     """
     along = (1.0, 0.0) if abs(b[0] - a[0]) > abs(b[1] - a[1]) else (0.0, 1.0)
     step = along[0] * (b[0] - a[0]) + along[1] * (b[1] - a[1])
-    if abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9:
+    if not aside and (abs(b[0] - a[0]) < 1e-9 or abs(b[1] - a[1]) < 1e-9):
         return a, b
     sign = lead if step > 0.0 else -lead
     one = (a[0] + sign * along[0], a[1] + sign * along[1])
     two = (b[0] - sign * along[0], b[1] - sign * along[1])
-    return a, one, two, b
+    if not aside:
+        return a, one, two, b
+    u, v = ((end - start) / math.dist(a, b) for start, end in zip(a, b, strict=True))
+    return a, one, (0.5 * (a[0] + b[0]) - aside * v, 0.5 * (a[1] + b[1]) + aside * u), two, b
 
 
 def oldmarket() -> Town:
@@ -142,7 +150,7 @@ def oldmarket() -> Town:
         (south[1], lower[2]),
         (lower[4], upper[3]),
     ]
-    streets = [street(_shift(a, b, lead=19.0)) for a, b in pairs]
+    streets = [street(shifted(a, b, lead=19.0)) for a, b in pairs]
     streets += [
         crescent((south[0], (lower[0][0], south[0][1]), lower[0])),
         crescent((south[2], (lower[4][0], south[2][1]), lower[4])),

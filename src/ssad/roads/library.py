@@ -61,10 +61,10 @@ def town_xodr(name: str) -> str:
 
     if name in BUILT_IN:
         return generate_town(name)
-    if RANDOM.fullmatch(name):
-        return write_random_town(name)
     plain = Path(name).name == name and Path(name).suffix != ".xodr"
     path = home() / "towns" / f"{name}.xodr" if plain else Path(name).with_suffix(".xodr")
+    if not path.is_file() and RANDOM.fullmatch(name):
+        return write_random_town(name)
     if not path.is_file():
         raise MapError(f"town '{name}' has no OpenDRIVE: there is no {path}; import its map: ssad import map FILE.xodr")
     return read_text(path, limit=MAX_BYTES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -11,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ssad.core.seeding import generator
+from ssad.roads.designs import shifted
 from ssad.roads.writer import write_town
 from ssad.roads.writer_parts import CLEARANCE, Point, RoadSpec, Town, plan_pieces
 
@@ -33,6 +33,9 @@ def random_town(number: int) -> Town:
 
     Args:
         number: Which one.
+
+    Returns:
+        The specification, from which `write_town` makes OpenDRIVE.
     """
     draws = generator("random town", number)
     lanes = 2 if draws.random() < 0.25 else 1
@@ -121,14 +124,6 @@ def _polylines(
                 way.append(ahead)
             points = [at[start]]
             for a, b in pairwise(way):
-                points += _block(at[a], at[b], lead, aside())
+                points += shifted(at[a], at[b], lead=lead, aside=aside())[1:]
             found.append(tuple(points))
     return found
-
-
-def _block(a: Point, b: Point, lead: float, aside: float) -> tuple[Point, ...]:
-    """Points of a street from a to b without the first: along the axis, by a place `aside` of the middle, and back."""
-    (u, v), length = (b[0] - a[0], b[1] - a[1]), math.dist(a, b)
-    along = (math.copysign(lead, u), 0.0) if abs(u) > abs(v) else (0.0, math.copysign(lead, v))
-    middle = (0.5 * (a[0] + b[0]) - aside * v / length, 0.5 * (a[1] + b[1]) + aside * u / length)
-    return (a[0] + along[0], a[1] + along[1]), middle, (b[0] - along[0], b[1] - along[1]), b

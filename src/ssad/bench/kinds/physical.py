@@ -25,7 +25,7 @@ from ssad.recording.target_attacks import TargetAttacks, see_all
 from ssad.recording.target_sheets import write_sheets
 from ssad.recording.target_table import CLEAN, GRID, TargetTable, rows_of, target_of
 from ssad.recording.target_views import TargetClips
-from ssad.roads import town_names
+from ssad.roads import is_town
 from ssad.scenarios.static.physical import TextureSpec
 from ssad.scenarios.static.physical.noninvasive.kept import LightSpec
 
@@ -75,7 +75,7 @@ class Physical(Kind):
             weights[name] = state_hash(detector)
         for pair in suite.pairs:
             for town in (pair.train, pair.test):
-                if town not in town_names():
+                if not is_town(town):
                     raise ConfigError(f"suite {suite.name}: unknown town '{town}' (see: ssad list towns)")
         for town in (suite.grid.towns or ()) if suite.grid is not None else ():
             if town not in {pair.test for pair in suite.pairs}:

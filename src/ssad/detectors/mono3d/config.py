@@ -5,8 +5,9 @@ Sources: Wang et al., FCOS3D (ICCVW 2021); Wang et al., PGD (CoRL 2021); mmdetec
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 from ssad.core.errors import ConfigError
 
@@ -113,6 +114,14 @@ class Mono3DConfig:
             raise ConfigError(f"{self.name}: heading '{self.heading}'; choose bins or vectors")
         if self.input_width is not None and self.input_width < 64:
             raise ConfigError(f"{self.name}: input_width {self.input_width} is too small; it takes 64 or more")
+
+    def changed(self, options: Mapping[str, Any]) -> Mono3DConfig:
+        """With other values. ConfigError: one that there is not."""
+        known = {f.name for f in fields(self)}
+        for name in options:
+            if name not in known:
+                raise ConfigError(f"{self.name}: no option '{name}'; there are {', '.join(sorted(known - {'name'}))}")
+        return replace(self, **options)
 
     @property
     def groups(self) -> tuple[int, ...]:
