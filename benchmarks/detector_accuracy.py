@@ -25,6 +25,7 @@ from ssad.camera.render import Weather
 from ssad.core import safeio
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CLASSES
+from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
@@ -41,6 +42,7 @@ FLAT, SOLID = ("yolov3-tiny", "yolov5n"), ("fcos3d-light", "pgd-det-light")
 CLEAR = 0.25  # least score of a detection that counts for recall
 SIZES, DISTANCES = (8.0, 16.0, 24.0, 32.0, 64.0, 1e9), (0.0, 10.0, 20.0, 30.0, 50.0, 1e9)
 RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
+ALIKE = ("traffic_cone", "barrier")  # front and rear look alike
 FEW = 20  # objects: groups with fewer are left out
 SMALL = 24.0  # px
 SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detector says
@@ -224,7 +226,7 @@ def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
 
 
 def pairs(real: BoxTable, seen: BoxTable) -> dict[str, Any]:
-    """Boxes that repeat what another one has found, by sample.
+    """Boxes that repeat what another one has found, by sample; and how often those that found it face the other way.
 
     They lie within 2 m of a true box of their class, but each true box there has been taken by a better one: the best
     box takes the nearest true one, and so on. People who walk side by side are no duplicates of each other.
@@ -232,19 +234,35 @@ def pairs(real: BoxTable, seen: BoxTable) -> dict[str, Any]:
     assert seen.score is not None
     seen = seen.take(np.flatnonzero(seen.score >= 0.15))
     more = 0
+    off: list[tuple[str, float, float]] = []  # class, distance, error of the yaw
     for sample in np.unique(real.sample):
         a, b = np.flatnonzero(real.sample == sample), np.flatnonzero(seen.sample == sample)
         b = b[np.argsort(-seen.score[b], kind="stable")]
         apart = np.linalg.norm(real.centre[a][:, None, :2] - seen.centre[b][None, :, :2], axis=-1)
         apart[(apart >= 2.0) | (real.label[a][:, None] != seen.label[b][None])] = np.inf
         free = np.ones(len(a), bool)
-        for column in apart.T:
+        for box, column in zip(b, apart.T, strict=True):
             own = np.where(free, column, np.inf)
             if np.isfinite(own).any():
                 free[own.argmin()] = False
+                true = a[own.argmin()]
+                error = wrap_angle(np.subtract(*quaternion_to_yaw(np.stack([seen.rotation[box], real.rotation[true]]))))
+                off.append((CLASSES[real.label[true]], float(real.ego_distance[true]), abs(float(error))))
             else:
                 more += int(np.isfinite(column).any())
-    return {"duplicates a sample": more / max(len(np.unique(real.sample)), 1)}
+    return {"duplicates a sample": more / max(len(np.unique(real.sample)), 1), "turned": turned(off)}
+
+
+def turned(off: Sequence[tuple[str, float, float]]) -> dict[str, dict[str, dict[str, float]]]:
+    """By class (without those that look alike from both ends) and distance: how many, and the share turned round."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for name in dict.fromkeys(c for c in CLASSES if c not in ALIKE):
+        for low, high in ((0.0, RINGS[-1]), *pairwise(RINGS)):
+            errors = np.array([e for c, d, e in off if c == name and low <= d < high])
+            if len(errors) >= FEW:
+                share = {"boxes": len(errors), "turned": float((errors > np.pi / 2).mean())}
+                found.setdefault(name, {})["all" if high - low > 10.0 else f"{low:g}-{high:g}"] = share
+    return found
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
@@ -364,6 +382,7 @@ def page() -> str:
             for c in CLASSES
         ],
     )  # fmt: skip
+    lines += turned_lines(solid)
     for what in ("light", "distance"):
         size = "scenes" if what == "light" else "objects"
         scores = ("mAP", "NDS") if what == "light" else ("mAP", "AP_car")
@@ -376,6 +395,23 @@ def page() -> str:
             ],
         )  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
+
+
+def turned_lines(solid: dict[str, Any]) -> list[str]:
+    """The part of the page on boxes that face the other way."""
+    parts = {name: one["pairs"]["turned"] for name, one in solid.items()}
+    rings = ["all", *(f"{low:g}-{high:g}" for low, high in pairwise(RINGS))]
+    rows = [
+        [f"{kind.replace('_', ' ')}, {name}",
+         *(f"{100 * own[kind][r]['turned']:.0f} of {own[kind][r]['boxes']:,}" if r in own[kind] else "" for r in rings)]
+        for kind in next(iter(parts.values())) for name, own in parts.items() if kind in own
+    ]  # fmt: skip
+    return [
+        "Turned round: percent of the boxes (score 0.15 and more, each with the true box that it found) whose yaw errs",
+        f"by more than a quarter turn, by distance. Groups with fewer than {FEW} are left out; 50 is a guess.",
+        "",
+        *table(["boxes turned round", *(r if r == "all" else f"{r} m" for r in rings)], rows),
+    ]
 
 
 def number(value: float | None) -> str:

@@ -32,7 +32,7 @@ def test_the_truth_costs_nothing(config: Mono3DConfig) -> None:
     dense, assignment = perfect(detector, some_truth(), (225, 400))
     found = detector.losses(dense, assignment)
     names = PGD if config.pgd else FCOS
-    assert set(found) == (names if config.heading == "bins" else names - {"rotsin", "dir"} | {"heading"})
+    assert set(found) == (names if config.heading == "bins" else names - {"rotsin", "dir"} | {"axis", "side"})
     for name in set(found) - {"centerness"}:
         assert float(found[name]) == pytest.approx(0.0, abs=1e-9), name
     near = assignment.extra["centreness"][assignment.label >= 0].clamp(1e-9, 1 - 1e-9)
@@ -89,15 +89,22 @@ def test_yaw_is_compared_by_the_sine_of_the_difference(told: tuple[Mono3D, Dense
         assert float(detector.losses(nudge(dense, 6, by), assignment)["rotsin"]) == pytest.approx(wanted, abs=1e-9)
 
 
-def test_vectors_of_the_yaw_are_compared_by_smooth_l1() -> None:
+@pytest.mark.parametrize("name", ["car", "barrier"])
+def test_vectors_of_the_yaw_are_an_axis_and_a_logit(name: str) -> None:
+    """Smooth L1 of twice the yaw; -log sigmoid of twice the part of the first vector along the true one."""
     detector = Mono3D(replace(TINY_VECTORS, code_weights=(1, 1, 0.2, 1, 1, 1, 0.5, 0.05, 0.05))).double()
-    dense, assignment = perfect(detector, some_truth(), (225, 400))
+    truth = some_truth()
+    label = torch.full_like(truth.label, detector.classes.index(name))
+    dense, assignment = perfect(detector, replace(truth, label=label), (225, 400))
     vectors = [m.clone() for m in dense.maps["dir_cls_preds"]]
     for m in vectors:
-        m[:, 0] += 0.05
+        ahead, across = m[:, :2] / 30.0, torch.stack([-m[:, 1], m[:, 0]], 1)
+        m[:, :2] = -0.7 * ahead + 3.0 * across  # what lies across the true axis says nothing
         m[:, 3] -= 0.8
     found = detector.losses(replace(dense, maps={**dense.maps, "dir_cls_preds": vectors}), assignment)
-    assert float(found["heading"]) == pytest.approx(0.5 * (0.05**2 * 4.5 + 0.8 - 1 / 18))
+    assert float(found["axis"]) == pytest.approx(0.5 * (0.8 - 1 / 18))
+    wanted = math.log1p(math.exp(1.4)) if name == "car" else 0.0  # a barrier looks alike from both ends
+    assert float(found["side"]) == pytest.approx(wanted, abs=1e-6)
 
 
 def test_pgd_compares_the_fused_depth() -> None:

@@ -94,7 +94,7 @@ def perfect(detector: Mono3D, truth: Truth, size: tuple[int, int]) -> tuple[Dens
     turned = (reg[:, 6] - config.dir_offset) % (2 * math.pi)
     direction = 60.0 * nn.functional.one_hot((turned >= math.pi).long(), 2) - 30.0
     if config.heading == "vectors":
-        direction = vectors_of_yaw(reg[:, 6])
+        direction = vectors_of_yaw(reg[:, 6]) * torch.tensor([30.0, 30.0, 1.0, 1.0])
     logit = torch.full((len(label), 10), -30.0, dtype=torch.float64)
     logit[owned, label[owned]] = 30.0
     attribute = 60.0 * nn.functional.one_hot(found.extra["attribute"][0], 9) - 30.0

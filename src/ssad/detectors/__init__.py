@@ -58,18 +58,20 @@ def make_detector(
     if weights is None or str(weights) == "random":
         return build(seed=seed, **options).to(device)
     path = Path(weights).expanduser()
-    if name.startswith("yolo") and "classes" not in options:
-        options |= _classes_of(path)
+    state = {} if path.suffix == ".weights" else load_weights(path)
+    if name.startswith("yolo"):
+        options = (_classes_of(path) if "classes" not in options else {}) | options
+    else:
+        options = {"heading": "vectors" if any(".heading_convs." in key for key in state) else "bins"} | options
     made = build(seed=seed, **options)
     if path.suffix == ".weights":
         from ssad.detectors.yolo.darknet import read_darknet
 
         read_darknet(made, path)
-    else:
-        state = load_weights(path)
-        if path.parent == SHIPPED:
-            _check_hash(path, state)
-        fit_state(made, state, path)
+        return made.to(device)
+    if path.parent == SHIPPED:
+        _check_hash(path, state)
+    fit_state(made, state, path)
     return made.to(device)
 
 

@@ -109,9 +109,10 @@ def vectors_of_yaw(yaw: Tensor) -> Tensor:
 
 
 def yaw_of_vectors(vectors: Tensor, dim: int = -1) -> Tensor:
-    """Yaw (-pi/2 to 3 pi/2) from cosine and sine of it and of twice it, which need not be of length 1, along `dim`.
+    """Yaw (-pi/2 to 3 pi/2) from two vectors along `dim`, which may be of any length.
 
-    The second pair tells the axis, the first which way along it.
+    The second has the direction of twice the yaw, which tells the axis; the first tells which way along it, by the sign
+    of its part along the axis. Twice that part is the logit of that way being the front.
     """
     cos, sin, cos2, sin2 = vectors.unbind(dim)
     axis = torch.atan2(sin2, cos2) / 2

@@ -28,6 +28,7 @@ from ssad.detectors.mono3d.decode import (
     places_of,
     project,
     unproject,
+    yaw_of_vectors,
 )
 from ssad.detectors.mono3d.head import Head
 from ssad.detectors.mono3d.losses import losses
@@ -143,7 +144,7 @@ class Mono3D(nn.Module):
             picked, xy = pick(flat, image, rows), places.xy[rows]
             solids = centre, extent, yaw = self._solids(picked, xy, lens, image)
             shown = self._boxes(picked, xy, solids, lens=lens[image], size=size)
-            place3d = torch.cat([centre, extent, picked.reg[:, 7:9]], 1)
+            place3d = torch.cat([centre, extent, picked.reg[:, 7:9], picked.direction], 1)
             ground = torch.stack([centre[:, 0], centre[:, 2], extent[:, 0], extent[:, 2], -yaw], -1)
             host = [v.cpu() for v in (image, label, score, shown, ground, place3d)]
             image, label, score, shown, ground, place3d = host
@@ -153,12 +154,14 @@ class Mono3D(nn.Module):
                 if self.config.vote is not None
                 else place3d[stay]
             )
-            centre, extent, velocity = torch.split(values, [3, 3, 2], 1)
+            centre, extent, velocity, direction = torch.split(values, [3, 3, 2, picked.direction.shape[1]], 1)
             of, device = stay.to(lens.device), lens.device
+            yaw = yaw[of]
+            if self.config.heading == "vectors":
+                yaw = yaw - picked.reg[of, 6] + yaw_of_vectors(direction).to(yaw)
             columns = (
-                score[stay], label[stay], shown[stay], centre, extent, yaw[of], velocity,
-                picked.attribute[of].argmax(-1),
-            )  # fmt: skip
+                score[stay], label[stay], shown[stay], centre, extent, yaw, velocity, picked.attribute[of].argmax(-1)
+            )
             counts = torch.bincount(image[stay], minlength=len(lens)).tolist()
             parts = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]

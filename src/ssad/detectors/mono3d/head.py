@@ -17,6 +17,7 @@ from ssad.detectors.mono3d.config import BASE_DEPTHS, BASE_DIMS, Mono3DConfig
 from ssad.detectors.mono3d.decode import yaw_of_vectors
 
 BINS, BIN = 6, 10.0  # depth bins of PGD, their spacing in m
+YAW = 3  # which part of the regression it is
 
 
 class Unit(nn.Module):
@@ -125,6 +126,8 @@ class Head(nn.Module):
         if config.heading == "bins":
             self.conv_dir_cls_prev = nn.ModuleList([Unit(c, c)])
             self.conv_dir_cls = _last(c, 2, rare=True)
+        else:
+            self.heading_convs = nn.ModuleList([Unit(c + 2 if config.rays else c, c), Unit(c, c)])
         self.conv_attr_prev = nn.ModuleList([Unit(c, c)])
         self.conv_attr = _last(c, len(MMDET3D_ATTRIBUTES), rare=True)
         narrow = max(c // 4, 32)
@@ -156,9 +159,9 @@ class Head(nn.Module):
 
         Returns:
             cls_scores [B, 10, h, w]; bbox_preds [B, 9 or 13, h, w] (offset in pixels, depth m, size m, yaw, velocity,
-            2D distances in pixels); dir_cls_preds: logits of the two bins, or with "vectors" cosine and sine of the
-            yaw and of twice the yaw, from which bbox_preds has its yaw [B, 2 or 4, h, w]; attr_preds; centernesses;
-            and for PGD depth_cls_preds.
+            2D distances in pixels); dir_cls_preds: logits of the two bins, or with "vectors" the two vectors from which
+            bbox_preds has its yaw (see `yaw_of_vectors`) [B, 2 or 4, h, w]; attr_preds; centernesses; and for PGD
+            depth_cls_preds.
         """
         found: dict[str, list[Tensor]] = {}
         for level, x in enumerate(maps):
@@ -167,22 +170,28 @@ class Head(nn.Module):
         return found
 
     def _level(self, level: int, x: Tensor, lens: Tensor | None, rays: Tensor | None) -> dict[str, Tensor]:
-        kinds, boxes = x, x if rays is None else torch.cat([x, rays.to(x)], 1)
+        seen = x if rays is None else torch.cat([x, rays.to(x)], 1)
+        kinds, boxes = x, seen
         for unit in self.get_submodule("cls_convs").children():
             kinds = unit(kinds)
         for unit in self.get_submodule("reg_convs").children():
             boxes = unit(boxes)
         logit = _full(self.conv_cls(self.conv_cls_prev[0](kinds)))
+        heading = boxes
+        if self.config.heading == "vectors":
+            heading = seen
+            for unit in self.heading_convs:
+                heading = unit(heading)
         parts = []
-        for prev, last in zip(self.conv_reg_prevs, self.conv_regs, strict=True):
-            value = boxes
+        for k, (prev, last) in enumerate(zip(self.conv_reg_prevs, self.conv_regs, strict=True)):
+            value = heading if k == YAW else boxes
             for unit in prev.children():
                 value = unit(value)
             parts.append(_full(last(value)))
         if self.config.heading == "bins":
             direction = _full(self.conv_dir_cls(self.conv_dir_cls_prev[0](boxes)))
         else:
-            direction, parts[3] = parts[3], yaw_of_vectors(parts[3], 1)[:, None]
+            direction, parts[YAW] = parts[YAW], yaw_of_vectors(parts[YAW], 1)[:, None]
         found = {
             "cls_scores": logit,
             "bbox_preds": self._decode(level, parts, logit, lens),

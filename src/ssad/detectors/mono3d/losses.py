@@ -10,10 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from ssad.core.detections import Assignment
+from ssad.core.nuscenes_names import MMDET3D_CLASSES
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject, vectors_of_yaw
 
 BETA = 1.0 / 9.0  # of smooth L1
+ALIKE = tuple(MMDET3D_CLASSES.index(name) for name in ("traffic_cone", "barrier"))  # front and rear look alike
 Reduction = Literal["batch", "image"]
 Fuse = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
@@ -36,7 +38,7 @@ def losses(
 
     Returns:
         cls, offset, depth, size, rotsin, velo, dir, attr, centerness, and for PGD bbox2d and consistency; where the yaw
-        is told by vectors, heading in place of rotsin and dir.
+        is told by vectors, axis and side in place of rotsin and dir.
     """
     label = assignment.label
     image, place = (label >= 0).nonzero(as_tuple=True)
@@ -64,8 +66,11 @@ def losses(
     found["velo"] = smooth(torch.where(known, reg[:, 7:9], 0.0), torch.where(known, moved, 0.0), 7)
     true, direction = target[:, 6], flat.direction[image, place]
     if config.heading == "vectors":
-        off = functional.smooth_l1_loss(direction, vectors_of_yaw(true), beta=BETA, reduction="none")
-        found["heading"] = total.mean(off.sum(1) * weights[6])
+        way, axis = torch.split(vectors_of_yaw(true), 2, 1)
+        off = functional.smooth_l1_loss(direction[:, 2:], axis, beta=BETA, reduction="none")
+        found["axis"] = total.mean(off.sum(1) * weights[6])
+        told = (label[image, place][:, None] != label.new_tensor(ALIKE)).all(1).to(reg.dtype)
+        found["side"] = total.mean(functional.softplus(-2.0 * (direction[:, :2] * way).sum(1)) * told)
     else:
         said = reg[:, 6]
         found["rotsin"] = smooth((said.sin() * true.cos())[:, None], (said.cos() * true.sin())[:, None], 6)

@@ -30,7 +30,7 @@ TERMS: Mapping[str, frozenset[str]] = {
          "loss_rpn_box_reg", "dfl"}
     ),
     "depth": frozenset({"depth"}),
-    "orientation": frozenset({"rotsin", "dir", "heading"}),
+    "orientation": frozenset({"rotsin", "dir", "axis", "side"}),
 }  # fmt: skip
 """Names of the training losses of our detectors, and of those that adapters wrap, by what they are about."""
 
