@@ -403,12 +403,12 @@ def turned_lines(solid: dict[str, Any]) -> list[str]:
     rings = ["all", *(f"{low:g}-{high:g}" for low, high in pairwise(RINGS))]
     rows = [
         [f"{kind.replace('_', ' ')}, {name}",
-         *(f"{100 * own[kind][r]['turned']:.0f} of {own[kind][r]['boxes']:,}" if r in own[kind] else "" for r in rings)]
+         *(f"{100 * own[kind][r]['turned']:.0f} % of {own[kind][r]['boxes']:,}" if r in own[kind] else "" for r in rings)]
         for kind in next(iter(parts.values())) for name, own in parts.items() if kind in own
     ]  # fmt: skip
     return [
-        "Turned round: percent of the boxes (score 0.15 and more, each with the true box that it found) whose yaw errs",
-        f"by more than a quarter turn, by distance. Groups with fewer than {FEW} are left out; 50 is a guess.",
+        "Turned round: share of the boxes (score 0.15 and more, each with the true box that it found) whose yaw errs",
+        f"by more than a quarter turn, by distance. Groups with fewer than {FEW} are left out; 50 % is a guess.",
         "",
         *table(["boxes turned round", *(r if r == "all" else f"{r} m" for r in rings)], rows),
     ]

@@ -67,9 +67,9 @@ class Mono3DConfig:
         dir_offset: Offset of the yaw's direction bins, rad.
         heading: How the yaw is told. "bins": a number that holds up to half a turn, and a bin of half a turn that says
             which half, as in the source. Beside the border of the bins (at `dir_offset` and half a turn on) the bin is
-            a guess that turns the box round, and the number has a seam somewhere. "vectors": cosine and sine of the
-            yaw and of twice the yaw, which have neither: the second pair tells the axis, even of what looks alike from
-            both ends, the first which way along it.
+            a guess that turns the box round, and the number has a seam somewhere. "vectors": two vectors, which have
+            neither: one of the direction of twice the yaw, which tells the axis, even of what looks alike from both
+            ends, and one whose part along the axis says which way along it (see `yaw_of_vectors`).
     """
 
     name: str
@@ -139,7 +139,7 @@ FCOS3D_LIGHT = Mono3DConfig(
     "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
     deformable=False, input_width=800, trained_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
     start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.7,
-    threshold=0.02, vote=0.7, fade=0.01,
+    threshold=0.02, vote=0.7, fade=0.01, heading="vectors",
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
     FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, sure=0.5,
