@@ -401,11 +401,16 @@ def turned_lines(solid: dict[str, Any]) -> list[str]:
     """The part of the page on boxes that face the other way."""
     parts = {name: one["pairs"]["turned"] for name, one in solid.items()}
     rings = ["all", *(f"{low:g}-{high:g}" for low, high in pairwise(RINGS))]
+
+    def cell(one: dict[str, float] | None) -> str:
+        return f"{100 * one['turned']:.0f} % of {one['boxes']:,}" if one else ""
+
     rows = [
-        [f"{kind.replace('_', ' ')}, {name}",
-         *(f"{100 * own[kind][r]['turned']:.0f} % of {own[kind][r]['boxes']:,}" if r in own[kind] else "" for r in rings)]
-        for kind in next(iter(parts.values())) for name, own in parts.items() if kind in own
-    ]  # fmt: skip
+        [f"{kind.replace('_', ' ')}, {name}", *(cell(own[kind].get(ring)) for ring in rings)]
+        for kind in next(iter(parts.values()))
+        for name, own in parts.items()
+        if kind in own
+    ]
     return [
         "Turned round: share of the boxes (score 0.15 and more, each with the true box that it found) whose yaw errs",
         f"by more than a quarter turn, by distance. Groups with fewer than {FEW} are left out; 50 % is a guess.",
