@@ -146,22 +146,23 @@ def test_what_is_missing_is_said_before_anything_is_read(
 
 def test_a_training_of_3d_detectors_runs(drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "make_detector", partial(make_detector, input_width=160))  # as wide as the pictures
-    changes = (("epochs", 2), ("batch", 4), ("options", {"heading": "vectors"}), ("weigh", {"side": 0.5}))
+    changes = (("epochs", 2), ("batch", 4), ("options", {"heading": "bins"}), ("weigh", {"dir": 0.5}))
     first = SHIPPED / "pgd-det-light.safetensors"
     plan = Plan("pgd-det-light", (drives,), tmp_path, changes=changes, weights=first, device="cpu", seconds=0.0)
     said: list[str] = []
     list(run_training(plan, say=said.append))
-    assert "pgd-det-light.safetensors: 10 weights do not fit and start fresh: " in said[0]
-    assert {name.split(".")[1] for name in said[0].split("fresh: ")[1].split(", ")} == {"conv_regs", "heading_convs"}
+    assert "pgd-det-light.safetensors: 8 weights do not fit and start fresh: " in said[0]
+    fresh = {name.split(".")[1] for name in said[0].split("fresh: ")[1].split(", ")}
+    assert fresh == {"conv_regs", "conv_dir_cls_prev", "conv_dir_cls"}
     assert said[-1] == "stopped after 1 of 2 epochs; run it again to go on"
     card = read_card(tmp_path / "pgd-det-light.safetensors")
     assert card.config["epochs_done"] == 1
     assert "--seconds 0.0" in card.command
     assert {"mAP", "NDS"} <= card.metrics.keys()
     made = make_detector("pgd-det-light", weights=tmp_path / "pgd-det-light.safetensors")
-    assert made.config.heading == "vectors"  # the weights say so
+    assert made.config.heading == "bins"  # the weights say so
     with pytest.raises(FormatError, match="conv_dir_cls"):
-        make_detector("pgd-det-light", weights=tmp_path / "pgd-det-light.safetensors", heading="bins")
+        make_detector("pgd-det-light", weights=tmp_path / "pgd-det-light.safetensors", heading="vectors")
 
 
 def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
