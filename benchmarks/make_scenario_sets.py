@@ -40,6 +40,8 @@ SIGN_TOWNS: Mapping[str, int] = {"Oldmarket": 12, "Larkhill": 12}
 UNSELECTED = 2  # draws of traffic on each route in the set `natural-unselected`
 TRAINING_TOWNS = ("Oldmarket", "Larkhill", "Ringmere", "Longreach")
 """Learned drivers are trained here, on none of the towns that the other sets are in."""
+LANE_TOWNS = ("Random4", "Random11", "Random13", "Random14", "Random15", "Random20")
+"""The first random towns with two lanes a direction: FREA is trained here, beside others who drive its ego's way."""
 Turn = Literal["left", "straight", "right"]
 # Trigger distances, m, at which an ego that does not react is hit at any speed from 8 to 10 m/s on these roads. The
 # others keep SafeBench's value, which is the default of their class.
@@ -317,13 +319,18 @@ def unselected(towns: Mapping[str, int]) -> list[Scenario]:
 
 
 def training() -> dict[str, str]:
-    """What drivers learn from, as `make`: the eight classes as far as the towns have roads for them, and junctions."""
+    """What drivers learn from, as `make`: the eight classes as far as the towns have roads for them, and junctions.
+
+    And what FREA learns in: junctions of towns with parallel lanes, which those towns hardly have.
+    """
     found = []
+    lanes = [s for town in LANE_TOWNS for s in natural(load_town(town), 12, repetitions=1)]
     for town in TRAINING_TOWNS:
         graph = load_town(town)
         drives = [replace(s, name=f"training/{s.name}") for s in natural(graph, 12, repetitions=1)]
         found += [*precrash(graph, 6, prefix=f"training/{town}/", least=0), *drives]
-    return {"training.yaml": scenario_text(found)}
+    beside = [replace(s, name=f"training-lanes/{s.name}") for s in lanes]
+    return {"training.yaml": scenario_text(found), "training-lanes.yaml": scenario_text(beside)}
 
 
 def make() -> dict[str, str]:

@@ -15,6 +15,7 @@ from world.worlds import episode as line_episode
 from benchmarks.crossing_traffic import crossings
 from benchmarks.make_scenario_sets import (
     CROSSING,
+    LANE_TOWNS,
     NATURAL_TOWNS,
     PRECRASH_TOWN,
     TRAINING_TOWNS,
@@ -110,15 +111,16 @@ def test_who_crosses_the_way_is_counted_once_and_nobody_else() -> None:
 
 
 @pytest.mark.slow
-def test_the_generator_makes_the_training_set() -> None:
-    (text,) = training().values()
-    assert (DATA / "training.yaml").read_text() == text
+def test_the_generator_makes_the_training_sets() -> None:
+    for name, text in training().items():
+        assert (DATA / name).read_text() == text, name
 
 
 def test_nothing_is_tested_where_drivers_were_trained() -> None:
-    trained = load_scenarios("training")
+    trained, beside = load_scenarios("training"), load_scenarios("training-lanes")
     assert {s.town for s in trained} == set(TRAINING_TOWNS)
-    assert not {s.town for s in SHIPPED + NATURAL + UNSELECTED} & set(TRAINING_TOWNS)
+    assert {s.town for s in beside} == set(LANE_TOWNS)
+    assert not {s.town for s in SHIPPED + NATURAL + UNSELECTED} & {*TRAINING_TOWNS, *LANE_TOWNS}
     assert {s.type for s in trained} == {*PRECRASH, "NaturalJunction"}
     # a class names the scenarios that systems are tested on
     assert all(s.town == "ProvingGround" for kind in PRECRASH for s in load_scenarios(kind))

@@ -429,8 +429,8 @@ def test_nothing_cannot_be_saved_and_one_of_several_may_be_wrong(tmp_path: Path)
 
 def test_names_of_sets(tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    towns = ("natural-crossgate", "natural-twinford")
-    shipped = ("lane-traffic", "natural", *towns, "natural-unselected", "precrash", "stop-signs", "training")
+    towns, learned = ("natural-crossgate", "natural-twinford"), ("training", "training-lanes")
+    shipped = ("lane-traffic", "natural", *towns, "natural-unselected", "precrash", "stop-signs", *learned)
     assert set_names() == shipped
     mine = scenario_from({**PLAIN, "name": "mine/0"})
     save_scenarios(ssad_home / "scenarios" / "mine.yaml", mine)

@@ -16,8 +16,8 @@ DATA = Path(__file__).parent / "data"
 SHIPPED = ("precrash", "natural")
 UNSELECTED = ("natural-unselected", "lane-traffic", "stop-signs")
 """Traffic as it comes, for rates and past stop signs; its scenarios belong to no class's own."""
-TRAINING = ("training",)
-"""What learned drivers are trained on, in towns that no other set uses; its scenarios belong to no class's own."""
+TRAINING = ("training", "training-lanes")
+"""What drivers and adversaries are trained on, in towns that no other set uses; they belong to no class's own."""
 IMPORTED = ("safebench", "frea")
 """Sets that a user imports from SafeBench's and FREA's folders."""
 _TOWN_SETS = {"natural-twinford": ("natural", "Twinford"), "natural-crossgate": ("natural", "Crossgate")}
@@ -28,8 +28,8 @@ _SUFFIXES = (".yaml", ".yml")
 def load_scenarios(ref: str | Path) -> tuple[Scenario, ...]:
     """The scenarios that `ref` names, in their order.
 
-    A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, training, or one that was
-    imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario class (its scenarios in
+    A set (precrash, natural, natural-twinford, natural-crossgate, natural-unselected, training, training-lanes, or one
+    that was imported, such as safebench, frea), a scenario ("StraightObstacle/00"), a scenario class (its scenarios in
     precrash and natural), a YAML file, or a folder of YAML files. UnknownNameError shows the three closest names.
     """
     if isinstance(ref, Path) or ref.endswith(_SUFFIXES):
