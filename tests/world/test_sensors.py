@@ -166,21 +166,16 @@ def test_equation_5_pays_for_what_brings_the_bodies_together() -> None:
     assert rewards.colliding(world.state(), who, before)[0] == pytest.approx(0.5, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("other", "own_speed", "way_out"),
-    [
-        (car(60.0), 8.0, True),  # far enough to brake
-        (car(17.0, 0.0, np.pi, speed=9.0), 8.0, False),  # head-on, 2 m between the bumpers
-        (car(20.0, 7.0, -np.pi / 2, speed=3.0), 8.0, True),  # will cross: brake, or go on
-    ],
-)
-def test_a_feasible_adversary_leaves_the_ego_a_way_out(other: EpisodeAgent, own_speed: float, way_out: bool) -> None:
-    world = after_a_step(episode(ego(speed=own_speed), other))
-    who = agents((0, 1))
-    assert rewards.avoidable(world.state(), who)[0] == way_out
+def test_a_contact_is_paid_if_a_careful_driver_would_have_avoided_it() -> None:
+    world = after_a_step(episode(ego(), car(14.5)), episode(ego(), car(14.5)), episode(ego(), car(20.0), car(24.0)))
+    who = agents((0, 1), (1, 1), (2, 1))
     before = rewards.distance_to_goal(world.state(), who) + 0.5
-    paid = rewards.feasible(world.state(), who, before)[0]
-    assert paid == (pytest.approx(rewards.adversary(world.state(), who, before)[0]) if way_out else -1.0)
+    paid = rewards.feasible(world.state(), who, before, np.array([True, False, True]))
+    np.testing.assert_allclose(paid, 0.15 + np.array([30.0, -10.0, -15.0]), atol=1e-6)
+    off = after_a_step(episode(ego(), car(40.0, -30.0)))
+    cost = rewards.feasible(off.state(), agents((0, 1)), rewards.distance_to_goal(off.state(), agents((0, 1))),
+                            np.array([False]), off_road=0.5)  # fmt: skip
+    assert cost[0] == pytest.approx(-0.5)
 
 
 def test_the_environment_takes_any_reward_and_other_drivers() -> None:

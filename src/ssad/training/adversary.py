@@ -31,7 +31,7 @@ ADVERSARIES = {
     )
 }  # fmt: skip
 ADVERSARIES |= {
-    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible"),
+    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=1),
     "adv-sac": replace(
         LEARNINGS["sac"], steps=100_000, observation="adversary", action="adversary", reward="adversary", draws=6,
         gamma=0.98, lr=3e-4, batch=256, validate=25_000,
@@ -46,6 +46,8 @@ ADVERSARIES |= {
     ),
 }  # fmt: skip
 """How adversaries are trained."""
+SCENARIOS = {"frea": ("training-lanes",)}
+"""What they learn in unless told otherwise, where that is not the set `training`."""
 REWARDS = ("adversary", "colliding", "feasible")
 """What they may learn from; see `ssad.training.adversary_env`."""
 
@@ -58,7 +60,7 @@ class AdversaryPlan:
         algorithm: A name of `ADVERSARIES`.
         out: Folder to write to.
         ego: Driving system that it is trained against.
-        scenarios: Natural traffic to learn in.
+        scenarios: Natural traffic to learn in; none: the usual of the algorithm (`SCENARIOS`, or `training`).
         test: What the weights are measured on in the end.
         literal: Whether the reward is equation 6 as it is printed.
         off_road: What each step off the road costs an adversary (the paper and FREA: 0).
@@ -69,12 +71,16 @@ class AdversaryPlan:
     algorithm: str
     out: Path
     ego: str = "autopilot"
-    scenarios: tuple[str, ...] = ("training",)
+    scenarios: tuple[str, ...] = ()
     test: tuple[str, ...] = ("natural",)
     literal: bool = False
     off_road: float = 0.5
     changes: tuple[tuple[str, Any], ...] = ()
     seconds: float | None = None
+
+    def learned_in(self) -> tuple[str, ...]:
+        """The sets and files that it learns in."""
+        return self.scenarios or SCENARIOS.get(self.algorithm, ("training",))
 
 
 def natural_only(refs: Sequence[str]) -> tuple[list[Scenario], dict[str, Any]]:
@@ -139,9 +145,11 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     ego = make_system(plan.ego)
     safeio.make_folder(plan.out)
     torch.set_num_threads(1)
-    scenarios, graphs = natural_only(plan.scenarios)
+    scenarios, graphs = natural_only(plan.learned_in())
     if not scenarios:
-        raise ConfigError(f"{', '.join(plan.scenarios)}: no scenario has background traffic to take adversaries from")
+        raise ConfigError(
+            f"{', '.join(plan.learned_in())}: no scenario has background traffic to take adversaries from"
+        )
     episodes = draw_episodes(scenarios, graphs, draws=learning.draws, seed=0)
     say(f"{len(episodes)} episodes of {len(scenarios)} scenarios in {', '.join(graphs)}; ego: {plan.ego}")
     env = _environment(learning, plan, episodes, graphs, ego)
@@ -150,19 +158,18 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
 
     def validate(policy: Policy) -> dict[str, float]:
         found = measure_adversary(PolicyDriver(policy, name="candidate"), **held)  # type: ignore[arg-type]
-        return found | {"score": found["valid"]}
+        # of what could have been avoided CR says nothing: there the last weights count
+        return found | ({} if learning.reward == "feasible" else {"score": found["valid"]})
 
     about = digest("adversary training", plan.ego, plan.literal, plan.off_road, *(e.key for e in episodes))[:16]
     state = learn(model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about)
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
-    data = (
-        f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}; ego {plan.ego}"
-    )
+    where = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
     yield finish(
-        path, learning, model, state=state, data=data, command=command_of(plan), test=measure_all(plan),
-        about={"ego": plan.ego},
+        path, learning, model, state=state, data=f"{where}; ego {plan.ego}", command=command_of(plan),
+        test=measure_all(plan), about={"ego": plan.ego},
     )  # fmt: skip
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.vec_env import VecEnv
 
-from ssad.core.driving import Driver
+from ssad.core.driving import Driver, WorldState
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import F64, I32, Bool, Controller, End, Episode
 from ssad.drivers import make_system
+from ssad.training.hindsight import Hindsight
 from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
 from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible
@@ -72,8 +73,9 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         self._reward: Any = {
             "adversary": partial(adversary_reward, literal=literal, off_road=off_road),
             "colliding": colliding,
-            "feasible": partial(feasible, off_road=off_road),
+            "feasible": partial(self._feasible, off_road=off_road),
         }[reward]
+        self._hindsight = Hindsight(num_envs, self.world.agents, dt=self.world.dt) if reward == "feasible" else None
         self._before = cost_of if reward == "colliding" else distance_to_goal
         self._scale, self._action = scale, action
         self._random = generator("adversary episodes", seed)
@@ -83,7 +85,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
 
     def reset(self) -> npt.NDArray[np.float32]:
         """Start all scenes."""
-        self.loop.reset(episodes=self._draw(self.num_envs))
+        self._start()
         self._who[:] = -1
         self._returns[:], self._lengths[:] = 0.0, 0
         self._choose()
@@ -105,6 +107,8 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         controls[acting, who[acting]] = to_controls(self._action, self._actions[acting])
         self.loop.step(controls)
         state = world.state()
+        if self._hindsight is not None:
+            self._hindsight.note(state)
         reward = np.zeros(self.num_envs)
         gain: F64 = self._reward(state, agents, before)
         reward[acting] = self._scale * gain
@@ -129,9 +133,23 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
         self._returns[released], self._lengths[released] = 0.0, 0
         over = np.flatnonzero(ended)
         if len(over):
-            self.loop.reset(over, episodes=self._draw(len(over)))
+            self._start(over)
             self._who[over] = -1
         return self._observe(self._who), reward.astype(np.float32), released | (who < 0), infos
+
+    def _start(self, scenes: npt.NDArray[np.intp] | None = None) -> None:
+        """Start scenes again, None: all."""
+        self.loop.reset(scenes, episodes=self._draw(self.num_envs if scenes is None else len(scenes)))
+        if self._hindsight is not None:
+            self._hindsight.forget(np.arange(self.num_envs) if scenes is None else scenes)
+
+    def _feasible(self, state: WorldState, agents: I32, before: F64, *, off_road: float) -> F64:
+        """`feasible`, with hindsight for those who touch the ego."""
+        assert self._hindsight is not None
+        avoided = (state.touch[agents[:, 0], agents[:, 1]] & np.int64(1)) != 0
+        if avoided.any():
+            avoided[avoided] = self._hindsight.avoided(state, agents[avoided])
+        return feasible(state, agents, before, avoided, off_road=off_road)
 
     def _draw(self, count: int) -> I32:
         return self._random.integers(len(self.world.episodes), size=count).astype(np.int32)

@@ -90,8 +90,11 @@ def train_adversary(
     ] = "adv-ppo",
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[
-        str, typer.Option(help="Comma-separated sets or files with background traffic to learn in.")
-    ] = "training",
+        str,
+        typer.Option(
+            help="Comma-separated sets or files with background traffic; usual: training, frea training-lanes."
+        ),
+    ] = "",
     test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "natural",
     literal: Annotated[bool, typer.Option("--literal", help="Reward as equation 6 of the paper prints it.")] = False,
     off_road: Annotated[float, typer.Option(min=0.0, help="What a step off the road costs; in the paper 0.")] = 0.5,

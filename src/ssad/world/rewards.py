@@ -18,9 +18,6 @@ GOAL_AHEAD = 6.5  # m along the ego's route from its centre to the adversary's g
 GOAL_RADIUS = 2.0  # m
 
 Reward = Callable[[WorldState], F64]
-_LOOK = 2.0  # s ahead that an ego's way out is looked for
-_ACCEL, _ACROSS = (-7.0, -3.5, 0.0, 2.5), (-4.0, 0.0, 4.0)  # m/s^2 of the manoeuvres that are tried
-_BEND = 0.15  # 1/m, greatest curvature of a car
 _ASIDE = 0.5  # m from the route that cost nothing
 
 
@@ -179,46 +176,26 @@ def cost_of(state: WorldState, agents: I32) -> F64:
     return np.asarray(collision_cost(state, mine)[agents[:, 0]])
 
 
-def feasible(state: WorldState, agents: I32, before: F64, *, off_road: float = 0.0) -> F64:
-    """The reward of a feasibility-guided adversary, [N]: `adversary` while the ego can still avoid it, else -1.
+def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_road: float = 0.0) -> F64:
+    """The reward of a feasibility-guided adversary, [N]: a contact with the ego counts by who could have avoided it.
 
-    A collision that nobody could avoid says nothing about the ego. So the goal counts only where the ego has a way out,
-    and a step into the infeasible region is a loss, as in FREA.
+    A collision that nobody could avoid says nothing about the ego. So a contact is paid with 30 if a careful driver
+    would have avoided it, and costs 10 if not. On the way there, a metre nearer to the goal brings 0.3; the goal itself
+    brings nothing. Others and the road cost what they cost `adversary`.
 
     Args:
         state: After the step.
         agents: [N, 2] scene and agent of the adversaries.
         before: [N] `distance_to_goal` before the step.
+        avoided: [N] whether a careful driver in the ego's place would have stayed clear; of those who touch the ego.
         off_road: As of `adversary`.
 
-    Source: FREA (Chen et al. 2024), its reward shaping. FREA learns from recorded drives which states are feasible;
-    here this is computed (`avoidable`).
-    """
-    return np.where(avoidable(state, agents), adversary(state, agents, before, off_road=off_road), -1.0)
-
-
-def avoidable(state: WorldState, agents: I32) -> Bool:
-    """[N] whether the ego has a manoeuvre that stays clear of an adversary for 2 s.
-
-    Tried are braking hard or half, keeping the speed and speeding up, each straight on and with 4 m/s^2 to either side.
-    The adversary keeps its speed and heading. Who touches the ego already is not avoidable.
+    Source: FREA (Chen et al. 2024), for the aim. FREA learns from recorded drives which states leave a way out, and
+    turns the adversary back where there is none; here the encounter is judged when it is over.
     """
     scene, agent = agents.T
-    time = np.arange(0.2, _LOOK + 0.01, 0.2)
-    accel, across = (v.ravel() for v in np.meshgrid(_ACCEL, _ACROSS, indexing="ij"))
-    speed = np.abs(state.speed[scene, 0])[:, None]
-    moving = np.where(accel < 0.0, speed / np.maximum(-accel, 1e-6), _LOOK)[..., None]  # s until it stands
-    clock = np.minimum(time, moving)
-    way = speed[..., None] * clock + 0.5 * accel[:, None] * clock**2
-    turn = np.clip(across / np.maximum(speed, 2.0) ** 2, -_BEND, _BEND)[..., None]  # 1/m
-    yaw = state.pose[scene, 0, 2][:, None, None] + turn * way
-    middle = yaw - 0.5 * turn * way  # of the chord of the bend
-    ego = np.stack([state.pose[scene, 0, 0][:, None, None] + way * np.cos(middle),
-                    state.pose[scene, 0, 1][:, None, None] + way * np.sin(middle), yaw], -1)  # fmt: skip
-    x, y, heading = (state.pose[scene, agent, k][:, None, None] for k in range(3))
-    far = state.speed[scene, agent][:, None, None] * time
-    other = np.stack(np.broadcast_arrays(x + far * np.cos(heading), y + far * np.sin(heading), heading), -1)
-    sizes = [np.broadcast_to(state.size[scene, who][:, None, None], (*ego.shape[:-1], 2)) for who in (0, agent)]
-    other = np.broadcast_to(other, ego.shape)
-    gap = obb_distance(np.concatenate([ego, sizes[0]], -1), np.concatenate([other, sizes[1]], -1))
-    return np.asarray((gap > 0.0).all(-1).any(-1))
+    nearer = np.clip(before - distance_to_goal(state, agents), -1.0, 1.0)
+    touched = (state.touch[scene, agent] & np.int64(1)) != 0
+    contact = np.where(touched, np.where(avoided, 30.0, -10.0), 0.0)
+    gain: F64 = 0.3 * nearer - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)
+    return gain

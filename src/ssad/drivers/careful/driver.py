@@ -81,8 +81,8 @@ class Careful:
         given = np.asarray(view.target_speed, np.float64)
         target = np.maximum(self._cruise[rows], 1.0) if self.keep_speed else given
         push = np.clip(2.0 * (np.minimum(target, _bend_speed(view)) - speed), -2.0 * EASY, PULL)
-        waits = (seen & _in_the_way(e, half[:, :1])).any(1)
-        push = np.where((seen & _comes(e)).any(1), np.minimum(push, 0.0), push)
+        waits = (seen & in_the_way(e, half[:, :1])).any(1)
+        push = np.where((seen & comes(e)).any(1), np.minimum(push, 0.0), push)
         brake = np.maximum(asked.max(1, initial=0.0), _red_light(view, half[:, 0]))
         brake = np.where(waits & (speed < 1.5), np.maximum(brake, 2.0 * EASY), brake)
         push = np.where(brake > 0.0, np.minimum(push, -brake), push)
@@ -99,7 +99,7 @@ def _only(e: Encounter, seen: Bool) -> Encounter:
     return Encounter(**values)
 
 
-def _in_the_way(e: Encounter, half: F64) -> Bool:
+def in_the_way(e: Encounter, half: F64) -> Bool:
     """For whom a driver that stands stays there: who stands before it, and who crosses or will within a moment."""
     near = (e.gap > -half) & (e.lead < 1.0)
     stands = (e.lateral <= 0.0) & (e.gap < WAIT)
@@ -107,7 +107,7 @@ def _in_the_way(e: Encounter, half: F64) -> Bool:
     return np.asarray(near & (stands | crosses))
 
 
-def _comes(e: Encounter) -> Bool:
+def comes(e: Encounter) -> Bool:
     """Towards whom no driver speeds up: who is in its way or will be within a moment, and is reached soon."""
     soon = np.maximum(e.gap, 0.0) < SOON * np.maximum(e.closing(), 1.0)
     return np.asarray(soon & (e.gap > -e.length) & (e.lead < e.speed) & (e.time_to_enter() < 3.0))

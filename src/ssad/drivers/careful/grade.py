@@ -116,20 +116,26 @@ def danger_begins(trace: EpisodeTrace, agent: int, contact: int, triggered: Bool
     if agent < 1:
         return earliest
     on_course = ttc(trace)[: contact + 1, agent - 1] <= HORIZON
-    begin, gap = contact, 0
-    for k in range(contact - 1, earliest - 1, -1):
-        if on_course[k]:
-            begin, gap = k, 0
-        else:
-            gap += 1
-            if gap > FLICKER:
-                break
+    begin = earliest + conflict_begins(on_course[earliest:])
     started = np.flatnonzero(triggered[: contact + 1])
     if len(started):
         begin = min(begin, int(started[0]))
     begin = max(begin, earliest)
     sight = np.flatnonzero(seen[begin:contact])
     return begin + int(sight[0]) if len(sight) else contact
+
+
+def conflict_begins(on_course: Bool) -> int:
+    """The step since which two have been on a course to touch, up to the last one [T], the contact."""
+    begin, gap = len(on_course) - 1, 0
+    for k in range(len(on_course) - 2, -1, -1):
+        if on_course[k]:
+            begin, gap = k, 0
+        else:
+            gap += 1
+            if gap > FLICKER:
+                break
+    return begin
 
 
 def grade_collision(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -63,9 +65,11 @@ class Path:
         point: F64 = self.a[row, k] + (s - self.s[row, k])[:, None] * t + left[:, None] * normal
         return point
 
-
-def _unit(v: F64) -> F64:
-    return np.asarray(v / np.maximum(np.hypot(v[..., :1], v[..., 1:]), 1e-9))
+    def heading(self, s: F64) -> F64:
+        """Where the chains head [N], rad, at `s` [N] m along them."""
+        k = np.maximum((self.s <= s[:, None]).sum(1) - 1, 0)
+        t = self.t[np.arange(len(s)), k]
+        return np.asarray(np.arctan2(t[:, 1], t[:, 0]))
 
 
 def encounters(
@@ -89,14 +93,46 @@ def encounters(
     """
     belief: Belief = view.readings["truth"]
     seen = in_sight(view.pose[:, :2], belief, reach) & (belief.kind != AgentKind.NONE)
-    place = np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64)
+    e = meet(
+        path, half=half, place=np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64),
+        yaw=np.asarray(belief.pose[..., 2] - view.pose[:, None, 2], np.float64), speed=np.asarray(belief.speed),
+        size=np.asarray(belief.size), own_speed=np.asarray(view.speed), own_accel=np.asarray(view.accel),
+    )  # fmt: skip
+    comes = seen & (e.approach > 0.05)
+    now = np.where(comes, moved + np.maximum(e.approach, 0.0) * dt, 0.0)
+    return replace(e, moved=now), seen, now
+
+
+def meet(
+    path: Path,
+    *,
+    half: F64,
+    place: F64,
+    yaw: F64,
+    speed: npt.NDArray[np.floating],
+    size: npt.NDArray[np.floating],
+    own_speed: npt.NDArray[np.floating],
+    own_accel: npt.NDArray[np.floating],
+) -> Encounter:
+    """Others in the frame of drivers' paths, [N, K]; none of them has moved towards its path yet.
+
+    Args:
+        path: The paths of N drivers.
+        half: [N, 2] half length and width of their bodies, m.
+        place: [N, K, 2] where the others are, in the drivers' frames, m.
+        yaw: [N, K] where these head, rad.
+        speed: [N, K] m/s.
+        size: [N, K, 2] length and width of their bodies, m.
+        own_speed: [N] of the drivers, m/s.
+        own_accel: [N] of the drivers, m/s^2.
+    """
     here, _, _ = path.project(np.zeros((len(place), 1, 2)))
     s, left, heading = path.project(place)
-    turn = np.asarray(belief.pose[..., 2] - view.pose[:, None, 2], np.float64) - heading
-    speed = np.asarray(belief.speed, np.float64)
-    ahead, across = speed * np.cos(turn), speed * np.sin(turn)
+    turn = yaw - heading
+    fast: F64 = np.asarray(speed, np.float64)
+    ahead, across = fast * np.cos(turn), fast * np.sin(turn)
     c, sn = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    own = np.asarray(belief.size, np.float64) / 2.0
+    own = np.asarray(size, np.float64) / 2.0
     long, wide = own[..., 0] * c + own[..., 1] * sn, own[..., 0] * sn + own[..., 1] * c
     room = half[:, 1:] + wide
     lateral = np.abs(left) - room
@@ -104,17 +140,18 @@ def encounters(
     approach = np.where(inside, np.abs(across), -np.sign(left) * across)
     stays = (c > np.cos(ALONG)) | (np.abs(across) < 0.1)
     through = np.where(stays, np.inf, room - left * np.sign(across))
-    comes = seen & (approach > 0.05)
-    now = np.where(comes, moved + np.maximum(approach, 0.0) * dt, 0.0)
-    e = Encounter(
-        speed=np.broadcast_to(np.asarray(view.speed, np.float64)[:, None], s.shape),
-        accel=np.broadcast_to(np.asarray(view.accel, np.float64)[:, None], s.shape),
+    return Encounter(
+        speed=np.broadcast_to(np.asarray(own_speed, np.float64)[:, None], s.shape),
+        accel=np.broadcast_to(np.asarray(own_accel, np.float64)[:, None], s.shape),
         gap=s - here - half[:, :1] - long,
         lead=ahead,
         lateral=lateral,
         approach=approach,
         through=np.maximum(through, 0.0),
         length=2.0 * (half[:, :1] + long),
-        moved=now,
+        moved=np.zeros(s.shape),
     )
-    return e, seen, now
+
+
+def _unit(v: F64) -> F64:
+    return np.asarray(v / np.maximum(np.hypot(v[..., :1], v[..., 1:]), 1e-9))

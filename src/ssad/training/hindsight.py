@@ -1,0 +1,132 @@
+"""Hindsight: would a careful driver have stayed clear of who touches the ego now? Of many scenes at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.driving import WorldState
+from ssad.core.geometry import obb_distance, to_local
+from ssad.core.types import F64, I32, Bool
+from ssad.drivers.careful.driver import EASY, PULL, comes, in_the_way
+from ssad.drivers.careful.encounter import Encounter
+from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_begins
+from ssad.drivers.careful.models import CarefulModel, calm, careful_model, react
+from ssad.drivers.careful.sight import Path, meet
+from ssad.metrics.criticality import time_to_collision
+from ssad.scenarios.dynamic.frozen import BRAKING
+
+AHEAD = 120  # points of the ego's route, a metre apart
+
+
+class Hindsight:
+    """Remembers the last 6 s of scenes, and plays them again with a careful driver at the wheel.
+
+    It is `ssad.drivers.careful.grade` for two in an empty town: the careful driver takes over when the danger begins,
+    goes on along the ego's route at the speed that it finds, and brakes as its model says. The other does what it did,
+    and from the contact on brakes to a stop straight ahead, as in a saved scenario. Whom else there is, bends and what
+    hides the other from sight are left out.
+    """
+
+    def __init__(self, scenes: int, agents: int, *, dt: float = 0.1, model: CarefulModel | None = None) -> None:
+        """Nothing has happened yet.
+
+        Args:
+            scenes: How many.
+            agents: Of each.
+            dt: s from one state to the next.
+            model: The careful driver; None: that of UN Regulation 157.
+        """
+        self.dt, self.model = dt, careful_model("reg157") if model is None else model
+        rows = round(EARLIEST / dt) + 1
+        self._motion = np.zeros((rows, scenes, agents, 4))  # x, y, yaw, speed; the last row is now
+        self._point = np.zeros((rows, scenes), np.int64)  # of the ego's route
+        self._known = np.zeros(scenes, np.int64)
+
+    def note(self, state: WorldState) -> None:
+        """Remember a step."""
+        for rows in (self._motion, self._point):
+            rows[:-1] = rows[1:]
+        self._motion[-1, ..., :3], self._motion[-1, ..., 3] = state.pose, state.speed
+        self._point[-1] = state.progress[:, 0]
+        self._known += 1
+
+    def forget(self, scenes: npt.ArrayLike) -> None:
+        """These scenes start again."""
+        self._known[np.asarray(scenes)] = 0
+
+    def avoided(self, state: WorldState, agents: I32) -> Bool:
+        """Whether the careful driver stays clear of them until 5 s after now, [N].
+
+        Args:
+            state: The last one that was noted.
+            agents: [N, 2] scene and agent of those who touch the ego.
+        """
+        scene, agent = agents.T
+        begin = np.array([self._begins(state, *pair) for pair in agents.tolist()], np.int64)
+        time = np.arange(len(self._motion) + round(AFTER / self.dt))
+        row = begin[:, None] + time
+        now = len(self._motion) - 1
+        late: F64 = np.asarray((row - now) * self.dt, np.float64)
+        other = _stopping(self._motion[np.minimum(row, now), scene[:, None], agent[:, None]], late)
+        start = self._motion[begin, scene, 0]
+        frame = start[:, None, :3]
+        first, count = np.moveaxis(state.route[scene, 0], -1, 0)
+        point = np.maximum(self._point[begin, scene] - 2, 0)[:, None] + np.arange(AHEAD)
+        path = Path(to_local(frame, state.roads.path[first[:, None] + np.minimum(point, count[:, None] - 1), :2]))
+        place: F64 = np.asarray(to_local(frame, other[..., :2]), np.float64)
+        yaw = other[..., 2] - start[:, None, 2]
+        size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
+        own = state.size[scene, 0].astype(np.float64)
+        v = np.maximum(start[:, 3], 0.0)
+        met = meet(
+            path, half=0.5 * own, place=place, yaw=yaw, speed=other[..., 3], size=size, own_speed=v, own_accel=v * 0.0
+        )
+        way = self._drive(path, met, 0.5 * own[:, 0])
+        ego = np.concatenate([way, np.broadcast_to(own[:, None], (*yaw.shape, 2))], -1)
+        gap = obb_distance(ego, np.concatenate([place, yaw[..., None], size], -1))
+        return np.asarray(((gap > 0.0) | (row > now + round(AFTER / self.dt))).all(1))
+
+    def _begins(self, state: WorldState, scene: int, agent: int) -> int:
+        """The row in which the danger begins."""
+        known = max(len(self._motion) - int(self._known[scene]), 0)
+        motion = self._motion[known:, scene][:, [0, agent]]
+        size = np.broadcast_to(state.size[scene, [0, agent]], (*motion.shape[:2], 2))
+        box = np.concatenate([motion[..., :3], size], -1)
+        velocity = motion[..., 3:] * np.stack([np.cos(motion[..., 2]), np.sin(motion[..., 2])], -1)
+        course = time_to_collision(box[:, 0], box[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
+        return known + conflict_begins(course)
+
+    def _drive(self, path: Path, met: Encounter, half: F64) -> F64:
+        """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
+
+        Args:
+            path: The path.
+            met: The other at each step, as if the driver stayed where it is.
+            half: [N] half the length of its body, m.
+        """
+        v = met.speed[:, 0]
+        keeps = np.maximum(v, 1.0)
+        here, left, _ = (part[:, 0] for part in path.project(np.zeros((len(v), 1, 2))))
+        x, accel, memory, poses = np.zeros(len(v)), np.zeros(len(v)), calm(v.shape), []
+        for t in range(met.gap.shape[1]):
+            aside = left * np.maximum(1.0 - x / 10.0, 0.0)
+            poses.append(np.concatenate([path.at(here + x, aside), path.heading(here + x)[:, None]], 1))
+            now = {name: value[:, t] for name, value in vars(met).items()}
+            e = Encounter(**now | {"speed": v, "accel": accel, "gap": now["gap"] - x})
+            asked, memory = react(self.model, e, memory, self.dt)
+            push = np.clip(2.0 * (keeps - v), -2.0 * EASY, PULL)
+            push = np.where(comes(e), np.minimum(push, 0.0), push)
+            asked = np.where(in_the_way(e, half) & (v < 1.5), np.maximum(asked, 2.0 * EASY), asked)
+            after = np.maximum(v + np.where(asked > 0.0, np.minimum(push, -asked), push) * self.dt, 0.0)
+            x, accel, v = x + 0.5 * (v + after) * self.dt, (after - v) / self.dt, after
+        return np.stack(poses, 1)
+
+
+def _stopping(motion: F64, late: F64) -> F64:
+    """Rows [N, T, 4] of x, y, yaw and speed of who brakes to a stop straight ahead from `late` = 0 s on."""
+    x, y, yaw, speed = np.moveaxis(motion, -1, 0)
+    rolling = np.clip(late, 0.0, np.abs(speed) / BRAKING)
+    way = np.sign(speed) * (np.abs(speed) * rolling - 0.5 * BRAKING * rolling**2)
+    left = np.sign(speed) * (np.abs(speed) - BRAKING * rolling)
+    return np.stack([x + way * np.cos(yaw), y + way * np.sin(yaw), yaw, left], -1)
