@@ -27,10 +27,14 @@ def moves(x: float, y: float = 0.0, speed: float = 0.0, turn: float = 0.0, until
     return np.column_stack([x + (way - way[-1])[:, 0], y + (way - way[-1])[:, 1], yaw, np.full(len(t), speed)])
 
 
-def played(own: np.ndarray, other: np.ndarray) -> tuple[Hindsight, WorldState]:
-    """Both as they are told to move, remembered."""
+def played(own: np.ndarray, other: np.ndarray, bend: float | None = None) -> tuple[Hindsight, WorldState]:
+    """Both as they are told to move, remembered; the ego's route makes a sharp bend about x = `bend`."""
     world = World([episode(ego(), EpisodeAgent("other", "car", Controller.NONE, Pose(60.0, 0.0)))], GRAPHS)
     base, memory = world.state(), Hindsight(1, world.agents)
+    if bend is not None:
+        path = base.roads.path.copy()
+        path[np.abs(path[:, 0] - bend) < 0.6, 1] += 1.0
+        base = replace(base, roads=replace(base.roads, path=path))
     state = base
     for mine, its in zip(own, other, strict=True):
         rows = np.stack([mine, its])[None].astype(np.float32)
@@ -68,6 +72,12 @@ BRAKES[:, 0] = 60.0 + np.cumsum(0.1 * BRAKES[:, 3]) - 0.1 * BRAKES[:, 3].sum()
 )
 def test_what_the_driver_of_regulation_157_avoids(own: np.ndarray, other: np.ndarray, avoided: bool) -> None:
     memory, state = played(own, other)
+    assert memory.avoided(state, BOTH).tolist() == [avoided]
+
+
+@pytest.mark.parametrize(("bend", "avoided"), [(None, False), (54.0, True), (85.0, False), (15.0, False)])
+def test_it_slows_down_for_bends_on_its_way(bend: float | None, avoided: bool) -> None:
+    memory, state = played(moves(60.0, speed=10.0), moves(63.4, 0.0, 12.0, np.pi / 2, -1), bend)
     assert memory.avoided(state, BOTH).tolist() == [avoided]
 
 

@@ -31,7 +31,7 @@ ADVERSARIES = {
     )
 }  # fmt: skip
 ADVERSARIES |= {
-    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=1),
+    "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=3),
     "adv-sac": replace(
         LEARNINGS["sac"], steps=100_000, observation="adversary", action="adversary", reward="adversary", draws=6,
         gamma=0.98, lr=3e-4, batch=256, validate=25_000,

@@ -8,11 +8,11 @@ import numpy.typing as npt
 from ssad.core.driving import WorldState
 from ssad.core.geometry import obb_distance, to_local
 from ssad.core.types import F64, I32, Bool
-from ssad.drivers.careful.driver import EASY, PULL, comes, in_the_way
+from ssad.drivers.careful.driver import EASY, PULL, bend_speed, bends, comes, in_the_way
 from ssad.drivers.careful.encounter import Encounter
 from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_begins
 from ssad.drivers.careful.models import CarefulModel, calm, careful_model, react
-from ssad.drivers.careful.sight import Path, meet
+from ssad.drivers.careful.sight import BEHIND, Path, meet
 from ssad.metrics.criticality import time_to_collision
 from ssad.scenarios.dynamic.frozen import BRAKING
 
@@ -23,9 +23,9 @@ class Hindsight:
     """Remembers the last 6 s of scenes, and plays them again with a careful driver at the wheel.
 
     It is `ssad.drivers.careful.grade` for two in an empty town: the careful driver takes over when the danger begins,
-    goes on along the ego's route at the speed that it finds, and brakes as its model says. The other does what it did,
-    and from the contact on brakes to a stop straight ahead, as in a saved scenario. Whom else there is, bends and what
-    hides the other from sight are left out.
+    goes on along the ego's route at the speed that it finds (less in bends), and brakes as its model says. The other
+    does what it did, and from the contact on brakes to a stop straight ahead, as in a saved scenario. Whom else there
+    is, red lights and what hides the other from sight are left out.
     """
 
     def __init__(self, scenes: int, agents: int, *, dt: float = 0.1, model: CarefulModel | None = None) -> None:
@@ -73,7 +73,8 @@ class Hindsight:
         frame = start[:, None, :3]
         first, count = np.moveaxis(state.route[scene, 0], -1, 0)
         point = np.maximum(self._point[begin, scene] - 2, 0)[:, None] + np.arange(AHEAD)
-        path = Path(to_local(frame, state.roads.path[first[:, None] + np.minimum(point, count[:, None] - 1), :2]))
+        route = to_local(frame, state.roads.path[first[:, None] + np.minimum(point, count[:, None] - 1), :2])
+        path = Path(route)
         place: F64 = np.asarray(to_local(frame, other[..., :2]), np.float64)
         yaw = other[..., 2] - start[:, None, 2]
         size = np.broadcast_to(state.size[scene, agent][:, None].astype(np.float64), (*yaw.shape, 2))
@@ -82,7 +83,7 @@ class Hindsight:
         met = meet(
             path, half=0.5 * own, place=place, yaw=yaw, speed=other[..., 3], size=size, own_speed=v, own_accel=v * 0.0
         )
-        way = self._drive(path, met, 0.5 * own[:, 0])
+        way = self._drive(path, bends(route), met, 0.5 * own[:, 0])
         ego = np.concatenate([way, np.broadcast_to(own[:, None], (*yaw.shape, 2))], -1)
         gap = obb_distance(ego, np.concatenate([place, yaw[..., None], size], -1))
         return np.asarray(((gap > 0.0) | (row > now + round(AFTER / self.dt))).all(1))
@@ -97,15 +98,16 @@ class Hindsight:
         course = time_to_collision(box[:, 0], box[:, 1], velocity[:, 0] - velocity[:, 1]) <= HORIZON
         return known + conflict_begins(course)
 
-    def _drive(self, path: Path, met: Encounter, half: F64) -> F64:
+    def _drive(self, path: Path, allowed: F64, met: Encounter, half: F64) -> F64:
         """Poses of the careful driver [N, T, 3]: it starts at the origin and keeps to its path.
 
         Args:
             path: The path.
+            allowed: What its bends allow.
             met: The other at each step, as if the driver stayed where it is.
             half: [N] half the length of its body, m.
         """
-        v = met.speed[:, 0]
+        v, bend = met.speed[:, 0], np.arange(allowed.shape[1]) - 1.0  # a driver sees its route from a metre ahead on
         keeps = np.maximum(v, 1.0)
         here, left, _ = (part[:, 0] for part in path.project(np.zeros((len(v), 1, 2))))
         x, accel, memory, poses = np.zeros(len(v)), np.zeros(len(v)), calm(v.shape), []
@@ -115,7 +117,8 @@ class Hindsight:
             now = {name: value[:, t] for name, value in vars(met).items()}
             e = Encounter(**now | {"speed": v, "accel": accel, "gap": now["gap"] - x})
             asked, memory = react(self.model, e, memory, self.dt)
-            push = np.clip(2.0 * (keeps - v), -2.0 * EASY, PULL)
+            slow = bend_speed(allowed, bend - (here - BEHIND + x)[:, None])
+            push = np.clip(2.0 * (np.minimum(keeps, slow) - v), -2.0 * EASY, PULL)
             push = np.where(comes(e), np.minimum(push, 0.0), push)
             asked = np.where(in_the_way(e, half) & (v < 1.5), np.maximum(asked, 2.0 * EASY), asked)
             after = np.maximum(v + np.where(asked > 0.0, np.minimum(push, -asked), push) * self.dt, 0.0)

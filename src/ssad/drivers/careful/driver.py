@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from ssad.core.driving import Observation
 from ssad.core.types import F32, F64, Bool, Controller, Episode, SignalState
@@ -80,7 +81,9 @@ class Careful:
         self._cruise[rows] = np.where(fresh, speed, self._cruise[rows])
         given = np.asarray(view.target_speed, np.float64)
         target = np.maximum(self._cruise[rows], 1.0) if self.keep_speed else given
-        push = np.clip(2.0 * (np.minimum(target, _bend_speed(view)) - speed), -2.0 * EASY, PULL)
+        fits = bends(view.route)
+        slow = bend_speed(fits, np.arange(fits.shape[1], dtype=np.float64))
+        push = np.clip(2.0 * (np.minimum(target, slow) - speed), -2.0 * EASY, PULL)
         waits = (seen & in_the_way(e, half[:, :1])).any(1)
         push = np.where((seen & comes(e)).any(1), np.minimum(push, 0.0), push)
         brake = np.maximum(asked.max(1, initial=0.0), _red_light(view, half[:, 0]))
@@ -113,19 +116,22 @@ def comes(e: Encounter) -> Bool:
     return np.asarray(soon & (e.gap > -e.length) & (e.lead < e.speed) & (e.time_to_enter() < 3.0))
 
 
-def _bend_speed(view: Observation) -> F64:
-    """m/s that the bends ahead allow, slowing down with `EASY`."""
-    route = np.asarray(view.route, np.float64)
-    step = np.diff(route, axis=1)
+def bends(route: npt.NDArray[np.floating]) -> F64:
+    """What the bends of routes [N, R, 2] of a point a metre allow, [N, R - 4] (m/s)^2; the first is two points on."""
+    points = np.asarray(route, np.float64)
+    step = np.diff(points, axis=1)
     yaw = np.unwrap(np.arctan2(step[..., 1], step[..., 0]), axis=1)
     moves = np.hypot(step[..., 0], step[..., 1]) > 1e-3
     turn = np.where(moves[:, 1:] & moves[:, :-1], np.abs(np.diff(yaw, axis=1)), 0.0)
     # over three metres, as routes are not smooth
     turn = (turn[:, :-2] + turn[:, 1:-1] + turn[:, 2:]) / 3.0
-    fits = BEND / np.maximum(turn, 1e-3)
-    ahead = np.maximum(np.arange(turn.shape[1]) - 2.0, 0.0)
-    allowed: F64 = np.sqrt((fits + 2.0 * EASY * ahead).min(1))
-    return allowed
+    return np.asarray(BEND / np.maximum(turn, 1e-3))
+
+
+def bend_speed(allowed: F64, ahead: F64) -> F64:
+    """m/s [N] that `bends` allow that begin `ahead` [N, R] m from the driver, slowing down with `EASY`."""
+    room = 2.0 * EASY * np.maximum(ahead - 2.0, 0.0)
+    return np.asarray(np.sqrt(np.where(ahead > -0.5, allowed + room, np.inf).min(1)))
 
 
 def _red_light(view: Observation, half: F64) -> F64:
