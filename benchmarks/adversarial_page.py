@@ -95,7 +95,7 @@ def keep(name: str, runs: list[Path], *, add: bool = False) -> None:
         if any(before[key] != about[key] for key in ("scenarios", "budget", "keep")):
             raise ValueError(f"{name}: the runs are of other settings than what is kept")
         about["systems"] = list(dict.fromkeys([*before["systems"], *about["systems"]]))
-        about["planned"] = before.get("planned", len(before["rows"]))
+        about["planned"] = before["planned"]
         rows = list(
             {tuple(row[k] for k in ("generator", "system", "base")): row for row in before["rows"] + rows}.values()
         )

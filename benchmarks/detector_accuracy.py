@@ -24,7 +24,7 @@ import torch
 from ssad.camera.render import Weather
 from ssad.core import safeio
 from ssad.core.images import read_image
-from ssad.core.nuscenes_names import CLASSES
+from ssad.core.nuscenes_names import ALIKE, CLASSES
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
@@ -42,7 +42,6 @@ FLAT, SOLID = ("yolov3-tiny", "yolov5n"), ("fcos3d-light", "pgd-det-light")
 CLEAR = 0.25  # least score of a detection that counts for recall
 SIZES, DISTANCES = (8.0, 16.0, 24.0, 32.0, 64.0, 1e9), (0.0, 10.0, 20.0, 30.0, 50.0, 1e9)
 RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
-ALIKE = ("traffic_cone", "barrier")  # front and rear look alike
 FEW = 20  # objects: groups with fewer are left out
 SMALL = 24.0  # px
 SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detector says

@@ -34,6 +34,13 @@ SUITES = {
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
     **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "judges")},
 }  # fmt: skip
+NOTES = {
+    "physical-lights": "Fewer than five drives have no intervals.",
+    "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "
+    "the number of test pictures belongs. All 16 are of one drive.",
+    "physical-lights-gpu": "Stopped before most searches, but on six drives, which have intervals.",
+}
+"""What a section says of its run beside the suite's description."""
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")  # of benchmarks/physical_speed.py
 OTHERS = ("margins", "transfer", "grid", "others", "effort")
@@ -83,7 +90,7 @@ def part(name: str) -> list[str]:
         return [f"## `{name}`", "", f"`{SUITES[name]}` has not run yet.", ""]
     about = json.loads((folder / "run.json").read_text())
     suite, old = about["suite"], outdated(about)
-    lines = [f"## `{name}`", "", suite["description"], ""]
+    lines = [f"## `{name}`", "", suite["description"], "", *([NOTES[name], ""] if name in NOTES else [])]
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
     commands = [about["command"]] if isinstance(about["command"], str) else about["command"]

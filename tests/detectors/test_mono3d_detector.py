@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from helpers.mono3d import TINY, TINY_PGD, lens, lively, some_truth, truth_of
+from helpers.mono3d import TINY, TINY_PGD, TINY_VECTORS, lens, lively, perfect, some_truth, truth_of
 from helpers.quick import others_slow
 from torch import Tensor
 from torchvision.ops import box_iou
@@ -493,6 +494,29 @@ def test_dropped_boxes_vote_on_where_the_one_that_stays_is(config: Mono3DConfig)
         for name in ("centre", "size_lhw", "velocity"):
             expected = weight @ getattr(every.solid, name)[same]
             torch.testing.assert_close(getattr(found.solid, name)[k], expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("vote", [None, 0.5])
+def test_dropped_boxes_vote_on_the_heading(vote: float | None) -> None:
+    """The best place of an object takes it for turned round, but is not sure; its neighbours are."""
+    detector = Mono3D(replace(TINY_VECTORS, image_nms=0.3, vote=vote)).double()
+    truth = some_truth(1)
+    dense, assignment = perfect(detector, truth, (225, 400))
+    best, maps = int(dense.quality[0].argmax()), {name: [m.clone() for m in of] for name, of in dense.maps.items()}
+    assert (assignment.label[0] >= 0).sum() > 2
+    assert assignment.label[0, best] >= 0
+    for way, box in zip(maps["dir_cls_preds"], maps["bbox_preds"], strict=True):
+        count = way[0, 0].numel()
+        if 0 <= best < count:
+            row, column = divmod(best, way.shape[3])
+            way[0, :2, row, column] *= -0.01
+            box[0, 6, row, column] += math.pi
+        best -= count
+    (found,) = detector.select(replace(dense, maps=maps), 0.3)
+    assert found.solid is not None
+    assert truth.solid is not None
+    error = float((found.solid.yaw[0] - truth.solid.yaw[0]).remainder(2 * math.pi))
+    assert math.cos(error) == pytest.approx(-1.0 if vote is None else 1.0, abs=1e-6)
 
 
 @BOTH

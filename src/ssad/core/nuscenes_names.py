@@ -23,6 +23,8 @@ MMDET3D_CLASSES: Final = (
     "barrier",
 )  # fmt: skip
 
+ALIKE: Final = ("traffic_cone", "barrier")  # classes whose front and rear look alike
+
 ATTRIBUTES: Final = (
     "pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing", "cycle.with_rider",
     "cycle.without_rider", "vehicle.moving", "vehicle.parked", "vehicle.stopped",

@@ -19,7 +19,7 @@ from ssad.drivers import make_system
 from ssad.training.hindsight import Hindsight
 from ssad.world.actions import ACTIONS, WIDTHS, to_controls
 from ssad.world.rewards import adversary as adversary_reward
-from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible
+from ssad.world.rewards import colliding, cost_of, distance_to_goal, feasible, hit_ego
 from ssad.world.rollout import Loop
 from ssad.world.sb3 import Alike
 from ssad.world.selection import FreaSelection, Note
@@ -146,7 +146,7 @@ class AdversaryEnv(Alike, VecEnv):  # type: ignore[misc]  # stable-baselines3 ma
     def _feasible(self, state: WorldState, agents: I32, before: F64, *, off_road: float) -> F64:
         """`feasible`, with hindsight for those who touch the ego."""
         assert self._hindsight is not None
-        avoided = (state.touch[agents[:, 0], agents[:, 1]] & np.int64(1)) != 0
+        avoided = hit_ego(state, agents)
         if avoided.any():
             avoided[avoided] = self._hindsight.avoided(state, agents[avoided])
         return feasible(state, agents, before, avoided, off_road=off_road)

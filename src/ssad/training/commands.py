@@ -91,9 +91,7 @@ def train_adversary(
     ego: Annotated[str, typer.Option(help="Driving system that it is trained against.")] = "autopilot",
     scenarios: Annotated[
         str,
-        typer.Option(
-            help="Comma-separated sets or files with background traffic; usual: training, frea training-lanes."
-        ),
+        typer.Option(help="Comma-separated sets or files with background traffic (training; for frea training-lanes)."),
     ] = "",
     test: Annotated[str, typer.Option(help="Sets that the weights are measured on in the end.")] = "natural",
     literal: Annotated[bool, typer.Option("--literal", help="Reward as equation 6 of the paper prints it.")] = False,

@@ -14,7 +14,7 @@ from ssad.drivers.careful.grade import AFTER, EARLIEST, HORIZON, conflict_begins
 from ssad.drivers.careful.models import CarefulModel, calm, careful_model, react
 from ssad.drivers.careful.sight import BEHIND, Path, meet
 from ssad.metrics.criticality import time_to_collision
-from ssad.scenarios.dynamic.frozen import BRAKING
+from ssad.scenarios.dynamic.frozen import braked
 
 AHEAD = 120  # points of the ego's route, a metre apart
 
@@ -129,7 +129,5 @@ class Hindsight:
 def _stopping(motion: F64, late: F64) -> F64:
     """Rows [N, T, 4] of x, y, yaw and speed of who brakes to a stop straight ahead from `late` = 0 s on."""
     x, y, yaw, speed = np.moveaxis(motion, -1, 0)
-    rolling = np.clip(late, 0.0, np.abs(speed) / BRAKING)
-    way = np.sign(speed) * (np.abs(speed) * rolling - 0.5 * BRAKING * rolling**2)
-    left = np.sign(speed) * (np.abs(speed) - BRAKING * rolling)
+    way, left = braked(speed, late)
     return np.stack([x + way * np.cos(yaw), y + way * np.sin(yaw), yaw, left], -1)

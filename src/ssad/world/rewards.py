@@ -88,6 +88,13 @@ def distance_to_goal(state: WorldState, agents: I32) -> F64:
     return found
 
 
+def hit_ego(state: WorldState, agents: I32) -> Bool:
+    """[N] whether an adversary touches the ego."""
+    scene, agent = agents.T
+    found: Bool = (state.touch[scene, agent] & np.int64(1)) != 0
+    return found
+
+
 def hit_others(state: WorldState, agents: I32) -> Bool:
     """[N] whether an adversary touches anybody but the ego."""
     scene, agent = agents.T
@@ -195,7 +202,6 @@ def feasible(state: WorldState, agents: I32, before: F64, avoided: Bool, *, off_
     """
     scene, agent = agents.T
     nearer = np.clip(before - distance_to_goal(state, agents), -1.0, 1.0)
-    touched = (state.touch[scene, agent] & np.int64(1)) != 0
-    contact = np.where(touched, np.where(avoided, 30.0, -10.0), 0.0)
+    contact = np.where(hit_ego(state, agents), np.where(avoided, 30.0, -10.0), 0.0)
     gain: F64 = 0.3 * nearer - 15.0 * hit_others(state, agents) + contact - off_road * (state.lane[scene, agent] < 0)
     return gain

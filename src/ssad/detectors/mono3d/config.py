@@ -42,9 +42,9 @@ class Mono3DConfig:
         nms: IoU on the ground above which the worse of two boxes of a class is dropped.
         image_nms: IoU in the image above which the worse of two boxes of a class is dropped as well: two guesses of one
             object's depth do not overlap on the ground. None: not used, as in the source.
-        vote: IoU in the image from which a box that is dropped has a say in the place, size and velocity of the one of
-            its class that stays, by its score: places beside each other guess one object's distance, and their mean
-            errs less (Gidaris and Komodakis, ICCV 2015). None: not used, as in the source.
+        vote: IoU in the image from which a box that is dropped has a say in the place, size, velocity and vectors of
+            the yaw of the one of its class that stays, by its score: places beside each other guess one object's
+            distance, and their mean errs less (Gidaris and Komodakis, ICCV 2015). None: not used, as in the source.
         fade: How scores fall with depth, 1/m: by exp(-fade depth). Far boxes are less often in their place, and without
             it score as high as near ones. 0: not used, as in the source.
         sure: Power of PGD's confidence of depth in the score; 1 as in the source.

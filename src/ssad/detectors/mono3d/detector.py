@@ -160,15 +160,8 @@ class Mono3D(nn.Module):
             if self.config.heading == "vectors":
                 yaw = yaw - picked.reg[of, 6] + yaw_of_vectors(direction).to(yaw)
             columns = (
-                score[stay],
-                label[stay],
-                shown[stay],
-                centre,
-                extent,
-                yaw,
-                velocity,
-                picked.attribute[of].argmax(-1),
-            )
+                score[stay], label[stay], shown[stay], centre, extent, yaw, velocity, picked.attribute[of].argmax(-1),
+            )  # fmt: skip
             counts = torch.bincount(image[stay], minlength=len(lens)).tolist()
             parts = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]

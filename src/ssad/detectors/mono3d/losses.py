@@ -10,12 +10,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from ssad.core.detections import Assignment
-from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.core.nuscenes_names import ALIKE, MMDET3D_CLASSES
 from ssad.detectors.mono3d.config import Mono3DConfig
 from ssad.detectors.mono3d.decode import Flat, Places, corners, global_yaw, hull, project, unproject, vectors_of_yaw
 
 BETA = 1.0 / 9.0  # of smooth L1
-ALIKE = tuple(MMDET3D_CLASSES.index(name) for name in ("traffic_cone", "barrier"))  # front and rear look alike
+_ALIKE = tuple(MMDET3D_CLASSES.index(name) for name in ALIKE)
 Reduction = Literal["batch", "image"]
 Fuse = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
@@ -69,7 +69,7 @@ def losses(
         way, axis = torch.split(vectors_of_yaw(true), 2, 1)
         off = functional.smooth_l1_loss(direction[:, 2:], axis, beta=BETA, reduction="none")
         found["axis"] = total.mean(off.sum(1) * weights[6])
-        told = (label[image, place][:, None] != label.new_tensor(ALIKE)).all(1).to(reg.dtype)
+        told = (label[image, place][:, None] != label.new_tensor(_ALIKE)).all(1).to(reg.dtype)
         found["side"] = total.mean(functional.softplus(-2.0 * (direction[:, :2] * way).sum(1)) * told)
     else:
         said = reg[:, 6]

@@ -114,6 +114,19 @@ def _rows(trace: EpisodeTrace, agent: int) -> F64 | None:
     return np.stack(columns, 1)
 
 
+def braked(speed: F64, time: F64) -> tuple[F64, F64]:
+    """How far somebody has gone (m) who brakes from a speed (m/s) for a time (s), and its speed then (m/s).
+
+    Args:
+        speed: [...] before; below 0: backwards.
+        time: [...] broadcast against it; below 0: not yet.
+    """
+    size = np.abs(speed)
+    rolling = np.clip(time, 0.0, size / BRAKING)
+    way = np.sign(speed) * (size * rolling - 0.5 * BRAKING * rolling**2)
+    return way, np.sign(speed) * (size - BRAKING * rolling)
+
+
 def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
     """Rows [T, 4] of time, x, y and yaw, and after them a stop straight ahead, until a time s."""
     end, before = rows[-1], rows[-2]
@@ -121,7 +134,6 @@ def stopping(rows: F64, until: float, *, step: float = 0.1) -> F64:
     speed = float((end[1:3] - before[1:3]) @ heading / (end[0] - before[0]))
     braking = np.arange(1, int(abs(speed) / BRAKING / step) + 2) * step
     time = np.append(braking, max(until - float(end[0]), braking[-1]) + 1.0)
-    rolling = np.minimum(time, abs(speed) / BRAKING)
-    way = np.sign(speed) * (abs(speed) * rolling - 0.5 * BRAKING * rolling**2)
+    way, _ = braked(np.asarray(speed), time)
     more = np.stack([end[0] + time, *(end[1:3, None] + heading[:, None] * way), np.full(len(time), end[3])], 1)
     return np.concatenate([rows, more])
