@@ -195,6 +195,33 @@ def test_searches_find_repeat_and_count(how: Any, monkeypatch: pytest.MonkeyPatc
     assert search.random_settings(Toy(), TARGET, key=(0,)) == search.random_settings(Toy(), TARGET, key=(0,))  # type: ignore[arg-type]
 
 
+class Egg(Bowl):
+    """A picture with many dents, one of them the deepest."""
+
+    def show(self, change: Tensor) -> Tensor:
+        return (-0.1 * change.square().sum(-1) + torch.cos(6.0 * change).sum(-1))[:, None]
+
+
+@pytest.mark.parametrize("how", ["swarm", "greedy", "gradient"])
+def test_the_best_of_several_searches_counts(how: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first is the one that is made alone, all are counted, and many come deeper than one."""
+    monkeypatch.setattr(search, "_loss", lambda detector, images, truth: images[:, 0])
+    given = {"detector": None, "target": TARGET, "views": [search.LitView(Egg(), None)], "search": how}
+    one, many = (
+        search.search_light(Toy(), budget=Budget(20, 4, 0.08, None, searches=n), **given)  # type: ignore[arg-type]
+        for n in (1, 12)
+    )
+    assert many.best[: len(one.best)] == one.best
+    assert many.before == one.before
+    assert many.loss == many.best[-1] == max(many.best)
+    assert 6 * one.queries < many.queries <= 12 * 20
+    change = Toy().change({name: torch.tensor([value]) for name, value in many.values.items()}, None, TARGET)
+    assert float(Egg().show(change)[0, 0]) == pytest.approx(many.loss, abs=1e-5), "the settings are those of that loss"
+    assert many.loss > one.loss + 0.01
+    with pytest.raises(ConfigError, match="one search"):
+        Budget(searches=0)
+
+
 def test_what_is_found_is_kept(tmp_path: Path) -> None:
     """Random settings with their power, an edit that repeats, and nothing searched again."""
     spec = LightSpec("random", {"watts": 0.2}, {}, "laser", "night", "", 1, {})

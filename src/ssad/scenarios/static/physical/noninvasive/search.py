@@ -46,18 +46,22 @@ class Budget:
         members: Particles of a swarm; starts of the greedy search and of gradient descent.
         rate: Of gradient descent, in sides of the space.
         window: Side of the square part around the target that the detector is shown, px; None: the whole picture.
+        searches: How many searches are made, each from draws of its own and with all `settings`; the best one counts.
     """
 
     settings: int = 120
     members: int = 10
     rate: float = 0.05
     window: int | None = 320
+    searches: int = 1
 
     def __post_init__(self) -> None:
         if not 1 <= self.members <= self.settings or not self.rate > 0.0:
             raise ConfigError("a search: members from 1 to the number of settings, rate above 0")
         if self.window is not None and (self.window < 64 or self.window % 32):
             raise ConfigError("a search: the window is a multiple of 32 px, 64 at least")
+        if self.searches < 1:
+            raise ConfigError("a search: one search at least")
 
 
 @dataclass(slots=True)
@@ -128,14 +132,19 @@ def search_light(
             total = total + torch.cat(losses).to(total)
         return total / len(views)
 
-    draws = generator("light search", attack.name, *key)
-    with steady(detector):
-        if how == "gradient":
-            point, best = _descend(loss, len(ranges), budget, draws)
-        else:
-            with torch.no_grad():
-                ask: Ask = lambda points: loss(torch.from_numpy(points)).numpy()  # noqa: E731
-                point, best = (_swarm if how == "swarm" else _greedy)(ask, len(ranges), budget, draws)
+    point, best = np.empty(0), list[float]()
+    for number in range(budget.searches):
+        draws = generator("light search", attack.name, *key, *([number] if number else []))
+        with steady(detector):
+            if how == "gradient":
+                found, losses = _descend(loss, len(ranges), budget, draws)
+            else:
+                with torch.no_grad():
+                    ask: Ask = lambda points: loss(torch.from_numpy(points)).numpy()  # noqa: E731
+                    found, losses = (_swarm if how == "swarm" else _greedy)(ask, len(ranges), budget, draws)
+        if not best or losses[-1] > best[-1]:
+            point = found
+        best += [max([*best[-1:], value]) for value in losses]
     values = {
         name: float(low + (high - low) * share)
         for (name, (low, high)), share in zip(ranges.items(), point.tolist(), strict=True)
