@@ -21,6 +21,7 @@ from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError, UnknownNameError
 from ssad.core.types import U8
 from ssad.detectors.mono3d.decode import corners, hull, project
+from ssad.training import loop
 from ssad.training.batches import (
     Change,
     Item,
@@ -50,6 +51,29 @@ def same(a: Any, b: Any) -> bool:
 
 
 # ---------------------------------------------------------------- the loop
+
+
+def test_a_rate_that_falls_within_a_time_falls_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first epoch takes 4 s as something compiles, the others 1 s; a stop in between changes nothing."""
+    clock, recipe = [0.0], replace(RECIPE, epochs=30, within=10.5, warmup=0)
+    follow = loop._follow
+
+    def tick(average: Any, detector: Any, decay: float) -> None:
+        clock[0] += (4.0 if clock[0] < 4.0 else 1.0) / 2
+        follow(average, detector, decay)
+
+    monkeypatch.setattr(loop, "_follow", tick)
+    monkeypatch.setattr("time.monotonic", lambda: clock[0])
+    whole = train(fresh(), bank(), recipe, out=tmp_path / "whole")
+    rows = loop.read_rows(tmp_path / "whole")
+    assert rows[0]["of"] == 2, "told by the first epoch alone"
+    assert [row["epoch"] for row in rows] == list(range(1, 8))
+    assert {row["of"] for row in rows[1:]} == {7}, "4 s and six of 1 s are within 10.5 s"
+    assert rows[-1]["lr"] == pytest.approx(recipe.lr * recipe.last)
+    clock[0] = 0.0
+    train(fresh(), bank(), recipe, out=tmp_path / "parts", seconds=5.5)
+    assert len(loop.read_rows(tmp_path / "parts")) < 7
+    assert same(whole, train(fresh(), bank(), recipe, out=tmp_path / "parts"))
 
 
 @pytest.mark.parametrize(

@@ -200,8 +200,9 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     validate = _validation(plan, device, three=recipe.three)
     before = _before(plan.weights)
     weights = plan.out / f"{recipe.detector}.safetensors"
-    if last is not None and last["epoch"] >= recipe.epochs and _card_epochs(weights) == recipe.epochs:
-        say(f"all {recipe.epochs} epochs are done, and {weights.name} is there")
+    done, ends = (last["epoch"], recipe.last_epoch(last["epoch"], last["spent"], last["quickest"])) if last else (0, 1)
+    if done >= ends and _card_epochs(weights) == done:
+        say(f"all {done} epochs are done, and {weights.name} is there")
         return
     del last
     mine = items[share.rank :: share.world][: len(items) // share.world]
@@ -216,8 +217,8 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     row = read_rows(plan.out)[-1]
     write_row(plan.out, row | metrics)
     say("  ".join(f"{name} {value:.4f}" for name, value in metrics.items()))
-    if row["epoch"] < recipe.epochs:
-        say(f"stopped after {row['epoch']} of {recipe.epochs} epochs; run it again to go on")
+    if row["epoch"] < row["of"]:
+        say(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
     card = Card(
         data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,

@@ -111,10 +111,10 @@ def train(
     batch = max(recipe.batch // share.world, 1)
     often = repeats(bank.truth, recipe.rare)
     per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
-    total = per_epoch * recipe.epochs
-    epoch, step = _resume(out / LAST, detector, average, optimizer, recipe, about)
+    epoch, step, spent, quickest = _resume(out / LAST, detector, average, optimizer, recipe, about)
     start = time.monotonic()
-    while epoch < recipe.epochs:
+    while epoch < (last := _same(recipe.last_epoch(epoch, spent, quickest), share, where)):
+        total = per_epoch * last
         _training_mode(detector, recipe)
         sums: dict[str, Tensor] = {}
         began = time.monotonic()
@@ -142,19 +142,24 @@ def train(
                 sums[name] = sums.get(name, torch.zeros((), device=where)) + value.detach()
             step += 1
         epoch += 1
-        shown = per_epoch * batch * share.world
+        shown, took = per_epoch * batch * share.world, time.monotonic() - began
+        spent, quickest = spent + took, min(quickest, took)
+        ends = recipe.last_epoch(epoch, spent, quickest)
         row: dict[str, Any] = {
-            "epoch": epoch, "lr": rate, "images_s": round(shown / (time.monotonic() - began), 1),
+            "epoch": epoch, "of": ends, "lr": rate, "images_s": round(shown / took, 1),
             **{f"loss_{name}": round(float(value) / per_epoch, 5) for name, value in sums.items()},
         }  # fmt: skip
         if not all(math.isfinite(v) for v in row.values()):
             raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
         if share.rank == 0:
             final = average if average is not None else detector
-            _save(out, {"model": detector.state_dict(), "average": None if average is None else average.state_dict(),
-                        "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step, "about": about,
-                        "recipe": safeio.dump_json(recipe_data(recipe))}, row)  # fmt: skip
-            if validate is not None and epoch % recipe.validate == 0 and epoch < recipe.epochs:
+            state = {
+                "model": detector.state_dict(), "average": None if average is None else average.state_dict(),
+                "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step, "spent": spent, "quickest": quickest,
+                "about": about, "recipe": safeio.dump_json(recipe_data(recipe)),
+            }  # fmt: skip
+            _save(out, state, row)
+            if validate is not None and epoch % recipe.validate == 0 and epoch < ends:
                 row |= validate(final.eval())
                 write_row(out, row)
             say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
@@ -330,17 +335,18 @@ def read_last(path: Path, recipe: Recipe, about: str) -> dict[str, Any] | None:
 
 def _resume(  # noqa: PLR0917
     path: Path, detector: Any, average: Any, optimizer: torch.optim.Optimizer, recipe: Recipe, about: str
-) -> tuple[int, int]:
-    """Epoch and step to go on with."""
+) -> tuple[int, int, float, float]:
+    """Epoch and step to go on with, the time that epochs took, s, and that of the quickest."""
     state = read_last(path, recipe, about)
     if state is None:
-        return 0, 0
+        return 0, 0, 0.0, math.inf
     try:
         detector.load_state_dict(state["model"])
         if average is not None:
             average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
-        return int(state["epoch"]), int(state["step"])
+        times = float(state.get("spent", 0.0)), float(state.get("quickest", math.inf))
+        return int(state["epoch"]), int(state["step"]), *times
     except (KeyError, RuntimeError, ValueError, TypeError, AttributeError) as error:
         why = type(error).__name__
         raise FormatError(

@@ -27,7 +27,9 @@ class Recipe:
 
     Attributes:
         detector: Name of the detector.
-        epochs: Number of epochs.
+        epochs: Number of epochs, at most.
+        within: The rate falls to its end within this time of training, s, judged by the quickest epoch so far,
+            however few epochs that makes, so that another machine trains otherwise; 0: it falls over `epochs`.
         batch: Images in a step, over all devices.
         lr: Learning rate.
         optimizer: "sgd" or "adamw".
@@ -91,6 +93,7 @@ class Recipe:
     keep: Part = 0.0
     rare: Part = 0.0
     validate: Whole = 5
+    within: Least = 0.0
     radius: Least = 0.0
     attack_steps: Whole = 1
     options: dict[str, Any] = field(default_factory=dict)
@@ -111,6 +114,18 @@ class Recipe:
     def three(self) -> bool:
         """Whether the detector is a 3D one."""
         return self.detector.startswith(("fcos3d", "pgd"))
+
+    def last_epoch(self, done: int, spent: float, quickest: float) -> int:
+        """The epoch after which the training ends, as far as can be told.
+
+        Args:
+            done: Epochs that are done.
+            spent: Time that they took, s.
+            quickest: Time that the quickest took, s; inf before the first.
+        """
+        if not self.within or not done:
+            return self.epochs
+        return min(self.epochs, done + max(0, int((self.within - spent) / max(quickest, 1e-9))))
 
     def rate(self, step: int, total: int, per_epoch: int) -> float:
         """Learning rate of a step out of `total`."""
