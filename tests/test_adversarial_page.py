@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import adversarial_page
+from benchmarks import adversarial_page, avoidable
 
 
 def record(generator: str, base: str, hit: float, **more: Any) -> dict[str, Any]:
@@ -64,3 +64,15 @@ def test_the_page_is_what_its_command_makes(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setattr("sys.argv", ["adversarial_page"])
     adversarial_page.main()
     assert page.read_text(encoding="utf-8") == before
+
+
+def test_the_table_of_trainings_is_what_its_command_makes() -> None:
+    shown = avoidable.DOCUMENT.read_text(encoding="utf-8").partition(avoidable.BEGIN)[2].partition(avoidable.END)[0]
+    assert shown.strip() == "\n".join(avoidable.table(json.loads(avoidable.RESULTS.read_text()))).strip()
+
+
+def test_every_draw_of_a_route_counts_in_the_table_of_trainings() -> None:
+    hits = {f"natural/Here_{k // 2}/{k % 2:02d}": float(k < 6) for k in range(12)}
+    assert avoidable.share(hits).startswith("0.50 ["), "and not the first of each route alone"
+    odd = {f"natural/Here_{k // 2}/{k % 2:02d}": float(k % 2) for k in range(12)}
+    assert avoidable.share(odd).startswith("0.50 "), "0.00 if later draws were taken for copies"
