@@ -35,7 +35,6 @@ SUITES = {
     **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "judges")},
 }  # fmt: skip
 NOTES = {
-    "physical-lights": "Fewer than five drives have no intervals.",
     "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "
     "the number of test pictures belongs. All 16 are of one drive.",
     "physical-lights-gpu": "Stopped before most searches, but on six drives, which have intervals.",
