@@ -32,7 +32,7 @@ SUITES = {
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     "physical-lights-16": "ssad run physical-lights", "physical-lights-gpu": "ssad run physical-lights --device cuda",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
-    **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "judges")},
+    **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "around", "judges")},
 }  # fmt: skip
 NOTES = {
     "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "
@@ -42,7 +42,7 @@ NOTES = {
 """What a section says of its run beside the suite's description."""
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")  # of benchmarks/physical_speed.py
-OTHERS = ("margins", "transfer", "grid", "others", "effort")
+OTHERS = ("margins", "rivals", "transfer", "grid", "others", "effort")
 
 
 def store(folders: Sequence[Path], name: str | None = None) -> None:

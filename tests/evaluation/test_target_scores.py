@@ -102,6 +102,17 @@ def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
     assert target_scores(some)["intervals"] == once["intervals"], "the draws come from the seed"
 
 
+def test_attacks_on_the_same_pictures_have_the_same_draws_of_drives() -> None:
+    """Of a drive that is found or not at all, a draw tells how often it came; so two attacks can be compared in it."""
+    clean = [seen((TARGET, 0.9), drive=str(k)) for k in range(6) for _ in range(4)]
+    assert target_scores(clean)["drawn"] == [1.0] * 100
+    less = [seen((TARGET, 0.9), drive=one.drive) if one.drive != "0" else seen(drive=one.drive) for one in clean]
+    more = [seen((TARGET, 0.8), drive=one.drive) if one.drive not in "01" else seen(drive=one.drive) for one in clean]
+    one, two = (np.array(target_scores(pictures)["drawn"]) for pictures in (less, more))
+    assert (one >= two).all(), "what two attacks hide is never more than what the stronger hides"
+    assert "drawn" not in target_scores(clean[:8]), "too few drives"
+
+
 def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:
     """Matched once, and drawn as pictures that are matched anew: the same, also where scores are equal."""
     draws = np.random.default_rng(0)

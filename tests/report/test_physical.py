@@ -7,11 +7,20 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ssad.report import write_report
 from ssad.report.heatmap import HeatMap, heat_maps
-from ssad.report.kinds.physical import PhysicalRun, grid_table, main_table, margin_table, tiles, transfer_table
+from ssad.report.kinds.physical import (
+    PhysicalRun,
+    grid_table,
+    main_table,
+    margin_table,
+    rivals_table,
+    tiles,
+    transfer_table,
+)
 from ssad.report.load import load_run
 from ssad.report.paper import PHYSICAL
 
@@ -81,6 +90,28 @@ def test_a_margin_is_between_the_ends_of_the_intervals(folder: Path) -> None:
     assert rows["Adv. Patch"].cells[2].mean == pytest.approx(90.0 - 65.0)
     assert rows["DAS"].head[3] == "shuffled DAS", "the control that hides the target best"
     assert rows["DAS"].cells[2].mean == pytest.approx(45.0 - 53.0), "inside the intervals, so below 0"
+
+
+def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> None:
+    """Hard and easy drives spread both alike: the difference is known far better than either."""
+    draws = np.random.default_rng(0).normal(0.0, 0.1, 200)
+    own = {"source": "yolov5n", "drives": 8}
+    lines = [
+        line("das", "camouflage", 0.50, drawn=(0.50 + draws).tolist(), **own),
+        line("tpa", "camouflage", 0.40, drawn=(0.40 + draws + 0.01 * np.sign(draws)).tolist(), **own),
+        line("adv-patch", "patch", 0.2, drawn=(0.2 + draws).tolist(), **own),
+        line("random", "camouflage", 0.1),
+    ]  # fmt: skip
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    (row,) = rivals_table(PhysicalRun(load_run(folder))).rows
+    assert row.head == ("Oldmarket", "behind", "yolov5n", "TPA", "DAS"), "of one carrier, and no control"
+    gap = row.cells[2]
+    half = 2.3646 * 100 * np.std(0.01 * np.sign(draws), ddof=1) * np.sqrt(8 / 7)  # Student's, 7 degrees of freedom
+    assert (gap.mean, gap.low, gap.high) == pytest.approx((10.0, 10.0 - half, 10.0 + half), abs=1e-3)
+    lines[1]["drives"] = 7
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    (row,) = rivals_table(PhysicalRun(load_run(folder))).rows
+    assert np.isnan(row.cells[2].low), "other drives: no pairs"
 
 
 def test_the_first_screen_shows_the_clean_pictures_of_the_hour_of_the_strongest_light(folder: Path) -> None:
