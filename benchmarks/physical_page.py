@@ -32,7 +32,10 @@ SUITES = {
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     "physical-lights-16": "ssad run physical-lights", "physical-lights-gpu": "ssad run physical-lights --device cuda",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
-    **{f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml" for what in ("vanishing", "around", "judges")},
+    **{
+        f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
+        for what in ("vanishing", "around", "around-drives", "judges")
+    },
 }  # fmt: skip
 NOTES = {
     "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "

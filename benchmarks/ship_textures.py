@@ -47,7 +47,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         )
         card = TextureCard(
             spec["attack"], spec["carrier"], spec["options"], line["source"], weights[line["source"]],
-            suite["target"], data, f"ssad run {suite['name']}", int(line["epochs"]),
+            suite["target"], data, run.command, int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
         )  # fmt: skip
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
