@@ -31,7 +31,7 @@ SUITES = {
     "physical-gpu-larkhill-camouflage": "ssad run physical-gpu --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     "physical-lights-16": "ssad run physical-lights", "physical-lights-gpu": "ssad run physical-lights --device cuda",
-    **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road")},
+    **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
         for what in ("vanishing", "around", "around-drives", "judges")

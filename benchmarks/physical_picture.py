@@ -51,7 +51,7 @@ def main() -> None:
                 ((_, view),) = clips.wearing(surface)
                 image = view.picture.together([view.picture], {0: albedo_of(colour)[None]})
             shown.append((title, image))
-    sheet = target_sheet(detector, shown, truth.box[0].tolist(), "cpu")
+    sheet = target_sheet(detector, shown, truth, "cpu")
     save_picture(OUT, np.asarray(cv2.resize(sheet, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA), np.uint8))
 
 

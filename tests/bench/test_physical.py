@@ -61,7 +61,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"detectors": ["fcos3d-light"]}, ConfigError, "fcos3d-light is no 2D detector"),
+        ({"detectors": ["fcos3d-light"], "lights": ["laser"]}, ConfigError, "fcos3d-light is no 2D detector; lights"),
         ({"pairs": [PAIR | {"test": "Nowhere"}]}, ConfigError, "unknown town 'Nowhere'"),
         ({"target": "stop_sign"}, ConfigError, "no panel 'rear'"),
         ({"target": "stop_sign", "attacks": [], "lights": ["laser"]}, ConfigError, "lights and around are for cars"),
@@ -224,6 +224,24 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     texture.with_suffix(".checkpoint.npz").unlink()
     Physical().execute([cell], job)  # which needs no piece of work done before it
     assert np.array_equal(attacks_of(job).texture(spec), colour), "trained anew, the same to the bit"
+
+
+def test_a_texture_is_trained_against_a_3d_detector_and_shown_to_a_2d_one(tmp_path: Path) -> None:
+    """The detector is shown whole pictures with their camera, whatever the window; its loss on them rises."""
+    given = suite(
+        detectors=["fcos3d-light"], judges=["yolov5n"], attacks=[{"name": "vanishing", "settings": {"batch": 2}}],
+        epochs=4, window=192,
+    )  # fmt: skip
+    plan = Physical().plan(given)
+    records = run(plan, tmp_path, Resources(workers=1))
+    assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * 4
+    plan.kind.finish(plan, tmp_path)
+    assert (tmp_path / "pictures" / "drive-oldmarket.jpg").is_file()
+    rows = {(r["detector"], r["attack"]): r for r in records}
+    own = rows["fcos3d-light", "vanishing"]
+    assert own["loss_after"] > own["loss_before"]
+    assert own["metrics"]["confidence"] < rows["fcos3d-light", "clean"]["metrics"]["confidence"]
+    assert rows["yolov5n", "vanishing"]["source"] == "fcos3d-light"
 
 
 @pytest.mark.slow

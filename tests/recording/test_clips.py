@@ -19,12 +19,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from helpers.bodies import plain_bodies, two_phases
 from helpers.sharing import Shared
 
 from ssad.camera.labels import label_picture
 from ssad.camera.render import Weather, render
 from ssad.camera.scene import Layer
+from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
@@ -35,7 +37,7 @@ from ssad.recording.drives import make_drive
 from ssad.recording.nuscenes_recorder import drive
 from ssad.recording.scene_objects import SceneObjects
 from ssad.recording.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
-from ssad.recording.target_views import target_truth
+from ssad.recording.target_views import solid_target, target_truth
 from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
 from ssad.roads import load_town
 
@@ -231,8 +233,35 @@ def test_boxes_are_in_the_picture_and_the_target_lies_in_its_3d_box(mode: str, r
         seen, whole = (target_truth(row, [thing], CLASSES, whole=chosen).box[0].tolist() for chosen in (False, True))
         assert seen == pytest.approx([x, y, x + w, y + h], abs=1e-3)
         assert whole == pytest.approx([x0, y0, x1, y1], abs=0.02), "all of it, as a 3D detector says it"
+        solid = solid_target(row, target_truth(row, [thing], CLASSES, whole=True)).solid
+        assert solid is not None
+        length, width, height = row["target_size"]
+        assert solid.size_lhw.tolist() == [pytest.approx([length, height, width])]
+        middle = np.array(row["target_pose"])[:3, 3] + [0.0, 0.0, 0.5 * height]
+        assert solid.centre[0].tolist() == pytest.approx(
+            (np.linalg.inv(np.array(row["pose"])) @ [*middle, 1.0])[:3].tolist(), abs=1e-3
+        )
         if thing["visible"] == 1.0:
             assert w * h > 0.5 * (x1 - x0) * (y1 - y0)
+
+
+def test_a_target_before_a_level_camera_has_its_3d_box() -> None:
+    """A car 20 m ahead, turned left by 30 degrees, from a camera 1.5 m above the road."""
+    turn = np.radians(30.0)
+    row = {
+        "pose": [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]],  # z of the camera is x of the world
+        "target_pose": [
+            [np.cos(turn), -np.sin(turn), 0, 20], [np.sin(turn), np.cos(turn), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]
+        ],
+        "target_size": [4.0, 1.8, 1.4],
+    }  # fmt: skip
+    given = Truth(torch.tensor([3, 3]), torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2), intrinsic=torch.eye(3))
+    truth = solid_target(row, given)
+    assert truth.label.tolist() == [3], "the target alone"
+    assert truth.solid is not None
+    assert truth.solid.centre.tolist() == [pytest.approx([0.0, 0.8, 20.0], abs=1e-5)]
+    assert truth.solid.yaw.tolist() == pytest.approx([-np.pi / 2 - turn], abs=1e-6)
+    assert torch.equal(truth.box, given.box[:1])
 
 
 def projected(row: dict[str, Any]) -> F64:

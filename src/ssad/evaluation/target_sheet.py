@@ -9,34 +9,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssad.core.detections import Detections, Truth
 from ssad.core.images import captioned
 from ssad.core.protocols import Detector
 from ssad.core.types import U8
 from ssad.evaluation.pictures import FOUND
 
-COLUMNS, WIDTH, LEAST = 3, 640, 0.25
+COLUMNS, WIDTH = 3, 640
+LEAST = {"2d": 0.25, "3d": 0.15}  # score of a box that is drawn; those of 3D detectors are lower
 AROUND = 4.0  # side of what is shown, in longer sides of the target's box
 
 
 @torch.no_grad()
 def target_sheet(
-    detector: Detector, shown: Sequence[tuple[str, Tensor]], box: Sequence[float], device: str, columns: int = COLUMNS
+    detector: Detector, shown: Sequence[tuple[str, Tensor]], truth: Truth, device: str, columns: int = COLUMNS
 ) -> U8:
     """Parts of pictures side by side, each with its title and the boxes that a detector finds in the whole picture.
 
     Args:
         detector: Whose boxes are drawn.
         shown: Titles and pictures [1, 3, H, W] in 0 to 1.
-        box: The target in them: x1, y1, x2, y2, px; what is around it is shown.
+        truth: What is in them, the target first; what is around it is shown.
         device: Where the detector is.
         columns: Pictures in a row.
 
     Returns:
         [H, W, 3] RGB.
     """
-    tiles = []
+    tiles, box = [], truth.box[0].tolist()
     for title, image in shown:
-        (found,) = detector.predict(image.to(device), threshold=LEAST)
+        found = _found(detector, image.to(device), truth.intrinsic)
         whole = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
         left, top, side = _square(box, whole.shape[1], whole.shape[0])
         scale = WIDTH / side
@@ -62,15 +64,23 @@ def _square(box: Sequence[float], width: int, height: int) -> tuple[int, int, in
     return left, top, side
 
 
+def _found(detector: Detector, image: Tensor, intrinsic: Tensor | None) -> Detections:
+    """What a detector finds in a picture [1, 3, H, W] that is clear enough to be drawn."""
+    camera = None if intrinsic is None or detector.task == "2d" else intrinsic[None].to(image)
+    (found,) = detector.predict(image, camera, threshold=LEAST[detector.task])
+    return found
+
+
 @torch.no_grad()
-def marked(detector: Detector, image: Tensor) -> U8:
+def marked(detector: Detector, image: Tensor, intrinsic: Tensor | None = None) -> U8:
     """A picture with the boxes that a detector finds, RGB [H, W, 3].
 
     Args:
         detector: Whose boxes are drawn.
         image: [1, 3, H, W] in 0 to 1, where the detector is.
+        intrinsic: Camera matrix [3, 3], for a 3D detector.
     """
-    (found,) = detector.predict(image, threshold=LEAST)
+    found = _found(detector, image, intrinsic)
     picture = np.ascontiguousarray((image[0].permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
     for box, label, score in zip(found.box.tolist(), found.label.tolist(), found.score.tolist(), strict=True):
         low, high = (round(box[0]), round(box[1])), (round(box[2]), round(box[3]))

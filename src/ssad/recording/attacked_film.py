@@ -58,6 +58,7 @@ def attacked_frames(
         ConfigError: The attack does not fit on its agent.
     """
     front = Camera.typical(width, width * 9 // 16)
+    lens = torch.tensor(front.intrinsic, dtype=torch.float32)
     sides = [
         (title, Onboard(weather=weather, attack=one).camera(front))
         for title, one in (("clean", None), (f"agent {attack.agent} attacked", attack))
@@ -68,6 +69,6 @@ def attacked_frames(
             (picture,) = camera.of_trace(trace, graph, steps=[step])
             image = np.ascontiguousarray(np.moveaxis(picture, 0, -1))
             if detector is not None:
-                image = marked(detector, torch.from_numpy(picture.copy())[None].float() / 255)
+                image = marked(detector, torch.from_numpy(picture.copy())[None].float() / 255, lens)
             tiles.append(captioned(image, f"{title}, {step * trace.dt:.1f} s", width))
         yield np.hstack(tiles)

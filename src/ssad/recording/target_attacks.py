@@ -79,7 +79,7 @@ class TargetAttacks:
             clips = [self.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
                 clips.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
-            return [view for one in clips for _, view in one.wearing(surface)]
+            return [view for one in clips for _, view in replace(one, solid=one.whole).wearing(surface)]
 
         return self.textures.texture(spec, surface, views=views, detector=lambda: self.detector(spec.source))
 
@@ -165,7 +165,7 @@ class TargetAttacks:
         for k, (_, image, truth) in enumerate(chosen(everything.clean())):
             shown = [(clean, image), *((title, views[k][1]) for title, views in worn.items())]
             columns = min(len(shown), COLUMNS)
-            sheets.append(target_sheet(made, shown, truth.box[0].tolist(), self.device, columns))
+            sheets.append(target_sheet(made, shown, truth, self.device, columns))
         return np.concatenate(sheets)
 
     def light_sheet(self, detector: str, recording: str, lights: Mapping[str, tuple[str, LightSpec | None]]) -> U8:
@@ -175,7 +175,7 @@ class TargetAttacks:
             own = LitPictures.of(self.clips(recording, 1, detector), hour)
             ((_, image, truth),) = own.clean() if spec is None else self.under(own, spec)
             shown.append((title, image))
-        return target_sheet(made, shown, truth.box[0].tolist(), self.device)
+        return target_sheet(made, shown, truth, self.device)
 
 
 def see_surfaces(task: tuple[Path, int, str, Sequence[str], str]) -> None:

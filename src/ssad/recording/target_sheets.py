@@ -7,6 +7,7 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.images import save_picture
+from ssad.evaluation.target_sheet import LEAST
 from ssad.recording.target_attacks import TargetAttacks
 from ssad.recording.target_table import CLEAN, GRID, Pair, TargetTable, options_title
 from ssad.recording.target_views import TargetClips
@@ -31,7 +32,7 @@ def write_sheets(attacks: TargetAttacks, table: TargetTable, cells: Cells) -> No
     lights, path = _lights_shown(cells, table, attacks), folder / "pictures" / "lights.jpg"
     if lights and not path.is_file() and (folder / "data" / table.pairs[0].test / "annotations").is_dir():
         save_picture(path, attacks.light_sheet(name, table.pairs[0].test, lights))
-    finds = f"What {name} finds (orange, score at least 0.25) in"
+    finds = f"What {name} finds (orange, score at least {LEAST[attacks.detector(name).task]:g}) in"
     if path.is_file():
         captions[path.name] = f"{finds} a picture of {table.pairs[0].test} under each light."
     for pair in table.pairs:

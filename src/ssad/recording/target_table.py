@@ -107,17 +107,17 @@ class TargetTable(Schema):
     Attributes:
         name: of the table.
         seed: root of all random numbers.
-        detectors: 2D detectors with a class `car`.
-        judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to; of 3D
-            detectors the hulls of their boxes in the picture count.
+        detectors: detectors with a class `car`, 2D or, for textures, 3D; of 3D detectors the hulls of their boxes in
+            the picture count.
+        judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to.
         transfer: whether a texture is shown to the other detectors too.
         target: a car, stop_sign or pedestrian, as for `ssad record --target`; what is no car is seen from all around.
         pairs: towns.
         attacks: names, or mappings with the keys of `Entry`.
         lights: names of light attacks, or mappings with the keys of `LightEntry`.
         epochs: of all trained textures, in place of their own; None: their own.
-        window: side of the part around the target that trainings show to a detector, px, a multiple of 32; None: whole
-            pictures. A window of 192 takes a sixth of the time.
+        window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
+            whole pictures, as for 3D detectors always. A window of 192 takes a sixth of the time.
         seeds: of each control that is drawn at random.
         grid: views from all around, beside those from behind; None: none.
         behind: m from the camera to a car that drives.

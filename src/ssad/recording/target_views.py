@@ -12,9 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssad.core.detections import Truth
+from ssad.core.boxes import camera_yaw
+from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
+from ssad.core.nuscenes_names import NO_ATTRIBUTE
 from ssad.recording.clip_recorder import CLASSES, clip_rows
 from ssad.recording.textured_clips import textured_clips
 from ssad.scenarios.static.physical import Surface, View
@@ -31,6 +33,8 @@ class TargetClips:
         device: Where pictures are rendered and shown.
         whole: Whether true boxes are those around the whole 3D boxes, as 3D detectors give them, and not around what is
             seen.
+        solid: Whether the truth of pictures that wait for a texture is the target alone, with its 3D box, as a training
+            against a 3D detector needs it.
     """
 
     folder: Path
@@ -38,6 +42,7 @@ class TargetClips:
     classes: tuple[str, ...] = CLASSES
     device: str = "cpu"
     whole: bool = False
+    solid: bool = False
 
     def rows(self) -> list[Mapping[str, Any]]:
         """What the annotation file says of each picture. FormatError: no recording of this version."""
@@ -67,10 +72,8 @@ class TargetClips:
         for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
             wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             seen |= bool(len(wearing.taps[0].pixel))
-            yield (
-                drive_of(clip.row),
-                View(wearing, target_truth(clip.row, clip.objects, self.classes, whole=self.whole)),
-            )
+            truth = target_truth(clip.row, clip.objects, self.classes, whole=self.whole)
+            yield drive_of(clip.row), View(wearing, solid_target(clip.row, truth) if self.solid else truth)
         if not seen:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
@@ -104,6 +107,24 @@ def target_truth(
         intrinsic=torch.tensor(row["intrinsic"], dtype=torch.float32),
         crowd=torch.tensor([bool(ordered[k]["iscrowd"]) for k in known]),
     )
+
+
+def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
+    """The target of a picture alone, with its 3D box, of which velocity and attribute are unknown.
+
+    Args:
+        row: Of the picture.
+        truth: What `target_truth` says of it.
+    """
+    turn = np.linalg.inv(np.array(row["pose"])) @ np.array(row["target_pose"])
+    length, width, height = row["target_size"]
+    centre = turn[:3, 3] + 0.5 * height * turn[:3, 2]  # a pose is that of the middle of the bottom
+    solid = Solids(
+        torch.tensor(centre[None], dtype=torch.float32), torch.tensor([[length, height, width]], dtype=torch.float32),
+        torch.tensor(camera_yaw(turn[None, :3, 0]), dtype=torch.float32), torch.full((1, 2), torch.nan),
+        torch.tensor([NO_ATTRIBUTE]),
+    )  # fmt: skip
+    return Truth(truth.label[:1], truth.box[:1], solid, truth.intrinsic)
 
 
 def drive_of(row: Mapping[str, Any]) -> str:

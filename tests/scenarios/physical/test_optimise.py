@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ssad.camera.scene import Layer
-from ssad.core.detections import Truth
+from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
@@ -119,6 +120,30 @@ def test_a_training_that_was_stopped_goes_on_to_the_bit(tmp_path: Path, optimise
     assert len(more.losses) == 6
     with pytest.raises(FormatError, match="of another training"):
         train_texture(replace(attack, rate=0.01), *given[1:], start=start, checkpoint=path)
+
+
+class Solid(ToyDetector):
+    """Keeps what it is shown, and with which cameras."""
+
+    seen: ClassVar[list[tuple[tuple[int, ...], list[float]]]] = []
+
+    def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
+        assert intrinsic is not None
+        self.seen.append((tuple(images.shape[2:]), intrinsic[:, 0, 0].tolist()))
+        return super().dense(images, intrinsic)
+
+
+def test_a_3d_detector_is_shown_whole_pictures_with_their_cameras() -> None:
+    pictures = [
+        replace(view, truth=replace(view.truth, intrinsic=torch.eye(3) * (k + 1.0))) for k, view in enumerate(views(4))
+    ]
+    attack = replace(PLAIN, epochs=1, window=128)
+    train_texture(
+        attack, Solid(("car",), spread=0.0, task="3d"), SURFACE, pictures, start=control("grey", SURFACE.size)
+    )
+    size = tuple(pictures[0].picture.show({0: control("grey", SURFACE.size)}).shape[2:])  # type: ignore[attr-defined]
+    assert {shape for shape, _ in Solid.seen} == {size}, "a window would move the camera's middle"
+    assert sorted(focal for _, focals in Solid.seen for focal in focals) == [1.0, 2.0, 3.0, 4.0]
 
 
 def test_draws_come_from_the_key_alone() -> None:

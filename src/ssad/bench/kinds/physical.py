@@ -1,4 +1,4 @@
-"""Kind `physical`: 2D detectors x textures on a car that drives, trained in one town and tested in another."""
+"""Kind `physical`: detectors x textures on a car that drives, trained in one town and tested in another."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ssad.scenarios.static.physical.noninvasive.kept import LightSpec
 
 
 class PhysicalSuite(SuiteBase, TargetTable):
-    """One table: 2D detectors x textures on a car, each trained on drives in one town and tested in another.
+    """One table: detectors x textures on a car, each trained on drives in one town and tested in another.
 
     Attributes:
         floor: least AP50 of the clean pictures, below which no attack is reported.
@@ -70,8 +70,8 @@ class Physical(Kind):
             detector = make_detector(name)
             if class_of_target(target) not in detector.classes:
                 raise ConfigError(f"suite {suite.name}: {name} has no class {class_of_target(target)}")
-            if detector.task != "2d" and name in suite.detectors:
-                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector; 3D detectors can be judges")
+            if detector.task != "2d" and name in suite.detectors and suite.lights:
+                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector; lights are searched against those")
             weights[name] = state_hash(detector)
         for pair in suite.pairs:
             for town in (pair.train, pair.test):

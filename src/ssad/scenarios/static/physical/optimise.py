@@ -66,7 +66,8 @@ class TextureAttack:
         expectation: What differs from print to print.
         worst: Share of the pictures of an epoch that are drawn by how badly the attack does on them, in place of once
             each; 0: none.
-        window: Side of the square part around the target that the detector is shown, px; None: the whole picture.
+        window: Side of the square part around the target that a 2D detector is shown, px; None: the whole picture, as
+            3D detectors are always shown, since their boxes belong to its camera.
     """
 
     name: str
@@ -128,7 +129,8 @@ def train_texture(
         attack: How.
         detector: What is attacked; its modes, flags and buffers are the same afterwards.
         surface: What the texture is printed on.
-        views: Pictures whose target wears texture 0 on that surface.
+        views: Pictures whose target wears texture 0 on that surface; with 3D truth and a camera matrix for a 3D
+            detector.
         start: The first texture, sRGB [3, H, W].
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
         shown: What pictures take of a texture's colours: the albedo of print, or the light of a projector.
@@ -215,13 +217,15 @@ def _ascended(  # noqa: PLR0917
     pictures, truth = [views[k].picture for k in chosen], [views[k].truth for k in chosen]
     printed = shown(attack.expectation.draw(colour, draws))
     images = type(pictures[0]).together(pictures, {0: printed}, draws)
-    if attack.window is not None:
+    three = detector.task == "3d"
+    if attack.window is not None and not three:
         parts = [
             around_target(image[None], seen, attack.window, own)
             for image, seen, own in zip(images, truth, draws, strict=True)
         ]
         images, truth = torch.cat([part for part, _ in parts]), [seen for _, seen in parts]
-    dense = detector.dense(images)
+    cameras = [one.intrinsic for one in truth if one.intrinsic is not None and three]
+    dense = detector.dense(images, torch.stack(cameras).to(images) if cameras else None)
     with torch.no_grad():
         assignment = detector.assign(dense, truth)
     return objective(dense, Situation(detector, assignment, TARGET))
