@@ -226,22 +226,19 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
     assert np.array_equal(attacks_of(job).texture(spec), colour), "trained anew, the same to the bit"
 
 
-def test_a_texture_is_trained_against_a_3d_detector_and_shown_to_a_2d_one(tmp_path: Path) -> None:
-    """The detector is shown whole pictures with their camera, whatever the window; its loss on them rises."""
+def test_a_texture_is_trained_against_a_3d_detector(tmp_path: Path) -> None:
+    """It is shown whole pictures with their camera, whatever the window; its loss on them rises."""
     given = suite(
-        detectors=["fcos3d-light"], judges=["yolov5n"], attacks=[{"name": "vanishing", "settings": {"batch": 2}}],
-        epochs=4, window=192,
+        detectors=["fcos3d-light"], attacks=[{"name": "vanishing", "settings": {"batch": 2}}], epochs=3, window=192,
+        pairs=[PAIR | {"test_images": 1}],
     )  # fmt: skip
     plan = Physical().plan(given)
     records = run(plan, tmp_path, Resources(workers=1))
-    assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * 4
+    assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * 2
     plan.kind.finish(plan, tmp_path)
     assert (tmp_path / "pictures" / "drive-oldmarket.jpg").is_file()
-    rows = {(r["detector"], r["attack"]): r for r in records}
-    own = rows["fcos3d-light", "vanishing"]
+    own = next(record for record in records if record["attack"] == "vanishing")
     assert own["loss_after"] > own["loss_before"]
-    assert own["metrics"]["confidence"] < rows["fcos3d-light", "clean"]["metrics"]["confidence"]
-    assert rows["yolov5n", "vanishing"]["source"] == "fcos3d-light"
 
 
 @pytest.mark.slow
