@@ -22,6 +22,7 @@ def test_pictures_are_shown_on_the_device_of_the_attacks(tmp_path: Path, monkeyp
         asked.append(clips.device)
         return np.zeros((8, 8, 3), np.uint8)
 
-    attacks: Any = SimpleNamespace(folder=tmp_path, device="cuda:3", sheet=sheet)
+    flat = SimpleNamespace(task="2d")
+    attacks: Any = SimpleNamespace(folder=tmp_path, device="cuda:3", sheet=sheet, detector=lambda _: flat)
     target_sheets.write_sheets(attacks, suite, [])
     assert asked == ["cuda:3"], "clips on another device than the textures cannot be shown"
