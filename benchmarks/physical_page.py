@@ -38,6 +38,7 @@ SUITES = {
     },
 }  # fmt: skip
 NOTES = {
+    "physical-around-drives": "Each pair of towns is a run of its own, with the textures that were trained in it.",
     "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "
     "the number of test pictures belongs. All 16 are of one drive.",
     "physical-lights-gpu": "Stopped before most searches, but on six drives, which have intervals.",
