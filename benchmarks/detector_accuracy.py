@@ -316,8 +316,8 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
     return [
         *lines,
         "Pixels are part of it: with the same weights a detector can enlarge the pictures before it looks",
-        "(`make_detector(NAME, input_width=960)`, in suites `NAME?input_width=960`; 2.25 times the pixels). At twice the",
-        "width near objects are larger than those that were learned. By width inside, px:",
+        "(`make_detector(NAME, input_width=960)`, in suites `NAME?input_width=960`; 2.25 times the pixels). At",
+        "twice the width near objects are larger than those that were learned. By width inside, px:",
         "",
         *table(["pictures of 640 px", *(f"{n}: {text}" for n in parts for text in told.values())], rows),
     ]

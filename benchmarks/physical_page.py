@@ -46,7 +46,7 @@ NOTES = {
 """What a section says of its run beside the suite's description."""
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin
 STAGES = ("print", "light", "sensor", "detector", "sensor_back", "texture_back")  # of benchmarks/physical_speed.py
-OTHERS = ("margins", "rivals", "transfer", "grid", "others", "effort")
+OTHERS = ("margins", "comparison", "transfer", "grid", "others", "effort")
 
 
 def store(folders: Sequence[Path], name: str | None = None) -> None:

@@ -103,14 +103,14 @@ def test_intervals_come_from_drives_and_copies_do_not_narrow_them() -> None:
 
 
 def test_attacks_on_the_same_pictures_have_the_same_draws_of_drives() -> None:
-    """An attack that hides the targets of one drive, and one that hides those of another too: less is left in each draw."""
+    """One attack hides the targets of a drive, another those of a second too: less is left in each draw."""
     clean = [seen((TARGET, 0.9), drive=str(k)) for k in range(6) for _ in range(4)]
-    assert target_scores(clean)["drawn"] == [1.0] * 100
+    assert target_scores(clean)["replicates"]["AP50"] == [1.0] * 100
     less = [seen((TARGET, 0.9), drive=one.drive) if one.drive != "0" else seen(drive=one.drive) for one in clean]
     more = [seen((TARGET, 0.8), drive=one.drive) if one.drive not in "01" else seen(drive=one.drive) for one in clean]
-    one, two = (np.array(target_scores(pictures)["drawn"]) for pictures in (less, more))
+    one, two = (np.array(target_scores(pictures)["replicates"]["AP50"]) for pictures in (less, more))
     assert (one >= two).all(), "in each draw both have the same drives"
-    assert "drawn" not in target_scores(clean[:8]), "too few drives"
+    assert not target_scores(clean[:8])["replicates"], "too few drives"
 
 
 def test_precision_of_drawn_drives_is_that_of_their_pictures() -> None:

@@ -114,26 +114,24 @@ def target_scores(
         seed: Of its draws.
 
     Returns:
-        metrics; intervals (95 %; of drives, absent where there are too few); n, the number of pictures; drives; where
-        there are intervals drawn, the AP50 of each draw of the bootstrap: pictures of the same drives have the same
-        draws, so what one attack leaves can be compared with what another does, draw by draw.
+        metrics; intervals (95 %; of drives, absent where there are too few); replicates of each AP (of the bootstrap,
+        the same draws for all attacks on the same pictures); n, the number of pictures; drives.
     """
     drives = sorted({one.drive for one in sightings})
     of = np.array([drives.index(one.drive) for one in sightings], np.int32)
     metrics: dict[str, float | None] = {}
     intervals: dict[str, list[float] | None] = {}
-    more: dict[str, Any] = {}
+    drawn: dict[str, list[float]] = {}
     for name, (target_only, least) in PRECISIONS.items():
         value = metrics[name] = precision(sightings, target_only=target_only, least=least)
         if len(drives) >= MIN_CLUSTERS and replicates and value is not None:
             draws = generator("target scores", seed, name)
-            drawn = [draws.integers(len(drives), size=len(drives)) for _ in range(replicates)]
-            values = _precisions(sightings, of, drawn, target_only=target_only, least=least)
+            picked = [draws.integers(len(drives), size=len(drives)) for _ in range(replicates)]
+            values = _precisions(sightings, of, picked, target_only=target_only, least=least)
             spread = np.asarray(np.var(values, ddof=1))
             low, high = replicate_limits(np.asarray(value), spread, len(drives), bounded=True)
             intervals[name] = [float(low), float(high)]
-            if name == "AP50":
-                more["drawn"] = [round(one, 5) for one in values]
+            drawn[name] = [round(one, 5) for one in values]
     scores = [one.confidences() for one in sightings]
     scores_before = scores if clean is None else [one.confidences() for one in clean]
     best, before = np.array([one[0] for one in scores]), np.array([one[0] for one in scores_before])
@@ -152,7 +150,9 @@ def target_scores(
     metrics["confidence"] = float(best.mean())
     kept = {name: limits for name, limits in intervals.items() if limits is not None}
     rounded = {name: None if value is None else round(value, 6) for name, value in metrics.items()}
-    return {"metrics": rounded, "intervals": kept, "n": len(sightings), "drives": len(drives)} | more
+    return {
+        "metrics": rounded, "intervals": kept, "replicates": drawn, "n": len(sightings), "drives": len(drives),
+    }  # fmt: skip
 
 
 def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:

@@ -15,5 +15,6 @@ from ssad.metrics.uncertainty import CaseValue as CaseValue
 from ssad.metrics.uncertainty import Estimate as Estimate
 from ssad.metrics.uncertainty import estimate as estimate
 from ssad.metrics.uncertainty import paired_difference as paired_difference
+from ssad.metrics.uncertainty import replicate_difference as replicate_difference
 from ssad.metrics.uncertainty import replicate_estimate as replicate_estimate
 from ssad.metrics.uncertainty import sign_flip_test as sign_flip_test

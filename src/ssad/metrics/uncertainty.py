@@ -137,6 +137,22 @@ def replicate_estimate(
     return Estimate(value, float(low), float(high), n, 0, "beta" if bounded else "t", clusters)
 
 
+def replicate_difference(value: float, differences: Sequence[float], *, n: int, clusters: int) -> Estimate:
+    """A difference of two scores in [0, 1], its interval from paired bootstrap replicates.
+
+    Args:
+        value: the difference, in [-1, 1].
+        differences: the same of resamples of clusters, in each of which both scores have the same clusters.
+        n: As for `replicate_estimate`.
+        clusters: As for `replicate_estimate`.
+
+    Returns:
+        The estimate; its limits are those of (1 + difference) / 2, a score in [0, 1].
+    """
+    half = [0.5 * (1.0 + one) for one in differences]
+    return replicate_estimate(0.5 * (1.0 + value), half, n=n, clusters=clusters).scaled(2.0, -1.0)
+
+
 def paired_difference(
     first: Mapping[str, CaseValue], second: Mapping[str, CaseValue], *, kind: Literal["share", "mean"] = "mean"
 ) -> Estimate:

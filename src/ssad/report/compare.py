@@ -11,7 +11,7 @@ from typing import Any
 
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
-from ssad.metrics import METRICS, CaseValue, Estimate, Outcome, paired_difference, replicate_estimate, sign_flip_test
+from ssad.metrics import METRICS, CaseValue, Estimate, Outcome, paired_difference, replicate_difference, sign_flip_test
 from ssad.report.load import Run, load_run
 from ssad.report.pages import render
 from ssad.report.tables import METHODS, Cell, Row, Table, write_tables
@@ -274,18 +274,17 @@ def _score_row(
     """A score in each run; the interval of the difference where both resampled the same scenes in the same way."""
     a, b = float(own["metrics"][metric]), float(other["metrics"][metric])
     draws = [(line.get("replicates") or {}).get(metric) or [] for line in (own, other)]
-    scenes = int(own.get("scenes") or 0)
+    scenes, others = (int(line.get("scenes") or line.get("drives") or 0) for line in (own, other))
     found = Estimate(b - a, math.nan, math.nan, int(own.get("n", 1)), clusters=scenes)
     p = math.nan
-    if paired and scenes == other.get("scenes") and own.get("n") == other.get("n") and len(draws[0]) == len(draws[1]):
+    if paired and scenes == others and own.get("n") == other.get("n") and len(draws[0]) == len(draws[1]):
         found, p = _replicate_difference(b - a, [y - x for x, y in zip(*draws, strict=True)], found)
     return Row((title, name, metric), (Cell(a), Cell(b), Cell.of(found), Cell(p, digits=4)))
 
 
 def _replicate_difference(value: float, draws: Sequence[float], bare: Estimate) -> tuple[Estimate, float]:
     """Interval and p-value of a difference of scores in [0, 1]; its limits are those of (1 + difference) / 2."""
-    half = [0.5 * (1.0 + d) for d in draws]
-    found = replicate_estimate(0.5 * (1.0 + value), half, n=bare.n, clusters=bare.clusters).scaled(2.0, -1.0)
+    found = replicate_difference(value, draws, n=bare.n, clusters=bare.clusters)
     known = [d for d in draws if not math.isnan(d)]
     if math.isnan(found.low) or not known:
         return bare, math.nan

@@ -9,9 +9,7 @@ from functools import cached_property
 from itertools import product
 from typing import Any
 
-import numpy as np
-
-from ssad.metrics.intervals import t_quantile
+from ssad.metrics import replicate_difference
 from ssad.report.artefacts import pictures
 from ssad.report.heatmap import HeatMap, heat_maps
 from ssad.report.load import Run
@@ -260,15 +258,15 @@ def grid_table(run: PhysicalRun) -> Table:
     return Table("grid", "Views from all around", heads, ("AP50", "ASR", "AP50 in the worst cell"), tuple(rows), note)
 
 
-def rivals_table(run: PhysicalRun) -> Table:
-    """In each town and view the strongest attack with a carrier against each other one, draw by draw of the drives."""
+def comparison_table(run: PhysicalRun) -> Table:
+    """In each town and view the strongest attack with a carrier beside each other one, with the paired difference."""
     rows = []
     carriers = list(dict.fromkeys(carrier for _, carrier in run.attacks))
     for (_, test), view, detector, carrier in product(run.pairs, ("drive", "grid"), run.detectors, carriers):
         own = {}
         for attack in run.attacks:
             lines = [] if is_control(attack[0]) else run.lines(test, view, detector, attack)
-            if attack[1] == carrier and lines and lines[0]["source"] and "drawn" in lines[0]:
+            if attack[1] == carrier and lines and lines[0]["source"] and lines[0].get("replicates"):
                 own[attack] = lines[0]
         best = min(own, key=lambda attack: own[attack]["metrics"]["AP50"], default=("", ""))
         for attack, line in own.items():
@@ -278,23 +276,20 @@ def rivals_table(run: PhysicalRun) -> Table:
                 rows.append(Row(head, cells))
     note = (
         "AP50 in percent. The difference is what the other leaves less what the strongest leaves in the same pictures. "
-        "In every draw of its bootstrap both have the same drives, so it can exclude zero where the two intervals "
-        "overlap: some drives are harder for both."
+        "Its interval is of paired replicates of the bootstrap over drives, so it can exclude zero where the two "
+        "intervals overlap: some drives are harder for both."
     )
     heads, columns = ("Town", "View", "Detector", "Strongest", "Other"), ("strongest", "other", "difference")
-    return Table("rivals", "Attacks against each other", heads, columns, tuple(rows), note)
+    return Table("comparison", "Attacks against each other", heads, columns, tuple(rows), note)
 
 
 def paired_gap(more: Line, less: Line) -> Cell:
-    """Difference of the AP50 of two records of the same pictures in percent, with its interval over drives."""
-    first, second = (np.array(line["drawn"]) for line in (more, less))
-    gap = 100.0 * (float(more["metrics"]["AP50"]) - float(less["metrics"]["AP50"]))
-    drives = int(more["drives"])
-    if len(first) != len(second) or drives != int(less["drives"]):
-        return Cell(gap)
-    variance = float(np.var(first - second, ddof=1)) * drives / (drives - 1.0)
-    reach = 100.0 * float(t_quantile(np.asarray(drives - 1.0))) * math.sqrt(variance)
-    return Cell(gap, gap - reach, gap + reach, int(more["n"]), clusters=drives, method="given")
+    """Difference of the AP50 of two records in percent; its interval where both are of the same pictures."""
+    gap, n, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
+    pairs = list(zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False))
+    if (n, drives) != (less["n"], less["drives"]):
+        return Cell(100.0 * gap)
+    return Cell.of(replicate_difference(gap, [a - b for a, b in pairs], n=n, clusters=drives).scaled(100.0))
 
 
 def effort_table(run: PhysicalRun) -> Table:
@@ -398,7 +393,7 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     run = PhysicalRun(found)
     main = [main_table(run, number) for number in range(len(run.pairs))]
     margins, others, effort = margin_table(run), others_table(run), effort_table(run)
-    further = [table for table in (rivals_table(run), transfer_table(run), grid_table(run)) if table.rows]
+    further = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
         "physical.html", found, main=main, margins=margins, further=further, others=others, effort=effort,
         tiles=tiles(run), maps=maps(run), weathers=weather_maps(run), pictures=pictures(found.folder),
