@@ -79,7 +79,7 @@ class TargetAttacks:
             clips = [self.clips(spec.pair["train"], spec.pair["train_images"], spec.source)]
             if spec.around:
                 clips.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
-            return [view for one in clips for _, view in replace(one, solid=one.whole).wearing(surface)]
+            return [view for one in clips for _, view in one.wearing(surface, solid=one.whole)]
 
         return self.textures.texture(spec, surface, views=views, detector=lambda: self.detector(spec.source))
 

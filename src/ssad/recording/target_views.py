@@ -33,8 +33,6 @@ class TargetClips:
         device: Where pictures are rendered and shown.
         whole: Whether true boxes are those around the whole 3D boxes, as 3D detectors give them, and not around what is
             seen.
-        solid: Whether the truth of pictures that wait for a texture is the target alone, with its 3D box, as a training
-            against a 3D detector needs it.
     """
 
     folder: Path
@@ -42,7 +40,6 @@ class TargetClips:
     classes: tuple[str, ...] = CLASSES
     device: str = "cpu"
     whole: bool = False
-    solid: bool = False
 
     def rows(self) -> list[Mapping[str, Any]]:
         """What the annotation file says of each picture. FormatError: no recording of this version."""
@@ -58,11 +55,12 @@ class TargetClips:
                 target_truth(row, objects, self.classes, whole=self.whole),
             )
 
-    def wearing(self, surface: Surface) -> Iterator[tuple[str, View]]:
+    def wearing(self, surface: Surface, *, solid: bool = False) -> Iterator[tuple[str, View]]:
         """Drive and picture with a target that waits for a texture, one after another.
 
         Args:
             surface: What the target wears.
+            solid: Whether the truth is the target alone, with its 3D box: what a training against a 3D detector needs.
 
         Raises:
             FormatError: No recording of this version.
@@ -73,7 +71,7 @@ class TargetClips:
             wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
             seen |= bool(len(wearing.taps[0].pixel))
             truth = target_truth(clip.row, clip.objects, self.classes, whole=self.whole)
-            yield drive_of(clip.row), View(wearing, solid_target(clip.row, truth) if self.solid else truth)
+            yield drive_of(clip.row), View(wearing, solid_target(clip.row, truth) if solid else truth)
         if not seen:
             raise ConfigError(
                 f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
@@ -113,8 +111,11 @@ def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
     """The target of a picture alone, with its 3D box, of which velocity and attribute are unknown.
 
     Args:
-        row: Of the picture.
+        row: Of the picture: poses of camera (x right, y down, z forward) and target in the world, its size, m.
         truth: What `target_truth` says of it.
+
+    Returns:
+        One object; its box is in the camera's frame, m and rad, centred at the middle of its height.
     """
     turn = np.linalg.inv(np.array(row["pose"])) @ np.array(row["target_pose"])
     length, width, height = row["target_size"]

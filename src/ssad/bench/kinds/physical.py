@@ -71,7 +71,9 @@ class Physical(Kind):
             if class_of_target(target) not in detector.classes:
                 raise ConfigError(f"suite {suite.name}: {name} has no class {class_of_target(target)}")
             if detector.task != "2d" and name in suite.detectors and suite.lights:
-                raise ConfigError(f"suite {suite.name}: {name} is no 2D detector; lights are searched against those")
+                raise ConfigError(
+                    f"suite {suite.name}: {name} is no 2D detector; lights are searched against 2D ones only"
+                )
             weights[name] = state_hash(detector)
         for pair in suite.pairs:
             for town in (pair.train, pair.test):
