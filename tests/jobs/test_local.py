@@ -18,7 +18,7 @@ from helpers.descriptors import open_files
 
 from ssad.core.errors import ConfigError, SSADError
 from ssad.jobs import local
-from ssad.jobs.local import WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
+from ssad.jobs.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
 from ssad.jobs.task import Outcome, Task
 
 GIB = 1 << 30
@@ -273,21 +273,28 @@ def test_with_a_start_the_first_worker_starts_alone(made: list[FakeWorker]) -> N
 
 
 def test_workers_get_gpus_in_turn_and_threads(made: list[FakeWorker], monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-    for name in names:
+    for name in THREADS:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("MKL_NUM_THREADS", "9")
     place = LocalProcesses(3, gpus=["4", "6"], threads=5)
     submitted(place, 3)
     place.wait(0.0)
     assert [worker.environment["CUDA_VISIBLE_DEVICES"] for worker in made] == ["4", "6", "4"]
-    assert [made[0].environment[name] for name in names] == ["5", "5", "9"]
+    assert [made[0].environment[name] for name in THREADS] == ["5", "5", "9"]
     place.close()
     made.clear()
     place = LocalProcesses(1)
     submitted(place, 1)
     place.wait(0.0)
     assert made[0].environment == {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "9"}
+    place.close()
+    made.clear()
+    monkeypatch.delenv("MKL_NUM_THREADS")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")  # said of OpenMP, meant of all
+    place = LocalProcesses(1, threads=5)
+    submitted(place, 1)
+    place.wait(0.0)
+    assert [made[0].environment[name] for name in THREADS] == ["2", "2", "2"]
     place.close()
 
 

@@ -21,6 +21,7 @@ from ssad.jobs.task import Outcome, Status, Task
 START_S = 600.0  # a worker may compile kernels when it starts
 SCARCE = 0.04  # share of the memory: with less left
 SCARCE_S = 2.0  # for so many seconds, the largest worker ends
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # environment variables
 WORKER_MEMORY = "SSAD_WORKER_MEMORY"  # environment variable: bytes that a worker may hold
 LOOK_S = 0.2  # from one look at the memory to the next
 
@@ -162,7 +163,8 @@ class LocalProcesses:
         start: a function and its argument, called once in each worker before its first task; its time does not count
             as a task's. With one the first worker starts alone, since it may compile kernels for all.
         gpus: the workers see one of these each, in turn, as `CUDA_VISIBLE_DEVICES` names them; none: left as it is.
-        threads: of linear algebra in each worker, unless the user's environment says otherwise.
+        threads: of linear algebra in each worker, unless the user's environment says otherwise; what it says of
+            OpenMP alone holds for all.
     """
 
     def __init__(self, workers: int, *, start: Start | None = None, gpus: Sequence[str] = (), threads: int = 1) -> None:
@@ -221,8 +223,8 @@ class LocalProcesses:
         while len(self._workers) < self.capacity and idle < len(self._waiting):
             if self._start is not None and self._workers and not any(worker.ready for worker in self._workers):
                 return  # the first one starts alone
-            names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            environment = {name: os.environ.get(name, str(self._threads)) for name in names}
+            wanted = os.environ.get("OMP_NUM_THREADS", str(self._threads))  # PyTorch asks MKL before OpenMP
+            environment = {name: os.environ.get(name, wanted) for name in THREADS}
             if self._gpus:
                 environment["CUDA_VISIBLE_DEVICES"] = self._gpus[self._started % len(self._gpus)]
             self._workers.append(Worker(self._start, environment))
