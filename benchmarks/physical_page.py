@@ -26,15 +26,13 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
-    "physical": "ssad run physical --device cuda", "physical-gpu": "ssad run physical-gpu --device cuda",
-    "physical-gpu-larkhill": "ssad run physical-gpu --device cuda",
-    "physical-gpu-larkhill-camouflage": "ssad run physical-gpu --device cuda",
+    "physical": "ssad run physical --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
     "physical-lights-16": "ssad run physical-lights", "physical-lights-gpu": "ssad run physical-lights --device cuda",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
-        for what in ("vanishing", "around", "around-drives", "judges")
+        for what in ("around", "around-drives", "judges")
     },
 }  # fmt: skip
 NOTES = {
