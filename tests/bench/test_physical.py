@@ -47,6 +47,14 @@ def test_cells_are_attacks_by_detector_and_towns() -> None:
     assert len(trained) == 2, "a texture for each detector, shown to both and shuffled"
 
 
+def test_stealth_is_in_the_title_and_the_loud_one_is_shuffled() -> None:
+    quiet = {"name": "vanishing", "settings": {"stealth": 0.5}}
+    plan = Physical().plan(suite(attacks=["vanishing", quiet, {"name": "shuffled", "of": "vanishing"}], seeds=1))
+    by_title = {cell.fields["attack"]: TextureSpec.of_row(cell.spec).name for cell in plan.cells if cell.spec["source"]}
+    assert set(by_title) == {"vanishing", "vanishing, stealth 0.5", "shuffled vanishing"}
+    assert by_title["shuffled vanishing"] == by_title["vanishing"] != by_title["vanishing, stealth 0.5"]
+
+
 def test_a_key_covers_what_decides_the_result() -> None:
     one = {cell.name: cell.key for cell in Physical().plan(suite()).cells}
     assert {cell.name: cell.key for cell in Physical().plan(suite()).cells} == one

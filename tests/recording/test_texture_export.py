@@ -43,6 +43,7 @@ def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: 
     assert about["metres"] == [1.2, 0.4]
     assert about["panels"]["rear"]["metres"][0] > 1.2
     assert 0.0 < about["non_printability"] < 0.5
+    assert 0.0 < about["delta_e"] < 100.0
     again = load_print(tmp_path)
     assert torch.equal(again.colour, colour)
     assert again.on(TargetCar().mesh()).layer == surface.layer

@@ -30,9 +30,11 @@ from ssad.recording.target import TargetCar, parse_target
 from ssad.recording.target_views import TargetClips
 from ssad.recording.textured_clips import see_clips, unseen_parts
 from ssad.scenarios.static.physical import Surface, TextureSpec, View, albedo_of, make_carrier
+from ssad.scenarios.static.physical.carrier import covered
 from ssad.scenarios.static.physical.kept import TextureFolder
 from ssad.scenarios.static.physical.noninvasive import LitView, Target
 from ssad.scenarios.static.physical.noninvasive.kept import LightFolder, LightSpec
+from ssad.scenarios.static.physical.printing import conspicuousness
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,10 @@ class TargetAttacks:
                 clips.append(self.clips(f"{spec.pair['train']}-around", spec.around, spec.source))
             return [view for one in clips for _, view in one.wearing(surface, solid=one.whole)]
 
-        return self.textures.texture(spec, surface, views=views, detector=lambda: self.detector(spec.source))
+        paint = paint_under(self.target, spec.surface)
+        return self.textures.texture(
+            spec, surface, views=views, detector=lambda: self.detector(spec.source), paint=paint
+        )
 
     def worn(self, clips: TargetClips, spec: TextureSpec) -> Iterator[tuple[str, Tensor, Truth]]:
         """Drive, picture and truth of clips under a texture."""
@@ -95,9 +100,12 @@ class TargetAttacks:
                 yield drive, image, view.truth
 
     def about(self, spec: TextureSpec) -> dict[str, Any]:
-        """What records say of a texture: its picture, and how it was trained."""
+        """What records say of a texture: its picture, how far its colours are from the paint, how it was trained."""
         artefacts = {"texture": str(self.textures.picture(spec).relative_to(self.folder))}
-        return {"artefacts": artefacts, **self.textures.history(spec)}
+        mask = torch.from_numpy(surface_of(self.target, spec.surface).mask.copy())
+        albedo = albedo_of(self.texture(spec).detach())
+        away = conspicuousness(albedo, paint_under(self.target, spec.surface), mask)
+        return {"artefacts": artefacts, "delta_e": round(float(away), 2), **self.textures.history(spec)}
 
     def light(self, spec: LightSpec) -> SceneEdit:
         """A light as an edit of a scene; searched now if it has to be. ConfigError as for `LightFolder.edit`."""
@@ -229,6 +237,13 @@ def surface_of(target: str, surface: str) -> Surface:
     """Where a texture goes, from a target and `TextureSpec.surface`."""
     row = safeio.parse_json(surface)
     return make_carrier(row["carrier"], row["options"]).on(parse_target(target).mesh())
+
+
+@lru_cache(maxsize=16)
+def paint_under(target: str, surface: str) -> Tensor:
+    """What a texture covers, linear RGB [3], from a target and `TextureSpec.surface`."""
+    made = parse_target(target)
+    return covered(surface_of(target, surface), made.mesh(), made.colour)
 
 
 def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:

@@ -283,11 +283,12 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
 
 
 def _title(row: Mapping[str, Any]) -> str:
-    """What tables call the attack of a row: such as "shuffled vanishing, all sides"."""
+    """What tables call the attack of a row: such as "shuffled vanishing, all sides" or "das, stealth 0.5"."""
     if row["attack"] is None:
         return CLEAN
     sides = ", all sides" if row.get("around") else ""
-    return f"shuffled {row['of']}{sides}" if row["of"] else f"{row['attack']}{sides}"
+    stealth = f", stealth {row['settings']['stealth']:g}" if row.get("settings", {}).get("stealth") else ""
+    return f"{'shuffled ' if row['of'] else ''}{row['of'] or row['attack']}{sides}{stealth}"
 
 
 def _light_title(row: Mapping[str, Any]) -> str:
@@ -327,6 +328,8 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
         one for one in table.attacks
         if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
     ]  # fmt: skip
+    if len(sources) > 1:
+        sources = [one for one in sources if not one.settings.get("stealth")]
     if len(sources) != 1:
         raise ConfigError(f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack")
     return {**row_of(table, sources[0]), "attack": "shuffled", "of": entry.of}

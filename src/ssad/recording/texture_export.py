@@ -24,9 +24,9 @@ from ssad.core.types import U8
 from ssad.recording.live_attack import LiveAttack
 from ssad.recording.target import Target, TargetCar, TargetSign, parse_target
 from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
-from ssad.scenarios.static.physical.carrier import metres_of
+from ssad.scenarios.static.physical.carrier import covered, metres_of
 from ssad.scenarios.static.physical.inks import printable_colours
-from ssad.scenarios.static.physical.printing import non_printability
+from ssad.scenarios.static.physical.printing import conspicuousness, non_printability
 
 LARGEST = 16384  # dots of a side
 ATLAS = 2048  # texels of a side of the atlas that shows a patch
@@ -124,13 +124,15 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
     write_obj(out / "target.obj", painted, texture="atlas.png")
     numbers = safeio.npz_bytes({"colour": colour.numpy()})
     safeio.write_atomic(out / "texture.npz", numbers)
-    score = float(non_printability(colour, printable_colours(), torch.from_numpy(surface.mask.copy())))
+    mask = torch.from_numpy(surface.mask.copy())
+    score = float(non_printability(colour, printable_colours(), mask))
+    away = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
     about = {
         "name": name, "target": made.target, "carrier": made.carrier, "options": dict(made.options),
         "dots_per_metre": dots, "sha256": hashlib.sha256(numbers).hexdigest(),
         "metres": [round(one, 4) for one in surface.metres], "texels": [colour.shape[2], colour.shape[1]],
         "rectangle": [round(v, 6) for v in _rectangle(surface)], "panels": _panels(mesh),
-        "non_printability": round(score, 4),
+        "non_printability": round(score, 4), "delta_e": round(away, 2),
     }  # fmt: skip
     safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
     return [

@@ -13,7 +13,7 @@ from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import PRINTABLE
 from ssad.core.errors import ConfigError
 from ssad.recording.target import TargetCar, TargetSign
-from ssad.scenarios.static.physical.carrier import Camouflage, Patch, albedo_of, metres_of
+from ssad.scenarios.static.physical.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
 
 PAINT = Material("paint", (0.5, 0.5, 0.5))
 CHANNEL = next(iter(RIG))
@@ -27,6 +27,16 @@ def panel(width: float, height: float, rectangle: tuple[float, float, float, flo
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
     normals = np.tile(np.array([-1, 0, 0], np.float32), (2, 3, 1))
     return Mesh(corners, faces, normals, uv[faces], np.zeros(2, np.int32), np.zeros(2, np.int32), (PAINT,), ("rear",))
+
+
+def test_what_a_texture_covers_is_paint_or_material() -> None:
+    car, sign = TargetCar(paint="red"), TargetSign()
+    mesh = car.mesh()
+    for carrier in (Camouflage(), Patch("rear"), Patch("rear", width=0.02, height=0.02)):
+        assert covered(carrier.on(mesh), mesh, car.colour).tolist() == pytest.approx(car.colour, abs=1e-6)
+    assert max(covered(Road().on(mesh), mesh, car.colour).tolist()) < 0.1, "asphalt is dark"
+    face = covered(Patch("face", width=0.4, height=0.4).on(sign.mesh()), sign.mesh(), sign.colour)
+    assert face[0] > 1.3 * face[1:].max(), "red with white letters"
 
 
 def test_a_patch_has_its_size_in_metres() -> None:

@@ -20,7 +20,7 @@ from ssad.scenarios.static.digital.objectives import Hide, Situation
 from ssad.scenarios.static.physical.carrier import Surface, albedo_of
 from ssad.scenarios.static.physical.invasive.attention import Distraction, Redistribution, _parts, attention
 from ssad.scenarios.static.physical.optimise import TARGET, TextureAttack, View, train_texture
-from ssad.scenarios.static.physical.printing import NOMINAL, Expectation
+from ssad.scenarios.static.physical.printing import NOMINAL, Expectation, conspicuousness
 from ssad.scenarios.static.physical.textures import control
 from tests.scenarios.digital.toy_detector import CELL, ToyDetector, pattern, toy_scene
 
@@ -87,6 +87,19 @@ def test_a_trained_texture_beats_all_that_learn_nothing() -> None:
     others.append(trained.colour.flatten(1).flip(1).reshape(trained.colour.shape))
     assert own < 0.5 * min(score(other, fresh) for other in others)
     assert bool((torch.sign(0.5 - trained.colour) == pattern("car")).float().mean() > 0.95)
+
+
+def test_stealth_keeps_a_texture_near_what_it_covers() -> None:
+    paint = torch.tensor([0.46, 0.47, 0.48])
+    attacks = [replace(PLAIN, stealth=weight, epochs=40) for weight in (0.0, 3.0, 100.0)]
+    start = control("grey", SURFACE.size)
+    made = [train_texture(one, detector(), SURFACE, views(), start=start, paint=paint).colour for one in attacks]
+    away = [float(conspicuousness(albedo_of(one), paint)) for one in made]
+    assert away[0] > 2.0 * away[1] > 4.0 * away[2], "83, 20 and 3 when this was written"
+    found = [score(one, views(seed=9)) for one in made]
+    assert found[0] < found[1] < 0.2 < found[2]
+    with pytest.raises(ConfigError, match="whose colour is known"):
+        train_texture(replace(PLAIN, stealth=0.1), detector(), SURFACE, views(), start=control("grey", SURFACE.size))
 
 
 @pytest.mark.parametrize("optimiser", ["adam", "sgd"])
@@ -190,7 +203,9 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
         train_texture(PLAIN, detector(), SURFACE, seen, start=control("grey", SURFACE.size))
 
 
-@pytest.mark.parametrize("wrong", [{"epochs": 0}, {"batch": 0}, {"rate": 0.0}, {"optimiser": "lbfgs"}, {"worst": 1.5}])
+@pytest.mark.parametrize(
+    "wrong", [{"epochs": 0}, {"batch": 0}, {"rate": 0.0}, {"optimiser": "lbfgs"}, {"worst": 1.5}, {"stealth": -1.0}]
+)
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigError, match="attack odd"):
         TextureAttack("odd", **wrong)  # type: ignore[arg-type]

@@ -9,7 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.scenarios.static.physical.printing import NOMINAL, Expectation, non_printability, total_variation
+from ssad.scenarios.static.physical.printing import (
+    NOMINAL,
+    Expectation,
+    conspicuousness,
+    non_printability,
+    total_variation,
+)
 from ssad.scenarios.static.physical.textures import CELL, control
 
 
@@ -31,7 +37,28 @@ def test_non_printability_by_hand() -> None:
     assert float(non_printability(colour, inks, torch.tensor([[True, True, False]]))) == pytest.approx(0.05)
 
 
-@pytest.mark.parametrize("what", ["variation", "printing", "draw"])
+@pytest.mark.parametrize(
+    ("colour", "paint", "away"),
+    [
+        ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 100.0),
+        ((0.184187, 0.184187, 0.184187), (0.0, 0.0, 0.0), 50.0),  # mid-grey, L* = 50
+        ((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (53.24**2 + 80.09**2 + 67.20**2) ** 0.5),  # CIELAB of sRGB's primaries
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), ((53.24 - 87.73) ** 2 + (80.09 + 86.18) ** 2 + (67.20 - 83.18) ** 2) ** 0.5),
+        ((0.3, 0.5, 0.1), (0.3, 0.5, 0.1), 0.0),
+    ],
+)
+def test_conspicuousness_of_known_colours(
+    colour: tuple[float, float, float], paint: tuple[float, float, float], away: float
+) -> None:
+    paper = torch.tensor(colour)[:, None, None].expand(3, 2, 3)
+    assert float(conspicuousness(paper, torch.tensor(paint))) == pytest.approx(away, abs=0.05)
+    half = torch.cat([paper, torch.tensor(paint)[:, None, None].expand(3, 2, 3)], 1)
+    assert float(conspicuousness(half, torch.tensor(paint))) == pytest.approx(away / 2, abs=0.05), "a mean over texels"
+    mask = torch.tensor([[True] * 3] * 2 + [[False] * 3] * 2)
+    assert float(conspicuousness(half, torch.tensor(paint), mask)) == pytest.approx(away, abs=0.05)
+
+
+@pytest.mark.parametrize("what", ["variation", "printing", "conspicuousness", "draw"])
 def test_gradients_equal_finite_differences(what: str) -> None:
     draws = torch.Generator().manual_seed(1)
     colour = (0.3 + 0.4 * torch.rand(3, 6, 7, generator=draws)).double()
@@ -43,6 +70,8 @@ def test_gradients_equal_finite_differences(what: str) -> None:
             return total_variation(colour)
         if what == "printing":
             return non_printability(colour, inks)
+        if what == "conspicuousness":
+            return conspicuousness(colour, inks[0]) / 100.0
         return (Expectation().draw(colour, [torch.Generator().manual_seed(2)])[0] * weight).sum()
 
     assert torch.autograd.gradcheck(value, (colour.requires_grad_(),), eps=1e-6, atol=1e-5)

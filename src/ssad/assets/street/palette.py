@@ -11,6 +11,8 @@ import numpy.typing as npt
 from ssad.assets.street.triangles import Palette
 from ssad.core.errors import unknown_name
 
+ASPHALT = (0.088, 0.088, 0.092)  # linear RGB; towns differ a little
+
 
 @dataclass(frozen=True)
 class TownStyle:
@@ -126,7 +128,7 @@ class Look:
     def __post_init__(self) -> None:
         add = self.palette.add
         grey = self.generator.uniform(0.9, 1.12)
-        self.asphalt = add("asphalt", np.array([0.088, 0.088, 0.092]) * grey, gloss=0.15)
+        self.asphalt = add("asphalt", np.array(ASPHALT) * grey, gloss=0.15)
         self.patch = add("asphalt_patch", np.array([0.055, 0.055, 0.058]) * grey, gloss=0.2)
         self.worn = add("asphalt_worn", np.array([0.097, 0.096, 0.098]) * grey, gloss=0.12)
         self.slab = add("paving", self._jitter((0.27, 0.255, 0.235), 0.06))

@@ -232,10 +232,20 @@ def others_table(run: PhysicalRun) -> Table:
             for attack in run.attacks:
                 lines = run.lines(test, "drive", detector, attack)
                 if lines:
-                    cells = tuple(score(lines, metric) for metric in OTHERS)
+                    cells = (*(score(lines, metric) for metric in OTHERS), _difference(lines))
                     rows.append(Row((test, detector, title_of(attack)), cells))
-    heads, columns = ("Town", "Detector", "Attack"), tuple(OTHERS.values())
-    return Table("others", "Other scores", heads, columns, tuple(rows), "Percent.")
+    heads, columns = ("Town", "Detector", "Attack"), (*OTHERS.values(), "colour difference")
+    note = (
+        "Percent; the colour difference (CIE 1976) is the mean between a texture and the paint that it covers: 0 for "
+        "the paint itself, 100 for white on black."
+    )
+    return Table("others", "Other scores", heads, columns, tuple(rows), note)
+
+
+def _difference(lines: Sequence[Line]) -> Cell:
+    """How far the colours of a texture are from what it covers, the mean over draws of a control."""
+    known = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
+    return Cell(math.fsum(known) / len(known)) if known else Cell(math.nan)
 
 
 def grid_table(run: PhysicalRun) -> Table:

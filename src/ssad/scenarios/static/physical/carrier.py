@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ssad.assets.mesh import Mesh, Rectangle
+from ssad.assets.street.palette import ASPHALT
 from ssad.camera.scene import Decal, Layer
 from ssad.camera.texture import paint_mask, printable, to_linear
 from ssad.core.errors import ConfigError
@@ -210,6 +212,25 @@ def metres_of(mesh: Mesh, panel: str | None = None) -> tuple[float, float]:
     lengths = np.linalg.norm(tangents, axis=1)
     u, v = np.average(lengths, axis=0, weights=area[some])
     return float(u), float(v)
+
+
+def covered(surface: Surface, mesh: Mesh, paint: tuple[float, float, float]) -> Tensor:
+    """Mean colour of what a texture covers, linear RGB [3].
+
+    Args:
+        surface: Where it is.
+        mesh: Of the target.
+        paint: Linear RGB of the target's paint; what takes no paint has the colour of its material.
+    """
+    if isinstance(surface.layer, Decal):
+        return torch.tensor(ASPHALT)
+    u0, v0, u1, v1 = surface.layer.rectangle
+    u, v = mesh.uv.astype(np.float64).mean(1).T
+    under = (mesh.panel >= 0) & (u0 <= u) & (u <= u1) & (v0 <= v) & (v <= v1)
+    if not under.any():  # a patch that is smaller than the faces below it
+        under = mesh.panel >= 0
+    colours = np.array([paint if one.paint else one.colour for one in mesh.materials])
+    return torch.from_numpy(np.average(colours[mesh.material[under]], axis=0, weights=mesh.areas()[under])).float()
 
 
 def albedo_of(colour: Tensor) -> Tensor:

@@ -53,6 +53,7 @@ class TextureFolder:
         *,
         views: Callable[[], Sequence[View]],
         detector: Callable[[], Detector],
+        paint: Tensor | None = None,
     ) -> Tensor:
         """A texture; trained now if it has to be. Written as a picture too.
 
@@ -61,6 +62,7 @@ class TextureFolder:
             surface: What it is printed on.
             views: Makes the pictures of the training.
             detector: Makes the detector that is attacked.
+            paint: Linear RGB [3] of what the texture covers, for attacks with `stealth`.
 
         Returns:
             sRGB [3, H, W] in 0 to 1.
@@ -70,7 +72,7 @@ class TextureFolder:
         """
         if spec.source:
             trained = spec.file is None
-            colour = self._trained(spec, surface, views, detector) if trained else _read(spec, surface)
+            colour = self._trained(spec, surface, views, detector, paint) if trained else _read(spec, surface)
             if spec.attack == "shuffled":
                 colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
         else:
@@ -85,13 +87,14 @@ class TextureFolder:
         surface: Surface,
         views: Callable[[], Sequence[View]],
         detector: Callable[[], Detector],
+        paint: Tensor | None,
     ) -> Tensor:
         path = self.kept(spec)
         if not path.is_file():
             trained = train_texture(
                 make_physical(spec.trained, **spec.settings), detector(), surface, views(),
-                start=control("grey", surface.size), printable=printable_colours(), device=self.device,
-                key=(self.seed, spec.name), checkpoint=path.with_suffix(".checkpoint.npz"),
+                start=control("grey", surface.size), printable=printable_colours(), paint=paint,
+                device=self.device, key=(self.seed, spec.name), checkpoint=path.with_suffix(".checkpoint.npz"),
             )  # fmt: skip
             losses, gradients = np.array(trained.losses), np.array(trained.gradients)
             safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})

@@ -19,7 +19,7 @@ from ssad.core.seeding import digest, generator
 from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
 from ssad.scenarios.static.physical.carrier import Surface, albedo_of
-from ssad.scenarios.static.physical.printing import Expectation, non_printability, total_variation
+from ssad.scenarios.static.physical.printing import Expectation, conspicuousness, non_printability, total_variation
 from ssad.scenarios.static.physical.zoom import STEP, around_target
 
 TARGET = Aim(objects=(0,))
@@ -63,6 +63,7 @@ class TextureAttack:
         batch: Pictures a step.
         smooth: Weight of the total variation.
         printed: Weight of the non-printability.
+        stealth: Weight of the conspicuousness, of 100: how far the colours are from those that the texture covers.
         expectation: What differs from print to print.
         worst: Share of the pictures of an epoch that are drawn by how badly the attack does on them, in place of once
             each; 0: none.
@@ -79,6 +80,7 @@ class TextureAttack:
     batch: int = 8
     smooth: float = 0.1
     printed: float = 0.01
+    stealth: float = 0.0
     expectation: Expectation = field(default_factory=Expectation)
     worst: float = 0.0
     window: int | None = None
@@ -88,6 +90,8 @@ class TextureAttack:
             raise ConfigError(f"attack {self.name}: epochs and batch are 1 or more, rate is above 0")
         if self.optimiser not in ("adam", "sgd"):
             raise ConfigError(f"attack {self.name}: optimiser '{self.optimiser}'; choose adam or sgd")
+        if self.stealth < 0.0:
+            raise ConfigError(f"attack {self.name}: stealth is 0 or more")
         if not 0.0 <= self.worst <= 1.0:
             raise ConfigError(f"attack {self.name}: worst is a share from 0 to 1")
         if self.window is not None and (self.window < 4 * STEP or self.window % STEP):
@@ -117,6 +121,7 @@ def train_texture(
     *,
     start: Tensor,
     printable: Tensor | None = None,
+    paint: Tensor | None = None,
     shown: Callable[[Tensor], Tensor] = albedo_of,
     key: tuple[object, ...] = (),
     device: str | torch.device = "cpu",
@@ -133,6 +138,7 @@ def train_texture(
             detector.
         start: The first texture, sRGB [3, H, W].
         printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
+        paint: Linear RGB [3] of what the texture covers, for `attack.stealth`.
         shown: What pictures take of a texture's colours: the albedo of print, or the light of a projector.
         key: What all draws come from.
         device: Where the detector is.
@@ -141,8 +147,8 @@ def train_texture(
         progress: Called with epochs done, and of how many.
 
     Raises:
-        ConfigError: No pictures, a texture of another size, a target that is never in view, or a loss that does not
-            depend on the texture.
+        ConfigError: No pictures, a texture of another size, a target that is never in view, a loss that does not
+            depend on the texture, or stealth without the paint.
         FormatError: The checkpoint is of another training, or broken.
     """
     if not views:
@@ -151,6 +157,8 @@ def train_texture(
         raise ConfigError(f"the texture is {list(start.shape)}, the surface takes {[3, *surface.size]}")
     if not (float(start.min()) >= 0.0 and float(start.max()) <= 1.0):
         raise ConfigError("a texture's colours lie in 0 to 1")
+    if attack.stealth > 0.0 and paint is None:
+        raise ConfigError(f"attack {attack.name}: stealth is for what is printed on something, whose colour is known")
     objective = make_objective(attack.objective) if isinstance(attack.objective, str) else attack.objective
     colour = start.detach().to(device, torch.float32).clone().requires_grad_()
     optimiser: torch.optim.Optimizer
@@ -176,6 +184,8 @@ def train_texture(
                 loss = -losses.mean() + attack.smooth * total_variation(colour, mask)
                 if inks is not None and attack.printed > 0.0:
                     loss = loss + attack.printed * non_printability(colour, inks, mask)
+                if paint is not None and attack.stealth > 0.0:
+                    loss = loss + attack.stealth * conspicuousness(albedo_of(colour), paint.to(colour), mask) / 100.0
                 optimiser.zero_grad()
                 torch.autograd.backward(loss)
                 assert colour.grad is not None

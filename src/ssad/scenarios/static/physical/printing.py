@@ -12,6 +12,8 @@ from torch.nn import functional
 from ssad.camera.torch_sensor import large_draws
 from ssad.core.errors import ConfigError
 
+_XYZ = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))  # of linear RGB
+
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
@@ -119,3 +121,33 @@ def non_printability(colour: Tensor, printable: Tensor, mask: Tensor | None = No
         return colour.sum() * 0.0
     gaps = torch.cdist(rows, printable.to(rows))
     return gaps.amin(1).mean()
+
+
+def conspicuousness(albedo: Tensor, paint: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Mean colour difference between a texture and what it covers, CIE 1976 (Delta E*ab): from 2 on one can see it.
+
+    Args:
+        albedo: Linear RGB [3, H, W] in 0 to 1, as it is printed (see `albedo_of`).
+        paint: Linear RGB [3] of what is covered.
+        mask: Texels [H, W] that count. None: all.
+
+    Returns:
+        A scalar; 0 for the paint itself, 100 for white on black. Differentiable.
+
+    Source: CIE 15, Colorimetry: CIELAB under D65; sRGB primaries of IEC 61966-2-1.
+    """
+    rows = albedo.flatten(1).T if mask is None else albedo[:, mask.bool()].T
+    if not len(rows):
+        return albedo.sum() * 0.0
+    away = _lab(rows) - _lab(paint.to(rows)[None])
+    return ((away.square().sum(1) + 1e-8).sqrt() - 1e-4).mean()
+
+
+def _lab(rows: Tensor) -> Tensor:
+    """CIELAB [N, 3] of linear RGB [N, 3]."""
+    share = rows @ rows.new_tensor(_XYZ).T / rows.new_tensor(_XYZ).sum(1)
+    least = (6.0 / 29.0) ** 3
+    f = torch.where(
+        share > least, share.clamp_min(least) ** (1.0 / 3.0), share / (3.0 * (6.0 / 29.0) ** 2) + 4.0 / 29.0
+    )
+    return torch.stack([116.0 * f[:, 1] - 16.0, 500.0 * (f[:, 0] - f[:, 1]), 200.0 * (f[:, 1] - f[:, 2])], 1)
