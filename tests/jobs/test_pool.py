@@ -68,7 +68,8 @@ def test_each_process_sees_one_gpu_in_turn() -> None:
 
 
 def test_processes_share_the_cores_in_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr("ssad.jobs.pool.default_workers", lambda: 6)
     assert set(run_all(open_pool(2, workers=2), threads, range(2))) == {"3"}
 
