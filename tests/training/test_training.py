@@ -417,6 +417,13 @@ def test_a_change_that_does_nothing_leaves_the_picture() -> None:
     torch.testing.assert_close(mirrored[1], pictures[1])
 
 
+def test_what_is_shrunk_is_averaged() -> None:
+    stripes = (torch.arange(96) % 2).float().expand(1, 3, 65, 96)
+    (shrunk,) = change_pictures(stripes, [Change(False, 0.4, (0.0, 0.0))])
+    assert shrunk[:, 2:24, 2:36].std() < 0.05  # 0.25 if taken from the pixels as they are
+    assert shrunk[:, 2:24, 2:36].mean() == pytest.approx(0.5, abs=0.02)
+
+
 def test_colours_stay_colours() -> None:
     pictures = torch.rand(3, 3, 8, 8, generator=torch.Generator().manual_seed(0))
     draws = torch.Generator().manual_seed(1)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import affine_grid, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, affine_grid, grid_sample
 
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
@@ -21,6 +21,7 @@ from ssad.core.types import F64, U8
 from ssad.training.recipe import Recipe
 
 GREY = 0.447
+SHRUNK = 0.7  # scale below which pictures are shrunk in two steps
 ROOM = 0.6  # share of the free memory that pictures may take
 
 
@@ -307,7 +308,11 @@ def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
 
 
 def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
-    """Pictures float [B, 3, H, W] after their changes; grey where there is nothing."""
+    """Pictures float [B, 3, H, W] after their changes; grey where there is nothing.
+
+    What is shrunk to less than 0.7 is taken from pictures of half the size, so that small things look as a camera shows
+    them, not as single rows of pixels.
+    """
     if all(not c.mirror and c.zoom == 1.0 for c in changes):
         return pictures
     height, width = pictures.shape[2:]
@@ -319,7 +324,15 @@ def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
         rows.append([[side / c.zoom, 0.0, x], [0.0, 1 / c.zoom, y]])
     theta = torch.tensor(rows, dtype=pictures.dtype, device=pictures.device)
     grid = affine_grid(theta, list(pictures.shape), align_corners=False)
-    return grid_sample(pictures - GREY, grid, align_corners=False) + GREY
+    deep = pictures - GREY
+    moved = grid_sample(deep, grid, align_corners=False)
+    small = torch.tensor(
+        [k for k, c in enumerate(changes) if c.zoom < SHRUNK], device=pictures.device, dtype=torch.int64
+    )
+    half = [max(length // 2, 1) for length in pictures.shape[2:]]
+    if len(small):
+        moved[small] = grid_sample(adaptive_avg_pool2d(deep[small], half), grid[small], align_corners=False)
+    return moved + GREY
 
 
 def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> Tensor:
