@@ -329,7 +329,7 @@ def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
     small = torch.tensor(
         [k for k, c in enumerate(changes) if c.zoom < SHRUNK], device=pictures.device, dtype=torch.int64
     )
-    half = [max(length // 2, 1) for length in pictures.shape[2:]]
+    half = (max(height // 2, 1), max(width // 2, 1))
     if len(small):
         moved[small] = grid_sample(adaptive_avg_pool2d(deep[small], half), grid[small], align_corners=False)
     return moved + GREY
