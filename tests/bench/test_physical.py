@@ -18,7 +18,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.images import read_image
 from ssad.report import write_report
-from ssad.scenarios.static.physical import TextureSpec
+from ssad.scenarios.static.physical import Expectation, TextureSpec, make_physical
 
 PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
 
@@ -80,7 +80,32 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"attacks": [{"name": "random", "around": 2}]}, ConfigError, "is not trained"),
         ({"attacks": ["vanish"]}, UnknownNameError, "vanishing"),
         ({"attacks": [{"name": "vanishing", "settings": {"speed": 3}}]}, ConfigError, "no setting 'speed'"),
-        ({"attacks": [{"name": "vanishing", "settings": {"rate": "fast"}}]}, ConfigError, "of a wrong type"),
+        *(
+            ({"attacks": [{"name": "vanishing", "settings": {key: value}}]}, ConfigError, f"attack vanishing: .*{key}")
+            for key, value in {
+                "rate": float("nan"),
+                "name": "x",
+                "expectation": 3,
+                "batch": 2.5,
+                "epochs": 2.5,
+                "smooth": -1,
+                "objective": "hid",
+                "window": "wide",
+            }.items()
+        ),
+        *(
+            ({"attacks": [{"name": "adv-patch", "options": {key: value}}]}, ConfigError, f"attack adv-patch: .*{key}")
+            for key, value in (("centre", [0.5]), ("centre", "mid"), ("texels", 64.5), ("width", "x"))
+        ),
+        (
+            {"attacks": [{"name": "das", "carrier": "road", "options": {"texels": 9.5}}]},
+            ConfigError,
+            r"attack das: road: texels=9\.5",
+        ),
+        ({"lights": [{"name": "projector", "settings": {"expectation": 3}}]}, ConfigError, "projector: expectation=3"),
+        ({"lights": [{"name": "projector", "settings": {"stealth": 1}}]}, ConfigError, "projector: stealth=1"),
+        ({"lights": [{"name": "laser", "options": {"search": "luck"}}]}, ConfigError, "laser: search='luck'"),
+        ({"lights": [{"name": "laser", "settings": {"search": "luck"}}]}, ConfigError, "laser: search='luck'"),
         ({"attacks": [{"name": "random", "settings": {"rate": 1.0}}]}, ConfigError, "is not trained"),
         ({"attacks": [{"name": "shuffled"}]}, ConfigError, "of which attack"),
         ({"attacks": [{"name": "shuffled", "of": "das"}]}, ConfigError, "there must be one such attack"),
@@ -89,7 +114,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"attacks": [{"name": "adv-patch", "options": {"colour": 1}}]}, ConfigError, "colour"),
         ({"lights": ["lazer"]}, UnknownNameError, "laser"),
         ({"lights": [{"name": "laser", "hour": "dawn"}]}, UnknownNameError, "noon"),
-        ({"lights": [{"name": "laser", "options": {"watts": -1.0}}]}, ConfigError, "power"),
+        ({"lights": [{"name": "laser", "options": {"watts": -1.0}}]}, ConfigError, r"laser: watts=-1\.0"),
         ({"lights": [{"name": "laser", "settings": {"epochs": 3}}]}, ConfigError, "epochs"),
         ({"lights": [{"name": "projector", "settings": {"members": 3}}]}, ConfigError, "members"),
     ],
@@ -98,6 +123,23 @@ def test_a_wrong_suite_ends_in_one_line(change: Mapping[str, Any], error: type[E
     with pytest.raises(error, match=message) as found:
         Physical().plan(suite(**change))
     assert "\n" not in str(found.value)
+
+
+def test_an_expectation_stands_in_a_suite_as_a_mapping() -> None:
+    settings = {"expectation": {"noise": 0.2, "contrast": [0.7, 1.3]}}
+    plan = Physical().plan(suite(attacks=[{"name": "vanishing", "settings": settings}]))
+    spec = TextureSpec.of_row(plan.cells[1].spec)
+    assert make_physical(spec.attack, **spec.settings).expectation == Expectation((0.7, 1.3), noise=0.2)
+
+
+def test_a_centre_of_one_number_ends_the_command_in_one_line(tmp_path: Path) -> None:
+    written = {**suite().model_dump(), "attacks": [{"name": "adv-patch", "options": {"centre": [0.5]}}]}
+    path = tmp_path / "small.yaml"
+    path.write_text(safeio.dump_json(written))
+    done = ssad("run", str(path), "--dry-run", "--out", str(tmp_path / "out"))
+    assert done.returncode == 2
+    assert "attack adv-patch: patch: centre" in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
 
 
 def test_judges_are_shown_what_is_trained_against_others_and_the_grid_is_scored_apart() -> None:

@@ -1,10 +1,16 @@
-"""What the schemas of suites share."""
+"""What the schemas of suites share, and the dataclasses whose values suites say."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from ssad.core.errors import ConfigError
+
+T = TypeVar("T")
 
 Names = Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)]
 """One name or more."""
@@ -14,3 +20,49 @@ class Schema(BaseModel):
     """Keys of a suite: no others are known, types are as they stand there, and nothing changes."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+def _in_order(span: tuple[float, float]) -> tuple[float, float]:
+    if span[0] > span[1]:
+        raise ValueError("the first is greater than the second")
+    return span
+
+
+VALUES = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
+"""Of a dataclass of pydantic: types are as they stand in a suite, and numbers are finite."""
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Least = Annotated[Number, Field(ge=0.0)]
+Above = Annotated[Number, Field(gt=0.0)]
+Part = Annotated[Number, Field(ge=0.0, le=1.0)]
+Whole = Annotated[int, Field(strict=True, ge=1)]
+Two = Annotated[tuple[T, T], Field(strict=False)]
+"""A pair, which is a list in YAML."""
+Span = Annotated[tuple[T, T], Field(strict=False), AfterValidator(_in_order)]
+"""The least and the greatest."""
+
+
+def checked(make: Callable[..., T], values: Mapping[str, Any], *, what: str, kind: type | None = None) -> T:
+    """A dataclass of pydantic with values that a user wrote.
+
+    Args:
+        make: The dataclass, or what makes one.
+        values: By field; the name of one that is called by it is no value.
+        what: What messages call it, such as "attack das".
+        kind: The dataclass, if `make` is not.
+
+    Raises:
+        ConfigError: One line: what, which key, and what is wrong with its value.
+    """
+    known = [one.name for one in fields(kind or make) if one.init and one.name != "name"]  # type: ignore[arg-type]
+    for key in values:
+        if key not in known:
+            raise ConfigError(f"{what}: there is no setting '{key}'; it has {', '.join(known)}")
+    try:
+        return make(**values)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]
+        key, shown = ".".join(map(str, problem["loc"])), repr(problem["input"])
+        text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it stands in a suite
+        short = shown if len(shown) < 60 else shown[:57] + "..."
+        raise ConfigError(f"{what}: " + (f"{key}={short}: {text}" if key else text)) from None

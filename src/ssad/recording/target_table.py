@@ -225,7 +225,10 @@ def rows_of(table: TargetTable) -> Iterator[TargetRow]:
     """
     rows = [row_of(table, entry) for entry in table.attacks]
     for row in rows:
-        make_carrier(row["carrier"], row["options"]).on(target_of(table).mesh())
+        try:
+            make_carrier(row["carrier"], row["options"]).on(target_of(table).mesh())
+        except ConfigError as error:
+            raise ConfigError(f"attack {row['attack']}: {error}") from None
     for pair, view, detector in product(table.pairs, VIEWS, [*table.detectors, *table.judges]):
         if view == GRID and not table.seen_around(pair):
             continue
@@ -340,13 +343,10 @@ def check_lights(table: TargetTable) -> None:
     for entry in table.lights:
         attack = make_light(entry.name, entry.options)
         at_hour(Weather(), entry.hour)
-        try:
-            if isinstance(attack, Projector):
-                attack.training(**entry.settings)
-            else:
-                budget_of(entry.settings)
-        except (TypeError, ConfigError) as error:
-            raise ConfigError(f"suite {table.name}: {entry.name}: {error}") from None
+        if isinstance(attack, Projector):
+            attack.training(**entry.settings)
+        else:
+            budget_of(entry.settings, entry.name)
 
 
 def carrier_title(row: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import PRINTABLE
 from ssad.core.errors import ConfigError
 from ssad.recording.target import TargetCar, TargetSign
+from ssad.scenarios.static.physical import make_carrier
 from ssad.scenarios.static.physical.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
 
 PAINT = Material("paint", (0.5, 0.5, 0.5))
@@ -57,13 +58,19 @@ def test_a_patch_has_its_size_in_metres() -> None:
         ({"width": 2.5, "height": 0.4}, "does not fit on the panel 'rear', which is 2.00 x 0.80 m"),
         ({"width": 1.0, "height": 0.4, "centre": (0.1, 0.5)}, "does not fit"),
         ({"panel": "wing"}, "no panel 'wing'; this mesh has: rear"),
-        ({"width": 0.0}, "width and a height above 0"),
-        ({"texels": 0}, "from 1 to 4096"),
+        ({"width": 0.0}, "patch: width=0.0"),
+        ({"width": float("inf")}, "patch: width=inf"),
+        ({"centre": [0.5]}, "patch: centre"),
+        ({"centre": "mid"}, "patch: centre='mid'"),
+        ({"centre": [0.5, 1.5]}, "patch: centre"),
+        ({"texels": 0}, "patch: texels=0"),
+        ({"texels": 64.5}, "patch: texels=64.5"),
+        ({"name": "x"}, "patch: there is no setting 'name'; it has panel, width, height, centre, texels"),
     ],
 )
 def test_a_patch_that_cannot_be_is_refused_in_one_line(patch: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
-        Patch(**patch).on(panel(2.0, 0.8, (0.1, 0.2, 0.6, 0.4)))  # type: ignore[arg-type]
+        make_carrier("patch", patch).on(panel(2.0, 0.8, (0.1, 0.2, 0.6, 0.4)))
     assert "\n" not in str(error.value)
 
 

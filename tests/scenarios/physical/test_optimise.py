@@ -14,11 +14,13 @@ from torch import Tensor
 
 from ssad.camera.scene import Layer
 from ssad.core.detections import Dense, Truth
-from ssad.core.errors import ConfigError, FormatError, UnknownNameError
+from ssad.core.errors import ConfigError, FormatError
 from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
+from ssad.scenarios.static.physical import make_physical
 from ssad.scenarios.static.physical.carrier import Surface, albedo_of
 from ssad.scenarios.static.physical.invasive.attention import Distraction, Redistribution, _parts, attention
+from ssad.scenarios.static.physical.noninvasive.projector import AIMED, Projector
 from ssad.scenarios.static.physical.optimise import TARGET, TextureAttack, View, train_texture
 from ssad.scenarios.static.physical.printing import NOMINAL, Expectation, conspicuousness
 from ssad.scenarios.static.physical.textures import control
@@ -179,7 +181,6 @@ def test_what_the_detector_was_stays() -> None:
         ({"views": []}, ConfigError, "no pictures"),
         ({"start": torch.zeros(3, 4, 4)}, ConfigError, "the surface takes"),
         ({"start": torch.full((3, CELL, CELL), 1.5)}, ConfigError, "lie in 0 to 1"),
-        ({"attack": replace(PLAIN, objective="hid")}, UnknownNameError, "hide"),
     ],
 )
 def test_what_cannot_be_trained_is_refused(change: dict[str, object], error: type[Exception], message: str) -> None:
@@ -204,11 +205,32 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"epochs": 0}, {"batch": 0}, {"rate": 0.0}, {"optimiser": "lbfgs"}, {"worst": 1.5}, {"stealth": -1.0}]
-)
-def test_settings_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match="attack odd"):
-        TextureAttack("odd", **wrong)  # type: ignore[arg-type]
+    ("key", "value"),
+    [
+        ("epochs", 0), ("epochs", 2.5), ("batch", 0), ("batch", 2.5), ("batch", True), ("rate", 0.0), ("rate", "fast"),
+        ("rate", float("nan")), ("optimiser", "lbfgs"), ("worst", 1.5), ("stealth", -1.0), ("smooth", "x"),
+        ("smooth", -1.0), ("printed", -1.0), ("decay", -1.0), ("window", 200), ("window", 96), ("window", "256"),
+        ("objective", "hid"), ("objective", 3), ("expectation", 3), ("expectation", {"noise": "x"}),
+        ("expectation", {"nois": 0.2}), ("expectation", {"contrast": [1.2, 0.8]}), ("name", "x"), ("speed", 3),
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_refused_in_one_line(key: str, value: object) -> None:
+    with pytest.raises(ConfigError, match=f"attack vanishing: .*{key}") as found:
+        make_physical("vanishing", **{key: value})
+    assert "\n" not in str(found.value)
+
+
+def test_an_expectation_is_said_as_a_mapping_of_what_differs() -> None:
+    made = make_physical("das", expectation={"noise": 0.2, "contrast": [0.5, 1]})
+    assert made.expectation == Expectation((0.5, 1.0), noise=0.2)
+    assert Projector().training(expectation={"noise": 0.2}).expectation == replace(AIMED, noise=0.2)
+    with pytest.raises(ConfigError, match="attack projector: stealth"):
+        Projector().training(stealth=1.0)
+
+
+def test_an_attack_of_a_package_may_be_an_object_and_takes_settings_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ssad.scenarios.static.physical.attacks.resolve", lambda *_: PLAIN)
+    assert make_physical("mine", epochs=3) == replace(PLAIN, epochs=3)
 
 
 def test_hide_is_the_best_box_on_the_object() -> None:

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
+from ssad.core.schema import checked
 from ssad.scenarios.static.physical.printing import (
     NOMINAL,
     Expectation,
@@ -124,8 +125,8 @@ def test_the_mean_over_draws_comes_nearer_with_more_of_them() -> None:
     [{"contrast": (1.2, 0.8)}, {"contrast": (0.0, 1.0)}, {"brightness": -0.1}, {"shift": 0.5}],
 )
 def test_ranges_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ConfigError):
-        Expectation(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=f"expectation: {next(iter(wrong))}"):
+        checked(Expectation, wrong, what="expectation")
 
 
 def test_controls() -> None:

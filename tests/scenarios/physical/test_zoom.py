@@ -7,7 +7,7 @@ import torch
 
 from ssad.core.detections import Solids, Truth
 from ssad.core.errors import ConfigError
-from ssad.scenarios.static.physical.optimise import TextureAttack
+from ssad.scenarios.static.physical import make_physical
 from ssad.scenarios.static.physical.zoom import around_target
 
 
@@ -62,5 +62,5 @@ def test_parts_of_3d_truth_and_odd_windows_are_refused() -> None:
     solid = Solids(none, none, none[:, 0], none[:, :2], none[:, 0])
     with pytest.raises(ConfigError, match="no 3D truth"):
         around_target(image, Truth(truth.label, truth.box, solid), 128, torch.Generator())
-    with pytest.raises(ConfigError, match="a multiple of 32"):
-        TextureAttack("odd", window=200)
+    with pytest.raises(ConfigError, match="window=200: Input should be a multiple of 32"):
+        make_physical("das", window=200)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from ssad.core.errors import ConfigError
 from ssad.core.registry import names, resolve
+from ssad.core.schema import checked
 from ssad.scenarios.static.physical.optimise import TextureAttack
 
 ATTACKS: dict[str, str] = {
@@ -22,7 +24,7 @@ def physical_names() -> dict[str, str]:
     return names("physical-attack", ATTACKS)
 
 
-def make_physical(name: str, **settings: Any) -> TextureAttack:
+def make_physical(name: str, /, **settings: Any) -> TextureAttack:
     """An attack that trains a texture, by name.
 
     Args:
@@ -34,14 +36,11 @@ def make_physical(name: str, **settings: Any) -> TextureAttack:
         ConfigError: A setting that it does not have, or a value that it refuses.
     """
     build = resolve("physical-attack", ATTACKS, name)
-    known = inspect.signature(TextureAttack).parameters
-    for setting in settings:
-        if setting not in known:
-            raise ConfigError(f"attack {name}: there is no setting '{setting}'; it has {', '.join(known)}")
+    make = build if callable(build) else partial(replace, build)
     try:
-        made = build(**settings) if callable(build) else build
+        made = checked(make, settings, what=f"attack {name}", kind=TextureAttack)
     except TypeError as error:
-        raise ConfigError(f"attack {name}: a setting of a wrong type ({error})") from None
+        raise ConfigError(f"attack {name}: {error}") from None
     if not isinstance(made, TextureAttack):
         raise ConfigError(f"attack {name}: expected a TextureAttack, not {type(made).__name__}")
     return made

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor
 
 from ssad.assets.mesh import Mesh, Rectangle
@@ -14,9 +16,11 @@ from ssad.assets.street.palette import ASPHALT
 from ssad.camera.scene import Decal, Layer
 from ssad.camera.texture import paint_mask, printable, to_linear
 from ssad.core.errors import ConfigError
+from ssad.core.schema import VALUES, Above, Least, Part, Two
 from ssad.core.types import F64, Bool
 
-LARGEST = 4096  # texels of a side
+Texels = Annotated[int, Field(strict=True, ge=1, le=4096)]
+"""Of a side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +74,7 @@ class Carrier(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
 class Patch:
     """A rectangle stuck on one panel; lamps, windows and plates that it covers stay as they are.
 
@@ -84,16 +88,11 @@ class Patch:
     """
 
     panel: str = "rear"
-    width: float = 1.0
-    height: float = 0.5
-    centre: tuple[float, float] = (0.5, 0.5)
-    texels: int = 96
+    width: Above = 1.0
+    height: Above = 0.5
+    centre: Two[Part] = (0.5, 0.5)
+    texels: Texels = 96
     name: str = "patch"
-
-    def __post_init__(self) -> None:
-        if not (self.width > 0.0 and self.height > 0.0):
-            raise ConfigError(f"a patch of {self.width} x {self.height} m: give a width and a height above 0")
-        _check_texels(self.texels)
 
     def on(self, mesh: Mesh) -> Surface:
         """See `Carrier`."""
@@ -116,7 +115,7 @@ class Patch:
         return _surface(mesh, rectangle, size, (self.width, self.height))
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
 class Camouflage:
     """The whole paint of the body: all panels, but no windows, lamps, plates and tyres.
 
@@ -125,11 +124,8 @@ class Camouflage:
         name: What tables call it.
     """
 
-    texels: int = 128
+    texels: Texels = 128
     name: str = "camouflage"
-
-    def __post_init__(self) -> None:
-        _check_texels(self.texels)
 
     def on(self, mesh: Mesh) -> Surface:
         """See `Carrier`."""
@@ -138,7 +134,7 @@ class Camouflage:
         return _surface(mesh, (0.0, 0.0, 1.0, 1.0), (self.texels, self.texels), metres_of(mesh))
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
 class Road:
     """A rectangle painted on the road behind the target, which takes it along: a stand-in for one at a place.
 
@@ -150,16 +146,11 @@ class Road:
         name: What tables call it.
     """
 
-    width: float = 2.5
-    length: float = 5.0
-    behind: float = 0.3
-    texels: int = 96
+    width: Above = 2.5
+    length: Above = 5.0
+    behind: Least = 0.3
+    texels: Texels = 96
     name: str = "road"
-
-    def __post_init__(self) -> None:
-        if not (self.width > 0.0 and self.length > 0.0 and self.behind >= 0.0):
-            raise ConfigError(f"{self.name}: width and length are above 0 m, behind is 0 m or more")
-        _check_texels(self.texels)
 
     def on(self, mesh: Mesh) -> Surface:
         """See `Carrier`."""
@@ -172,11 +163,6 @@ class Road:
         size = max(1, round(self.texels * self.length / longest)), max(1, round(self.texels * self.width / longest))
         decal = Decal(0, pose, (self.width, self.length), tag=0)
         return Surface(decal, size, np.ones(size, np.bool_), (self.width, self.length))
-
-
-def _check_texels(texels: int) -> None:
-    if not 1 <= texels <= LARGEST:
-        raise ConfigError(f"a texture of {texels} texels: from 1 to {LARGEST} a side")
 
 
 def _surface(mesh: Mesh, rectangle: Rectangle, size: tuple[int, int], metres: tuple[float, float]) -> Surface:

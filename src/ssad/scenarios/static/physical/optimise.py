@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import torch
+from pydantic import Field, PlainValidator
+from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor
 
 from ssad.core import safeio
 from ssad.core.detections import Truth
-from ssad.core.errors import ConfigError, FormatError
+from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.protocols import Detector
+from ssad.core.schema import VALUES, Above, Least, Part, Whole
 from ssad.core.seeding import digest, generator
 from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
@@ -49,7 +52,19 @@ class View:
     truth: Truth
 
 
-@dataclass(frozen=True, slots=True)
+def _loss(value: Any) -> Any:
+    """A loss, or the name of one, as it is."""
+    if isinstance(value, str):
+        try:
+            make_objective(value)
+        except UnknownNameError as error:
+            raise ValueError(str(error)) from None
+    elif not callable(value):
+        raise ValueError("expected a loss, or the name of one")
+    return value
+
+
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
 class TextureAttack:
     """How a texture is trained.
 
@@ -72,30 +87,18 @@ class TextureAttack:
     """
 
     name: str
-    objective: str | Objective = "hide"
-    epochs: int = 20
-    rate: float = 0.04
+    objective: Annotated[str | Objective, PlainValidator(_loss)] = "hide"
+    epochs: Whole = 20
+    rate: Above = 0.04
     optimiser: Literal["adam", "sgd"] = "adam"
-    decay: float = 0.0
-    batch: int = 8
-    smooth: float = 0.1
-    printed: float = 0.01
-    stealth: float = 0.0
+    decay: Least = 0.0
+    batch: Whole = 8
+    smooth: Least = 0.1
+    printed: Least = 0.01
+    stealth: Least = 0.0
     expectation: Expectation = field(default_factory=Expectation)
-    worst: float = 0.0
-    window: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.epochs < 1 or self.batch < 1 or self.rate <= 0.0:
-            raise ConfigError(f"attack {self.name}: epochs and batch are 1 or more, rate is above 0")
-        if self.optimiser not in ("adam", "sgd"):
-            raise ConfigError(f"attack {self.name}: optimiser '{self.optimiser}'; choose adam or sgd")
-        if self.stealth < 0.0:
-            raise ConfigError(f"attack {self.name}: stealth is 0 or more")
-        if not 0.0 <= self.worst <= 1.0:
-            raise ConfigError(f"attack {self.name}: worst is a share from 0 to 1")
-        if self.window is not None and (self.window < 4 * STEP or self.window % STEP):
-            raise ConfigError(f"attack {self.name}: a window is a multiple of {STEP} px, {4 * STEP} at least")
+    worst: Part = 0.0
+    window: Annotated[int, Field(ge=4 * STEP, multiple_of=STEP)] | None = None
 
 
 @dataclass(slots=True)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torch.nn import functional
 
 from ssad.camera.torch_sensor import large_draws
-from ssad.core.errors import ConfigError
+from ssad.core.schema import Above, Least, Span
 
 _XYZ = ((0.4124, 0.3576, 0.1805), (0.2126, 0.7152, 0.0722), (0.0193, 0.1192, 0.9505))  # of linear RGB
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))  # not strict: a suite says it as a mapping
 class Expectation:
     """How a texture differs from print to print and from car to car: uniform draws, one of each for a picture.
 
@@ -29,17 +31,11 @@ class Expectation:
     Source: ranges of contrast, brightness and noise as in Thys et al., Fooling automated surveillance cameras (2019).
     """
 
-    contrast: tuple[float, float] = (0.8, 1.2)
-    brightness: float = 0.1
-    noise: float = 0.1
-    shift: float = 0.03
-    turn: float = 0.05
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.contrast[0] <= self.contrast[1]:
-            raise ConfigError(f"contrast {self.contrast}: give a least and a greatest factor above 0")
-        if min(self.brightness, self.noise, self.shift, self.turn) < 0.0 or self.shift >= 0.5:
-            raise ConfigError("brightness, noise, shift and turn are 0 or more, shift is below 0.5")
+    contrast: Span[Above] = (0.8, 1.2)
+    brightness: Least = 0.1
+    noise: Least = 0.1
+    shift: Annotated[Least, Field(lt=0.5)] = 0.03
+    turn: Least = 0.05
 
     def draw(self, colour: Tensor, generators: Sequence[torch.Generator]) -> Tensor:
         """The texture as it is on several cars.

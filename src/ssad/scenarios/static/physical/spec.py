@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
 
 from ssad.core import safeio
-from ssad.core.errors import ConfigError
+from ssad.core.errors import unknown_name
+from ssad.core.schema import checked
 from ssad.core.seeding import digest
 from ssad.scenarios.static.physical.carrier import Camouflage, Carrier, Patch, Road
 from ssad.scenarios.static.physical.textures import CONTROLS
 
-CARRIERS: dict[str, type[Patch] | type[Camouflage] | type[Road]] = {
-    "patch": Patch, "camouflage": Camouflage, "road": Road,
-}  # fmt: skip
+CARRIERS: dict[str, Callable[..., Carrier]] = {"patch": Patch, "camouflage": Camouflage, "road": Road}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +80,7 @@ class TextureSpec:
 
 
 def make_carrier(name: str, options: Mapping[str, Any]) -> Carrier:
-    """A carrier by name. ConfigError: there is none, or an option that it does not have."""
-    try:
-        return CARRIERS[name](**options)
-    except TypeError as error:
-        raise ConfigError(f"{name}: {str(error).partition(') ')[2] or error}") from None
+    """A carrier by name. ConfigError: there is none, an option that it does not have, or a value that it refuses."""
+    if name not in CARRIERS:
+        raise unknown_name("carrier", name, CARRIERS)
+    return checked(CARRIERS[name], options, what=name)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.errors import unknown_name
+from ssad.core.schema import checked
 from ssad.scenarios.static.physical.noninvasive.flashlight import Flashlight
 from ssad.scenarios.static.physical.noninvasive.laser import Laser
 from ssad.scenarios.static.physical.noninvasive.light import LightAttack, Target
@@ -24,7 +25,7 @@ def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projec
 
     Args:
         name: Of `LIGHTS`.
-        options: Its fields that differ; lists stand for pairs.
+        options: Its fields that differ.
 
     Raises:
         UnknownNameError: There is no such attack.
@@ -32,11 +33,7 @@ def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projec
     """
     if name not in LIGHTS:
         raise unknown_name("light attack", name, LIGHTS)
-    given = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-    try:
-        return LIGHTS[name](**given)
-    except TypeError as error:
-        raise ConfigError(f"{name}: {str(error).partition(') ')[2] or error}") from None
+    return checked(LIGHTS[name], options, what=f"attack {name}")
 
 
 __all__ = [

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.camera.lamps import Lamp
 from ssad.camera.scene_edit import SceneEdit
+from ssad.core.schema import VALUES, Least, Number, Part, Span
 from ssad.core.types import F64
 from ssad.scenarios.static.physical.noninvasive.lamps import added_light
-from ssad.scenarios.static.physical.noninvasive.light import (
-    Ranges,
-    Target,
-    aimed,
-    at_values,
-    check_range,
-    numbers,
-)
+from ssad.scenarios.static.physical.noninvasive.light import Away, Ranges, Target, aimed, at_values, numbers
 from ssad.scenarios.static.physical.noninvasive.lit_picture import LitPicture
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Flashlight:
     """A spot light with a colour filter, held by somebody behind the target or carried by a drone.
 
@@ -41,20 +36,14 @@ class Flashlight:
         search: Its light has exact gradients.
     """
 
-    lumens: float = 3000.0
-    distance: tuple[float, float] = (4.0, 12.0)
-    height: tuple[float, float] = (0.5, 3.0)
-    aside: float = 0.6
-    beam: tuple[float, float] = (0.03, 0.3)
-    soft: float = 0.5
+    lumens: Least = 3000.0
+    distance: Span[Away] = (4.0, 12.0)
+    height: Span[Least] = (0.5, 3.0)
+    aside: Number = 0.6
+    beam: Span[Annotated[Number, Field(ge=1e-3)]] = (0.03, 0.3)
+    soft: Part = 0.5
     name: str = "flashlight"
     search: Literal["swarm", "greedy", "gradient"] = "gradient"
-
-    def __post_init__(self) -> None:
-        check_range(f"{self.name}: power", 0.0, self.lumens)
-        check_range(f"{self.name}: distance", *self.distance, above=1.0)
-        check_range(f"{self.name}: height", *self.height)
-        check_range(f"{self.name}: beam", *self.beam, above=1e-3)
 
     def ranges(self, target: Target) -> Ranges:
         """See `LightAttack`."""

@@ -15,6 +15,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.images import save_picture
 from ssad.core.protocols import Detector
+from ssad.core.schema import checked
 from ssad.core.seeding import digest
 from ssad.scenarios.static.physical.noninvasive import (
     Budget,
@@ -118,7 +119,7 @@ class LightFolder:
             return self._projected(spec, attack, target, projected, detector)
         if not path.is_file():
             if spec.source:
-                budget, how = budget_of(spec.settings)
+                budget, how = budget_of(spec.settings, attack.name)
                 found = search_light(
                     attack, detector(), target, views(), budget=budget, search=how, key=(self.seed, spec.name)
                 )
@@ -181,16 +182,17 @@ class LightFolder:
         return {**kept, "light": values}
 
 
-def budget_of(settings: Mapping[str, Any]) -> tuple[Budget, Any]:
-    """The budget of a search, and its kind (None: the attack's own). ConfigError: a setting that it does not have."""
+def budget_of(settings: Mapping[str, Any], attack: str) -> tuple[Budget, Any]:
+    """The budget of an attack's search, and its kind (None: the attack's own).
+
+    Raises:
+        ConfigError: A setting that it does not have, or a value that it refuses.
+    """
     given = dict(settings)
     how = given.pop("search", None)
     if how not in (None, "swarm", "greedy", "gradient"):
-        raise ConfigError(f"search '{how}'; choose swarm, greedy or gradient")
-    try:
-        return Budget(**given), how
-    except TypeError as error:
-        raise ConfigError(f"the search of a light: {str(error).partition(') ')[2] or error}") from None
+        raise ConfigError(f"attack {attack}: search={how!r}: choose swarm, greedy or gradient")
+    return checked(Budget, given, what=f"attack {attack}"), how
 
 
 def _write(path: Path, about: Mapping[str, Any]) -> None:

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.camera.lamps import Lamp
 from ssad.camera.scene_edit import SceneEdit
+from ssad.core.schema import VALUES, Above, Least, Number, Span
 from ssad.scenarios.static.physical.noninvasive.flashlight import _IDENTITY, lamp_of
 from ssad.scenarios.static.physical.noninvasive.lamps import added_light
-from ssad.scenarios.static.physical.noninvasive.light import (
-    Ranges,
-    Target,
-    aimed,
-    at_values,
-    check_range,
-    numbers,
-)
+from ssad.scenarios.static.physical.noninvasive.light import Away, Ranges, Target, aimed, at_values, numbers
 from ssad.scenarios.static.physical.noninvasive.lit_picture import LitPicture
 
 LUMEN_PER_WATT = 683.0  # of light of 555 nm, by definition of the candela
 TO_SRGB = ((3.2406, -1.5372, -0.4986), (-0.9689, 1.8758, 0.0415), (0.0557, -0.2040, 1.0570))  # IEC 61966-2-1, from XYZ
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Laser:
     """A laser whose beam a cylindrical lens spreads to a line.
 
@@ -49,20 +44,14 @@ class Laser:
         search: As in the source.
     """
 
-    watts: float = 0.5
-    distance: float = 8.0
-    height: float = 1.5
-    fan: float = 0.15
-    width: tuple[float, float] = (0.05, 0.3)
-    wavelength: tuple[float, float] = (400.0, 680.0)
+    watts: Least = 0.5
+    distance: Away = 8.0
+    height: Least = 1.5
+    fan: Above = 0.15
+    width: Span[Annotated[Number, Field(ge=0.01)]] = (0.05, 0.3)
+    wavelength: Span[Annotated[Number, Field(ge=360.0)]] = (400.0, 680.0)
     name: str = "laser"
     search: Literal["swarm", "greedy", "gradient"] = "greedy"
-
-    def __post_init__(self) -> None:
-        check_range(f"{self.name}: power", 0.0, self.watts)
-        check_range(f"{self.name}: distance", self.distance, self.distance, above=1.0)
-        check_range(f"{self.name}: width", *self.width, above=0.01)
-        check_range(f"{self.name}: wavelength", *self.wavelength, above=360.0)
 
     def ranges(self, target: Target) -> Ranges:
         """See `LightAttack`."""

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from ssad.camera.scene_edit import SceneEdit
-from ssad.core.errors import ConfigError
+from ssad.core.schema import Number
 from ssad.core.types import F64
 from ssad.scenarios.static.physical.noninvasive.lit_picture import LitPicture
 
 Ranges = Mapping[str, tuple[float, float]]
 """Names of what is searched -> least and greatest value, in the units of their names."""
+
+Away = Annotated[Number, Field(ge=1.0)]
+"""From the target's rear to a lamp, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +99,6 @@ def aimed(place: Tensor, point: Tensor, roll: Tensor | None = None) -> Tensor:
     top = torch.cat([torch.stack([across, down, ahead], -1), place[..., None]], -1)
     last = place.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(place), 1, 4)
     return torch.cat([top, last], 1)
-
-
-def check_range(what: str, least: float, greatest: float, *, above: float = 0.0) -> None:
-    """ConfigError unless the numbers are finite, in order and not below `above`."""
-    if not (np.isfinite([least, greatest]).all() and above <= least <= greatest):
-        raise ConfigError(f"{what}: from {least:g} to {greatest:g}; give two numbers in order, from {above:g} up")
 
 
 def at_values(values: Mapping[str, float]) -> dict[str, Tensor]:

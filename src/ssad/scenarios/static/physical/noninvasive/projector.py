@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, field
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.camera.lamps import Lamp
@@ -14,13 +18,16 @@ from ssad.camera.scene import Layer
 from ssad.camera.scene_edit import SceneEdit
 from ssad.camera.texture import to_linear
 from ssad.core.errors import ConfigError
+from ssad.core.schema import VALUES, Least, Number, Two, checked
 from ssad.scenarios.static.physical.carrier import Surface
-from ssad.scenarios.static.physical.noninvasive.light import Target, aimed, check_range, numbers
+from ssad.scenarios.static.physical.noninvasive.light import Away, Target, aimed, numbers
 from ssad.scenarios.static.physical.optimise import TextureAttack
 from ssad.scenarios.static.physical.printing import Expectation
 
+AIMED = Expectation((0.9, 1.1), 0.05, 0.02, 0.03, 0.03)
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Projector:
     """A projector behind the target, on a vehicle or a drone that keeps its distance.
 
@@ -38,22 +45,15 @@ class Projector:
         name: What tables call it.
     """
 
-    lumens: float = 5000.0
-    distance: float = 5.0
-    aside: float = 0.35
-    height: float = 2.0
-    size: tuple[float, float] = (1.0, 0.9)
-    texels: int = 32
-    leak: float = 0.001
+    lumens: Least = 5000.0
+    distance: Away = 5.0
+    aside: Number = 0.35
+    height: Least = 2.0
+    size: Two[Annotated[Number, Field(ge=0.05)]] = (1.0, 0.9)
+    texels: Annotated[int, Field(ge=1, le=1024)] = 32
+    leak: Annotated[Least, Field(lt=1.0)] = 0.001
     name: str = "projector"
     search: str = field(default="gradient", init=False)
-
-    def __post_init__(self) -> None:
-        check_range(f"{self.name}: power", 0.0, self.lumens)
-        check_range(f"{self.name}: distance", self.distance, self.distance, above=1.0)
-        check_range(f"{self.name}: size", min(self.size), max(self.size), above=0.05)
-        if not 1 <= self.texels <= 1024 or not 0.0 <= self.leak < 1.0:
-            raise ConfigError(f"{self.name}: texels from 1 to 1024, leak from 0 to 1")
 
     def lamp(self, target: Target) -> Lamp:
         """The projector in the target's frame, power in lumen; it shows texture 0."""
@@ -90,10 +90,22 @@ class Projector:
         share = self.light_of(colour).mean((1, 2)).double()
         return float(self.lumens * (share @ share.new_tensor([0.2126, 0.7152, 0.0722])))
 
-    def training(self, **settings: Any) -> TextureAttack:
-        """How its picture is trained: no ink, so nothing about printing; it is aimed well, not perfectly."""
+    def training(self, /, **settings: Any) -> TextureAttack:
+        """How its picture is trained: no ink, so nothing about printing; it is aimed well, not perfectly.
+
+        Args:
+            **settings: Fields of `TextureAttack` that differ; of `expectation` those of its fields that differ.
+
+        Raises:
+            ConfigError: A setting that it does not have, or a value that it refuses.
+        """
         given: dict[str, Any] = {
-            "epochs": 40, "rate": 0.1, "smooth": 0.02, "printed": 0.0, "window": 320,
-            "expectation": Expectation((0.9, 1.1), 0.05, 0.02, 0.03, 0.03),
+            "epochs": 40, "rate": 0.1, "smooth": 0.02, "printed": 0.0, "window": 320, "expectation": AIMED, **settings,
         }  # fmt: skip
-        return TextureAttack(self.name, "hide", **(given | settings))
+        if isinstance(given["expectation"], Mapping):
+            given["expectation"] = {**asdict(AIMED), **given["expectation"]}
+        what = f"attack {self.name}"
+        made = checked(partial(TextureAttack, self.name), given, what=what, kind=TextureAttack)
+        if made.stealth:
+            raise ConfigError(f"{what}: stealth={made.stealth:g}: it is for what is printed on something")
+        return made

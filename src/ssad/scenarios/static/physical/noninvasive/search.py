@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
 from torch import Tensor
 
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
 from ssad.core.protocols import Detector
+from ssad.core.schema import VALUES, Above, Whole
 from ssad.core.seeding import digest, generator
 from ssad.core.types import F64
 from ssad.scenarios.static.digital.objectives import Aim, Situation, make_objective
@@ -37,7 +40,7 @@ class LitView:
     truth: Truth
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
 class Budget:
     """How long is searched.
 
@@ -49,19 +52,20 @@ class Budget:
         searches: How many searches are made, each from draws of its own and with all `settings`; the best one counts.
     """
 
-    settings: int = 120
-    members: int = 10
-    rate: float = 0.05
-    window: int | None = 320
-    searches: int = 1
+    settings: Whole = 120
+    members: Whole = 10
+    rate: Above = 0.05
+    window: Annotated[int, Field(ge=64, multiple_of=32)] | None = 320
+    searches: Whole = 1
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.members <= self.settings or not self.rate > 0.0:
-            raise ConfigError("a search: members from 1 to the number of settings, rate above 0")
-        if self.window is not None and (self.window < 64 or self.window % 32):
-            raise ConfigError("a search: the window is a multiple of 32 px, 64 at least")
-        if self.searches < 1:
-            raise ConfigError("a search: one search at least")
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.members > self.settings:
+            raise ValueError(f"members={self.members}: more than the settings that are tried ({self.settings})")
+        return self
+
+
+USUAL = Budget()
 
 
 @dataclass(slots=True)
@@ -93,7 +97,7 @@ def search_light(
     target: Target,
     views: Sequence[LitView],
     *,
-    budget: Budget = Budget(),
+    budget: Budget = USUAL,
     search: Literal["swarm", "greedy", "gradient"] | None = None,
     key: tuple[object, ...] = (),
 ) -> Found:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from ssad.camera.scene_edit import Card, SceneEdit
-from ssad.core.errors import ConfigError
+from ssad.core.schema import VALUES, Least, Number
 from ssad.core.types import F64
-from ssad.scenarios.static.physical.noninvasive.light import Ranges, Target, check_range
+from ssad.scenarios.static.physical.noninvasive.light import Ranges, Target
 from ssad.scenarios.static.physical.noninvasive.lit_picture import LitPicture
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Shadow:
     """A triangular card between the sun and the target's rear.
 
@@ -34,15 +35,10 @@ class Shadow:
         search: As in the source.
     """
 
-    beyond: float = 0.25
-    away: float = 10.0
+    beyond: Least = 0.25
+    away: Annotated[Number, Field(ge=0.5, le=20.0)] = 10.0
     name: str = "shadow"
     search: Literal["swarm", "greedy", "gradient"] = "swarm"
-
-    def __post_init__(self) -> None:
-        check_range(f"{self.name}: beyond", self.beyond, self.beyond)
-        if not 0.5 <= self.away <= 20.0:
-            raise ConfigError(f"{self.name}: the card hangs 0.5 to 20 m away, not {self.away:g}")
 
     def ranges(self, target: Target) -> Ranges:
         """See `LightAttack`."""
