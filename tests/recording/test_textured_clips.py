@@ -15,21 +15,23 @@ from helpers.bodies import plain_bodies
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import ssad.recording.textured_clips as module
-from ssad.camera.render import render
+from ssad.camera.render import Picture, render
 from ssad.camera.scene import Layer
-from ssad.camera.texture import retexture, taps_of
+from ssad.camera.texture import paint_mask, retexture, taps_of
 from ssad.camera.torch_jpeg import jpeg
 from ssad.camera.torch_sensor import develop
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import clip_views, record_clips
+from ssad.recording.clip_recorder import TARGET, clip_views, record_clips
 from ssad.recording.clips import Clips
 from ssad.recording.nuscenes_recorder import SENSOR
 from ssad.recording.target import TargetCar
 from ssad.recording.textured_clips import KEPT, Wearing, textured_clips
+from ssad.recording.viewpoints import look_at
 from ssad.scenarios.static.physical.carrier import Road
 
 LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
+CAR = TargetCar("suv", "red", seed=2)
 SIZES: dict[int, int | tuple[int, int]] = {0: 32, 1: (16, 24)}
 
 
@@ -70,6 +72,63 @@ def test_a_texture_looks_as_if_rendered_anew(folder: Path) -> None:
             assert not changed[: max(int(y) - 40, 0)].any(), "far from the car nothing changes"
             torch.testing.assert_close(shown[..., changed], whole[..., changed], rtol=0, atol=1e-5)
             assert torch.equal(shown[..., ~changed], before[..., ~changed])
+
+
+@pytest.fixture(scope="module")
+def same_metal(tmp_path_factory: pytest.TempPathFactory) -> list[Picture]:
+    """A named car in each of two towns, from the same places: behind its right, and before its left from above."""
+    out = tmp_path_factory.mktemp("towns") / "clips"
+    record_clips(Clips(out, (("Twinford", 1), ("Oldmarket", 1)), (), size=160, behind=8.0, target=CAR), workers=0)
+    eyes = (np.array([-6.0, -2.5, 1.8]), np.array([5.0, 3.5, 3.0]))
+    found = []
+    for seen in clip_views(out):
+        worn = seen.wearing(Layer(0))
+        at = worn.things[0].pose
+        own = [replace(worn, pose=at @ look_at(eye, np.array([0.0, 0.0, 0.7])), focus=None) for eye in eyes]
+        found.append(render(seen.scene, own))
+    return found
+
+
+def numbered(picture: Picture, size: tuple[int, int]) -> np.ndarray:
+    """Where in its texture each pixel [B * H * W, 2] shows a car, u and v as its texels say; NaN where none is seen."""
+    height, width = size
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    texels = torch.stack([(columns + 0.5) / width, (rows + 0.5) / height, torch.ones(size)]).double()
+    taps = taps_of(picture, size, mask=paint_mask(CAR.mesh(), size), dtype=torch.float64)
+    nothing = torch.zeros((*picture.tag.shape, 3), dtype=torch.float64)
+    shown, full = (retexture(taps, one, nothing).reshape(-1, 3) for one in (texels, torch.ones_like(texels)))
+    return (shown / full)[:, :2].numpy()
+
+
+def faces_at(places: np.ndarray) -> np.ndarray:
+    """The face of the car [N] that lies at each place [N, 2] of its atlas; -1: between its panels."""
+    mesh = CAR.mesh()
+    own = np.flatnonzero(mesh.panel >= 0)
+    start, right, up = mesh.uv[own].astype(np.float64).transpose(1, 0, 2)
+    sides = np.stack([right - start, up - start], -1)
+    flat = np.abs(np.linalg.det(sides)) < 1e-12
+    sides[flat] = np.eye(2) * 1e9
+    part = np.einsum("fij,nfj->nfi", np.linalg.inv(sides), places[:, None] - start)
+    inside = (part.min(-1) > -1e-6) & (part.sum(-1) < 1 + 1e-6) & ~flat
+    return np.where(inside.any(1), own[inside.argmax(1)], -1)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (192, 192), (96, 160)])
+def test_a_texture_lies_on_the_same_faces_in_every_town(same_metal: list[Picture], size: tuple[int, int]) -> None:
+    """Whatever its size: its texels are numbered, and each pixel of the car shows the same ones."""
+    here, there = (numbered(picture, size) for picture in same_metal)
+    free = np.logical_and(*((picture.tag == TARGET).ravel() for picture in same_metal))
+    worn = [free & np.isfinite(places).all(1) for places in (here, there)]
+    both = worn[0] & worn[1]
+    assert both.sum() > 2000, "the car is seen"
+    assert (worn[0] != worn[1]).sum() < 0.01 * both.sum(), "on the same pixels"
+    assert (np.abs(here - there)[both].max(1) < 0.5 / max(size)).mean() > 0.95, "the same texels"
+    finest = numbered(same_metal[1], (512, 512))[both]
+    assert (np.abs(here[both] - finest).max(1) < 1.0 / min(size)).mean() > 0.95, "other sizes lie in the same place"
+    some = np.flatnonzero(both)[::7]
+    one, other = faces_at(here[some]), faces_at(there[some])
+    assert len(np.unique(one)) > 50
+    assert (one == other).mean() > 0.98, "the same faces"
 
 
 def test_a_picture_is_rendered_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
