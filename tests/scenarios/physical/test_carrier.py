@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,12 +14,14 @@ from ssad.camera.rig import RIG, rig_camera
 from ssad.camera.scene import Scene, Thing
 from ssad.camera.texture import PRINTABLE
 from ssad.core.errors import ConfigError
-from ssad.recording.target import TargetCar, TargetSign
+from ssad.recording.target import TargetCar, TargetSign, TargetWalker
+from ssad.recording.viewpoints import look_at
 from ssad.scenarios.static.physical import make_carrier
 from ssad.scenarios.static.physical.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
 
 PAINT = Material("paint", (0.5, 0.5, 0.5))
 CHANNEL = next(iter(RIG))
+SIDES = ("left", "right")
 
 
 def panel(width: float, height: float, rectangle: tuple[float, float, float, float]) -> Mesh:
@@ -99,6 +103,54 @@ def test_a_patch_lies_on_the_rear_of_every_car_in_its_size(style: str) -> None:
     assert np.ptp(columns) + 1 == pytest.approx(0.9 * pixel, abs=0.12 * 0.9 * pixel + 2)
     assert np.ptp(rows) + 1 <= 0.3 * pixel + 3
     assert (columns.min() + columns.max()) / 2 == pytest.approx(camera.intrinsic[0, 2], abs=2.5)
+
+
+def faces_of(mesh: Mesh, chosen: np.ndarray) -> Mesh:
+    """The chosen faces of a mesh."""
+    own = {name: getattr(mesh, name)[chosen] for name in ("faces", "normals", "uv", "material", "panel")}
+    return replace(mesh, **own)
+
+
+FROM = {"ahead": (1, 0, 0), "behind": (-1, 0, 0), "left": (0, 1, 0), "right": (0, -1, 0), "above": (-0.2, 0, 1)}
+
+
+@pytest.mark.parametrize(
+    ("target", "panel", "size", "side"),
+    [
+        (TargetCar(), "rear", (0.8, 0.3), "behind"),
+        (TargetCar(), "hood", (0.8, 0.5), "above"),
+        (TargetCar(), "roof", (0.7, 0.7), "above"),
+        *((TargetCar(), f"{side}_side/{door}_door", (0.4, 0.3), side) for side in SIDES for door in ("front", "rear")),
+        (TargetWalker(), "torso_front", (0.25, 0.3), "ahead"),
+        (TargetWalker(), "torso_back", (0.25, 0.3), "behind"),
+    ],
+    ids=lambda one: one if isinstance(one, str) else None,
+)
+def test_a_patch_lies_on_its_panel_and_nowhere_else(
+    target: TargetCar | TargetWalker, panel: str, size: tuple[float, float], side: str
+) -> None:
+    """Seen from all sides; from its own it can be read from left to right, on the left as on the right of a car."""
+    mesh = target.mesh()
+    surface = Patch(panel, width=size[0], height=size[1]).on(mesh)
+    own = np.isin(mesh.panel, mesh.panel_indices(panel))
+    scene = Scene(None, [faces_of(mesh, own), faces_of(mesh, ~own)])
+    camera, middle = rig_camera(CHANNEL, 320), np.array([0.0, 0.0, target.full_size[2] / 2])
+    eyes = [look_at(middle + 2.0 * max(target.full_size) * np.array(one), middle) for one in FROM.values()]
+    found = []
+    for wearer in (0, 1):
+        things = tuple(Thing(k, np.eye(4), tag=k + 1, layers=(surface.layer,) * (k == wearer)) for k in (0, 1))
+        found.append(render(scene, [View(camera, eye, things) for eye in eyes]).fragments)
+    on_panel, elsewhere = found
+    assert not len(elsewhere), "on no other face"
+    view, place = np.divmod(on_panel["place"].astype(int), camera.width * camera.height)
+    seen = {name: int((view == k).sum()) for k, name in enumerate(FROM)}
+    assert seen[side] == max(seen.values()) > 40
+    opposite = {"ahead": "behind", "behind": "ahead", "left": "right", "right": "left"}.get(side)
+    if opposite is not None:
+        assert seen[opposite] == 0
+        piece = view == list(FROM).index(side)
+        turn = np.corrcoef(on_panel["u"][piece], place[piece] % camera.width)[0, 1]
+        assert turn > 0.9, "not mirrored"
 
 
 def test_a_camouflage_covers_every_panel_and_nothing_between() -> None:
