@@ -9,10 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from helpers.command import ssad
 from rich.console import Console
 
 from ssad.bench.kind import Plan, Resources
@@ -23,6 +26,8 @@ from ssad.core.errors import ConfigError, RouteError, SSADError, StoreError
 from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace, save_trace
+from ssad.recording.attacked_film import attacked_frames
+from ssad.recording.texture_export import Print, export_texture
 from ssad.report.terminal import summary
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
@@ -129,6 +134,31 @@ def test_replay_is_identical_and_sees_a_changed_bit(done: Path) -> None:
         assert changed.startswith("step 7: x")
     finally:
         path.write_bytes(kept)
+
+
+def test_replay_films_a_drive_with_a_texture(done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shirt on the walker before the ego; what is no attack is refused before anything is driven."""
+    agents = []
+
+    def short(trace: Any, graph: Any, attack: Any, **options: Any) -> Any:
+        agents.append(attack.agent)
+        return islice(attacked_frames(trace, graph, attack, **(options | {"width": 96})), 2)
+
+    monkeypatch.setattr("ssad.recording.attacked_film.attacked_frames", short)
+    monkeypatch.setattr("ssad.recording.episode_scene.PHASES", 1)  # bodies are made faster
+    export_texture(tmp_path / "shirt", Print(torch.zeros((3, 128, 128)), "camouflage", {}, "pedestrian"), dots=20)
+    words = "replay", done, "blind/StraightObstacle/00", "--detector", "none", "--out", tmp_path / "out", "--wear"
+    shown = ssad(*words, tmp_path / "shirt")
+    assert shown.returncode == 0, shown.stderr
+    assert agents == [1]
+    (film,) = (tmp_path / "out").glob("*.worn.mp4")
+    assert f"film: {film}" in shown.stdout.replace("\n", "")
+    assert film.stat().st_size > 500
+    (tmp_path / "shirt" / "texture.npz").write_bytes(b"other")
+    refused = ssad(*words, tmp_path / "shirt")
+    assert refused.returncode != 0
+    assert "not the texture that texture.json describes" in refused.stderr.replace("\n", " ")
+    assert "identical" not in refused.stdout
 
 
 def test_replay_says_what_it_cannot_find(done: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from ssad.assets.mesh import Mesh
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
-from ssad.recording.attacked_film import attacked_frames, first_car
+from ssad.recording.attacked_film import attacked_frames, first_ahead
 from ssad.recording.light_export import Shining, export_light, load_worn
 from ssad.recording.lit_clips import at_hour
 from ssad.recording.live_attack import LiveAttack
@@ -58,12 +58,13 @@ def white(mesh: Mesh) -> SceneEdit:
 
 
 def test_the_car_before_the_ego_is_attacked(trace: EpisodeTrace) -> None:
-    assert first_car(trace) == 1
+    assert first_ahead(trace) == 1
     behind = replace(trace, x=2 * trace.x[:, :1] - trace.x, y=2 * trace.y[:, :1] - trace.y)
-    assert first_car(behind) is None
+    assert first_ahead(behind) is None
     walker = trace.kind.copy()
     walker[1] = AgentKind.WALKER
-    assert first_car(replace(trace, kind=walker)) is None
+    assert first_ahead(replace(trace, kind=walker)) is None
+    assert first_ahead(replace(trace, kind=walker), AgentKind.WALKER) == 1
 
 
 def test_a_film_shows_clean_beside_attacked(trace: EpisodeTrace) -> None:

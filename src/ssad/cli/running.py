@@ -158,10 +158,10 @@ def replay(
     out: Annotated[Path | None, typer.Option(help="Output folder.  [default: DIR/replays]")] = None,
     video: Annotated[Video, typer.Option(help="Video format.")] = Video.mp4,
     wear: Annotated[
-        Path | None, typer.Option(metavar="ATTACK", help="Also film the drive with this texture or light on a car.")
+        Path | None, typer.Option(metavar="ATTACK", help="Also film the drive with this texture or light in it.")
     ] = None,
     wearer: Annotated[
-        int | None, typer.Option(min=1, help="Number of the agent that is attacked.  [default: the car nearest ahead]")
+        int | None, typer.Option(min=1, help="Number of the agent that is attacked.  [default: the one longest ahead]")
     ] = None,
     detector: Annotated[str, typer.Option(help="Detector whose boxes the film shows, or none.")] = "yolov5n",
     mcap: Annotated[
@@ -218,25 +218,26 @@ def replay(
 
 
 def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any, Any, Path], Path] | None:
-    """What films a drive with an attack on a car; None without one. SSADError: no such attack or detector."""
+    """What films a drive with an attack in it; None without one. SSADError: no such attack or detector."""
     if wear is None:
         if wearer is not None:
             raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
         return None
     from ssad.detectors import make_detector
-    from ssad.recording.attacked_film import attacked_frames, first_car
+    from ssad.recording.attacked_film import attacked_frames, first_ahead
     from ssad.recording.light_export import load_worn
     from ssad.recording.lit_clips import at_hour
     from ssad.recording.loop_sensors import DAY
     from ssad.report.video import save_frames
 
     worn, judge = load_worn(wear), None if detector == "none" else make_detector(detector)
-    worn.live(1)
+    kind = worn.live(1).kind
 
     def film(trace: Any, graph: Any, path: Path) -> Path:
-        agent = first_car(trace) if wearer is None else wearer
+        agent = first_ahead(trace, kind) if wearer is None else wearer
         if agent is None:
-            raise ConfigError(f"{trace.key}: no car is ahead of the ego at any time; name the agent with --wearer")
+            whom = kind.name.lower()
+            raise ConfigError(f"{trace.key}: no {whom} is ahead of the ego at any time; name the agent with --wearer")
         weather = at_hour(DAY, worn.hour)
         shown = attacked_frames(trace, graph, worn.live(agent), detector=judge, every=2, weather=weather)
         return save_frames(shown, path, dt=2 * trace.dt)

@@ -17,15 +17,15 @@ from ssad.evaluation.target_sheet import marked
 from ssad.recording.live_attack import LiveAttack
 from ssad.recording.loop_sensors import DAY, Onboard
 
-NEAR = 40.0  # m ahead of the ego within which a car is worth filming
+NEAR = 40.0  # m ahead of the ego within which an agent is worth filming
 
 
-def first_car(trace: EpisodeTrace) -> int | None:
-    """The car that is longest before the ego, within `NEAR` m and in its camera's view; None if no car ever is."""
+def first_ahead(trace: EpisodeTrace, kind: AgentKind = AgentKind.CAR) -> int | None:
+    """The agent of a kind that is longest before the ego, within `NEAR` m and in its camera's view; None if none is."""
     dx, dy = trace.x - trace.x[:, :1], trace.y - trace.y[:, :1]
     cos, sin = np.cos(trace.yaw[:, :1]), np.sin(trace.yaw[:, :1])
     ahead, aside = dx * cos + dy * sin, dy * cos - dx * sin
-    seen = trace.active & (ahead > 2.0 * np.abs(aside)) & (ahead < NEAR) & (trace.kind == AgentKind.CAR)
+    seen = trace.active & (ahead > 2.0 * np.abs(aside)) & (ahead < NEAR) & (trace.kind == kind)
     steps = seen[:, 1:].sum(0)
     return int(steps.argmax()) + 1 if steps.size and steps.max() > 0 else None
 

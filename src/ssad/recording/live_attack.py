@@ -12,7 +12,7 @@ from ssad.camera.scene import Thing
 from ssad.camera.scene_edit import SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.types import AgentKind
-from ssad.recording.target import TargetCar, TargetSign
+from ssad.recording.target import Target, TargetSign, TargetWalker
 from ssad.world.models import MODELS
 
 SIGN: Final = "stop_sign"
@@ -25,14 +25,19 @@ class LiveAttack:
 
     Attributes:
         edit: What changes around a target, given its body.
-        target: What the attack is made for: a car plays the agent, in the size that the agent has in the world; a sign
-            stands in place of every stop sign.
+        target: What the attack is made for: a car or a walker plays the agent, in the size that the agent has in the
+            world, a walker without moving its legs; a sign stands in place of every stop sign.
         agent: Who is attacked; 0 is the ego. Of no account where the target is a sign.
     """
 
     edit: Callable[[Mesh], SceneEdit]
-    target: TargetCar | TargetSign
+    target: Target
     agent: int = 1
+
+    @property
+    def kind(self) -> AgentKind:
+        """Of the agents that the target can play; of no account where it is a sign."""
+        return AgentKind.WALKER if isinstance(self.target, TargetWalker) else AgentKind.CAR
 
     @cached_property
     def _bodies(self) -> dict[str, tuple[Mesh, SceneEdit]]:
@@ -42,16 +47,17 @@ class LiveAttack:
         """The body that plays an agent of a model, or a sign, and the edit for it; made once.
 
         Raises:
-            ConfigError: The model is no car, or the attack does not fit on it.
+            ConfigError: The target cannot play an agent of this model, or the attack does not fit on it.
         """
         if model not in self._bodies:
             if isinstance(self.target, TargetSign):
                 mesh = self.target.mesh()
             else:
                 one = MODELS[model]
-                if one.kind != AgentKind.CAR:
+                if one.kind != self.kind:
                     raise ConfigError(
-                        f"agent {self.agent} is a {model}; the attack is made for a car: name another agent"
+                        f"agent {self.agent} is a {model}; the attack is made for a {self.kind.name.lower()}: name "
+                        "another agent"
                     )
                 mesh = replace(self.target, size=(one.length, one.width, one.height)).mesh()
             self._bodies[model] = mesh, self.edit(mesh)

@@ -22,7 +22,7 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.types import U8
 from ssad.recording.live_attack import LiveAttack
-from ssad.recording.target import Target, TargetCar, TargetSign, parse_target
+from ssad.recording.target import Target, parse_target
 from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
 from ssad.scenarios.static.physical.carrier import covered, metres_of
 from ssad.scenarios.static.physical.inks import printable_colours
@@ -69,11 +69,8 @@ class Print:
         return SceneEdit((surface.layer,), textures=shown, masks=masks)
 
     def live(self, agent: int) -> LiveAttack:
-        """An agent of the closed loop, or every stop sign, wears it. ConfigError: it is made for a walker."""
-        target = parse_target(self.target)
-        if not isinstance(target, TargetCar | TargetSign):
-            raise ConfigError(f"this texture is made for {self.target}; in the loop, cars and stop signs wear textures")
-        return LiveAttack(self.edit, target, agent)
+        """An agent of the closed loop, a car or a walker, wears it, or every stop sign."""
+        return LiveAttack(self.edit, parse_target(self.target), agent)
 
 
 def load_print(folder: Path) -> Print:
