@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,11 @@ from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.images import read_image
+from ssad.recording.target_table import rows_of
 from ssad.report import write_report
 from ssad.scenarios.static.physical import Expectation, TextureSpec, make_physical
 
+ROOT = Path(__file__).parents[2]
 PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_images": 2}
 
 
@@ -53,6 +56,90 @@ def test_stealth_is_in_the_title_and_the_loud_one_is_shuffled() -> None:
     by_title = {cell.fields["attack"]: TextureSpec.of_row(cell.spec).name for cell in plan.cells if cell.spec["source"]}
     assert set(by_title) == {"vanishing", "vanishing, stealth 0.5", "shuffled vanishing"}
     assert by_title["shuffled vanishing"] == by_title["vanishing"] != by_title["vanishing, stealth 0.5"]
+
+
+def titles(attacks: list[Any], **changes: Any) -> dict[str, str]:
+    """Of what is trained, in a suite with these attacks: title and carrier -> name of the texture."""
+    plan = Physical().plan(suite(attacks=attacks, **changes))
+    cells = [cell for cell in plan.cells if cell.spec["source"]]
+    return {f"{c.fields['attack']} | {c.fields['carrier']}": TextureSpec.of_row(c.spec).name for c in cells}
+
+
+WIDE = {"width": 1.9, "height": 0.86}
+
+
+def test_shuffled_says_by_carrier_options_and_settings_which_attack_is_meant() -> None:
+    patches = [{"name": "adv-patch", "options": WIDE}, {"name": "adv-patch", "options": {"width": 0.8}}]
+    found = titles([*patches, {"name": "shuffled", "of": "adv-patch", "options": {"width": 1.9}}])
+    assert len(found) == 3
+    wide = "patch, height 0.86, width 1.9"
+    assert found[f"shuffled adv-patch | {wide}"] == found[f"adv-patch | {wide}"]
+    found = titles([patches[0], "adv-patch", {"name": "shuffled", "of": "adv-patch"}])
+    assert found["shuffled adv-patch | patch"] == found["adv-patch | patch"], "the one that says nothing more"
+    roads = [{"name": "das", "carrier": "road"}, "das", {"name": "shuffled", "of": "das", "carrier": "road"}]
+    found = titles(roads)
+    assert found["shuffled das | road"] == found["das | road"] != found["das | camouflage"]
+    slow = {"rate": 0.01}
+    rows = ["vanishing", {"name": "vanishing", "settings": slow}]
+    found = titles([*rows, {"name": "shuffled", "of": "vanishing", "settings": slow}])
+    assert found["shuffled vanishing, rate 0.01 | camouflage"] == found["vanishing, rate 0.01 | camouflage"]
+    shown = [{"name": "das", "texture": f"das-{which}yolov5n-twinford"} for which in ("", "all-sides-")]
+    found = titles([*shown, {"name": "shuffled", "of": "das", "texture": shown[1]["texture"]}])
+    own = f"das, texture {shown[1]['texture']} | camouflage"
+    assert found[f"shuffled {own}"] == found[own]
+
+
+def test_shuffled_of_one_of_several_ends_in_a_line_that_names_them() -> None:
+    patches = [{"name": "adv-patch", "options": WIDE}, {"name": "adv-patch", "options": {"width": 0.8}}]
+    several = "several fit, say carrier, .* of one: patch, height 0.86, width 1.9; patch, width 0.8"
+    for options, message in (({}, several), ({"width": 3.0}, "none fits, say carrier, .* patch, width 0.8")):
+        with pytest.raises(ConfigError, match=message) as found:
+            titles([*patches, {"name": "shuffled", "of": "adv-patch", "options": options}])
+        assert "\n" not in str(found.value)
+    rows = [{"name": "das", "settings": {"rate": rate}} for rate in (0.01, 0.1)]
+    with pytest.raises(ConfigError, match=r"one: camouflage, rate 0\.01; camouflage, rate 0\.1"):
+        titles([*rows, {"name": "shuffled", "of": "das"}])
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ([{}, {"rate": 0.01}], ["vanishing", "vanishing, rate 0.01"]),
+        ([{"batch": 16}, {"batch": 16, "stealth": 0.5}], ["vanishing", "vanishing, stealth 0.5"]),
+        ([{"batch": 16}, {"batch": 4}], ["vanishing, batch 16", "vanishing, batch 4"]),
+        ([{}, {"epochs": 3}], ["vanishing", "vanishing, epochs 3"]),
+        ([{}, {"expectation": {"noise": 0.2}}], ["vanishing", "vanishing, expectation noise 0.2"]),
+        ([{"batch": 16}], ["vanishing"]),
+    ],
+)
+def test_titles_tell_rows_of_one_attack_apart(settings: list[dict[str, Any]], names: list[str]) -> None:
+    found = titles([{"name": "vanishing", "settings": one} for one in settings])
+    assert list(found) == [f"{name} | camouflage" for name in names]
+    lights = [{"name": "laser", "settings": one} for one in ({}, {"searches": 4})]
+    plan = Physical().plan(suite(attacks=[], lights=lights))
+    assert [c.fields["attack"] for c in plan.cells] == ["clean", "laser", "random laser", "laser, searches 4"]
+
+
+def test_titles_tell_textures_apart_that_are_shown_or_trained_from_more_sides() -> None:
+    rows = [{"name": "das", "texture": "das-yolov5n-twinford"}, {"name": "das", "around": 2}]
+    more = [{"name": "das", "texture": "das-all-sides-yolov5n-twinford"}, {"name": "das", "around": 3}]
+    usual = [cell.fields["attack"] for cell in Physical().plan(suite(attacks=rows)).cells]
+    assert usual == ["clean", "das", "das, all sides"]
+    found = [cell.fields["attack"] for cell in Physical().plan(suite(attacks=rows + more)).cells]
+    assert found == [
+        "clean", "das, texture das-yolov5n-twinford", "das, all sides, around 2",
+        "das, texture das-all-sides-yolov5n-twinford", "das, all sides, around 3",
+    ]  # fmt: skip
+
+
+def test_titles_of_the_suites_whose_tables_are_kept_stay_as_they_are() -> None:
+    """They name sides and stealth alone; a stored table would not be found again under another."""
+    files = [path for folder in ("suites", "benchmarks") for path in (ROOT / folder).glob("physical*.yaml")]
+    assert len(files) >= 13
+    usual = re.compile(r"(shuffled |random )?[a-z-]+(, all sides)?(, stealth [0-9.]+)?")
+    for path in files:
+        names = {row.fields["attack"] for row in rows_of(load_suite(str(path)))}
+        assert [name for name in names if not usual.fullmatch(name)] == [], path.name
 
 
 def test_a_key_covers_what_decides_the_result() -> None:
@@ -108,6 +195,7 @@ def test_a_key_covers_what_decides_the_result() -> None:
         ({"lights": [{"name": "laser", "settings": {"search": "luck"}}]}, ConfigError, "laser: search='luck'"),
         ({"attacks": [{"name": "random", "settings": {"rate": 1.0}}]}, ConfigError, "is not trained"),
         ({"attacks": [{"name": "shuffled"}]}, ConfigError, "of which attack"),
+        ({"attacks": ["das", {"name": "vanishing", "of": "das"}]}, ConfigError, "of which attack"),
         ({"attacks": [{"name": "shuffled", "of": "das"}]}, ConfigError, "there must be one such attack"),
         ({"attacks": [{"name": "adv-patch", "options": {"panel": "wing"}}]}, ConfigError, "no panel 'wing'"),
         ({"attacks": [{"name": "adv-patch", "options": {"width": 9.0}}]}, ConfigError, "does not fit"),

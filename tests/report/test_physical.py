@@ -141,6 +141,10 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, night", "random laser, night")
     assert row.cells[2].mean == pytest.approx(90.0 - 75.0)
+    lines[0] = line("laser, searches 4", night, 0.70, source="yolov5n")
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    (row,) = margin_table(PhysicalRun(load_run(folder))).rows
+    assert row.head[2:] == ("laser, searches 4, night", "random laser, night")
 
 
 def test_transfer_and_the_worst_cell(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -68,10 +68,12 @@ class Entry(Schema):
         name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
         carrier: patch, camouflage or road, with its settings as `options`; default: the attack's own.
         options: of the carrier.
-        settings: fields of `TextureAttack` that differ.
+        settings: fields of `TextureAttack` that differ; titles name those in which two rows of one attack differ.
         around: pictures from all around the target, in the town of the training, that the texture is trained on beside
             those from behind.
-        of: of the control shuffled: the attack whose texture is shuffled (the one with the same `around`).
+        of: of the control shuffled: the attack whose texture is shuffled. Of several it is the one with the same
+            `around` and with all that is said here of carrier, options, settings and texture; of several such, the one
+            that says nothing beyond what the others say too.
         texture: a shipped texture, or the card of one (NAME.json): it is shown in place of training; carrier, options
             and the detector that it was trained against are those of the card.
     """
@@ -229,16 +231,17 @@ def rows_of(table: TargetTable) -> Iterator[TargetRow]:
             make_carrier(row["carrier"], row["options"]).on(target_of(table).mesh())
         except ConfigError as error:
             raise ConfigError(f"attack {row['attack']}: {error}") from None
+    titled = [({"attack": None}, CLEAN), *((row, _title(table, row, rows)) for row in rows)]
     for pair, view, detector in product(table.pairs, VIEWS, [*table.detectors, *table.judges]):
         if view == GRID and not table.seen_around(pair):
             continue
-        for row in [{"attack": None}, *rows] if rows or not table.lights else []:
-            yield from _texture_rows(table, pair, view, detector, row)
+        for row, title in titled if rows or not table.lights else []:
+            yield from _texture_rows(table, pair, view, detector, row, title)
     yield from _light_rows(table)
 
 
-def _texture_rows(
-    table: TargetTable, pair: Pair, view: str, detector: str, row: Mapping[str, Any]
+def _texture_rows(  # noqa: PLR0917
+    table: TargetTable, pair: Pair, view: str, detector: str, row: Mapping[str, Any], called: str
 ) -> Iterator[TargetRow]:
     """A texture before a detector, from each detector that it is trained against, and with each seed."""
     attack = row["attack"]
@@ -251,7 +254,7 @@ def _texture_rows(
         spec["source"] = source if trained else ""
         fields = {
             "test": pair.test, "train": pair.train, "view": view, "detector": detector, "carrier": carrier_title(row),
-            "attack": _title(row), "source": spec["source"], "number": seed,
+            "attack": called, "source": spec["source"], "number": seed,
         }  # fmt: skip
         words = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
         title = "/".join(map(str, words)) + (f"/{GRID}" if view == GRID else "")
@@ -279,25 +282,57 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
             fields = {
                 "test": pair.test, "train": pair.train, "view": "drive", "detector": detector,
                 "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}),
-                "attack": _light_title(row), "source": source, "number": light["number"],
+                "attack": _light_title(table, row), "source": source, "number": light["number"],
             }  # fmt: skip
             words = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
             yield TargetRow("/".join(map(str, words)), fields, {"attack": None, "light": light})
 
 
-def _title(row: Mapping[str, Any]) -> str:
-    """What tables call the attack of a row: such as "shuffled vanishing, all sides" or "das, stealth 0.5"."""
-    if row["attack"] is None:
-        return CLEAN
-    sides = ", all sides" if row.get("around") else ""
-    stealth = f", stealth {row['settings']['stealth']:g}" if row.get("settings", {}).get("stealth") else ""
-    return f"{'shuffled ' if row['of'] else ''}{row['of'] or row['attack']}{sides}{stealth}"
+def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """What tables call a row: such as "shuffled vanishing, all sides", "das, stealth 0.5" or "vanishing, rate 0.01"."""
+
+    def place(one: Mapping[str, Any]) -> tuple[str, str, bool]:
+        return one["of"] or one["attack"], carrier_title(one), bool(one["around"])
+
+    def sources(one: Mapping[str, Any]) -> set[str]:
+        return {one["source"]} if "file" in one else set(table.detectors)
+
+    alike = [_said(table, one) for one in rows if place(one) == place(row) and sources(one) & sources(row)]
+    name, _, around = place(row)
+    sides, shuffled = ", all sides" if around else "", "shuffled " if row["of"] else ""
+    return f"{shuffled}{name}{sides}{_differing(_said(table, row), alike)}"
 
 
-def _light_title(row: Mapping[str, Any]) -> str:
+def _said(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides a row beside its attack, its carrier and what the whole table says."""
+    usual = {"epochs": table.epochs, "window": table.window}
+    more = {"around": row["around"] or None, "texture": row.get("file")}
+    return {key: value for key, value in {**row["settings"], **more}.items() if value != usual.get(key)}
+
+
+def _differing(own: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+    """Stealth, and what others do not say alike: such as ", rate 0.01"."""
+    told = (
+        (key, value) for key, value in own.items()
+        if (key == "stealth" and value) or any(one.get(key) != value for one in others)
+    )  # fmt: skip
+    return "".join(f", {key} {_words(value)}" for key, value in told)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return " ".join(f"{key} {_words(one)}" for key, one in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _light_title(table: TargetTable, row: Mapping[str, Any]) -> str:
     if row["attack"] is None:
         return CLEAN
-    return f"{RANDOM} {row['of']}" if row["of"] else str(row["attack"])
+    if row["of"]:
+        return f"{RANDOM} {row['of']}"
+    place = row["attack"], row["hour"], row["options"]
+    alike = [one.settings for one in table.lights if (one.name, one.hour, one.options) == place]
+    return f"{row['attack']}{_differing(row['settings'], alike)}"
 
 
 def options_title(row: Mapping[str, Any]) -> str:
@@ -311,7 +346,11 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
     Raises:
         UnknownNameError, ConfigError: No such attack, or settings that it does not have.
     """
-    carrier = entry.carrier or default_carrier(entry.of or entry.name)
+    if (entry.name == "shuffled") != (entry.of is not None):
+        raise ConfigError(f"suite {table.name}: shuffled, and it alone, says of which attack (of: NAME)")
+    if entry.of is not None:
+        return {**_shuffled(table, entry), "attack": "shuffled", "of": entry.of}
+    carrier = entry.carrier or default_carrier(entry.name)
     found: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
     found |= {"of": None, "around": entry.around}
     if entry.texture is not None:
@@ -321,21 +360,36 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
         settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
         make_physical(entry.name, **settings)
         return found | {"settings": settings}
-    if entry.settings or (entry.around and entry.of is None):
+    if entry.settings or entry.around:
         raise ConfigError(f"suite {table.name}: {entry.name} is not trained and has no settings")
-    if (entry.name == "shuffled") != (entry.of is not None):
-        raise ConfigError(f"suite {table.name}: shuffled, and it alone, says of which attack (of: NAME)")
-    if entry.of is None:
-        return found
-    sources = [
-        one for one in table.attacks
+    return found
+
+
+def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
+    """The row whose texture is shuffled (see `Entry.of`). ConfigError: there is none, or more than one."""
+    rows = [
+        row_of(table, one) for one in table.attacks
         if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
     ]  # fmt: skip
-    if len(sources) > 1:
-        sources = [one for one in sources if not one.settings.get("stealth")]
-    if len(sources) != 1:
-        raise ConfigError(f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack")
-    return {**row_of(table, sources[0]), "attack": "shuffled", "of": entry.of}
+    fit = [
+        row for row in rows
+        if entry.carrier in (None, row["carrier"]) and entry.texture in (None, row.get("file"))
+        and _within({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
+    ]  # fmt: skip
+    said = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in fit]
+    plain = [row for row, own in zip(fit, said, strict=True) if all(_within(own, other) for other in said)]
+    if not plain:
+        known = "; ".join(f"{carrier_title(row)}{_differing(_said(table, row), [{}])}" for row in fit or rows)
+        which = f"; {'several fit' if fit else 'none fits'}, say carrier, options, settings or texture of one: {known}"
+        raise ConfigError(
+            f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack{which if rows else ''}"
+        )
+    return plain[0]
+
+
+def _within(some: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
+    """Whether all that one says the other says too."""
+    return {**more, **some} == more
 
 
 def check_lights(table: TargetTable) -> None:
@@ -359,7 +413,7 @@ def _ready(table: TargetTable, entry: Entry) -> dict[str, Any]:
     """What the card of a texture says of a row. ConfigError: the suite says otherwise."""
     assert entry.texture is not None
     colour, card = load_texture(entry.texture)
-    if entry.carrier or entry.options or entry.settings or entry.of or entry.around:
+    if entry.carrier or entry.options or entry.settings or entry.around:
         raise ConfigError(f"suite {table.name}: texture {entry.texture}: its card says carrier, options and settings")
     if (card.attack, card.target) != (entry.name, table.target):
         raise ConfigError(

@@ -197,9 +197,9 @@ def is_control(name: str) -> bool:
 
 
 def learns_nothing(control: str, attack: str) -> bool:
-    """Whether it is a control of an attack; of a light ("random laser") only of its own kind."""
+    """Whether it is a control of an attack; of a light ("random laser") only of its own kind ("laser, searches 4")."""
     first, _, rest = control.partition(" ")
-    return first in CONTROLS and (first != "random" or rest in ("", attack))
+    return first in CONTROLS and (first != "random" or rest in ("", attack.partition(", ")[0]))
 
 
 def lower(cell: Cell) -> float:
