@@ -18,6 +18,7 @@ from ssad.report.kinds.physical import (
     grid_table,
     main_table,
     margin_table,
+    score,
     tiles,
     transfer_table,
 )
@@ -81,13 +82,27 @@ def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
     assert text["DAS"] == ["48.00", "48.00", "52.00"]
     assert text["TPA"] == ["n/a", "n/a", "n/a"], "what was refused has no number"
     random = next(row for row in rows if row.head == ("random patch",)).cells[0]
-    assert (random.text, random.interval) == ("94.00", "90.00–98.00"), "mean and range of two draws"
+    assert (random.text, random.interval) == ("94.00", "[85.00, 100.00]"), "mean of two draws, ends of their intervals"
+
+
+def test_the_interval_of_several_draws_covers_drives_and_draws() -> None:
+    """Two draws of 100 % are as sure as their drives make them, and no surer; without intervals their range is left."""
+    ends = {"AP50": [0.8, 1.0]}
+    sure = [line("random", "patch", 1.0, intervals=ends), line("random", "patch", 1.0, number=1, intervals=ends)]
+    assert score(sure, "AP50").interval == "[80.00, 100.00]"
+    other = line("random", "patch", 0.7, number=2, intervals={"AP50": [0.5, 0.9]})
+    wide = score([*sure, other], "AP50")
+    assert (wide.text, wide.interval, wide.clusters) == ("90.00", "[50.00, 100.00]", 8)
+    few = score([*sure, {**other, "intervals": {}}], "AP50")
+    assert (few.text, few.interval, few.clusters) == ("90.00", "70.00–100.00", 3)
+    assert score([{**other, "intervals": {}}], "AP50").interval == ""
+    assert score(sure, "ASR_50").text == "n/a"
 
 
 def test_a_margin_is_between_the_ends_of_the_intervals(folder: Path) -> None:
     rows = {row.head[2]: row for row in margin_table(PhysicalRun(load_run(folder))).rows}
     assert rows["Adv. Patch"].head[3] == "random patch"
-    assert rows["Adv. Patch"].cells[2].mean == pytest.approx(90.0 - 65.0)
+    assert rows["Adv. Patch"].cells[2].mean == pytest.approx(85.0 - 65.0)
     assert rows["DAS"].head[3] == "shuffled DAS", "the control that hides the target best"
     assert rows["DAS"].cells[2].mean == pytest.approx(45.0 - 53.0), "inside the intervals, so below 0"
 
@@ -140,7 +155,7 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, night", "random laser, night")
-    assert row.cells[2].mean == pytest.approx(90.0 - 75.0)
+    assert row.cells[2].mean == pytest.approx(85.0 - 75.0)
     lines[0] = line("laser, searches 4", night, 0.70, source="yolov5n")
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows

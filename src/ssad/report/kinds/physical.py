@@ -107,17 +107,22 @@ def _attack(name: str) -> str:
 
 
 def score(lines: Sequence[Line], metric: str) -> Cell:
-    """A metric in percent: with its interval over drives, or the range over several draws of a control."""
-    values = [line["metrics"].get(metric) for line in lines]
-    known = [100.0 * float(value) for value in values if value is not None]
-    if not known:
+    """A metric in percent, the mean over draws of a control, and how sure it is.
+
+    The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
+    covers drives and draws. Where a draw has none it is the range of the draws.
+    """
+    own = [line for line in lines if line["metrics"].get(metric) is not None]
+    if not own:
         return Cell(math.nan)
-    if len(known) > 1:
-        mean = math.fsum(known) / len(known)
-        return Cell(mean, min(known), max(known), int(lines[0]["n"]), clusters=len(known), method="range")
-    limits = (lines[0].get("intervals") or {}).get(metric) or [math.nan, math.nan]
-    low, high = (100.0 * float(limit) for limit in limits)
-    return Cell(known[0], low, high, int(lines[0]["n"]), clusters=int(lines[0]["drives"]), method="given")
+    known = [100.0 * float(line["metrics"][metric]) for line in own]
+    mean, n = math.fsum(known) / len(known), int(own[0]["n"])
+    limits = [ends for line in own if (ends := (line.get("intervals") or {}).get(metric))]
+    if len(limits) < len(own) > 1:
+        return Cell(mean, min(known), max(known), n, clusters=len(known), method="range")
+    low = 100.0 * min((float(ends[0]) for ends in limits), default=math.nan)
+    high = 100.0 * max((float(ends[1]) for ends in limits), default=math.nan)
+    return Cell(mean, low, high, n, clusters=int(own[0]["drives"]), method="given")
 
 
 def main_table(run: PhysicalRun, number: int) -> Table:
@@ -142,7 +147,8 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
-        "not found attacked. [a, b]: 95 % interval over drives; a–b: the range over several draws of a control."
+        "not found attacked. [a, b]: 95 % interval over drives, of several draws of a control from the lowest to the "
+        "highest end of theirs; a–b: the range over the draws, where drives are too few for intervals."
     )
     if told:
         note += (
