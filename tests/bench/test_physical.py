@@ -213,6 +213,15 @@ def test_a_wrong_suite_ends_in_one_line(change: Mapping[str, Any], error: type[E
     assert "\n" not in str(found.value)
 
 
+def test_a_town_of_the_training_is_no_town_of_the_test(tmp_path: Path) -> None:
+    written = safeio.dump_json({**suite().model_dump(), "pairs": [PAIR]})
+    path = tmp_path / "small.yaml"
+    path.write_text(written)
+    with pytest.raises(ConfigError, match=r"pairs.*trained and tested in Twinford: name another town") as found:
+        load_suite(str(path), ["pairs=[{train: Twinford, test: Twinford}]"])
+    assert "\n" not in str(found.value)
+
+
 def test_an_expectation_stands_in_a_suite_as_a_mapping() -> None:
     settings = {"expectation": {"noise": 0.2, "contrast": [0.7, 1.3]}}
     plan = Physical().plan(suite(attacks=[{"name": "vanishing", "settings": settings}]))

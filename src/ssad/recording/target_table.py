@@ -30,12 +30,19 @@ VIEWS = ("drive", GRID)
 
 
 class Pair(Schema):
-    """Where textures are trained and where they are tested: towns, and numbers of pictures."""
+    """Where textures are trained and where they are tested: two towns, and numbers of pictures."""
 
     train: str
     test: str
     train_images: int = Field(default=600, ge=1)
     test_images: int = Field(default=400, ge=1)
+
+    @model_validator(mode="after")
+    def _held_out(self) -> Self:
+        """What a texture was trained on says nothing of other pictures."""
+        if self.train == self.test:
+            raise ValueError(f"trained and tested in {self.train}: name another town for the test")
+        return self
 
 
 class Grid(Schema):
