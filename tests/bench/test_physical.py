@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -422,6 +423,8 @@ def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch:
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
     (clean,) = Physical().execute([plan.cells[0]], job).values()
     assert clean["metrics"]["AP50"] == 0.0
-    with pytest.raises(CellError, match=r"AP50 0\.000, which is less than the floor of 0\.9"):
-        Physical().execute([plan.cells[1]], job)
+    for target, noun in (("sedan:silver:0", "car"), ("stop_sign", "stop sign"), ("pedestrian", "pedestrian")):
+        other = replace(job, settings={**job.settings, "target": target})
+        with pytest.raises(CellError, match=rf"the clean {noun} with AP50 0\.000, which is less than the floor of 0\."):
+            Physical().execute([plan.cells[1]], other)
     assert safeio.dump_json(dict(clean))

@@ -20,7 +20,7 @@ from ssad.jobs.machine import keep_memory, quiet_warp
 from ssad.jobs.progress import Live
 from ssad.recording.clip_recorder import record_all
 from ssad.recording.lit_clips import LitPictures
-from ssad.recording.target import class_of_target
+from ssad.recording.target import class_of_target, parse_target
 from ssad.recording.target_attacks import TargetAttacks, see_all
 from ssad.recording.target_sheets import write_sheets
 from ssad.recording.target_table import CLEAN, GRID, TargetTable, rows_of, target_of
@@ -154,7 +154,8 @@ class Physical(Kind):
         have = round(precision(clean) or 0.0, 6)
         if have < floor:
             when = f" ({light['hour']})" if light else ""
-            found_at = f"{detector} finds the clean target{when} with AP50 {have:.3f}"
+            noun = class_of_target(parse_target(settings["target"])).replace("_", " ")
+            found_at = f"{detector} finds the clean {noun}{when} with AP50 {have:.3f}"
             raise CellError(f"{found_at}, which is less than the floor of {floor:g}")
         if lit:
             spec = LightSpec.of_row(light or {})
