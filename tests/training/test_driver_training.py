@@ -175,7 +175,7 @@ def test_an_adversary_needs_traffic(tmp_path: Path) -> None:
 def test_wrong_settings_are_named(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="ppo"):
         list(run_driver_training(replace(plan(tmp_path), algorithm="pp0")))
-    with pytest.raises(ConfigError, match="no value 'speed'"):
+    with pytest.raises(ConfigError, match="no setting 'speed'"):
         list(run_driver_training(plan(tmp_path, speed=3)))
     with pytest.raises(ConfigError, match="steps=0"):
         list(run_driver_training(plan(tmp_path, steps=0)))

@@ -531,9 +531,9 @@ def test_the_learning_rate_rises_and_falls(name: str) -> None:
 def test_a_recipe_that_is_unknown_or_wrong_is_one_line() -> None:
     with pytest.raises(UnknownNameError, match="yolov5n"):
         find_recipe("yolov5")
-    with pytest.raises(ConfigError, match=r"no value 'epoch'; it has .*epochs"):
+    with pytest.raises(ConfigError, match=r"no setting 'epoch'; it has .*epochs"):
         find_recipe("yolov5n", epoch=3)
-    with pytest.raises(ConfigError, match="no value 'detector'"):
+    with pytest.raises(ConfigError, match="no setting 'detector'"):
         find_recipe("yolov5n", detector="yolov3")
     numbers = ({"epochs": 0}, {"lr": 0.0}, {"zoom": (0.0, 1.0)}, {"average": 1.0}, {"validate": 0}, {"clip": -1.0},
                {"jitter": 5}, {"momentum": 2}, {"seed": -1}, {"lr": math.nan}, {"warmup": -5})  # fmt: skip

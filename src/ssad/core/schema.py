@@ -42,19 +42,22 @@ Span = Annotated[tuple[T, T], Field(strict=False), AfterValidator(_in_order)]
 """The least and the greatest."""
 
 
-def checked(make: Callable[..., T], values: Mapping[str, Any], *, what: str, kind: type | None = None) -> T:
+def checked(
+    make: Callable[..., T], values: Mapping[str, Any], *, what: str, kind: type | None = None, fixed: str = "name"
+) -> T:
     """A dataclass of pydantic with values that a user wrote.
 
     Args:
         make: The dataclass, or what makes one.
-        values: By field; the name of one that is called by it is no value.
+        values: By field.
         what: What messages call it, such as "attack das".
         kind: The dataclass, if `make` is not.
+        fixed: The field that is no value: what it is called.
 
     Raises:
         ConfigError: One line: what, which key, and what is wrong with its value.
     """
-    known = [one.name for one in fields(kind or make) if one.init and one.name != "name"]  # type: ignore[arg-type]
+    known = [one.name for one in fields(kind or make) if one.init and one.name != fixed]  # type: ignore[arg-type]
     for key in values:
         if key not in known:
             raise ConfigError(f"{what}: there is no setting '{key}'; it has {', '.join(known)}")

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, field, fields, replace
-from typing import Annotated, Any, Literal, Self, TypeVar
+from collections.abc import Iterable
+from dataclasses import asdict, field, replace
+from functools import partial
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 from pydantic.dataclasses import dataclass
 
-from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.errors import unknown_name
+from ssad.core.schema import VALUES, Above, Least, Part, Whole, checked
 
-T = TypeVar("T")
-Whole = Annotated[int, Field(ge=1)]
 FromNone = Annotated[int, Field(ge=0)]
-Above = Annotated[float, Field(gt=0.0)]
-Least = Annotated[float, Field(ge=0.0)]
-Part = Annotated[float, Field(ge=0.0, le=1.0)]
 Decay = Annotated[float, Field(ge=0.0, lt=1.0)]
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, allow_inf_nan=False))
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Recipe:
     """A training run. Learning rates are for one step on `batch` images over all devices.
 
@@ -180,32 +177,7 @@ def find_recipe(name: str, **changes: Any) -> Recipe:
     """
     if name not in RECIPES:
         raise unknown_name("recipe", name, RECIPES)
-    return changed(RECIPES[name], changes, fixed="detector", what=f"recipe {name}")
-
-
-def changed(usual: T, changes: Mapping[str, Any], *, fixed: str, what: str) -> T:
-    """A recipe with some of its values changed.
-
-    Args:
-        usual: A dataclass of pydantic.
-        changes: By field.
-        fixed: The field that cannot be changed.
-        what: What messages call it: a word and its name.
-
-    Raises:
-        ConfigError: A value does not fit.
-    """
-    known = sorted(f.name for f in fields(usual) if f.name != fixed)  # type: ignore[arg-type]
-    for key in changes:
-        if key not in known:
-            raise ConfigError(f"a {what.partition(' ')[0]} has no value '{key}'; it has {', '.join(known)}")
-    try:
-        return replace(usual, **changes)  # type: ignore[type-var]
-    except ValidationError as error:
-        problem = error.errors(include_url=False)[0]
-        key = str(problem["loc"][0]) if problem["loc"] else ""
-        text = problem["msg"].removeprefix("Value error, ").replace("tuple", "list")  # as it is written with --set
-        raise ConfigError(f"{what}: " + (f"{key}={changes.get(key)!r}: {text}" if key else text)) from None
+    return checked(partial(replace, RECIPES[name]), changes, what=f"recipe {name}", kind=Recipe, fixed="detector")
 
 
 def set_words(changes: Iterable[tuple[str, Any]]) -> list[str]:

@@ -8,21 +8,22 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass
 
 from ssad.core import safeio
 from ssad.core.checkpoints import Card, read_state, save_weights
 from ssad.core.driving import Driver
 from ssad.core.errors import ConfigError, FormatError, StoreError, unknown_name
-from ssad.training.recipe import Above, Decay, FromNone, Part, Whole, changed
+from ssad.core.schema import VALUES, Above, Part, Whole, checked
+from ssad.training.recipe import Decay, FromNone
 from ssad.world.actions import ACTIONS, CHOICES
 from ssad.world.policy import Policy, PolicyDriver, policy_of, tensors_of
 
@@ -30,7 +31,7 @@ LOG, LAST = "log.jsonl", "last.pt"
 Say = Callable[[str], None]
 
 
-@dataclass(frozen=True, slots=True, config=ConfigDict(strict=True, allow_inf_nan=False))
+@dataclass(frozen=True, slots=True, config=VALUES)
 class Learning:
     """How a policy is trained: all that decides the result but the scenarios.
 
@@ -101,7 +102,7 @@ def find_learning(table: Mapping[str, Learning], name: str, changes: Mapping[str
     """
     if name not in table:
         raise unknown_name("algorithm", name, table)
-    return changed(table[name], changes, fixed="algorithm", what=f"training {name}")
+    return checked(partial(replace, table[name]), changes, what=f"training {name}", kind=Learning, fixed="algorithm")
 
 
 def require() -> Any:
