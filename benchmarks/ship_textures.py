@@ -15,7 +15,7 @@ from typing import Any
 from ssad.core.images import read_image
 from ssad.core.safeio import make_folder
 from ssad.recording.target import class_of_target, parse_target
-from ssad.report.kinds.physical import PhysicalRun, margin_table, title_of
+from ssad.report.kinds.physical import PhysicalRun, lower, margin_table, title_of
 from ssad.report.load import load_run
 from ssad.scenarios.static.physical.shipped import SHIPPED, TextureCard, save_texture
 
@@ -26,7 +26,7 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
     """Write the textures; their names."""
     run = load_run(folder)
     suite, weights = run.suite, run.header["weights"]
-    margins = {row.head[:3]: row.cells[2].mean for row in margin_table(PhysicalRun(run)).rows}
+    margins = {row.head[:3]: lower(row.cells[2]) for row in margin_table(PhysicalRun(run)).rows}
     found: dict[str, tuple[dict[str, Any], TextureCard]] = {}
     for line in run.lines:
         own = line["status"] == "ok" and line["view"] == "drive" and line["detector"] == line["source"]

@@ -170,31 +170,28 @@ def _place(suite: Mapping[str, Any]) -> str:
 
 
 def margin_table(run: PhysicalRun) -> Table:
-    """Each trained texture against the control of its carrier that hides the target best."""
+    """Each trained texture against that draw of a control of its carrier which comes nearest to it."""
     rows = []
     for (_, test), detector in ((pair, d) for pair in run.pairs for d in run.detectors):
         for attack in run.attacks:
             name, carrier = attack
-            if name == "clean" or name.split()[0] in CONTROLS:
-                continue
-            own = score(run.lines(test, "drive", detector, attack), "AP50")
-            controls = {
-                other: score(run.lines(test, "drive", detector, other), "AP50") for other in run.attacks
-                if other[1] == carrier and learns_nothing(other[0], name)
-            }  # fmt: skip
-            measured = {other: cell for other, cell in controls.items() if not math.isnan(cell.mean)}
-            if math.isnan(own.mean) or not measured:
-                continue
-            best = min(measured, key=lambda other: lower(measured[other]))
-            gap = lower(measured[best]) - (own.mean if math.isnan(own.high) else own.high)
-            cells = (own, measured[best], Cell(gap))
-            rows.append(Row((test, detector, title_of(attack), title_of(best)), cells))
+            own = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
+            controls = [other for other in run.attacks if other[1] == carrier and learns_nothing(other[0], name)]
+            gaps = [
+                (paired_gap(draw, line), other)
+                for other, line in product(controls, own) for draw in run.lines(test, "drive", detector, other)
+            ]  # fmt: skip
+            if gaps:
+                gap, best = min(gaps, key=lambda one: lower(one[0]))
+                cells = score(own, "AP50"), score(run.lines(test, "drive", detector, best), "AP50"), gap
+                rows.append(Row((test, detector, title_of(attack), title_of(best)), cells))
     note = (
-        "AP50 in percent. The margin lies between the upper end of the attack's interval and the lower end of the best "
-        "control's interval or range; above 0 the attack is stronger than all that learns nothing."
+        "AP50 in percent. The difference is what a control leaves less what the attack leaves in the same pictures; "
+        "its interval is of paired replicates of the bootstrap over drives. Of all controls and all their draws it is "
+        "that with the least lower end; above 0 the attack is stronger than all that learns nothing."
     )
-    heads = ("Town", "Detector", "Attack", "Best control")
-    return Table("margins", "Attacks against controls", heads, ("attack", "control", "margin"), tuple(rows), note)
+    heads = ("Town", "Detector", "Attack", "Nearest control")
+    return Table("margins", "Attacks against controls", heads, ("attack", "control", "difference"), tuple(rows), note)
 
 
 def is_control(name: str) -> bool:
@@ -302,9 +299,9 @@ def comparison_table(run: PhysicalRun) -> Table:
 def paired_gap(more: Line, less: Line) -> Cell:
     """Difference of the AP50 of two records in percent; its interval where both are of the same pictures."""
     gap, n, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
-    pairs = list(zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False))
-    if (n, drives) != (less["n"], less["drives"]):
+    if (n, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
         return Cell(100.0 * gap)
+    pairs = zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False)
     return Cell.of(replicate_difference(gap, [a - b for a, b in pairs], n=n, clusters=drives).scaled(100.0))
 
 
