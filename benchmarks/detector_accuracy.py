@@ -26,12 +26,13 @@ from ssad.core import safeio
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ALIKE, CLASSES
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
+from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.detection import box_table, detect, detect_2d, numbers
-from ssad.metrics.detection import BoxTable, filter_boxes, match
+from ssad.metrics.detection import BoxTable, filter_boxes, match, scene_intervals
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
 from ssad.recording.viewpoints import weather_name
 from ssad.training.detector import describe_data
@@ -42,6 +43,7 @@ FLAT, SOLID = ("yolov3-tiny", "yolov5n"), ("fcos3d-light", "pgd-det-light")
 CLEAR = 0.25  # least score of a detection that counts for recall
 SIZES, DISTANCES = (8.0, 16.0, 24.0, 32.0, 64.0, 1e9), (0.0, 10.0, 20.0, 30.0, 50.0, 1e9)
 RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
+REPLICATES = 400  # of the bootstrap over drives
 FEW = 20  # objects: groups with fewer are left out
 SMALL = 24.0  # px
 WIDTHS = (960, 1280)  # px to which pictures of 640 px are enlarged inside 2D detectors
@@ -215,13 +217,16 @@ def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
         truth = read_truth(root, version, scenes=frozenset(members))
         real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
         seen = filter_boxes(box_table(boxes, truth), racks=truth.racks)
-        scores = match(real, seen, samples=len(truth.samples)).scores()
+        matches = match(real, seen, samples=len(truth.samples))
+        scores = matches.scores()
         result.setdefault("by light", {})[group] = numbers(scores, few=True) | {"scenes": len(members)}
         if group != "all":
             continue
         result |= numbers(scores) | {"errors": scores.label_tp_errors, "truth": dict(Counter(
             CLASSES[int(k)] for k in real.label))}  # fmt: skip
         result["pairs"] = pairs(real, seen)
+        limits = scene_intervals(matches, truth.scene, generator=generator("accuracy", name), replicates=REPLICATES)
+        result["intervals"] = {"mAP": limits["mean_ap"], "NDS": limits["nd_score"]}
         for low, high in pairwise(RINGS):
             near, close = between(real, low, high), between(seen, low, high)
             own = match(near, close, samples=len(truth.samples)).scores()
@@ -385,12 +390,12 @@ def page() -> str:
         "## 3D detectors",
         "AP in percent, errors as nuScenes defines them (`-`: not defined for the class). *Duplicates*: boxes (score",
         "0.15 and more) within 2 m of true boxes of their class that better boxes have all found, a sample of six",
-        "images, after the merge of the cameras.",
+        "images, after the merge of the cameras. In brackets: 95 % intervals over drives.",
         "",
     ]
     names = list(solid)
     keys = ("mAP", "NDS", "mATE", "mASE", "mAOE", "mAVE", "mAAE")
-    rows = [[k, *(f"{100 * solid[n][k]:.1f}" if k in keys[:2] else f"{solid[n][k]:.2f}" for n in names)] for k in keys]
+    rows = [[k, *(score_of(solid[n], k) if k in keys[:2] else f"{solid[n][k]:.2f}" for n in names)] for k in keys]
     rows.append(["duplicates a sample", *(f"{solid[n]['pairs']['duplicates a sample']:.2f}" for n in names)])
     lines += table(["", *names], rows)
     shown = ("trans_err", "orient_err", "vel_err")
@@ -439,6 +444,12 @@ def turned_lines(solid: dict[str, Any]) -> list[str]:
         "",
         *table(["boxes turned round", *(r if r == "all" else f"{r} m" for r in rings)], rows),
     ]
+
+
+def score_of(one: dict[str, Any], name: str) -> str:
+    """A score in percent with its interval."""
+    low, high = one["intervals"][name]
+    return f"{100 * one[name]:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def number(value: float | None) -> str:
