@@ -218,7 +218,9 @@ def test_a_town_of_the_training_is_no_town_of_the_test(tmp_path: Path) -> None:
     written = safeio.dump_json({**suite().model_dump(), "pairs": [PAIR]})
     path = tmp_path / "small.yaml"
     path.write_text(written)
-    with pytest.raises(ConfigError, match=r"pairs.*trained and tested in Twinford: name another town") as found:
+    with pytest.raises(
+        ConfigError, match=r"pairs.*: trained and tested in Twinford: name another town for the test$"
+    ) as found:
         load_suite(str(path), ["pairs=[{train: Twinford, test: Twinford}]"])
     assert "\n" not in str(found.value)
 

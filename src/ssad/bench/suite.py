@@ -140,6 +140,8 @@ def _explain(error: ValidationError, document: Document, changed: dict[str, str]
     elif problem["type"] == "missing":
         text = f"the key '{location[-1]}' is missing"
         location = location[:-1]
+    elif problem["type"] == "value_error":  # a check of ours, which says it all
+        text = problem["msg"].removeprefix("Value error, ")
     else:
         shown = repr(problem["input"])
         text = f"{problem['msg']}, not {shown if len(shown) < 60 else shown[:57] + '...'}"

@@ -21,7 +21,7 @@ from ssad.core.types import F64, U8
 from ssad.training.recipe import Recipe
 
 GREY = 0.447
-SHRUNK = 0.7  # scale below which pictures are shrunk in two steps
+SHRUNK = 0.7  # zoom below which pictures are halved first
 ROOM = 0.6  # share of the free memory that pictures may take
 
 
@@ -310,8 +310,8 @@ def _mirrored(solids: Sequence[Solids | None], mirror: Tensor) -> Solids:
 def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
     """Pictures float [B, 3, H, W] after their changes; grey where there is nothing.
 
-    What is shrunk to less than 0.7 is taken from pictures of half the size, so that small things look as a camera shows
-    them, not as single rows of pixels.
+    Below a zoom of `SHRUNK` samples are taken from the picture averaged to half its size: at full size they would skip
+    pixels, which no camera does.
     """
     if all(not c.mirror and c.zoom == 1.0 for c in changes):
         return pictures
@@ -324,14 +324,14 @@ def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
         rows.append([[side / c.zoom, 0.0, x], [0.0, 1 / c.zoom, y]])
     theta = torch.tensor(rows, dtype=pictures.dtype, device=pictures.device)
     grid = affine_grid(theta, list(pictures.shape), align_corners=False)
-    deep = pictures - GREY
-    moved = grid_sample(deep, grid, align_corners=False)
-    small = torch.tensor(
-        [k for k, c in enumerate(changes) if c.zoom < SHRUNK], device=pictures.device, dtype=torch.int64
-    )
+    centred = pictures - GREY
+    moved = torch.empty_like(centred)
     half = (max(height // 2, 1), max(width // 2, 1))
-    if len(small):
-        moved[small] = grid_sample(adaptive_avg_pool2d(deep[small], half), grid[small], align_corners=False)
+    for small in (False, True):
+        chosen = [k for k, c in enumerate(changes) if (c.zoom < SHRUNK) == small]
+        if chosen:
+            source = adaptive_avg_pool2d(centred[chosen], half) if small else centred[chosen]
+            moved[chosen] = grid_sample(source, grid[chosen], align_corners=False)
     return moved + GREY
 
 
