@@ -3,6 +3,7 @@
 import json
 import math
 import socket
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,13 +57,18 @@ def same(a: Any, b: Any) -> bool:
 def test_a_rate_that_falls_within_a_time_falls_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first epoch takes 4 s as something compiles, the others 1 s; a stop in between changes nothing."""
     clock, recipe = [0.0], replace(RECIPE, epochs=30, within=10.5, warmup=0)
-    follow = loop._follow
+    follower = loop._follower
 
-    def tick(average: Any, detector: Any, decay: float) -> None:
-        clock[0] += (4.0 if clock[0] < 4.0 else 1.0) / 2
-        follow(average, detector, decay)
+    def ticking(average: Any, detector: Any) -> Callable[[float], None]:
+        follow = follower(average, detector)
 
-    monkeypatch.setattr(loop, "_follow", tick)
+        def tick(decay: float) -> None:
+            clock[0] += (4.0 if clock[0] < 4.0 else 1.0) / 2
+            follow(decay)
+
+        return tick
+
+    monkeypatch.setattr(loop, "_follower", ticking)
     monkeypatch.setattr("time.monotonic", lambda: clock[0])
     whole = train(fresh(), bank(), recipe, out=tmp_path / "whole")
     rows = loop.read_rows(tmp_path / "whole")

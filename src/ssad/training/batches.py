@@ -163,6 +163,11 @@ def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = 
     return [shuffled[k * batch : (k + 1) * batch].tolist() for k in range(full)]
 
 
+def _send(value: Tensor, device: torch.device | str) -> Tensor:
+    """A small tensor on a device. A GPU need not be done with what it was given before."""
+    return value.to(device, non_blocking=True)
+
+
 def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
     """Truth on a device, in one transfer for each kind of value."""
     truths = list(truths)
@@ -170,14 +175,14 @@ def move(truths: Iterable[Truth], device: torch.device | str) -> list[Truth]:
 
     def together(values: list[Tensor | None]) -> list[Tensor | None]:
         if any(v is None for v in values):
-            return [None if v is None else v.to(device) for v in values]
+            return [None if v is None else _send(v, device) for v in values]
         given = [v for v in values if v is not None]
-        return list(torch.split(torch.cat(given).to(device, non_blocking=True), counts))
+        return list(torch.split(_send(torch.cat(given), device), counts))
 
     columns = {name: together([getattr(t, name) for t in truths]) for name in ("label", "box", "crowd")}
     lens = [t.intrinsic for t in truths]
     if lens and all(k is not None for k in lens):
-        stacked = torch.stack([k for k in lens if k is not None]).to(device, non_blocking=True)
+        stacked = _send(torch.stack([k for k in lens if k is not None]), device)
         columns["intrinsic"] = list(stacked.unbind())
     else:
         columns["intrinsic"] = [None] * len(truths)
@@ -322,14 +327,15 @@ def change_pictures(pictures: Tensor, changes: Sequence[Change]) -> Tensor:
         x = side * (1 / c.zoom - 2 * c.shift[0] / (c.zoom * width) - 1)
         y = 1 / c.zoom - 2 * c.shift[1] / (c.zoom * height) - 1
         rows.append([[side / c.zoom, 0.0, x], [0.0, 1 / c.zoom, y]])
-    theta = torch.tensor(rows, dtype=pictures.dtype, device=pictures.device)
+    theta = _send(torch.tensor(rows, dtype=pictures.dtype), pictures.device)
     grid = affine_grid(theta, list(pictures.shape), align_corners=False)
     centred = pictures - GREY
     moved = torch.empty_like(centred)
     half = (max(height // 2, 1), max(width // 2, 1))
     for small in (False, True):
-        chosen = [k for k, c in enumerate(changes) if (c.zoom < SHRUNK) == small]
-        if chosen:
+        members = [k for k, c in enumerate(changes) if (c.zoom < SHRUNK) == small]
+        if members:
+            chosen = _send(torch.tensor(members), pictures.device)
             source = adaptive_avg_pool2d(centred[chosen], half) if small else centred[chosen]
             moved[chosen] = grid_sample(source, grid[chosen], align_corners=False)
     return moved + GREY
@@ -343,18 +349,17 @@ def change_colours(pictures: Tensor, recipe: Recipe, draws: torch.Generator) -> 
 
     def about(spread: float) -> Tensor:
         value = torch.rand((len(pictures), 1, 1, 1), generator=draws)
-        return (1.0 + spread * (2 * value - 1)).to(device)
+        return _send(1.0 + spread * (2 * value - 1), device)
 
     grey = pictures.mean(1, keepdim=True)
     pictures = grey + (pictures - grey) * about(1.5 * recipe.jitter)
     middle = pictures.mean((1, 2, 3), keepdim=True)
     pictures = (middle + (pictures - middle) * about(recipe.jitter)) * about(recipe.jitter)
-    pictures = pictures * (
-        1.0 + recipe.jitter * 0.15 * (torch.rand((len(pictures), 3, 1, 1), generator=draws) * 2 - 1)
-    ).to(device)
+    tint = 1.0 + recipe.jitter * 0.15 * (torch.rand((len(pictures), 3, 1, 1), generator=draws) * 2 - 1)
+    pictures = pictures * _send(tint, device)
     pictures = pictures.clamp(1e-4, 1.0) ** about(recipe.jitter)
     if recipe.noise > 0:
-        level = torch.rand((len(pictures), 1, 1, 1), generator=draws).to(device) ** 2 * recipe.noise
+        level = _send(torch.rand((len(pictures), 1, 1, 1), generator=draws), device) ** 2 * recipe.noise
         grain = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=draws)))
         pictures = pictures + torch.randn(pictures.shape, generator=grain, device=device) * level
     return pictures.clamp(0.0, 1.0)
@@ -366,7 +371,7 @@ def make_batch(
     """Pictures float [B, 3, H, W] and their truth on the device, changed at random as the key says."""
     rng = np.random.default_rng(key)
     draws = torch.Generator().manual_seed(int(rng.integers(2**62)))
-    chosen = torch.as_tensor(indices, device=bank.pictures.device)
+    chosen = _send(torch.tensor(indices), bank.pictures.device)
     pictures = bank.pictures[chosen].to(device, non_blocking=True).permute(0, 3, 1, 2).float() / 255
     size = (pictures.shape[2], pictures.shape[3])
     changes = [draw_change(recipe, size, rng, lens=bank.truth[i].intrinsic) for i in indices]

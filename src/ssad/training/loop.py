@@ -107,7 +107,9 @@ def train(
         ids = [where.index or 0] if where.type == "cuda" else None
         shared = nn.parallel.DistributedDataParallel(step_of, device_ids=ids)
     optimizer = _optimizer(detector, recipe)
+    learning = [p for p in detector.parameters() if p.requires_grad]
     average = copy.deepcopy(detector).requires_grad_(False).eval() if recipe.average else None
+    follow = _follower(average, detector)
     batch = max(recipe.batch // share.world, 1)
     often = repeats(bank.truth, recipe.rare)
     per_epoch = _same(len(order(len(bank), batch, seed=0, epoch=0, often=often)), share, where)
@@ -134,10 +136,9 @@ def train(
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             if recipe.clip:
-                nn.utils.clip_grad_norm_([p for p in detector.parameters() if p.requires_grad], recipe.clip)
+                nn.utils.clip_grad_norm_(learning, recipe.clip)
             optimizer.step()
-            if average is not None:
-                _follow(average, detector, min(recipe.average, (1 + step) / (10 + step)))
+            follow(min(recipe.average, (1 + step) / (10 + step)))
             for name, value in losses.items():
                 sums[name] = sums.get(name, torch.zeros((), device=where)) + value.detach()
             step += 1
@@ -266,15 +267,23 @@ def _optimizer(detector: Any, recipe: Recipe) -> torch.optim.Optimizer:
     return torch.optim.AdamW(groups, lr=recipe.lr, betas=(recipe.momentum, 0.999), fused=fused)
 
 
-@torch.no_grad()
-def _follow(average: Any, detector: Any, decay: float) -> None:
-    """The moving average of weights and statistics; counters are taken as they are."""
+def _follower(average: Any, detector: Any) -> Callable[[float], None]:
+    """Moves an average of weights and statistics towards a detector's by a decay; counters are taken as they are."""
+    if average is None:
+        return lambda decay: None
     kept, fresh = average.state_dict(), detector.state_dict()
     floats = [name for name, value in kept.items() if value.is_floating_point()]
-    torch._foreach_lerp_([kept[n] for n in floats], [fresh[n] for n in floats], 1.0 - decay)
-    for name, value in kept.items():
-        if not value.is_floating_point():
-            value.copy_(fresh[name])
+    counters = [name for name in kept if name not in set(floats)]
+    mean, new = [kept[n] for n in floats], [fresh[n] for n in floats]
+    old, counts = [kept[n] for n in counters], [fresh[n] for n in counters]
+
+    @torch.no_grad()
+    def follow(decay: float) -> None:
+        torch._foreach_lerp_(mean, new, 1.0 - decay)
+        if counts:
+            torch._foreach_copy_(old, counts)
+
+    return follow
 
 
 def _save(out: Path, state: dict[str, Any], row: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError
@@ -52,11 +51,7 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
         boxes.append(one.box.detach().to(scale.device, scale.dtype))
         crowd = one.crowd if one.crowd is not None else torch.zeros(count, dtype=torch.bool)
         crowds.append(crowd.to(scale.device, torch.bool))
-    label = pad_sequence(labels, batch_first=True)
-    box = pad_sequence(boxes, batch_first=True)
-    crowd = pad_sequence(crowds, batch_first=True)
-    counts = torch.tensor([len(one) for one in labels], device=scale.device)
-    real = torch.arange(label.shape[1], device=scale.device) < counts[:, None]
+    label, box, crowd, real = _padded(labels, boxes, crowds)
     wrong = (label < 0) | (label >= classes)
     wrong |= ~(box.isfinite().all(-1) & (box[..., 2:] > box[..., :2]).all(-1))
     if bool((wrong & real).any()):
@@ -66,6 +61,23 @@ def pad_truth(truth: Sequence[Truth], scale: Tensor, *, classes: int) -> Targets
             f"labels go from 0 to {classes - 1}, boxes are finite x1 < x2, y1 < y2"
         )
     return Targets(label, box * scale, real, crowd, any(one.crowd is not None for one in truth))
+
+
+def _padded(*columns: list[Tensor]) -> tuple[Tensor, ...]:
+    """Each column, a tensor [Q, ...] an image, as one tensor [B, largest Q, ...] filled with zeros; and what is real.
+
+    Few steps for all images: one for each image is what a GPU would wait for.
+    """
+    counts = torch.tensor([len(one) for one in columns[0]])
+    real = torch.arange(int(counts.max())) < counts[:, None]
+    place = real.view(-1).nonzero()[:, 0].to(columns[0][0].device, non_blocking=True)
+    found = []
+    for column in columns:
+        rows = torch.cat(column)
+        whole = rows.new_zeros(real.numel(), *rows.shape[1:])
+        whole[place] = rows
+        found.append(whole.view(*real.shape, *rows.shape[1:]))
+    return (*found, real.to(place.device, non_blocking=True))
 
 
 def match_best(targets: Targets, grid: Grid, places: int) -> Tensor:
@@ -160,7 +172,8 @@ def label_places(
     label = torch.where(owned & targets.crowd.gather(1, index), IGNORED, label)
     if ignore_objects or targets.crowded:
         hiding = targets.real if ignore_objects else targets.real & targets.crowd
-        near = _touches(predicted, targets.box, hiding)
+        first = hiding.long().argsort(dim=1, descending=True, stable=True)[:, : int(hiding.sum(1).max())]
+        near = _touches(predicted, targets.box.gather(1, first[..., None].expand(-1, -1, 4)), hiding.gather(1, first))
         label = torch.where((label == BACKGROUND) & near, IGNORED, label)
     owner = torch.where(label >= 0, owner, -1)
     box = targets.box.gather(1, index[..., None].expand(-1, -1, 4))
