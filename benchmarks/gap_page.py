@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ssad.metrics import CaseValue, estimate, paired_difference
+from ssad.recording.perceiving_loop import PerceivingSystem
 from ssad.report.kinds.gap import (
     COLOURS,
     Condition,
@@ -346,7 +347,15 @@ def _measured(run: Run) -> str:
     return (
         f"`{run.command}`{in_runs}, {len(run.lines):,} of {run.planned:,} drives on {' and '.join(_devices(run))}"
         f"{f', {failed} of them failed' if failed else ''}, {drives} scenarios."
+        f"{f' **Driven with earlier weights of {old}.**' if (old := ' and '.join(outdated(run))) else ''}"
     )
+
+
+def outdated(run: Run) -> list[str]:
+    """Detectors whose shipped weights are others than those that drove."""
+    told = run.header.get("systems", {})
+    systems = map(PerceivingSystem.model_validate, run.header["suite"].get("systems", ()))
+    return sorted({one.detector for one in systems if one.version != told.get(one.name, one.version)})
 
 
 def _damage(run: Run, condition: Condition) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
+from ssad.recording.perceiving_loop import PerceivingSystem
 from ssad.report.kinds.gap import scatter, sign_table
 from ssad.report.load import load_run
 
@@ -47,6 +48,16 @@ def page(tmp_path: Path) -> dict[str, Any]:
     module["keep"].__globals__["RESULTS"] = tmp_path / "stored"
     module["keep"]("damage", tmp_path / "run")
     return module
+
+
+def test_a_run_of_other_weights_than_those_that_ship_is_told(page: dict[str, Any], tmp_path: Path) -> None:
+    """A perfect detector has no weights; those of the other are named in the run."""
+    truth, found = PerceivingSystem(name="truth", detector="truth"), PerceivingSystem(name="a", detector="yolov5n")
+    suite = {"kind": "gap", "name": "x", "systems": [one.model_dump() for one in (truth, found)]}
+    for known, said in ((found.version, []), ("0" * 12, ["yolov5n"])):
+        header = {"kind": "gap", "suite": suite, "systems": {"truth": truth.version, "a": known}, "command": "x"}
+        write_run(tmp_path / known, header, [line(("none", 0), 0, 0.5, crash=False)])
+        assert page["outdated"](load_run(tmp_path / known)) == said
 
 
 def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(

@@ -1,4 +1,4 @@
-"""Scores of a target by hand: AP of it alone and of all cars, targets lost, intervals from drives."""
+"""Scores of a target by hand: AP of it alone and of its whole class, targets lost, intervals from drives."""
 
 from __future__ import annotations
 

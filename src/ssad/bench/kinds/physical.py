@@ -51,11 +51,11 @@ class Physical(Kind):
     columns = (
         Column("AP50", "AP50", "", "lower"),
         Column("AP50_25", "AP50 above 0.25", "", "lower"),
-        Column("AP50_all", "AP50 of all cars", "", "lower"),
-        Column("AP50_all_25", "AP50 of all cars above 0.25", "", "lower"),
+        Column("AP50_all", "AP50 of the whole class", "", "lower"),
+        Column("AP50_all_25", "AP50 of the whole class above 0.25", "", "lower"),
         Column("ASR_25", "ASR at 0.25", "", "higher"),
         Column("ASR_50", "ASR at 0.5", "", "higher"),
-        Column("ASR_all_25", "ASR of all cars at 0.25", "", "higher"),
+        Column("ASR_all_25", "ASR of the whole class at 0.25", "", "higher"),
         Column("confidence", "mean score", "", "lower"),
     )
     factors = ("test", "view", "detector", "attack", "carrier", "source")

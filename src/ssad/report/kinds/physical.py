@@ -29,8 +29,8 @@ LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
 CONTROLS = ("random", "noise", "grey", "shuffled")
 SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR"}
 OTHERS = {
-    "ASR_50": "ASR at 0.5", "AP50_all": "AP50, all cars", "AP50_all_25": "AP50 > 0.25, all cars",
-    "ASR_all_25": "ASR, all cars", "confidence": "mean score",
+    "ASR_50": "ASR at 0.5", "AP50_all": "AP50, whole class", "AP50_all_25": "AP50 > 0.25, whole class",
+    "ASR_all_25": "ASR, whole class", "confidence": "mean score",
 }  # fmt: skip
 
 Line = Mapping[str, Any]
@@ -228,7 +228,7 @@ def transfer_table(run: PhysicalRun) -> Table:
 
 
 def others_table(run: PhysicalRun) -> Table:
-    """The other scores: at a higher confidence, and of all cars."""
+    """The other scores: at a higher confidence, and of its whole class."""
     rows = []
     for _, test in run.pairs:
         for detector in run.judges:
