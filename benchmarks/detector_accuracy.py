@@ -285,9 +285,18 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(head) + " |", line, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
 
+def _with_day(lights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Shares by light, with those of all but the night after those of all."""
+    own = [row for light, row in lights.items() if light not in {"all", "night"}]
+    many = sum(row["objects"] for row in own)
+    day = {key: sum(row[key] * row["objects"] for row in own) / many for key in own[0]} | {"objects": many}
+    return {"all": lights["all"], "all but night": day, **lights}
+
+
 def small_lines(flat: dict[str, Any]) -> list[str]:
     """The part of the page on small cars."""
     parts = {name: one["small cars"] for name, one in flat.items()}
+    parts = {name: one | {"by light": _with_day(one["by light"])} for name, one in parts.items()}
     scores, lights = (list(next(iter(parts.values()))[key].items()) for key in ("by score", "by light"))
     rows = [
         [key.replace("-", " to ").replace("1.01", "1"),
