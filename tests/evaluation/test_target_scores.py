@@ -12,11 +12,16 @@ from ssad.evaluation.target_scores import Sighting, _precisions, precision, sigh
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 
 
-def seen(*found: tuple[list[float], float], drive: str = "a", real: tuple[list[float], ...] = (TARGET,)) -> Sighting:
+def seen(
+    *found: tuple[list[float], float],
+    drive: str = "a",
+    real: tuple[list[float], ...] = (TARGET,),
+    other: float = 0.0,
+) -> Sighting:
     """A picture with true boxes, the target first, and found boxes with their scores."""
     boxes = np.array([box for box, _ in found], float).reshape(-1, 4)
     scores = np.array([score for _, score in found], float)
-    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool))
+    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool), other)
 
 
 def test_only_boxes_of_the_targets_class_count() -> None:
@@ -49,6 +54,21 @@ def test_a_box_finds_one_car_and_a_car_is_found_once() -> None:
     assert both.confidences().tolist() == pytest.approx([0.9, 0.7]), "the second box on the target finds nothing more"
     alone = seen((between, 0.9), real=(TARGET, near))
     assert alone.confidences().tolist() == pytest.approx([0.9, 0.0]), "one box is one car"
+
+
+def test_a_target_that_is_taken_for_something_else_is_not_gone() -> None:
+    half, less = [10.0, 10.0, 30.0, 40.0], [10.0, 10.0, 29.0, 40.0]
+    truth = Truth(torch.tensor([1, 0]), torch.tensor([TARGET, OTHER]))
+    for boxes, other in (([half, OTHER], 0.9), ([less, OTHER], 0.0), ([half, TARGET], 0.9)):
+        found = Detections(torch.tensor([0.9, 0.8]), torch.tensor([2, 0]), torch.tensor(boxes))
+        assert sighting("a", found, truth).other == pytest.approx(other)
+    own = Detections(torch.tensor([0.9]), torch.tensor([1]), torch.tensor([TARGET]))
+    assert sighting("a", own, truth).other == 0.0, "its own class is told by the boxes"
+    clean = [seen((TARGET, 0.9)) for _ in range(4)] + [seen((TARGET, 0.1))]
+    attacked = [seen((TARGET, 0.3)), seen(other=0.8), seen((TARGET, 0.2), other=0.2), seen(), seen()]
+    metrics = target_scores(attacked, clean)["metrics"]
+    assert metrics["ASR_25"] == pytest.approx(3 / 4)
+    assert metrics["ASR_any_25"] == pytest.approx(2 / 4), "one of the three is taken for something else"
 
 
 def test_precision_of_the_target_alone_leaves_other_cars_out() -> None:

@@ -36,6 +36,7 @@ class Sighting:
         score: Their scores [N].
         real: True boxes of that class [Q, 4], the target first.
         crowd: Which of these count neither as found nor as missed [Q].
+        other: The best score of a box of another class on the target; 0: there is none.
     """
 
     drive: str
@@ -43,6 +44,7 @@ class Sighting:
     score: F64
     real: F64
     crowd: Bool
+    other: float = 0.0
 
     def confidences(self) -> F64:
         """The score with which each true box is found [Q], 0 without.
@@ -51,12 +53,7 @@ class Sighting:
         of one half at least; so none is counted twice, and it is found at every confidence below its score.
         """
         found = np.zeros(len(self.real))
-        low, high = self.box[:, None], self.real[None]
-        side = np.minimum(low[..., 2:], high[..., 2:]) - np.maximum(low[..., :2], high[..., :2])
-        both = np.where((side > 0.0).all(-1), side.prod(-1), 0.0)
-        area = (low[..., 2:] - low[..., :2]).prod(-1) + (high[..., 2:] - high[..., :2]).prod(-1) - both
-        overlap = both / np.maximum(area, 1e-9)
-        for row, score in zip(overlap, self.score.tolist(), strict=True):
+        for row, score in zip(_overlaps(self.box, self.real), self.score.tolist(), strict=True):
             free = np.where(found > 0.0, 0.0, row)
             best = int(free.argmax())
             if free[best] >= IOU:
@@ -64,14 +61,25 @@ class Sighting:
         return found
 
 
+def _overlaps(box: F64, real: F64) -> F64:
+    """IoU [N, Q] of boxes [N, 4] and [Q, 4]."""
+    low, high = box[:, None], real[None]
+    side = np.minimum(low[..., 2:], high[..., 2:]) - np.maximum(low[..., :2], high[..., :2])
+    both = np.where((side > 0.0).all(-1), side.prod(-1), 0.0)
+    area = (low[..., 2:] - low[..., :2]).prod(-1) + (high[..., 2:] - high[..., :2]).prod(-1) - both
+    return np.asarray(both / np.maximum(area, 1e-9))
+
+
 def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
-    """What was found of the class of the target, the first object of the truth."""
+    """What was found of the class of the target, the first object of the truth, and on it of any other class."""
     label = int(truth.label[0])
     own, same = (found.label == label).cpu(), (truth.label == label).cpu()
+    box, score = found.box.cpu().double().numpy(), found.score.cpu().double().numpy()
+    on_it = _overlaps(box, truth.box[:1].cpu().double().numpy())[:, 0] >= IOU
     crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     return Sighting(
-        drive, found.box.cpu()[own].double().numpy(), found.score.cpu()[own].double().numpy(),
-        truth.box.cpu()[same].double().numpy(), crowd[same.numpy()],
+        drive, box[own.numpy()], score[own.numpy()], truth.box.cpu()[same].double().numpy(), crowd[same.numpy()],
+        float(score[on_it & ~own.numpy()].max(initial=0.0)),
     )  # fmt: skip
 
 
@@ -104,8 +112,9 @@ def target_scores(
 
     AP50 counts the target alone and boxes of any score, AP50_25 boxes above a score of 0.25; AP50_all and AP50_all_25
     count every vehicle of its class. found_25 and found_50 are shares of the pictures in which the target is found with
-    that score; ASR_25 and ASR_50 the share of those where it is found without the attack and is not with it; ASR_all_25
-    that of all vehicles (no match is counted twice).
+    that score; ASR_25 and ASR_50 the share of those where it is found without the attack and is not with it; ASR_any_25
+    the share of these where no box of any other class lies on it either; ASR_all_25 that of all vehicles (no match is
+    counted twice).
 
     Args:
         sightings: With the attack.
@@ -142,10 +151,13 @@ def target_scores(
         if clean is not None:
             metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
     if clean is not None:
+        least = CONFIDENCES[0]
+        unseen = np.maximum(best, [one.other for one in sightings]) <= least
+        metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(unseen, before > least, of)
         real = np.concatenate([~one.crowd for one in sightings])
         every, every_before = np.concatenate(scores)[real], np.concatenate(scores_before)[real]
         drive = np.repeat(of, [len(one.real) for one in sightings])[real]
-        lost = every <= CONFIDENCES[0], every_before > CONFIDENCES[0]
+        lost = every <= least, every_before > least
         metrics["ASR_all_25"], intervals["ASR_all_25"] = _share(*lost, drive)
     metrics["confidence"] = float(best.mean())
     kept = {name: limits for name, limits in intervals.items() if limits is not None}

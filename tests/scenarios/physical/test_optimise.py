@@ -253,6 +253,22 @@ def test_hide_is_the_best_box_on_the_object() -> None:
     assert make_objective("hide").needs_objects
 
 
+def test_hide_any_does_not_hide_a_thing_by_making_it_another() -> None:
+    """With the scores of the two classes swapped, `hide` finds nothing left, `hide-any` as much as before."""
+    victim = ToyDetector(("car", "truck"), spread=0.0)
+    images, truth = toy_scene(1, objects=1, classes=("car",))
+    dense = victim.dense(images)
+    logit = torch.stack([dense.logit[..., 0], torch.full_like(dense.logit[..., 0], -20.0)], -1)
+    clear, taken = replace(dense, logit=logit), replace(dense, logit=logit.flip(-1))
+    situation = Situation(victim, victim.assign(clear, truth))
+    own, anything = make_objective("hide"), make_objective("hide-any")
+    found = own(clear, situation).item()
+    assert found < -0.5
+    assert own(taken, situation).item() == pytest.approx(0.0, abs=1e-3)
+    assert anything(clear, situation).item() == pytest.approx(found)
+    assert anything(taken, situation).item() == pytest.approx(found)
+
+
 class Attentive(ToyDetector):
     """Shows one feature map a level: the picture's cells, which its logits are computed from."""
 

@@ -55,6 +55,7 @@ class Physical(Kind):
         Column("AP50_all_25", "AP50 of the whole class above 0.25", "", "lower"),
         Column("ASR_25", "ASR at 0.25", "", "higher"),
         Column("ASR_50", "ASR at 0.5", "", "higher"),
+        Column("ASR_any_25", "ASR at 0.25, of any class", "", "higher"),
         Column("ASR_all_25", "ASR of the whole class at 0.25", "", "higher"),
         Column("confidence", "mean score", "", "lower"),
     )

@@ -27,7 +27,7 @@ DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name be
 BESIDE = {"Oldmarket": "Town04", "Larkhill": "Town03"}  # town of a test -> the paper's that stands in its place
 LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
 CONTROLS = ("random", "noise", "grey", "shuffled")
-SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR"}
+SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class"}
 OTHERS = {
     "ASR_50": "ASR at 0.5", "AP50_all": "AP50, whole class", "AP50_all_25": "AP50 > 0.25, whole class",
     "ASR_all_25": "ASR, whole class", "confidence": "mean score",
@@ -131,9 +131,11 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     told = BESIDE.get(test, dict(enumerate(PUBLISHED)).get(number)) if run.run.suite.get("reference") else None
     names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
     rows = []
+    known = {metric for line in run.run.lines for metric in line.get("metrics") or ()}
+    scores = {metric: title for metric, title in SCORES.items() if metric in known or metric != "ASR_any_25"}
     for attack in run.attacks:
         cells = [
-            score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in SCORES
+            score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in scores
         ]
         rows.append(Row((title_of(attack),), tuple(cells)))
         if told and attack in PAPER and any(names):
@@ -141,13 +143,15 @@ def main_table(run: PhysicalRun, number: int) -> Table:
             cells = []
             for name in names:
                 precision, rate = own.get(name, (math.nan, None))
-                cells += [Cell(precision), Cell(math.nan), Cell(math.nan if rate is None else rate)]
+                own_row = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
+                cells += [Cell(own_row.get(metric, math.nan)) for metric in scores]
             rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
-    columns = tuple(f"{detector} {title}" for detector in run.detectors for title in SCORES.values())
+    columns = tuple(f"{detector} {title}" for detector in run.detectors for title in scores.values())
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
-        "not found attacked. [a, b]: 95 % interval over drives, of several draws of a control from the lowest to the "
+        "not found attacked; any class: nor taken for anything else. [a, b]: 95 % interval over drives, of several "
+        "draws of a control from the lowest to the "
         "highest end of theirs; a–b: the range over the draws, where drives are too few for intervals."
     )
     if told:

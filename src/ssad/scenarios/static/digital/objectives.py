@@ -183,7 +183,8 @@ class Margin:
 class Hide:
     """No box on an object with any score.
 
-    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim.
+    log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim. `hide-any`
+    takes the largest score of any class, so that an object is not hidden by being taken for another.
 
     Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any head.
 
@@ -191,11 +192,13 @@ class Hide:
         others: How many locations next to the best one count too, by their own value; 1 is the source's.
         name: What records call it.
         needs_objects: Without an object there is nothing to hide.
+        every: Whether boxes of all classes count, and not of the object's alone as in the source.
     """
 
     others: int = 1
     name: str = "hide"
     needs_objects: bool = True
+    every: bool = False
 
     def __call__(self, dense: Dense, situation: Situation) -> Tensor:
         """See `Objective`."""
@@ -204,7 +207,8 @@ class Hide:
         for k, truth in enumerate(situation.assignment.truth):
             for number in objects_of(situation, k):
                 overlap = _overlap(dense.box[k], truth.box[number].to(dense.box))
-                value = score[k, :, int(truth.label[number])] * overlap
+                own = score[k].amax(-1) if self.every else score[k, :, int(truth.label[number])]
+                value = own * overlap
                 best = value.topk(min(self.others, len(value))).values.clamp_max(1 - 1e-6)
                 total[k] = total[k] + torch.log1p(-best).sum()
         return total
@@ -265,6 +269,7 @@ OBJECTIVES: Mapping[str, Callable[[], Objective]] = {
     "vanish": Vanish,
     "margin": Margin,
     "hide": Hide,
+    "hide-any": partial(Hide, name="hide-any", every=True),
     "fabricate": Fabricate,
     "mislabel": Mislabel,
 }
