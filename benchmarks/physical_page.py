@@ -32,7 +32,7 @@ SUITES = {
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
-        for what in ("around", "around-drives", "judges", "patches", "stealth")
+        for what in ("around", "around-drives", "any", "judges", "patches", "stealth")
     },
 }  # fmt: skip
 NOTES = {

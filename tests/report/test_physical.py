@@ -85,6 +85,20 @@ def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
     assert (random.text, random.interval) == ("94.00", "[85.00, 100.00]"), "mean of two draws, ends of their intervals"
 
 
+def test_records_that_tell_of_any_class_have_a_column_of_it(folder: Path) -> None:
+    """Between those of a detector; the paper has none, and records from before have none."""
+    assert not any("any class" in one for one in main_table(PhysicalRun(load_run(folder)), 0).columns)
+    lines = [json.loads(one) for one in (folder / "results.jsonl").read_text().splitlines()]
+    for one in lines:
+        one["metrics"]["ASR_any_25"] = 0.25 if one["attack"] == "das" else None
+    (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
+    made = main_table(PhysicalRun(load_run(folder)), 0)
+    assert made.columns == ("yolov5n AP50", "yolov5n AP50 > 0.25", "yolov5n ASR", "yolov5n ASR, any class")
+    text = {row.head[0]: [cell.text for cell in row.cells] for row in made.rows}
+    assert text["DAS"] == ["48.00", "48.00", "52.00", "25.00"]
+    assert text["DAS, Town04"] == ["56.20", "n/a", "80.30", "n/a"]
+
+
 def test_the_interval_of_several_draws_covers_drives_and_draws() -> None:
     """Two draws of 100 % are as sure as their drives make them, and no surer; without intervals their range is left."""
     ends = {"AP50": [0.8, 1.0]}
