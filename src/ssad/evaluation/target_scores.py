@@ -20,6 +20,7 @@ from ssad.metrics.detection_boxes import I64
 from ssad.metrics.intervals import MIN_CLUSTERS, Clusters, bounded_limits, replicate_limits
 
 IOU = 0.5
+COVERED = 0.25  # share of the target from which on a box of any class says that something is there
 PRECISIONS = {"AP50": (True, 0.0), "AP50_25": (True, 0.25), "AP50_all": (False, 0.0), "AP50_all_25": (False, 0.25)}
 THRESHOLD = 0.001  # least score of a box that AP counts
 TOGETHER = 16  # pictures that a GPU is shown at once; a processor takes one, whose bits depend on nothing else
@@ -36,7 +37,8 @@ class Sighting:
         score: Their scores [N].
         real: True boxes of that class [Q, 4], the target first.
         crowd: Which of these count neither as found nor as missed [Q].
-        other: The best score of a box of another class on the target; 0: there is none.
+        there: The best score of a box of any class that covers a quarter of the target or more, and finds no other
+            object; 0: there is none.
     """
 
     drive: str
@@ -44,7 +46,7 @@ class Sighting:
     score: F64
     real: F64
     crowd: Bool
-    other: float = 0.0
+    there: float = 0.0
 
     def confidences(self) -> F64:
         """The score with which each true box is found [Q], 0 without.
@@ -53,7 +55,7 @@ class Sighting:
         of one half at least; so none is counted twice, and it is found at every confidence below its score.
         """
         found = np.zeros(len(self.real))
-        for row, score in zip(_overlaps(self.box, self.real), self.score.tolist(), strict=True):
+        for row, score in zip(_overlaps(self.box, self.real)[0], self.score.tolist(), strict=True):
             free = np.where(found > 0.0, 0.0, row)
             best = int(free.argmax())
             if free[best] >= IOU:
@@ -61,25 +63,34 @@ class Sighting:
         return found
 
 
-def _overlaps(box: F64, real: F64) -> F64:
-    """IoU [N, Q] of boxes [N, 4] and [Q, 4]."""
+def _overlaps(box: F64, real: F64) -> tuple[F64, F64]:
+    """IoU [N, Q] of boxes [N, 4] and [Q, 4], and the share of the latter that the former cover [N, Q]."""
     low, high = box[:, None], real[None]
     side = np.minimum(low[..., 2:], high[..., 2:]) - np.maximum(low[..., :2], high[..., :2])
     both = np.where((side > 0.0).all(-1), side.prod(-1), 0.0)
-    area = (low[..., 2:] - low[..., :2]).prod(-1) + (high[..., 2:] - high[..., :2]).prod(-1) - both
-    return np.asarray(both / np.maximum(area, 1e-9))
+    whole = (high[..., 2:] - high[..., :2]).prod(-1)
+    area = (low[..., 2:] - low[..., :2]).prod(-1) + whole - both
+    return both / np.maximum(area, 1e-9), both / np.maximum(whole, 1e-9)
+
+
+def _there(box: F64, score: F64, real: F64) -> float:
+    """The best score of a box that covers a part of the first object, and is not what finds another."""
+    overlap, covered = _overlaps(box, real)
+    another = overlap[:, 1:].max(1, initial=0.0)
+    on_it = (covered[:, 0] >= COVERED) & ((another < IOU) | (another < overlap[:, 0]))
+    return float(score[on_it].max(initial=0.0))
 
 
 def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
-    """What was found of the class of the target, the first object of the truth, and on it of any other class."""
+    """What was found of the class of the target, the first object of the truth, and on it of any class."""
     label = int(truth.label[0])
     own, same = (found.label == label).cpu(), (truth.label == label).cpu()
     box, score = found.box.cpu().double().numpy(), found.score.cpu().double().numpy()
-    on_it = _overlaps(box, truth.box[:1].cpu().double().numpy())[:, 0] >= IOU
+    real = truth.box.cpu().double().numpy()
     crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     return Sighting(
-        drive, box[own.numpy()], score[own.numpy()], truth.box.cpu()[same].double().numpy(), crowd[same.numpy()],
-        float(score[on_it & ~own.numpy()].max(initial=0.0)),
+        drive, box[own.numpy()], score[own.numpy()], real[same.numpy()], crowd[same.numpy()],
+        _there(box, score, real),
     )  # fmt: skip
 
 
@@ -113,8 +124,8 @@ def target_scores(
     AP50 counts the target alone and boxes of any score, AP50_25 boxes above a score of 0.25; AP50_all and AP50_all_25
     count every vehicle of its class. found_25 and found_50 are shares of the pictures in which the target is found with
     that score; ASR_25 and ASR_50 the share of those where it is found without the attack and is not with it; ASR_any_25
-    the share of these where no box of any other class lies on it either; ASR_all_25 that of all vehicles (no match is
-    counted twice).
+    the share of these where no box of any class covers a quarter of it either; ASR_all_25 that of all vehicles (no
+    match is counted twice).
 
     Args:
         sightings: With the attack.
@@ -152,7 +163,7 @@ def target_scores(
             metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
     if clean is not None:
         least = CONFIDENCES[0]
-        unseen = np.maximum(best, [one.other for one in sightings]) <= least
+        unseen = np.maximum(best, [one.there for one in sightings]) <= least
         metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(unseen, before > least, of)
         real = np.concatenate([~one.crowd for one in sightings])
         every, every_before = np.concatenate(scores)[real], np.concatenate(scores_before)[real]

@@ -150,9 +150,9 @@ def main_table(run: PhysicalRun, number: int) -> Table:
     note = (
         f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
         "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
-        "not found attacked; any class: nor taken for anything else. [a, b]: 95 % interval over drives, of several "
-        "draws of a control from the lowest to the "
-        "highest end of theirs; a–b: the range over the draws, where drives are too few for intervals."
+        "not found attacked; any class: and no box of any class above 0.25 covers a quarter of them. [a, b]: 95 % "
+        "interval over drives, of several draws of a control from the lowest to the highest end of theirs; a–b: the "
+        "range over the draws, where drives are too few for intervals."
     )
     if told:
         note += (

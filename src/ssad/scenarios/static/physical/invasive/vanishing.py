@@ -12,7 +12,8 @@ def vanishing(**settings: Any) -> TextureAttack:
     """The loss of ACTIVE and RAUCA on a texture of the whole paint, with the scores of all classes.
 
     The source lowers the score of the target's own class (`objective="hide"`), and the target is then taken for
-    something else in most pictures. Half of each epoch's pictures are those on which the attack does worst, as in R-PGA.
+    something else in most pictures. Half of each epoch's pictures are those on which the attack does worst, as in
+    R-PGA.
 
     Source: Suryanto et al., ACTIVE (2023); Zhou et al., RAUCA (2024); the mining of views: R-PGA (2026).
     """
