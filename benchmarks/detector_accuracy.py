@@ -14,6 +14,8 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,7 +23,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ssad.camera.render import Weather
+from ssad.camera.labels import label_picture
+from ssad.camera.render import Weather, render
+from ssad.camera.sensor import BRIGHTEST, noise_levels
 from ssad.core import safeio
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ALIKE, CLASSES
@@ -34,6 +38,7 @@ from ssad.evaluation.camera_truth import scenes_of
 from ssad.evaluation.detection import box_table, detect, detect_2d, numbers
 from ssad.metrics.detection import BoxTable, filter_boxes, match, scene_intervals
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
+from ssad.recording.clip_recorder import clip_views
 from ssad.recording.viewpoints import weather_name
 from ssad.training.detector import describe_data
 
@@ -46,6 +51,7 @@ RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 REPLICATES = 400  # of the bootstrap over drives
 FEW = 20  # objects: groups with fewer are left out
 SMALL = 24.0  # px
+FAINT = 4.0  # deviations of the sensor's noise; what differs less from what is behind it is hardly seen
 WIDTHS = (960, 1280)  # px to which pictures of 640 px are enlarged inside 2D detectors
 SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detector says
 
@@ -83,6 +89,35 @@ class Clips:
         self.side = np.sqrt(table[:, 4] * table[:, 5])
         self.crowd, self.target, self.distance = table[:, 6] > 0, table[:, 7] > 0, table[:, 8]
 
+    @property
+    def small_cars(self) -> np.ndarray[Any, Any]:
+        """Which objects are cars below 24 px that count."""
+        return ~self.crowd & (self.label == self.classes.index("car")) & (self.side < SMALL)
+
+    @cached_property
+    def contrast(self) -> np.ndarray[Any, Any]:
+        """How far small cars differ from what is behind them, in deviations of the sensor's noise; NaN for others.
+
+        The root of the mean squared difference of exposed light over their pixels, rendered with and without bodies.
+        """
+        found = np.full(len(self.image), np.nan)
+        shown = {file: number for number, file in enumerate(self.files)}
+        wanted = {self.files[number] for number in np.unique(self.image[self.small_cars])}
+        for folder in dict.fromkeys(file.parents[1] for file in self.files):
+            names = {file.name for file in wanted if file.parents[1] == folder}
+            for one in clip_views(folder, split="test", only=names):
+                picture, street = render(one.scene, [one.view]), render(one.scene, [replace(one.view, things=())])
+                light, behind = (
+                    np.minimum(p.radiance[0] * p.exposure[0], BRIGHTEST).mean(-1) for p in (picture, street)
+                )
+                photons, dark = noise_levels(one.view.sensor.noise, float(picture.exposure[0]))
+                labels = label_picture(one.scene, one.view, picture)
+                for row in np.flatnonzero(self.small_cars & (self.image == shown[folder / "images" / one.file])):
+                    own = picture.tag[0] == labels.tag[np.abs(labels.box - self.box[row]).max(1).argmin()]
+                    noise = np.sqrt(np.mean(photons * behind[own] + dark**2))
+                    found[row] = np.sqrt(np.mean((light[own] - behind[own]) ** 2)) / noise
+        return found
+
     def truth(self, counts: np.ndarray[Any, Any]) -> Boxes2D:
         """Objects of which only some count; the others take detections as crowds do."""
         return Boxes2D(self.image, self.label, self.box, ignore=self.crowd | ~counts)
@@ -114,8 +149,7 @@ def recall(
 
 def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
     """Cars below 24 px: how many are found from each score on, and how often a score of so much is right."""
-    car, weather = clips.classes.index("car"), np.array(clips.weather)[clips.image]
-    few = ~clips.crowd & (clips.label == car) & (clips.side < SMALL)
+    car, weather, few = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small_cars
     matched = match_2d(clips.truth(~clips.crowd), found, labels=labels)
     assert found.score is not None
     assert matched.row is not None
@@ -138,7 +172,16 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
         for light, own in groups.items()
         if own.any()
     }
-    return {"by score": by_score, "by light": by_light}
+    return {"by score": by_score, "by light": by_light, "by contrast": by_contrast(clips, found, labels)}
+
+
+def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
+    """How many small cars are found of those that hardly differ from what is behind them, and of the others."""
+    faint = clips.contrast < FAINT
+    return {
+        name: {"objects": int(own.sum()), "clear": recall(clips, found, own, labels)}
+        for name, own in (("faint", clips.small_cars & faint), ("others", clips.small_cars & ~faint))
+    }
 
 
 def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
@@ -186,7 +229,7 @@ def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
         for kind in ("car", "pedestrian")
     }
     result["small cars"] = small_cars(clips, found, labels)
-    few = below & (clips.label == car)
+    few = clips.small_cars
     for width, own in ((None, found), *((w, found_in(name, clips, device, input_width=w)) for w in WIDTHS)):
         values = average_precision(clips.truth(every), own, labels=labels)
         result.setdefault("enlarged", {})[str(width or "as they are")] = {
@@ -322,6 +365,17 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         for light, row in lights
     ]  # fmt: skip
     lines += table(["light", *(f"{n}: {text}" for n in parts for text in what.values()), "cars"], rows)
+    faint, others = (next(iter(parts.values()))["by contrast"][key]["objects"] for key in ("faint", "others"))
+    shares = [
+        " and ".join(f"{100 * one['by contrast'][key]['clear']:.0f} by {n}" for n, one in parts.items())
+        for key in ("faint", "others")
+    ]
+    lines += [
+        f"{faint} of these cars differ from what is behind them by less than {FAINT:g} deviations of the sensor's",
+        "noise (RMS of the light over their pixels, rendered with and without all bodies). Of 100 of them, at a score",
+        f"of {CLEAR:g}, {shares[0]} are found; of 100 of the {others} others {shares[1]}.",
+        "",
+    ]
     told = {"mean": "mean AP50", "small": f"score {CLEAR:g}", "small, any": least}
     rows = [
         [width, *(f"{100 * one['enlarged'][width][key]:.0f}" for one in flat.values() for key in told)]
