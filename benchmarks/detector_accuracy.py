@@ -51,7 +51,7 @@ RINGS = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 REPLICATES = 400  # of the bootstrap over drives
 FEW = 20  # objects: groups with fewer are left out
 SMALL = 24.0  # px
-FAINT = 4.0  # deviations of the sensor's noise; what differs less from what is behind it is hardly seen
+FAINT = 4.0  # contrast-to-noise ratio below which a thing hardly stands out
 WIDTHS = (960, 1280)  # px to which pictures of 640 px are enlarged inside 2D detectors
 SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detector says
 
@@ -96,9 +96,10 @@ class Clips:
 
     @cached_property
     def contrast(self) -> np.ndarray[Any, Any]:
-        """How far small cars differ from what is behind them, in deviations of the sensor's noise; NaN for others.
+        """Contrast-to-noise ratio of small cars [N]; NaN for other objects.
 
-        The root of the mean squared difference of exposed light over their pixels, rendered with and without bodies.
+        RMS difference of exposed light over their pixels, rendered with and without all bodies, over the standard
+        deviation of the sensor's noise there.
         """
         found = np.full(len(self.image), np.nan)
         shown = {file: number for number, file in enumerate(self.files)}
@@ -176,7 +177,7 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
 
 
 def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
-    """How many small cars are found of those that hardly differ from what is behind them, and of the others."""
+    """How many small cars are found of those with a low contrast-to-noise ratio, and of the others."""
     faint = clips.contrast < FAINT
     return {
         name: {"objects": int(own.sum()), "clear": recall(clips, found, own, labels)}
@@ -328,18 +329,19 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return ["| " + " | ".join(head) + " |", line, *("| " + " | ".join(row) + " |" for row in rows), ""]
 
 
-def _with_day(lights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+def _with_all_but_night(lights: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
     """Shares by light, with those of all but the night after those of all."""
     own = [row for light, row in lights.items() if light not in {"all", "night"}]
     many = sum(row["objects"] for row in own)
-    day = {key: sum(row[key] * row["objects"] for row in own) / many for key in own[0]} | {"objects": many}
-    return {"all": lights["all"], "all but night": day, **lights}
+    rest = {key: sum(row[key] * row["objects"] for row in own) / many for key in own[0]} | {"objects": many}
+    return {"all": lights["all"], "all but night": rest, **lights}
 
 
 def small_lines(flat: dict[str, Any]) -> list[str]:
     """The part of the page on small cars."""
-    parts = {name: one["small cars"] for name, one in flat.items()}
-    parts = {name: one | {"by light": _with_day(one["by light"])} for name, one in parts.items()}
+    parts = {name: dict(one["small cars"]) for name, one in flat.items()}
+    for one in parts.values():
+        one["by light"] = _with_all_but_night(one["by light"])
     scores, lights = (list(next(iter(parts.values()))[key].items()) for key in ("by score", "by light"))
     rows = [
         [key.replace("-", " to ").replace("1.01", "1"),
@@ -371,9 +373,9 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         for key in ("faint", "others")
     ]
     lines += [
-        f"{faint} of these cars differ from what is behind them by less than {FAINT:g} deviations of the sensor's",
-        "noise (RMS of the light over their pixels, rendered with and without all bodies). Of 100 of them, at a score",
-        f"of {CLEAR:g}, {shares[0]} are found; of 100 of the {others} others {shares[1]}.",
+        f"{faint} of these cars have a contrast-to-noise ratio below {FAINT:g} (RMS difference of light over their",
+        "pixels, rendered with and without all bodies, over the standard deviation of the sensor's noise). Found of",
+        f"100 of them, at a score of {CLEAR:g}: {shares[0]}; of 100 of the {others} others: {shares[1]}.",
         "",
     ]
     told = {"mean": "mean AP50", "small": f"score {CLEAR:g}", "small, any": least}

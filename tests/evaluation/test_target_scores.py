@@ -16,12 +16,12 @@ def seen(
     *found: tuple[list[float], float],
     drive: str = "a",
     real: tuple[list[float], ...] = (TARGET,),
-    there: float = 0.0,
+    any_class: float = 0.0,
 ) -> Sighting:
     """A picture with true boxes, the target first, and found boxes with their scores."""
     boxes = np.array([box for box, _ in found], float).reshape(-1, 4)
     scores = np.array([score for _, score in found], float)
-    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool), there)
+    return Sighting(drive, boxes, scores, np.array(real, float), np.zeros(len(real), bool), any_class)
 
 
 def test_only_boxes_of_the_targets_class_count() -> None:
@@ -60,11 +60,11 @@ def test_a_target_that_is_taken_for_something_else_is_not_gone() -> None:
     """A quarter of it, of any class, says that something is there; a box that finds another object does not."""
     quarter, less, beside = [10.0, 10.0, 20.0, 40.0], [10.0, 10.0, 19.0, 40.0], [30.0, 10.0, 70.0, 40.0]
     truth = Truth(torch.tensor([1, 0, 2]), torch.tensor([TARGET, OTHER, beside]))
-    for box, label, there in ((quarter, 2, 0.9), (quarter, 1, 0.9), (less, 2, 0.0), (TARGET, 2, 0.9), (beside, 0, 0.0)):
+    for box, label, best in ((quarter, 2, 0.9), (quarter, 1, 0.9), (less, 2, 0.0), (TARGET, 2, 0.9), (beside, 0, 0.0)):
         found = Detections(torch.tensor([0.9, 0.8]), torch.tensor([label, 0]), torch.tensor([box, OTHER]))
-        assert sighting("a", found, truth).there == pytest.approx(there), (box, label)
+        assert sighting("a", found, truth).any_class == pytest.approx(best), (box, label)
     clean = [seen((TARGET, 0.9)) for _ in range(4)] + [seen((TARGET, 0.1))]
-    attacked = [seen((TARGET, 0.3)), seen(there=0.8), seen((TARGET, 0.2), there=0.2), seen(), seen()]
+    attacked = [seen((TARGET, 0.3)), seen(any_class=0.8), seen((TARGET, 0.2), any_class=0.2), seen(), seen()]
     metrics = target_scores(attacked, clean)["metrics"]
     assert metrics["ASR_25"] == pytest.approx(3 / 4)
     assert metrics["ASR_any_25"] == pytest.approx(2 / 4), "one of the three is taken for something else"

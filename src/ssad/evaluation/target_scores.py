@@ -37,7 +37,7 @@ class Sighting:
         score: Their scores [N].
         real: True boxes of that class [Q, 4], the target first.
         crowd: Which of these count neither as found nor as missed [Q].
-        there: The best score of a box of any class that covers a quarter of the target or more, and finds no other
+        any_class: The best score of a box of any class that covers a quarter of the target or more, and finds no other
             object; 0: there is none.
     """
 
@@ -46,7 +46,7 @@ class Sighting:
     score: F64
     real: F64
     crowd: Bool
-    there: float = 0.0
+    any_class: float = 0.0
 
     def confidences(self) -> F64:
         """The score with which each true box is found [Q], 0 without.
@@ -73,8 +73,8 @@ def _overlaps(box: F64, real: F64) -> tuple[F64, F64]:
     return both / np.maximum(area, 1e-9), both / np.maximum(whole, 1e-9)
 
 
-def _there(box: F64, score: F64, real: F64) -> float:
-    """The best score of a box that covers a part of the first object, and is not what finds another."""
+def _on_target(box: F64, score: F64, real: F64) -> float:
+    """The best score of boxes [N, 4] that cover enough of the first true box [Q, 4] and do not find another."""
     overlap, covered = _overlaps(box, real)
     another = overlap[:, 1:].max(1, initial=0.0)
     on_it = (covered[:, 0] >= COVERED) & ((another < IOU) | (another < overlap[:, 0]))
@@ -90,7 +90,7 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     return Sighting(
         drive, box[own.numpy()], score[own.numpy()], real[same.numpy()], crowd[same.numpy()],
-        _there(box, score, real),
+        _on_target(box, score, real),
     )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def target_scores(
             metrics[f"ASR_{percent}"], intervals[f"ASR_{percent}"] = _share(~found, before > level, of)
     if clean is not None:
         least = CONFIDENCES[0]
-        unseen = np.maximum(best, [one.there for one in sightings]) <= least
+        unseen = np.maximum(best, [one.any_class for one in sightings]) <= least
         metrics["ASR_any_25"], intervals["ASR_any_25"] = _share(unseen, before > least, of)
         real = np.concatenate([~one.crowd for one in sightings])
         every, every_before = np.concatenate(scores)[real], np.concatenate(scores_before)[real]

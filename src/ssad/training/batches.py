@@ -164,7 +164,7 @@ def order(count: int, batch: int, *, seed: int, epoch: int, often: F64 | None = 
 
 
 def _send(value: Tensor, device: torch.device | str) -> Tensor:
-    """A small tensor on a device. A GPU need not be done with what it was given before."""
+    """Copy a small tensor to a device without waiting for what a GPU was given before."""
     return value.to(device, non_blocking=True)
 
 

@@ -143,8 +143,8 @@ def main_table(run: PhysicalRun, number: int) -> Table:
             cells = []
             for name in names:
                 precision, rate = own.get(name, (math.nan, None))
-                own_row = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
-                cells += [Cell(own_row.get(metric, math.nan)) for metric in scores]
+                printed = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
+                cells += [Cell(printed.get(metric, math.nan)) for metric in scores]
             rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
     columns = tuple(f"{detector} {title}" for detector in run.detectors for title in scores.values())
     note = (

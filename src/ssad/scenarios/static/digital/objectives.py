@@ -184,8 +184,8 @@ class Hide:
     """No box on an object with any score.
 
     log(1 - the largest score of its class times IoU over all locations), summed over the objects of the aim. `hide-any`
-    takes the largest scores of any class at the 20 best locations, so that an object is not hidden by being taken for
-    another, or for two.
+    sums over the 20 best locations, each with its largest score of any class, so that an object is not hidden by
+    being taken for another, or for two.
 
     Source: the detection loss of ACTIVE and RAUCA (Suryanto et al. 2023, Zhou et al. 2024), with the score of any head.
 
