@@ -268,7 +268,7 @@ def _optimizer(detector: Any, recipe: Recipe) -> torch.optim.Optimizer:
 
 
 def _follower(average: Any, detector: Any) -> Callable[[float], None]:
-    """A function of a decay: it moves an average of weights and statistics towards a detector's, and copies counters."""
+    """A function of a decay that moves an average of weights and statistics, and copies counters."""
     if average is None:
         return lambda decay: None
     kept, fresh = average.state_dict(), detector.state_dict()
