@@ -57,9 +57,20 @@ SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detec
 
 
 def weather_of(description: str) -> str:
-    """Day, night, wet ... of a scene, from the text that the recorder wrote."""
-    fields = dict(re.findall(r"(\w+)=([-\d.e]+)", description))
-    return weather_name(Weather(**{name: float(value) for name, value in fields.items()}))
+    """Day, night, wet ... of a scene, from the words that `ssad.recording.nuscenes_recorder.weather_words` writes."""
+    found = re.search(r"sun (\d+) degrees (above|below) the horizon, clouds (\d+) %", description)
+    if found is None:
+        raise SystemExit(f"a scene tells no weather: {description}")
+    height = np.radians(float(found[1])) * (1 if found[2] == "above" else -1)
+    fog, wet = (re.search(rf"{name} ([\d.]+)", description) for name in ("fog of", "wet road"))
+    return weather_name(
+        Weather(
+            height,
+            clouds=float(found[3]) / 100,
+            fog=float(fog[1]) if fog else 0.0,
+            wet=float(wet[1]) / 100 if wet else 0.0,
+        )
+    )
 
 
 class Clips:

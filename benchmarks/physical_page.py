@@ -28,7 +28,6 @@ PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
     "physical": "ssad run physical --device cuda",
     "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
-    "physical-lights-16": "ssad run physical-lights", "physical-lights-gpu": "ssad run physical-lights --device cuda",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
@@ -37,9 +36,6 @@ SUITES = {
 }  # fmt: skip
 NOTES = {
     "physical-around-drives": "Each pair of towns is a run of its own, with the textures that were trained in it.",
-    "physical-lights-16": "Other searches than those above: their random numbers depend on the pair of towns, to which "
-    "the number of test pictures belongs. All 16 are of one drive.",
-    "physical-lights-gpu": "Stopped before most searches, but on six drives, which have intervals.",
 }
 """What a section says of its run beside the suite's description."""
 FIRST = "physical-"  # how the names of the tables of a pair of towns begin

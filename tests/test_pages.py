@@ -14,6 +14,8 @@ import pytest
 
 from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
+from ssad.recording.nuscenes_recorder import WEATHERS, draw_weather, weather_words
+from ssad.recording.viewpoints import weather_name
 from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +35,14 @@ ROOT = Path(__file__).parents[1]
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
     assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python benchmarks/{script}.py"
+
+
+@pytest.mark.parametrize("kind", WEATHERS)
+def test_the_light_of_a_recorded_drive_is_read_from_its_words(kind: str) -> None:
+    read = runpy.run_path(str(ROOT / "benchmarks" / "detector_accuracy.py"))["weather_of"]
+    for k in range(20):
+        weather = draw_weather(("drive", k), kind)
+        assert read(f"Town, {weather_words(weather)}") == weather_name(weather)
 
 
 @pytest.mark.parametrize("run", ["shifts", "shifts-paper"])
