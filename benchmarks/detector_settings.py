@@ -1,11 +1,12 @@
 """How the light 3D detectors turn maps into boxes best: thresholds of suppression, votes, and how scores fade.
 
-    python benchmarks/detector_settings.py DETECTOR DRIVES --out FILE [--weights FILE] [--device cuda] [--workers 8]
+    python -m benchmarks.detector_settings DETECTOR DRIVES --out FILE [--weights FILE] [--device cuda] [--workers 8]
+    python -m benchmarks.detector_settings DETECTOR DRIVES --out FILE --split val --try fade=0.02,vote=0.8 --try ...
 
 DRIVES: a folder that `ssad record` wrote of TRAINING towns that this detector was not trained on (another seed); the
 towns that are reported on must not decide. The maps of all its pictures are computed once; then one setting after the
 other is changed, and the value with the largest sum of mAP and NDS is kept, until nothing gets better. FILE gets all
-that was tried, the best last.
+that was tried, the best last. With --try nothing is searched: these settings are scored, all others as they are.
 """
 
 from __future__ import annotations
@@ -21,13 +22,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.detector_accuracy import pairs
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
 from ssad.detectors.mono3d.multi_camera import merge_cameras
 from ssad.evaluation.camera_truth import scenes_of
-from ssad.evaluation.detection import SampleBoxes, match_boxes, numbers, to_images
+from ssad.evaluation.detection import SampleBoxes, box_table, numbers, to_images
+from ssad.metrics.detection import filter_boxes, match
+from ssad.training.detector import parse_changes
 
 SETTINGS: Mapping[str, tuple[float | None, ...]] = {
     "fade": (0.0, 0.01, 0.02, 0.03, 0.04),
@@ -80,11 +84,17 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--try", dest="tries", action="append", default=[], metavar="KEY=VALUE,...")
     given = parser.parse_args()
+    tries = [dict(parse_changes(text.split(","))) for text in given.tries]
+    for chosen in tries:
+        if not chosen.keys() <= SETTINGS.keys():
+            parser.error(f"--try {chosen}: the settings are {', '.join(SETTINGS)}")
     detector = make_detector(given.detector, weights=given.weights, device=given.device)
     version, scenes = look(detector, given.drives, given.split, given.device)
     DETECTOR.append(detector.to("cpu"))
     truth = read_truth(given.drives, version, scenes=frozenset(scenes))
+    real = filter_boxes(truth.boxes, points=truth.points, racks=truth.racks)
     usual = detector.config
     tried: dict[tuple[float | None, ...], dict[str, float]] = {}
     best = tuple(getattr(usual, name) for name in SETTINGS)
@@ -94,10 +104,15 @@ def main() -> None:
             if values not in tried:
                 config = replace(usual, **dict(zip(SETTINGS, values, strict=True)))
                 parts = pool.map(boxes_of, [(config, k, given.workers) for k in range(given.workers)], chunksize=1)
-                tried[values] = numbers(match_boxes([one for part in parts for one in part], truth).scores())
+                seen = box_table([one for part in parts for one in part], truth)
+                seen = filter_boxes(seen, racks=truth.racks)
+                tried[values] = numbers(match(real, seen, samples=len(truth.samples)).scores())
+                tried[values]["duplicates"] = pairs(real, seen)["duplicates a sample"]
             return tried[values]["mAP"] + tried[values]["NDS"]
 
-        before = None
+        for chosen in tries:
+            score(best := tuple(chosen.get(name, getattr(usual, name)) for name in SETTINGS))
+        before = best if tries else None
         while best != before:
             before = best
             for k, (name, choices) in enumerate(SETTINGS.items()):

@@ -166,6 +166,8 @@ def page() -> str:
         f"training; {samples} samples of six cameras, {data['width']} pixels wide.",
         f"Software: torch {versions['torch']}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
+        "Boxes of PGD-Det still voted and faded as those of FCOS3D do; on clean drives its own settings change mAP by",
+        "less than half a point ([detectors.md](detectors.md#weights-and-cards)).",
         "",
         "* Brackets: 95 % intervals, from how the drives vary (how: [metrics.md](metrics.md)).",
         "* *Published*: results of the paper on nuScenes val with full-size detectors. Images and detectors differ, so",

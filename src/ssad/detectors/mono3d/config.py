@@ -142,6 +142,6 @@ FCOS3D_LIGHT = Mono3DConfig(
     threshold=0.02, vote=0.7, fade=0.01, heading="vectors",
 )  # fmt: skip
 PGD_DET_LIGHT = replace(
-    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, sure=0.5,
+    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, sure=0.5, vote=0.8, fade=0.02,
     code_weights=(*_LIGHT_WEIGHTS, *_PGD_WEIGHTS[9:]),
 )  # fmt: skip
