@@ -20,6 +20,7 @@ from ssad.core.traces import trace_hash
 from ssad.core.types import AgentKind, Episode, Limits
 from ssad.drivers.perceiving.driver import Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, on_host
+from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
 from ssad.drivers.perceiving.tracker import Tracking
 from ssad.recording.closed_loop import system_version
 from ssad.world.rollout import Loop
@@ -233,3 +234,11 @@ def test_detections_that_are_brought_to_the_host_together_are_those_of_their_ima
         if one.solid is not None and other.solid is not None:
             for name in ("centre", "size_lhw", "yaw", "velocity", "attribute"):
                 assert torch.equal(getattr(one.solid, name), getattr(other.solid, name))
+
+
+@pytest.mark.parametrize("system", [Fcos3d, PgdDet, Yolov5n])
+def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type[OneCamera]) -> None:
+    for made, low in ((system(), system.usual.low), (system(tracking=Tracking(high=0.5, low=0.2)), 0.2)):
+        assert isinstance(made.eyes, CameraEyes)
+        assert made.eyes.threshold == made.tracking.low == low
+    assert PgdDet.usual.high < Fcos3d.usual.high < Yolov5n.usual.high

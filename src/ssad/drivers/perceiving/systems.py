@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.tracker import Tracking
 
 
-class Fcos3d(Perceiving):
+class OneCamera(Perceiving):
+    """One front camera and a detector with the weights that ship.
+
+    Attributes:
+        weights: Name of the detector; results depend on them.
+        usual: Scores from which the tracker takes what it finds; detectors are not sure of themselves alike.
+    """
+
+    weights: ClassVar[str]
+    usual: ClassVar[Tracking] = Tracking()
+
+    def __init__(self, *, width: int = 640, tracking: Tracking | None = None, **settings: Any) -> None:
+        own = tracking or self.usual
+        super().__init__(CameraEyes(self.weights, front(width), threshold=own.low), tracking=own, **settings)
+
+
+class Fcos3d(OneCamera):
     """One front camera, FCOS3D light."""
 
-    weights = "fcos3d-light"  # results depend on them
-
-    def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes(self.weights, front(width)), **settings)
+    weights = "fcos3d-light"
+    usual = Tracking(high=0.25)
 
 
-class PgdDet(Perceiving):
+class PgdDet(OneCamera):
     """One front camera, PGD-Det light."""
 
-    weights = "pgd-det-light"  # results depend on them
-
-    def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes(self.weights, front(width)), **settings)
+    weights = "pgd-det-light"
+    usual = Tracking(high=0.13, low=0.05)  # about as many false boxes as FCOS3D has from 0.25
 
 
-class Yolov5n(Perceiving):
+class Yolov5n(OneCamera):
     """One front camera, YOLOv5n, whose boxes are lifted by the ground plane."""
 
-    weights = "yolov5n"  # results depend on them
-
-    def __init__(self, *, width: int = 640, **settings: Any) -> None:
-        super().__init__(CameraEyes(self.weights, front(width)), **settings)
+    weights = "yolov5n"
 
 
 class Perfect(Perceiving):
