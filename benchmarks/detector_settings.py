@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from benchmarks.detector_accuracy import pairs
+from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
@@ -86,10 +87,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--try", dest="tries", action="append", default=[], metavar="KEY=VALUE,...")
     given = parser.parse_args()
-    tries = [dict(parse_changes(text.split(","))) for text in given.tries]
-    for chosen in tries:
+    try:
+        tries = [dict(parse_changes(text.split(","))) for text in given.tries]
+    except ConfigError as error:
+        parser.error(str(error).replace("--set", "--try", 1))
+    for text, chosen in zip(given.tries, tries, strict=True):
         if not chosen.keys() <= SETTINGS.keys():
-            parser.error(f"--try {chosen}: the settings are {', '.join(SETTINGS)}")
+            parser.error(f"--try {text}: the settings are {', '.join(SETTINGS)}")
     detector = make_detector(given.detector, weights=given.weights, device=given.device)
     version, scenes = look(detector, given.drives, given.split, given.device)
     DETECTOR.append(detector.to("cpu"))

@@ -14,7 +14,7 @@ class OneCamera(Perceiving):
 
     Attributes:
         weights: Name of the detector; results depend on them.
-        usual: Scores from which the tracker takes what it finds; detectors are not sure of themselves alike.
+        usual: Settings of the tracker unless others are given; detectors differ in how high they score.
     """
 
     weights: ClassVar[str]
@@ -36,7 +36,7 @@ class PgdDet(OneCamera):
     """One front camera, PGD-Det light."""
 
     weights = "pgd-det-light"
-    usual = Tracking(high=0.13, low=0.05)  # about as many false boxes as FCOS3D has from 0.25
+    usual = Tracking(high=0.13, low=0.05)
 
 
 class Yolov5n(OneCamera):
