@@ -24,11 +24,6 @@ PAGE = ROOT / "docs" / "results.md"
 RUNS = ("shifts", "shifts-paper")  # the physical calibration, and the paper's
 NAMES = {"fcos3d-light": ("light FCOS3D", "FCOS3D"), "pgd-det-light": ("light PGD-Det", "PGD")}  # ours, the paper's
 PLACE = {"mAP": 0, "NDS": 1}
-BEFORE = "4766b9c0d1d8"  # code of runs before PGD-Det got votes and fading of its own
-SHARED = (
-    "PGD-Det ran with the votes and the fading of FCOS3D. What it has now changes its clean mAP by a few tenths of a",
-    "point ([detectors.md](detectors.md#weights-and-cards)).",
-)
 SHIFTS = [shift for shift in PUBLISHED if shift]
 
 Key = tuple[str, ...]
@@ -171,7 +166,6 @@ def page() -> str:
         f"training; {samples} samples of six cameras, {data['width']} pixels wide.",
         f"Software: torch {versions['torch']}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
-        *(SHARED if about["code"] == BEFORE else ()),
         "",
         "* Brackets: 95 % intervals, from how the drives vary (how: [metrics.md](metrics.md)).",
         "* *Published*: results of the paper on nuScenes val with full-size detectors. Images and detectors differ, so",
