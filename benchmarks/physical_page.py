@@ -31,7 +31,7 @@ SUITES = {
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
-        for what in ("around", "around-drives", "any", "judges", "patches", "stealth")
+        for what in ("around", "around-drives", "judges", "stealth")
     },
 }  # fmt: skip
 NOTES = {

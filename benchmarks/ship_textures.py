@@ -1,4 +1,4 @@
-"""Ship the textures of a finished run: python benchmarks/ship_textures.py RUN [--attacks adv-patch,vanishing]
+"""Ship the textures of a finished run: python benchmarks/ship_textures.py RUN [--attacks adv-patch,vanishing-all-sides]
 
 RUN is what `ssad run physical` wrote. For each attack that was trained against a detector and scored on it, NAME.png
 and NAME.json go to src/ssad/scenarios/static/physical/trained; suites then name them (`texture: NAME`). What did not
@@ -30,7 +30,8 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
     found: dict[str, tuple[dict[str, Any], TextureCard]] = {}
     for line in run.lines:
         own = line["status"] == "ok" and line["view"] == "drive" and line["detector"] == line["source"]
-        if not own or "epochs" not in line or (attacks and line["attack"] not in attacks) or line["spec"]["of"]:
+        attack = line["attack"].replace(", ", "-").replace(" ", "-")
+        if not own or "epochs" not in line or (attacks and attack not in attacks) or line["spec"]["of"]:
             continue
         title = title_of((line["attack"], line["carrier"]))
         margin = margins.get((line["test"], line["detector"], title))
@@ -51,7 +52,6 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             {name: line["metrics"][name] for name in METRICS},
         )  # fmt: skip
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
-        attack = line["attack"].replace(", ", "-").replace(" ", "-")
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"
         found[name] = (line, card)
     make_folder(SHIPPED)
