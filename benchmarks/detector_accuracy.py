@@ -100,10 +100,9 @@ class Clips:
         self.side = np.sqrt(table[:, 4] * table[:, 5])
         self.crowd, self.target, self.distance = table[:, 6] > 0, table[:, 7] > 0, table[:, 8]
 
-    @property
-    def small_cars(self) -> np.ndarray[Any, Any]:
-        """Which objects are cars below 24 px that count."""
-        return ~self.crowd & (self.label == self.classes.index("car")) & (self.side < SMALL)
+    def small(self, kind: str) -> np.ndarray[Any, Any]:
+        """Which objects are below 24 px, of this class and count."""
+        return ~self.crowd & (self.label == self.classes.index(kind)) & (self.side < SMALL)
 
     @cached_property
     def contrast(self) -> np.ndarray[Any, Any]:
@@ -114,7 +113,8 @@ class Clips:
         """
         found = np.full(len(self.image), np.nan)
         shown = {file: number for number, file in enumerate(self.files)}
-        wanted = {self.files[number] for number in np.unique(self.image[self.small_cars])}
+        few = self.small("car")
+        wanted = {self.files[number] for number in np.unique(self.image[few])}
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
             for one in clip_views(folder, split="test", only=names):
@@ -124,7 +124,7 @@ class Clips:
                 )
                 photons, dark = noise_levels(one.view.sensor.noise, float(picture.exposure[0]))
                 labels = label_picture(one.scene, one.view, picture)
-                for row in np.flatnonzero(self.small_cars & (self.image == shown[folder / "images" / one.file])):
+                for row in np.flatnonzero(few & (self.image == shown[folder / "images" / one.file])):
                     own = picture.tag[0] == labels.tag[np.abs(labels.box - self.box[row]).max(1).argmin()]
                     noise = np.sqrt(np.mean(photons * behind[own] + dark**2))
                     found[row] = np.sqrt(np.mean((light[own] - behind[own]) ** 2)) / noise
@@ -159,9 +159,19 @@ def recall(
     return float((matched.hit & ~matched.ignored).sum() / matched.truth.sum())
 
 
+def of_target(clips: Clips, found: Boxes2D, labels: int) -> dict[str, float]:
+    """AP50 of what each recording is about, a car or a sign."""
+    folder, scores = np.array(clips.folders)[clips.image], {}
+    for recording in dict.fromkeys(clips.folders):
+        aimed = clips.target & (folder == recording)
+        kind = int(clips.label[aimed][0])
+        scores[recording] = float(average_precision(clips.truth(aimed), found, labels=labels)[kind])
+    return scores
+
+
 def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
     """Cars below 24 px: how many are found from each score on, and how often a score of so much is right."""
-    car, weather, few = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small_cars
+    car, weather, few = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small("car")
     matched = match_2d(clips.truth(~clips.crowd), found, labels=labels)
     assert found.score is not None
     assert matched.row is not None
@@ -189,10 +199,10 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
 
 def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
     """How many small cars are found of those with a low contrast-to-noise ratio, and of the others."""
-    faint = clips.contrast < FAINT
+    few, faint = clips.small("car"), clips.contrast < FAINT
     return {
         name: {"objects": int(own.sum()), "clear": recall(clips, found, own, labels)}
-        for name, own in (("faint", clips.small_cars & faint), ("others", clips.small_cars & ~faint))
+        for name, own in (("faint", few & faint), ("others", few & ~faint))
     }
 
 
@@ -202,15 +212,9 @@ def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
     every = ~clips.crowd
     ap = average_precision(clips.truth(every), found, labels=labels)
     car = clips.classes.index("car")
-    folder = np.array(clips.folders)[clips.image]
-    followed = {}
-    for recording in dict.fromkeys(clips.folders):
-        aimed = clips.target & (folder == recording)
-        kind = int(clips.label[aimed][0])
-        followed[recording] = float(average_precision(clips.truth(aimed), found, labels=labels)[kind])
     result: dict[str, Any] = {
         "AP50": {c: float(v) for c, v in zip(clips.classes, ap, strict=True) if np.isfinite(v)},
-        "target": followed,
+        "target": of_target(clips, found, labels),
         "objects": {c: int((every & (clips.label == k)).sum()) for k, c in enumerate(clips.classes)},
     }
     weather = np.array(clips.weather)
@@ -235,20 +239,19 @@ def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
                 if counts.sum() >= FEW:
                     row = {"recall": recall(clips, found, counts, labels), "objects": int(counts.sum())}
                     result.setdefault(f"by {what}", {}).setdefault(kind, {})[f"{low:g}-{high:g}"] = row
-    below = every & (clips.side < SMALL)
     result["recall below 24 px"] = {
-        kind: recall(clips, found, below & (clips.label == clips.classes.index(kind)), labels)
-        for kind in ("car", "pedestrian")
+        kind: recall(clips, found, clips.small(kind), labels) for kind in ("car", "pedestrian")
     }
     result["small cars"] = small_cars(clips, found, labels)
-    few = clips.small_cars
     for width, own in ((None, found), *((w, found_in(name, clips, device, input_width=w)) for w in WIDTHS)):
         values = average_precision(clips.truth(every), own, labels=labels)
         result.setdefault("enlarged", {})[str(width or "as they are")] = {
             "mean": float(np.nanmean(values)),
             "car": float(values[car]),
-            "small": recall(clips, own, few, labels),
-            "small, any": recall(clips, own, few, labels, least=SCORES[-1]),
+            "target": of_target(clips, own, labels),
+            "small": recall(clips, own, clips.small("car"), labels),
+            "small, any": recall(clips, own, clips.small("car"), labels, least=SCORES[-1]),
+            "people": recall(clips, own, clips.small("pedestrian"), labels),
         }
     return result
 
@@ -389,18 +392,21 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         f"100 of them, at a score of {CLEAR:g}: {shares[0]}; of 100 of the {others} others: {shares[1]}.",
         "",
     ]
-    told = {"mean": "mean AP50", "small": f"score {CLEAR:g}", "small, any": least}
     rows = [
-        [width, *(f"{100 * one['enlarged'][width][key]:.0f}" for one in flat.values() for key in told)]
-        for width in next(iter(flat.values()))["enlarged"]
-    ]
+        [name, width, *(f"{100 * score:.1f}" for score in (row["mean"], row["target"]["e_drive"])),
+         *(f"{100 * row[key]:.0f}" for key in ("small", "small, any", "people"))]
+        for name, one in flat.items()
+        for width, row in one["enlarged"].items()
+    ]  # fmt: skip
+    columns = ("mean AP50", "target of e_drive", f"cars, score {CLEAR:g}", f"cars, {least}", f"people, score {CLEAR:g}")
     return [
         *lines,
         "Pixels are part of it: with the same weights a detector can enlarge the pictures before it looks",
         "(`make_detector(NAME, input_width=960)`, in suites `NAME?input_width=960`; 2.25 times the pixels). At",
-        "twice the width near objects are larger than those that were learned. By width inside, px:",
+        "twice the width near objects are larger than those that were learned. Cars and people: the share that is",
+        f"found of those below {SMALL:g} px.",
         "",
-        *table(["pictures of 640 px", *(f"{n}: {text}" for n in parts for text in told.values())], rows),
+        *table(["detector", "width inside, px", *columns], rows),
     ]
 
 

@@ -1,20 +1,25 @@
-"""Write docs/digital.md from the tables of `ssad run digital`: python benchmarks/digital_page.py [FOLDER]
+"""Write docs/digital.md from the tables of `ssad run digital`: python -m benchmarks.digital_page [RUN...]
 
-benchmarks/results/digital holds what a run wrote: tables/*.md of its folder, and run.json without its cells. With
-FOLDER they are copied from there first.
+benchmarks/results/digital holds the tables of runs, and run.json without its cells. With runs (folders) these are
+stored first; several of them, such as the rest of one on another device, are joined.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 import sys
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.joined_runs import joined
 from ssad.bench.suite import load_suite
 from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
+from ssad.report.digital_run import Setting, setting_of
+from ssad.report.kinds.digital import section
+from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "digital"
@@ -25,16 +30,26 @@ TABLES = (
 )  # fmt: skip
 
 
-def keep(folder: Path) -> None:
-    """Copy what the page needs from the folder of a run, and how many of its cells have run."""
-    told = json.loads((folder / "run.json").read_text())
-    told["planned"] = len(told.pop("cells"))
-    told["ran"] = len((folder / "results.jsonl").read_text().splitlines())
+def store(folders: Sequence[Path]) -> None:
+    """Keep what the page needs of runs, and how many of their cells have run where."""
+    run = joined(folders, _place)
+    told = {key: value for key, value in run.header.items() if key not in ("cells", "commands")}
+    told |= {
+        "command": run.header["commands"],
+        "planned": run.planned,
+        "ran": Counter(line["versions"]["device"] for line in run.lines if line["status"] == "ok"),
+    }
+    tables = {table.name: table for table in section(run)[1]}
     for name in TABLES:
         (RESULTS / f"{name}.md").unlink(missing_ok=True)
-        if (folder / "tables" / f"{name}.md").is_file():
-            shutil.copy(folder / "tables" / f"{name}.md", RESULTS)
+        if name in tables:
+            (RESULTS / f"{name}.md").write_text(to_markdown(tables[name]))
     (RESULTS / "run.json").write_text(json.dumps(told, indent=1) + "\n")
+
+
+def _place(row: Mapping[str, Any]) -> tuple[str, Setting]:
+    """What tells a cell from others, whatever device it ran on."""
+    return row["detector"], setting_of(row)
 
 
 def outdated() -> list[str]:
@@ -74,10 +89,10 @@ def page() -> str:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.** Compare these numbers with each other,"]
         lines += ["> not with a new run.", ""]
     lines += [
-        "`benchmarks/digital_page.py` makes this page from `benchmarks/results/digital`, which has the tables that one",
-        "command wrote:",
+        "`benchmarks/digital_page.py` makes this page from `benchmarks/results/digital`, which has the tables that",
+        f"{'this command' if len(about['command']) == 1 else 'these commands'} wrote:",
         "```",
-        about["command"] if " --device " in about["command"] else f"{about['command']} --device {versions['device']}",
+        *about["command"],
         "```",
         f"Data: {data['scenes']} drives of {data['seconds']:g} s in each of {towns}, which were not used for training;",
         f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
@@ -85,10 +100,11 @@ def page() -> str:
         "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
         "",
     ]
-    if about["ran"] < about["planned"]:
-        missing = (
-            f"{about['planned'] - about['ran']} of its {about['planned']} cells have not run, points of the curves"
-        )
+    if len(about["ran"]) > 1:
+        spread = " and ".join(f"{count} cells on {device}" for device, count in about["ran"].items())
+        lines[-1:] = [f"{spread[0].upper()}{spread[1:]}.", ""]
+    if (ran := sum(about["ran"].values())) < about["planned"]:
+        missing = f"{about['planned'] - ran} of the {about['planned']} cells have not run, points of the curves"
         lines[-1:] = [f"{missing} over budget and steps: n/a below.", ""]
     if new := grown(about["suite"]):
         lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
@@ -99,5 +115,5 @@ def page() -> str:
 
 if __name__ == "__main__":
     if sys.argv[1:]:
-        keep(Path(sys.argv[1]))
+        store([Path(folder) for folder in sys.argv[1:]])
     PAGE.write_text(page())

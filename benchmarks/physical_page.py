@@ -1,8 +1,8 @@
-"""Write docs/physical_results.md from stored runs: python benchmarks/physical_page.py [--as NAME] [RUN...]
+"""Write docs/physical_results.md from stored runs: python -m benchmarks.physical_page [--as NAME] [RUN...]
 
 With runs (folders that `ssad run physical` or another of `SUITES` wrote) the tables and run.json without its cells are
 stored first, in benchmarks/results/NAME (of the suite, if none is said). Several runs of one suite, such as of one pair
-of towns each, are joined: of a cell that two have, the later counts.
+of towns each, are joined.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.joined_runs import joined
 from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
 from ssad.report.kinds.physical import section
-from ssad.report.load import load_run
 from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]
@@ -45,26 +44,18 @@ OTHERS = ("margins", "comparison", "transfer", "grid", "others", "effort")
 
 def store(folders: Sequence[Path], name: str | None = None) -> None:
     """Keep what the page needs of runs of one suite."""
-    runs = [load_run(folder) for folder in folders]
-    suite = runs[0].suite["name"]
-    folder = RESULTS / (name or suite)
-    lines: dict[tuple[Any, ...], Mapping[str, Any]] = {}
-    cells: set[tuple[Any, ...]] = set()
-    for run in runs:
-        if run.suite["name"] != suite:
-            raise SystemExit(f"{run.folder} is of the suite {run.suite['name']}, not of {suite}")
-        lines |= {_place(line): line for line in run.lines}
-        cells |= {_place(cell) for cell in run.header["cells"]}
-    about = {key: value for key, value in runs[0].header.items() if key != "cells"}
-    about["weights"] = {key: value for run in runs for key, value in run.header["weights"].items()}
-    about["command"] = list(dict.fromkeys(run.command for run in runs))
-    done = sum(line["status"] == "ok" for line in lines.values())
-    about["refused"] = Counter(line["reason"] for line in lines.values() if line["status"] != "ok")
-    joined = replace(runs[0], header=about, lines=tuple(lines.values()), planned=len(cells))
+    run = joined(folders, _place)
+    folder = RESULTS / (name or run.suite["name"])
+    about = {key: value for key, value in run.header.items() if key not in ("cells", "commands")}
+    about |= {
+        "command": run.header["commands"],
+        "refused": Counter(line["reason"] for line in run.failures),
+        "cells": run.planned, "cells_done": len(run.lines) - len(run.failures),
+    }  # fmt: skip
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    (folder / "run.json").write_text(json.dumps(about | {"cells": len(cells), "cells_done": done}, indent=1) + "\n")
-    for table in section(joined)[1]:
+    (folder / "run.json").write_text(json.dumps(about, indent=1) + "\n")
+    for table in section(run)[1]:
         (folder / f"{table.name}.md").write_text(to_markdown(table))
 
 

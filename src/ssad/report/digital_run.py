@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ssad.core.registry import label_of, split_weights
-from ssad.report.kinds.detection import cell_of, replicates_of, score_cell
+from ssad.metrics.uncertainty import replicate_difference
+from ssad.report.kinds.detection import cell_of, replicates_of
 from ssad.report.load import Run
 from ssad.report.tables import Cell
 
@@ -202,14 +203,16 @@ def metric_cell(record: Mapping[str, Any] | None, metric: str) -> Cell:
 
 
 def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> Cell:
-    """Share of the clean score that an attack took away, percent; the interval from paired replicates."""
+    """Share of the clean score that an attack took away, percent; the interval from paired replicates.
+
+    A score that more than doubled has no interval.
+    """
     clean, own = run.clean(detector, setting), run.record(detector, setting)
     if clean is None or own is None or not clean["metrics"].get(metric) or own["metrics"].get(metric) is None:
         return Cell(math.nan)
     pairs = zip(replicates_of(clean, metric), replicates_of(own, metric), strict=True)
     shares = [1.0 - after / before for before, after in pairs if before > 0]
-    value = 1.0 - own["metrics"][metric] / clean["metrics"][metric]
-    return score_cell(Resampling(int(own.get("scenes", 0))), value, shares, own["n"], bounded=False)
+    return _difference(1.0 - own["metrics"][metric] / clean["metrics"][metric], shares, own)
 
 
 def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
@@ -218,5 +221,11 @@ def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, m
     if one is None or other is None or one["metrics"].get(metric) is None or other["metrics"].get(metric) is None:
         return Cell(math.nan)
     pairs = zip(replicates_of(one, metric), replicates_of(other, metric), strict=True)
-    value = one["metrics"][metric] - other["metrics"][metric]
-    return score_cell(Resampling(int(one.get("scenes", 0))), value, [a - b for a, b in pairs], one["n"], bounded=False)
+    return _difference(one["metrics"][metric] - other["metrics"][metric], [a - b for a, b in pairs], one)
+
+
+def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> Cell:
+    if value < -1.0:
+        return Cell(100.0 * value)
+    found = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
+    return Cell.of(found.scaled(100.0))
