@@ -24,7 +24,7 @@ from helpers.own_kind import DiceSuite
 from rich.console import Console
 
 from ssad.bench.kind import Resources
-from ssad.bench.run import read_plan, run
+from ssad.bench.run import read_plan, run, slice_of
 from ssad.bench.suite import kind_of, load_suite
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.jsonl import read_lines
@@ -328,3 +328,17 @@ def test_slices_add_up_to_the_run(tmp_path: Path) -> None:
     ):
         with pytest.raises(UnknownNameError, match=expected):
             run(plan, tmp_path, quiet, only=only)
+
+
+@pytest.mark.parametrize(
+    ("only", "expected"),
+    [
+        ({"system": ["fair,loaded"], "number": ["a"]}, ["fair/a#0", "loaded/a#0"]),
+        ({"number": ["a,b"]}, ["fair/a,b#0", "loaded/a,b#0"]),  # there is one that is called so
+        ({"number": ["a,c"]}, ["fair/a#0", "fair/c#0", "loaded/a#0", "loaded/c#0"]),
+        ({"name": ["loaded/a,b#0", "fair/c#0"]}, ["fair/c#0", "loaded/a,b#0"]),
+    ],
+)
+def test_a_slice_is_named_by_values_with_or_without_commas(only: dict[str, list[str]], expected: list[str]) -> None:
+    plan = own_kind.Dice().plan(dice(["a", "c", "a,b"], systems=["fair", "loaded"]))
+    assert sorted(cell.name for cell in slice_of(plan, only)) == sorted(expected)

@@ -37,11 +37,13 @@ def test_what_an_attack_takes_has_an_interval_around_it(left: float, spread: flo
 def test_a_score_that_more_than_doubles_has_no_interval() -> None:
     run = run_of({("one", CLEAN): record(0.1, 0.01, 0), ("one", PGD): record(0.3, 0.01, 1)})
     cell = lost_cell(run, "one", PGD, "mAP")
-    assert cell.mean == pytest.approx(-200.0) and np.isnan(cell.low)
+    assert cell.mean == pytest.approx(-200.0)
+    assert np.isnan(cell.low)
 
 
 def test_a_difference_of_two_detectors_is_mirrored_with_them() -> None:
     run = run_of({("one", PGD): record(0.06, 0.02, 0), ("two", PGD): record(0.01, 0.01, 1)})
     there, back = (gained_cell(run, names, PGD, "mAP") for names in (("one", "two"), ("two", "one")))
-    assert there.mean == pytest.approx(5.0) and there.low < 5.0 < there.high
+    assert there.mean == pytest.approx(5.0)
+    assert there.low < 5.0 < there.high
     assert (back.mean, back.low, back.high) == pytest.approx((-there.mean, -there.high, -there.low))

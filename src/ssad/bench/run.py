@@ -41,7 +41,7 @@ def run(
         folder: Where its records are.
         resources: What may be used.
         retry: Whether failed cells run again.
-        only: Run a slice: the cells whose fields have one of these values, as text.
+        only: Run a slice: the cells whose fields, or name, have one of these values, as text.
 
     Raises:
         ConfigError: no cell has such a value.
@@ -62,17 +62,22 @@ def run(
 
 
 def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
-    """The cells whose fields have one of these values, as text. ConfigError: no cell has such a field or value."""
+    """The cells whose fields, or name, have one of these values, as text.
+
+    A value "a,b" means a and b, unless there is one that is called so. ConfigError: no cell has such a field or value.
+    """
+    fields = {cell.key: {"name": cell.name, **{key: str(value) for key, value in cell.fields.items()}}
+              for cell in plan.cells}  # fmt: skip
     cells = list(plan.cells)
-    for name, wanted in only.items():
-        known = dict.fromkeys(str(cell.fields[name]) for cell in plan.cells if name in cell.fields)
+    for name, texts in only.items():
+        known = dict.fromkeys(own[name] for own in fields.values() if name in own)
         if not known:
-            fields = dict.fromkeys(field for cell in plan.cells for field in cell.fields)
-            raise unknown_name("field of cells", name, fields)
+            raise unknown_name("field of cells", name, dict.fromkeys(one for own in fields.values() for one in own))
+        wanted = [value for text in texts for value in ([text] if text in known else text.split(","))]
         for value in wanted:
             if value not in known:
                 raise unknown_name(name, value, known)
-        cells = [cell for cell in cells if str(cell.fields.get(name)) in wanted]
+        cells = [cell for cell in cells if fields[cell.key].get(name) in wanted]
     if not cells:
         asked = " and ".join(f"{name}={','.join(wanted)}" for name, wanted in only.items())
         raise ConfigError(f"no cell has {asked} at once")

@@ -101,13 +101,13 @@ def run(
 
 
 def _wanted(texts: list[str]) -> dict[str, list[str]]:
-    """Values by field, of texts "field=value,value"."""
+    """What is said of each field, of texts "field=value,value"."""
     found: dict[str, list[str]] = {}
     for text in texts:
         name, sign, values = text.partition("=")
         if not name or not sign or not values:
             raise ConfigError(f"--only {text}: expected FIELD=VALUE,..., such as perturbation=none,fog")
-        found.setdefault(name, []).extend(values.split(","))
+        found.setdefault(name, []).append(values)
     return found
 
 
