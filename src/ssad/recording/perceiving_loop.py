@@ -19,7 +19,7 @@ from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
 from ssad.drivers.perceiving.repair import Repair
 from ssad.drivers.perceiving.signs import SignReading, sign_labels
-from ssad.drivers.perceiving.tracker import Tracking
+from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 from ssad.evaluation.drive_perception import Watcher
 from ssad.metrics import episode_metrics
 from ssad.recording.closed_loop import Order, drive
@@ -45,7 +45,7 @@ class PerceivingSystem(Schema):
         latency: s from a picture to its detections.
         confirm: hits from which an object is believed (H).
         reserve: looks without a hit that it stays believed for (R).
-        high, low: scores of the tracker's two stages.
+        high, low: scores of the tracker's two stages; none: those that suit the detector.
         reads_signs: whether it knows of stop signs only what its detector reads; else those of the map.
         sign_memory: s that a sign is remembered after it was last read; none: until it has been passed.
         missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
@@ -61,8 +61,8 @@ class PerceivingSystem(Schema):
     latency: float = Field(default=0.1, ge=0, le=10, allow_inf_nan=False)
     confirm: int = Field(default=2, ge=1)
     reserve: int = Field(default=6, ge=0)
-    high: float = Field(default=0.3, ge=0, le=1)
-    low: float = Field(default=0.1, ge=0, le=1)
+    high: float | None = Field(default=None, ge=0, le=1)
+    low: float | None = Field(default=None, ge=0, le=1)
     reads_signs: bool = False
     sign_memory: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     missed: float = Share
@@ -80,8 +80,16 @@ class PerceivingSystem(Schema):
         """Whether it is told the truth."""
         return self.detector == "truth"
 
+    @property
+    def tracking(self) -> Tracking:
+        """Settings of the tracker, with the scores that suit the detector unless others are said."""
+        said = {"confirm": self.confirm, "reserve": self.reserve}
+        return tracking_of(self.detector, high=self.high, low=self.low, **said)
+
     def check(self) -> None:
-        """ConfigError: its settings of stop signs do not fit together, or its detector knows no stop signs."""
+        """ConfigError: scores cross, settings of stop signs do not fit, or its detector knows no stop signs."""
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
         if self.sign_memory is not None and not self.reads_signs:
             raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
         if self.reads_signs:
@@ -106,12 +114,11 @@ class PerceivingSystem(Schema):
             )  # fmt: skip
         else:
             detector = _detector(self.detector, self.weights, self.input_width, device)
-            eyes = CameraEyes(detector, cameras, threshold=self.low, device=device)
-        tracking = Tracking(confirm=self.confirm, reserve=self.reserve, high=self.high, low=self.low)
+            eyes = CameraEyes(detector, cameras, threshold=self.tracking.low, device=device)
         memory = float("inf") if self.sign_memory is None else self.sign_memory
-        signs = SignReading(confirm=self.confirm, memory=memory, score=self.high) if self.reads_signs else None
+        signs = SignReading(confirm=self.confirm, memory=memory, score=self.tracking.high) if self.reads_signs else None
         return Perceiving(
-            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
+            eyes, rate=self.rate, latency=self.latency, tracking=self.tracking, watch=watch, repair=repair, signs=signs
         )  # fmt: skip
 
 

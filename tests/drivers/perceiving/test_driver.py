@@ -21,7 +21,7 @@ from ssad.core.types import AgentKind, Episode, Limits
 from ssad.drivers.perceiving.driver import Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, on_host
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
-from ssad.drivers.perceiving.tracker import Tracking
+from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 from ssad.recording.closed_loop import system_version
 from ssad.world.rollout import Loop
 
@@ -238,7 +238,27 @@ def test_detections_that_are_brought_to_the_host_together_are_those_of_their_ima
 
 @pytest.mark.parametrize("system", [Fcos3d, PgdDet, Yolov5n])
 def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type[OneCamera]) -> None:
-    for made, low in ((system(), system.usual.low), (system(tracking=Tracking(high=0.5, low=0.2)), 0.2)):
+    for made, low in ((system(), tracking_of(system.weights).low), (system(tracking=Tracking(high=0.5, low=0.2)), 0.2)):
         assert isinstance(made.eyes, CameraEyes)
         assert made.eyes.threshold == made.tracking.low == low
-    assert PgdDet.usual.high < Fcos3d.usual.high < Yolov5n.usual.high
+    scores = [tracking_of(system.weights).high for system in (PgdDet, Fcos3d, Yolov5n)]
+    assert scores == sorted(set(scores))
+
+
+@pytest.mark.parametrize(
+    ("detector", "said", "expected"),
+    [
+        ("yolov5n", {}, (0.3, 0.1)),
+        ("pgd-det-light?input_width=640", {}, (0.13, 0.05)),
+        ("pgd-det-light", {"high": 0.03}, (0.03, 0.03)),
+        ("pgd-det-light", {"low": 0.2}, (0.2, 0.2)),
+        ("fcos3d-light", {"high": 0.5, "low": 0.0}, (0.5, 0.0)),
+    ],
+)
+def test_a_suite_takes_the_scores_that_suit_the_detector(
+    detector: str, said: dict[str, float], expected: tuple[float, float]
+) -> None:
+    settings = tracking_of(detector, confirm=3, **said)
+    assert (settings.high, settings.low, settings.confirm) == (*expected, 3)
+    with pytest.raises(ConfigError, match="low <= high"):
+        tracking_of(detector, high=0.1, low=0.2)

@@ -71,8 +71,9 @@ def test_settings_that_cannot_be() -> None:
     [
         ({"detector": "truth", "reads_signs": True}, "system a, detector truth: signs are read by a detector with"),
         ({"detector": "yolov5n", "sign_memory": 1.0}, "system a: sign_memory can only be used with reads_signs: true"),
+        ({"detector": "pgd-det-light", "high": 0.1, "low": 0.2}, "system a: low 0.2 is above high 0.1"),
     ],
 )
-def test_a_suite_says_before_it_drives_that_signs_cannot_be_read(settings: dict, message: str) -> None:
+def test_a_suite_says_before_it_drives_what_does_not_fit(settings: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         PerceivingSystem(name="a", **settings).check()

@@ -185,7 +185,7 @@ class Gap(ScenarioKind):
             about: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
             if seen is not None:
                 own, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), seen.perceived(k)
-                metrics |= component_metrics(trace, perceived, sure=own.high)
+                metrics |= component_metrics(trace, perceived, sure=own.tracking.high)
                 metrics |= sign_metrics(trace, perceived, signs_of_route(town(trace.town), trace.route))
                 metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
                 about["cause"] = cause_of_collision(trace, perceived)

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
-from ssad.drivers.perceiving.tracker import Tracking
+from ssad.drivers.perceiving.tracker import Tracking, tracking_of
 
 
 class OneCamera(Perceiving):
@@ -14,14 +14,12 @@ class OneCamera(Perceiving):
 
     Attributes:
         weights: Name of the detector; results depend on them.
-        usual: Settings of the tracker unless others are given; detectors differ in how high they score.
     """
 
     weights: ClassVar[str]
-    usual: ClassVar[Tracking] = Tracking()
 
     def __init__(self, *, width: int = 640, tracking: Tracking | None = None, **settings: Any) -> None:
-        own = tracking or self.usual
+        own = tracking or tracking_of(self.weights)
         super().__init__(CameraEyes(self.weights, front(width), threshold=own.low), tracking=own, **settings)
 
 
@@ -29,14 +27,12 @@ class Fcos3d(OneCamera):
     """One front camera, FCOS3D light."""
 
     weights = "fcos3d-light"
-    usual = Tracking(high=0.25)
 
 
 class PgdDet(OneCamera):
     """One front camera, PGD-Det light."""
 
     weights = "pgd-det-light"
-    usual = Tracking(high=0.13, low=0.05)
 
 
 class Yolov5n(OneCamera):

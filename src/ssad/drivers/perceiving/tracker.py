@@ -27,6 +27,7 @@ from ssad.drivers.perceiving.kalman import distance, predict, update
 from ssad.drivers.perceiving.objects import I64, Objects
 
 MEMORY = 0.8  # what earlier sizes, kinds and headings weigh, at each hit
+SCORES = {"fcos3d-light": (0.25, 0.1), "pgd-det-light": (0.13, 0.05)}  # high and low of detectors that score low
 SURE = 2.0  # standard deviations of its speed above which the direction in which a track moves is its heading
 
 
@@ -64,6 +65,25 @@ class Tracking:
             )
         if min(self.gate, self.density, self.speed) <= 0.0 or self.stranger < 0.0:
             raise ConfigError("tracking needs gate, density and speed above 0, and stranger of at least 0")
+
+
+def tracking_of(detector: str, *, high: float | None = None, low: float | None = None, **settings: Any) -> Tracking:
+    """Settings for a detector: unless others are said, from the scores that it gives.
+
+    Args:
+        detector: Its name, with or without options.
+        high: As of `Tracking`; one of `high` and `low` alone takes the other along where they would cross.
+        low: As of `Tracking`.
+        settings: The other fields of `Tracking`.
+
+    Raises:
+        ConfigError: high is below low, or a setting is out of its range.
+    """
+    plain = Tracking()
+    usual_high, usual_low = SCORES.get(detector.partition("?")[0], (plain.high, plain.low))
+    if low is None:
+        low = usual_low if high is None else min(usual_low, high)
+    return Tracking(high=max(usual_high, low) if high is None else high, low=low, **settings)
 
 
 @dataclass(frozen=True, slots=True)
