@@ -192,6 +192,17 @@ def test_what_failed_is_kept_until_it_is_retried(tmp_path: Path) -> None:
     assert len(read_lines(tmp_path / "results.jsonl")) == 3
 
 
+def test_a_slice_that_is_retried_leaves_what_failed_elsewhere(tmp_path: Path) -> None:
+    plan = own_kind.Dice().plan(dice(["raise"], systems=["fair", "loaded"]))
+    quiet = Resources(1, console=Console(file=io.StringIO()))
+    assert {record["status"] for record in run(plan, tmp_path, quiet)} == {"failed"}
+    kept = read_lines(tmp_path / "results.jsonl")
+    run(plan, tmp_path, quiet, retry=True, only={"system": ["fair"]})
+    after = read_lines(tmp_path / "results.jsonl")
+    assert [line["system"] for line in after] == ["loaded", "fair"]
+    assert after[0] == next(line for line in kept if line["system"] == "loaded")
+
+
 def test_a_worker_that_cannot_start_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_kind.Dice, "start", _cannot_start)
     monkeypatch.setattr("ssad.bench.run._start", _cannot_start)

@@ -79,6 +79,16 @@ def test_what_failed_goes_when_it_is_to_be_tried_again(tmp_path: Path) -> None:
         assert (tmp_path / name).read_bytes() == (tmp_path / "never" / name).read_bytes()
 
 
+def test_only_what_is_named_is_tried_again(tmp_path: Path) -> None:
+    with Store.open(tmp_path, RUN) as store:
+        for key in ("a", "b"):
+            store.append({"key": key, "status": "failed"}, None)
+    with Store.open(tmp_path, RUN, retry=["b", "c"]) as store:
+        assert (list(store.results), store.retried) == (["a"], {"b"})
+    with Store.open(tmp_path, RUN, retry=[]) as store:
+        assert (list(store.results), store.retried) == (["a"], frozenset())
+
+
 def test_a_last_line_of_zeros_is_cut(tmp_path: Path) -> None:
     fill(tmp_path, "a", "b")
     with open(tmp_path / "results.jsonl", "ab") as file:

@@ -40,7 +40,7 @@ def run(
         plan: The whole run.
         folder: Where its records are.
         resources: What may be used.
-        retry: Whether failed cells run again.
+        retry: Whether failed cells run again; of a slice, those that are in it.
         only: Run a slice: the cells whose fields, or name, have one of these values, as text.
 
     Raises:
@@ -51,7 +51,7 @@ def run(
     resources = resources or Resources(device=plan.device)
     chosen = slice_of(plan, only or {})  # a wrong name is told before there is a folder
     header, out = run_json(plan), Path(folder).resolve()
-    with Store.open(folder, header, retry=retry) as store:
+    with Store.open(folder, header, retry=[cell.key for cell in chosen] if retry else False) as store:
         missing = sorted((c for c in chosen if c.key not in store.results), key=plan.kind.order)
         if missing:
             again = [cell for cell in missing if cell.key in store.retried]

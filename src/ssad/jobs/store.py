@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -44,13 +44,20 @@ class Store:
         self.retried: frozenset[str] = frozenset()
 
     @classmethod
-    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: bool = False, what: str = "ssad run") -> Self:
+    def open(
+        cls,
+        folder: str | Path,
+        run: Mapping[str, Any],
+        *,
+        retry: bool | Collection[str] = False,
+        what: str = "ssad run",
+    ) -> Self:
         """Take the folder for this run: a new one, or one of the same run that is resumed.
 
         Args:
             folder: The folder.
             run: What run.json shall say; its "identity" must equal that of a run already there.
-            retry: Whether cells that failed are treated as if they had never run.
+            retry: Whether cells that failed, or those of these keys, are treated as if they had never run.
             what: The command, for messages.
 
         Raises:
@@ -68,7 +75,7 @@ class Store:
             raise
         return store
 
-    def _begin(self, run: Mapping[str, Any], *, retry: bool) -> None:
+    def _begin(self, run: Mapping[str, Any], *, retry: bool | Collection[str]) -> None:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
         results, ends = scan_lines(self.folder / RESULTS)
@@ -77,9 +84,10 @@ class Store:
             if record["key"] in self.results:
                 raise StoreError(f"{self.folder / RESULTS}: the cell {record['key']} is there twice")
             self.results[record["key"]] = record
-        self.retried = frozenset(record["key"] for record in results if retry and _failed(record))
+        failed = frozenset(record["key"] for record in results if _failed(record))
+        self.retried = failed.intersection(failed if retry is True else retry or ())
         if self.retried:
-            self.results = {key: record for key, record in self.results.items() if not _failed(record)}
+            self.results = {key: record for key, record in self.results.items() if key not in self.retried}
             lines = [safeio.dump_json(record) + "\n" for record in self.results.values()]
             safeio.write_atomic(self.folder / RESULTS, "".join(lines))
         episodes, ends = scan_lines(self.folder / EPISODES)
