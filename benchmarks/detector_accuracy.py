@@ -101,7 +101,7 @@ class Clips:
         self.crowd, self.target, self.distance = table[:, 6] > 0, table[:, 7] > 0, table[:, 8]
 
     def small(self, kind: str) -> np.ndarray[Any, Any]:
-        """Which objects are below 24 px, of this class and count."""
+        """Which objects of this class are below 24 px and count."""
         return ~self.crowd & (self.label == self.classes.index(kind)) & (self.side < SMALL)
 
     @cached_property
@@ -113,8 +113,8 @@ class Clips:
         """
         found = np.full(len(self.image), np.nan)
         shown = {file: number for number, file in enumerate(self.files)}
-        few = self.small("car")
-        wanted = {self.files[number] for number in np.unique(self.image[few])}
+        small = self.small("car")
+        wanted = {self.files[number] for number in np.unique(self.image[small])}
         for folder in dict.fromkeys(file.parents[1] for file in self.files):
             names = {file.name for file in wanted if file.parents[1] == folder}
             for one in clip_views(folder, split="test", only=names):
@@ -124,7 +124,7 @@ class Clips:
                 )
                 photons, dark = noise_levels(one.view.sensor.noise, float(picture.exposure[0]))
                 labels = label_picture(one.scene, one.view, picture)
-                for row in np.flatnonzero(few & (self.image == shown[folder / "images" / one.file])):
+                for row in np.flatnonzero(small & (self.image == shown[folder / "images" / one.file])):
                     own = picture.tag[0] == labels.tag[np.abs(labels.box - self.box[row]).max(1).argmin()]
                     noise = np.sqrt(np.mean(photons * behind[own] + dark**2))
                     found[row] = np.sqrt(np.mean((light[own] - behind[own]) ** 2)) / noise
@@ -171,7 +171,7 @@ def of_target(clips: Clips, found: Boxes2D, labels: int) -> dict[str, float]:
 
 def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
     """Cars below 24 px: how many are found from each score on, and how often a score of so much is right."""
-    car, weather, few = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small("car")
+    car, weather, small = clips.classes.index("car"), np.array(clips.weather)[clips.image], clips.small("car")
     matched = match_2d(clips.truth(~clips.crowd), found, labels=labels)
     assert found.score is not None
     assert matched.row is not None
@@ -182,8 +182,8 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
     for low, high in zip(SCORES, (1.01, *SCORES), strict=False):
         own = tiny & (score >= low) & (score < high)
         part = {"boxes": int(own.sum()), "right": float(matched.hit[own].mean()) if own.any() else float("nan")}
-        by_score[f"{low:g}-{high:g}"] = part | {"recall": recall(clips, found, few, labels, least=low)}
-    groups = {"all": few} | {light: few & (weather == light) for light in sorted(set(clips.weather))}
+        by_score[f"{low:g}-{high:g}"] = part | {"recall": recall(clips, found, small, labels, least=low)}
+    groups = {"all": small} | {light: small & (weather == light) for light in sorted(set(clips.weather))}
     by_light = {
         light: {
             "objects": int(own.sum()),
@@ -199,10 +199,10 @@ def small_cars(clips: Clips, found: Boxes2D, labels: int) -> dict[str, Any]:
 
 def by_contrast(clips: Clips, found: Boxes2D, labels: int) -> dict[str, dict[str, float]]:
     """How many small cars are found of those with a low contrast-to-noise ratio, and of the others."""
-    few, faint = clips.small("car"), clips.contrast < FAINT
+    small, faint = clips.small("car"), clips.contrast < FAINT
     return {
         name: {"objects": int(own.sum()), "clear": recall(clips, found, own, labels)}
-        for name, own in (("faint", few & faint), ("others", few & ~faint))
+        for name, own in (("faint", small & faint), ("others", small & ~faint))
     }
 
 
@@ -247,7 +247,6 @@ def flat_tables(name: str, clips: Clips, device: str) -> dict[str, Any]:
         values = average_precision(clips.truth(every), own, labels=labels)
         result.setdefault("enlarged", {})[str(width or "as they are")] = {
             "mean": float(np.nanmean(values)),
-            "car": float(values[car]),
             "target": of_target(clips, own, labels),
             "small": recall(clips, own, clips.small("car"), labels),
             "small, any": recall(clips, own, clips.small("car"), labels, least=SCORES[-1]),
@@ -403,8 +402,8 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         *lines,
         "Pixels are part of it: with the same weights a detector can enlarge the pictures before it looks",
         "(`make_detector(NAME, input_width=960)`, in suites `NAME?input_width=960`; 2.25 times the pixels). At",
-        "twice the width near objects are larger than those that were learned. Cars and people: the share that is",
-        f"found of those below {SMALL:g} px.",
+        "twice the width near objects are larger than those that were learned. In percent; cars and people: found of",
+        f"those below {SMALL:g} px.",
         "",
         *table(["detector", "width inside, px", *columns], rows),
     ]

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import json
 import sys
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.joined_runs import joined
+from benchmarks.joined_runs import joined, summary_of
 from ssad.bench.suite import load_suite
 from ssad.core.checkpoints import state_hash
 from ssad.evaluation.scene_boxes import detector_of
@@ -31,20 +30,14 @@ TABLES = (
 
 
 def store(folders: Sequence[Path]) -> None:
-    """Keep what the page needs of runs, and how many of their cells have run where."""
+    """Keep what the page needs of runs."""
     run = joined(folders, _place)
-    told = {key: value for key, value in run.header.items() if key not in ("cells", "commands")}
-    told |= {
-        "command": run.header["commands"],
-        "planned": run.planned,
-        "ran": Counter(line["versions"]["device"] for line in run.lines if line["status"] == "ok"),
-    }
     tables = {table.name: table for table in section(run)[1]}
     for name in TABLES:
         (RESULTS / f"{name}.md").unlink(missing_ok=True)
         if name in tables:
             (RESULTS / f"{name}.md").write_text(to_markdown(tables[name]))
-    (RESULTS / "run.json").write_text(json.dumps(told, indent=1) + "\n")
+    (RESULTS / "run.json").write_text(json.dumps(summary_of(run, _place), indent=1) + "\n")
 
 
 def _place(row: Mapping[str, Any]) -> tuple[str, Setting]:
@@ -98,16 +91,14 @@ def page() -> str:
         f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
         "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
-        "",
     ]
     if len(about["ran"]) > 1:
-        spread = " and ".join(f"{count} cells on {device}" for device, count in about["ran"].items())
-        lines[-1:] = [f"{spread[0].upper()}{spread[1:]}.", ""]
-    if (ran := sum(about["ran"].values())) < about["planned"]:
-        missing = f"{about['planned'] - ran} of the {about['planned']} cells have not run, points of the curves"
-        lines[-1:] = [f"{missing} over budget and steps: n/a below.", ""]
+        lines.append(f"{' and '.join(f'{count} cells on {device}' for device, count in about['ran'].items())}.")
+    if gone := [*about["missing"], *about["failed"]]:
+        lines.append(f"Not there, so n/a or without a row: {', '.join(f'`{one}`' for one in gone)}.")
     if new := grown(about["suite"]):
-        lines[-1:] = [f"Added to the suite since, and not in these tables: {'; '.join(new)}.", ""]
+        lines.append(f"Added to the suite since, and not in these tables: {'; '.join(new)}.")
+    lines.append("")
     for name in (name for name in TABLES if (RESULTS / f"{name}.md").is_file()):
         lines += [(RESULTS / f"{name}.md").read_text().strip(), ""]
     return "\n".join(lines)

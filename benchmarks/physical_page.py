@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.joined_runs import joined
+from benchmarks.joined_runs import joined, summary_of
 from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
 from ssad.report.kinds.physical import section
@@ -46,15 +46,9 @@ def store(folders: Sequence[Path], name: str | None = None) -> None:
     """Keep what the page needs of runs of one suite."""
     run = joined(folders, _place)
     folder = RESULTS / (name or run.suite["name"])
-    about = {key: value for key, value in run.header.items() if key not in ("cells", "commands")}
-    about |= {
-        "command": run.header["commands"],
-        "refused": Counter(line["reason"] for line in run.failures),
-        "cells": run.planned, "cells_done": len(run.lines) - len(run.failures),
-    }  # fmt: skip
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    (folder / "run.json").write_text(json.dumps(about, indent=1) + "\n")
+    (folder / "run.json").write_text(json.dumps(summary_of(run, _place), indent=1) + "\n")
     for table in section(run)[1]:
         (folder / f"{table.name}.md").write_text(to_markdown(table))
 
@@ -81,17 +75,20 @@ def part(name: str) -> list[str]:
     lines = [f"## `{name}`", "", suite["description"], "", *([NOTES[name], ""] if name in NOTES else [])]
     if old:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
-    commands = [about["command"]] if isinstance(about["command"], str) else about["command"]
+    commands = ", then ".join(f"`{one}`" for one in about["command"])
     lines += [
-        f"Command: {', then '.join(f'`{one}`' for one in commands)}. Software: torch {about['versions']['torch']}. "
+        f"Command: {commands}. Software: torch {about['versions']['torch']}. "
         "Weights: " + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items()) + ".",
         "",
     ]
-    done, cells, refused = about.get("cells_done"), about.get("cells"), about.get("refused", {})
-    for reason, count in refused.items():
-        lines += [f"> **{count} of {cells} cells were refused:** {reason}.", ""]
-    if done is not None and done + sum(refused.values()) != cells:
-        lines += [f"> **The run was stopped: {done} of {cells} cells are there.** What is missing is n/a.", ""]
+    for reason, count in Counter(about["failed"].values()).items():
+        lines += [f"> **{count} of {about['planned']} cells were refused:** {reason}.", ""]
+    if about["missing"]:
+        done = about["planned"] - len(about["missing"])
+        lines += [
+            f"> **The run was stopped: {done} of {about['planned']} cells are there.** What is missing is n/a.",
+            "",
+        ]
     tables = [*sorted(folder.glob(f"{FIRST}*.md")), *(folder / f"{other}.md" for other in OTHERS)]
     for table in tables:
         if table.is_file() and table.read_text().count("\n| ") > 1:  # one is its head

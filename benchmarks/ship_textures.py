@@ -2,7 +2,7 @@
 
 RUN is what `ssad run physical` wrote. For each attack that was trained against a detector and scored on it, NAME.png
 and NAME.json go to src/ssad/scenarios/static/physical/trained; suites then name them (`texture: NAME`). What did not
-beat the controls is left out: the run's own records decide.
+beat the controls is left out: the run's own records decide. Of an attack in several sizes the last that did ships.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
         )  # fmt: skip
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"
+        if name in found:
+            print(f"{name}: {spec['options']} ships, not {found[name][1].options}")
         found[name] = (line, card)
     make_folder(SHIPPED)
     for name, (line, card) in found.items():

@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[1]
 )
 def test_a_page_is_made_from_the_measurements(script: str, name: str) -> None:
     page = runpy.run_path(str(ROOT / "benchmarks" / f"{script}.py"))["page"]()
-    assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python benchmarks/{script}.py"
+    assert page == (ROOT / "docs" / f"{name}.md").read_text(), f"run python -m benchmarks.{script}"
 
 
 @pytest.mark.parametrize("kind", WEATHERS)

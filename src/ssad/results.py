@@ -224,8 +224,8 @@ def run(
         workers: Number of worker processes; None: one per core; 0: all in this process.
         ray: Address of a Ray cluster to run on; "local" starts one here.
         retry: Whether failed cells are run again.
-        only: Run a slice: the cells whose fields have one of these values, such as {"perturbation": ["none", "fog"]};
-            slices add up in the folder.
+        only: Run a slice: the cells whose fields, or name, have one of these values, such as
+            {"perturbation": ["none", "fog"]}; "none,fog" means the same. Slices add up in the folder.
         quiet: Whether nothing is said about progress.
 
     Returns:

@@ -64,24 +64,23 @@ def run(
 def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
     """The cells whose fields, or name, have one of these values, as text.
 
-    A value "a,b" means a and b, unless there is one that is called so. ConfigError: no cell has such a field or value.
+    A value "a,b" means a and b, unless a cell has that very value. ConfigError: no cell has such a field or value.
     """
-    fields = {cell.key: {"name": cell.name, **{key: str(value) for key, value in cell.fields.items()}}
-              for cell in plan.cells}  # fmt: skip
-    cells = list(plan.cells)
-    for name, texts in only.items():
-        known = dict.fromkeys(own[name] for own in fields.values() if name in own)
+    rows = [{"name": cell.name} | {key: str(value) for key, value in cell.fields.items()} for cell in plan.cells]
+    chosen = list(zip(plan.cells, rows, strict=True))
+    for field, texts in only.items():
+        known = dict.fromkeys(row[field] for row in rows if field in row)
         if not known:
-            raise unknown_name("field of cells", name, dict.fromkeys(one for own in fields.values() for one in own))
+            raise unknown_name("field of cells", field, dict.fromkeys(key for row in rows for key in row))
         wanted = [value for text in texts for value in ([text] if text in known else text.split(","))]
         for value in wanted:
             if value not in known:
-                raise unknown_name(name, value, known)
-        cells = [cell for cell in cells if fields[cell.key].get(name) in wanted]
-    if not cells:
-        asked = " and ".join(f"{name}={','.join(wanted)}" for name, wanted in only.items())
+                raise unknown_name(field, value.strip(), known)
+        chosen = [(cell, row) for cell, row in chosen if row.get(field) in wanted]
+    if not chosen:
+        asked = " and ".join(f"{field}={','.join(texts)}" for field, texts in only.items())
         raise ConfigError(f"no cell has {asked} at once")
-    return cells
+    return [cell for cell, _ in chosen]
 
 
 def run_json(plan: Plan) -> dict[str, Any]:

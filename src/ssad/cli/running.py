@@ -40,7 +40,7 @@ def run(
         typer.Option(
             "--only",
             metavar="FIELD=VALUE,...",
-            help="Run a slice: cells with these values, such as perturbation=none,fog; slices add up in the folder.",
+            help="Run a slice: cells with these values, such as perturbation=none,fog or name=NAME; slices add up.",
         ),
     ] = None,
     print_config: Annotated[

@@ -83,8 +83,9 @@ class PerceivingSystem(Schema):
     @property
     def tracking(self) -> Tracking:
         """Settings of the tracker, with the scores that suit the detector unless others are said."""
-        said = {"confirm": self.confirm, "reserve": self.reserve}
-        return tracking_of(self.detector, high=self.high, low=self.low, **said)
+        return tracking_of(
+            self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve
+        )  # fmt: skip
 
     def check(self) -> None:
         """ConfigError: scores cross, settings of stop signs do not fit, or its detector knows no stop signs."""
@@ -106,7 +107,7 @@ class PerceivingSystem(Schema):
         device: str = "cpu",
     ) -> Perceiving:
         """The driver, its detector on a device; `watch` is told what it sees, `repair` mends one error of it."""
-        cameras = front(self.width, self.cameras)
+        cameras, tracking = front(self.width, self.cameras), self.tracking
         eyes: CameraEyes | PerfectEyes
         if self.perfect:
             eyes = PerfectEyes(
@@ -114,11 +115,11 @@ class PerceivingSystem(Schema):
             )  # fmt: skip
         else:
             detector = _detector(self.detector, self.weights, self.input_width, device)
-            eyes = CameraEyes(detector, cameras, threshold=self.tracking.low, device=device)
+            eyes = CameraEyes(detector, cameras, threshold=tracking.low, device=device)
         memory = float("inf") if self.sign_memory is None else self.sign_memory
-        signs = SignReading(confirm=self.confirm, memory=memory, score=self.tracking.high) if self.reads_signs else None
+        signs = SignReading(confirm=self.confirm, memory=memory, score=tracking.high) if self.reads_signs else None
         return Perceiving(
-            eyes, rate=self.rate, latency=self.latency, tracking=self.tracking, watch=watch, repair=repair, signs=signs
+            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
         )  # fmt: skip
 
 

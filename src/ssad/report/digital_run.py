@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ssad.core.registry import label_of, split_weights
-from ssad.metrics.uncertainty import replicate_difference
+from ssad.metrics import replicate_difference
 from ssad.report.kinds.detection import cell_of, replicates_of
 from ssad.report.load import Run
 from ssad.report.tables import Cell
@@ -211,8 +211,10 @@ def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> 
     if clean is None or own is None or not clean["metrics"].get(metric) or own["metrics"].get(metric) is None:
         return Cell(math.nan)
     pairs = zip(replicates_of(clean, metric), replicates_of(own, metric), strict=True)
-    shares = [1.0 - after / before for before, after in pairs if before > 0]
-    return _difference(1.0 - own["metrics"][metric] / clean["metrics"][metric], shares, own)
+    value = 1.0 - own["metrics"][metric] / clean["metrics"][metric]
+    if value < -1.0:  # a share of the clean score less one of at most twice that: in [-1, 1], as differences of scores
+        return Cell(100.0 * value)
+    return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], own)
 
 
 def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, metric: str) -> Cell:
@@ -225,7 +227,5 @@ def gained_cell(run: DigitalRun, detectors: tuple[str, str], setting: Setting, m
 
 
 def _difference(value: float, replicates: Sequence[float], record: Mapping[str, Any]) -> Cell:
-    if value < -1.0:
-        return Cell(100.0 * value)
     found = replicate_difference(value, replicates, n=record["n"], clusters=int(record.get("scenes", 0)))
     return Cell.of(found.scaled(100.0))

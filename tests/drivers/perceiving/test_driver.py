@@ -249,7 +249,7 @@ def test_what_the_tracker_may_use_is_what_the_detector_is_asked_for(system: type
     ("detector", "said", "expected"),
     [
         ("yolov5n", {}, (0.3, 0.1)),
-        ("pgd-det-light?input_width=640", {}, (0.13, 0.05)),
+        ("pgd-det-light?input_width=640@mine", {}, (0.13, 0.05)),
         ("pgd-det-light", {"high": 0.03}, (0.03, 0.03)),
         ("pgd-det-light", {"low": 0.2}, (0.2, 0.2)),
         ("fcos3d-light", {"high": 0.5, "low": 0.0}, (0.5, 0.0)),

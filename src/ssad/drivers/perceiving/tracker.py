@@ -22,12 +22,16 @@ from scipy.optimize import linear_sum_assignment
 
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
+from ssad.core.registry import Reference
 from ssad.core.types import F64, I32, AgentKind
 from ssad.drivers.perceiving.kalman import distance, predict, update
 from ssad.drivers.perceiving.objects import I64, Objects
 
 MEMORY = 0.8  # what earlier sizes, kinds and headings weigh, at each hit
-SCORES = {"fcos3d-light": (0.25, 0.1), "pgd-det-light": (0.13, 0.05)}  # high and low of detectors that score low
+SCORES = {
+    "fcos3d-light": (0.25, 0.1), "fcos3d-light-robust": (0.25, 0.1), "pgd-det-light": (0.13, 0.05),
+}  # fmt: skip
+"""High and low for detectors that score low."""
 SURE = 2.0  # standard deviations of its speed above which the direction in which a track moves is its heading
 
 
@@ -71,8 +75,8 @@ def tracking_of(detector: str, *, high: float | None = None, low: float | None =
     """Settings for a detector: unless others are said, from the scores that it gives.
 
     Args:
-        detector: Its name, with or without options.
-        high: As of `Tracking`; one of `high` and `low` alone takes the other along where they would cross.
+        detector: Its name, with or without options and label.
+        high: As of `Tracking`. One of `high` and `low` alone takes the other along where they would cross.
         low: As of `Tracking`.
         settings: The other fields of `Tracking`.
 
@@ -80,7 +84,7 @@ def tracking_of(detector: str, *, high: float | None = None, low: float | None =
         ConfigError: high is below low, or a setting is out of its range.
     """
     plain = Tracking()
-    usual_high, usual_low = SCORES.get(detector.partition("?")[0], (plain.high, plain.low))
+    usual_high, usual_low = SCORES.get(Reference.of(detector).name, (plain.high, plain.low))
     if low is None:
         low = usual_low if high is None else min(usual_low, high)
     return Tracking(high=max(usual_high, low) if high is None else high, low=low, **settings)

@@ -142,7 +142,8 @@ def interval_note(run: Resampled) -> str:
     if run.scenes < MIN_CLUSTERS:
         few = "one scene is" if run.scenes == 1 else f"{run.scenes} scenes are"
         return f"no intervals, since {few} too few (five are the least)."
-    return f"95 % intervals by the bootstrap over {run.scenes} scenes (beta limits; Student's t for ratios)."
+    limits = "beta limits; Student's t for ratios that may exceed 1"
+    return f"95 % intervals by the bootstrap over {run.scenes} scenes ({limits})."
 
 
 def title_of(shift: str) -> str:
