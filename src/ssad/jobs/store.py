@@ -21,6 +21,8 @@ from ssad.core.jsonl import scan_lines
 
 RUN, RESULTS, EPISODES, LOCK = "run.json", "results.jsonl", "episodes.jsonl", ".lock"
 
+Retry = bool | Collection[str]  # whether all that failed is tried again, or which keys
+
 
 def read_run(folder: str | Path) -> dict[str, Any]:
     """run.json of a results folder. StoreError when the folder holds no run."""
@@ -44,14 +46,7 @@ class Store:
         self.retried: frozenset[str] = frozenset()
 
     @classmethod
-    def open(
-        cls,
-        folder: str | Path,
-        run: Mapping[str, Any],
-        *,
-        retry: bool | Collection[str] = False,
-        what: str = "ssad run",
-    ) -> Self:
+    def open(cls, folder: str | Path, run: Mapping[str, Any], *, retry: Retry = False, what: str = "ssad run") -> Self:
         """Take the folder for this run: a new one, or one of the same run that is resumed.
 
         Args:
@@ -75,7 +70,7 @@ class Store:
             raise
         return store
 
-    def _begin(self, run: Mapping[str, Any], *, retry: bool | Collection[str]) -> None:
+    def _begin(self, run: Mapping[str, Any], *, retry: Retry) -> None:
         if not (self.folder / RUN).exists():
             safeio.write_atomic(self.folder / RUN, safeio.dump_json(dict(run), indent=1) + "\n")
         results, ends = scan_lines(self.folder / RESULTS)
