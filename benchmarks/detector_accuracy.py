@@ -391,13 +391,20 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         f"100 of them, at a score of {CLEAR:g}: {shares[0]}; of 100 of the {others} others: {shares[1]}.",
         "",
     ]
+    first = next(iter(next(iter(flat.values()))["target"]))  # of the recordings
     rows = [
-        [name, width, *(f"{100 * score:.1f}" for score in (row["mean"], row["target"]["e_drive"])),
+        [name, width, *(f"{100 * score:.1f}" for score in (row["mean"], row["target"][first])),
          *(f"{100 * row[key]:.0f}" for key in ("small", "small, any", "people"))]
         for name, one in flat.items()
         for width, row in one["enlarged"].items()
     ]  # fmt: skip
-    columns = ("mean AP50", "target of e_drive", f"cars, score {CLEAR:g}", f"cars, {least}", f"people, score {CLEAR:g}")
+    columns = (
+        "mean AP50",
+        f"target of {first}",
+        f"cars, score {CLEAR:g}",
+        f"cars, {least}",
+        f"people, score {CLEAR:g}",
+    )
     return [
         *lines,
         "Pixels are part of it: with the same weights a detector can enlarge the pictures before it looks",

@@ -74,7 +74,7 @@ def _said(told: Any) -> Any:
 def page() -> str:
     """The page."""
     about = json.loads((RESULTS / "run.json").read_text())
-    data, versions, weights = about["data"], about["versions"], about["weights"]
+    data, weights = about["data"], about["weights"]
     old = outdated()
     towns = " and ".join(data["towns"])
     lines = ["# The shipped 3D detectors under digital attacks", ""]
@@ -88,12 +88,13 @@ def page() -> str:
         *about["command"],
         "```",
         f"Data: {data['scenes']} drives of {data['seconds']:g} s in each of {towns}, which were not used for training;",
-        f"six cameras, {data['width']} pixels wide. Software: torch {versions['torch']}. Weights:",
+        f"six cameras, {data['width']} pixels wide. Software: torch {' and '.join(about['torch'])}. Weights:",
         ", ".join(f"`{name}` {digest}" for name, digest in weights.items()) + ".",
         "What the attacks, losses and rules of the audit are: [attacks.md](attacks.md).",
     ]
     if len(about["ran"]) > 1:
         lines.append(f"{' and '.join(f'{count} cells on {device}' for device, count in about['ran'].items())}.")
+        lines.append("A cell that failed on one device kept the scenes that it had finished there.")
     if gone := [*about["missing"], *about["failed"]]:
         lines.append(f"Not there, so n/a or without a row: {', '.join(f'`{one}`' for one in gone)}.")
     if new := grown(about["suite"]):

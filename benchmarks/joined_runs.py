@@ -44,7 +44,7 @@ def joined(folders: Sequence[Path], place: Callable[[Mapping[str, Any]], Hashabl
 
 def summary_of(run: Run, place: Callable[[Mapping[str, Any]], Hashable]) -> dict[str, Any]:
     """run.json of a joined run without its cells: with all commands, how many cells were planned and have run on each
-    device, the names of those that have not run, and why others failed.
+    device, with which PyTorch, the names of those that have not run, and why others failed.
     """
     names = {place(cell): cell["name"] for cell in run.header["cells"]}
     there = {place(line) for line in run.lines}
@@ -52,6 +52,7 @@ def summary_of(run: Run, place: Callable[[Mapping[str, Any]], Hashable]) -> dict
         "command": run.header["commands"],
         "planned": run.planned,
         "ran": Counter(line["versions"]["device"] for line in run.lines if line["status"] == "ok"),
+        "torch": sorted({line["versions"]["torch"] for line in run.lines if "torch" in line["versions"]}),
         "missing": [name for cell, name in names.items() if cell not in there],
         "failed": {names[place(line)]: line["reason"] for line in run.failures},
     }  # fmt: skip

@@ -77,7 +77,7 @@ def part(name: str) -> list[str]:
         lines += [f"> **Measured with earlier weights of {' and '.join(old)}.**", ""]
     commands = ", then ".join(f"`{one}`" for one in about["command"])
     lines += [
-        f"Command: {commands}. Software: torch {about['versions']['torch']}. "
+        f"Command: {commands}. Software: torch {' and '.join(about['torch'])}. "
         "Weights: " + ", ".join(f"`{key}` {digest}" for key, digest in about["weights"].items()) + ".",
         "",
     ]

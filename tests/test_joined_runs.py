@@ -17,7 +17,13 @@ def cell(name: str, device: str) -> dict[str, Any]:
 
 
 def line(name: str, device: str, status: str = "ok", **more: Any) -> dict[str, Any]:
-    return {**cell(name, device), "status": status, "reason": "", "versions": {"device": device}, **more}
+    return {
+        **cell(name, device),
+        "status": status,
+        "reason": "",
+        "versions": {"device": device, "torch": f"2.{len(device)}"},
+        **more,
+    }
 
 
 def place(row: Mapping[str, Any]) -> str:
@@ -45,6 +51,7 @@ def test_what_failed_in_one_run_is_taken_from_the_other(tmp_path: Path) -> None:
     told = summary_of(run, place)
     assert "cells" not in told
     assert told["command"] == ["ssad run digital --device cuda", "ssad run digital --device cpu"]
+    assert told["torch"] == ["2.3", "2.4"]
     assert told["weights"] == {"one": "a", "two": "b"}
     assert (told["planned"], told["ran"], told["missing"], told["failed"]) == (
         4, {"cuda": 1, "cpu": 1}, ["d"], {"c": "time"},
