@@ -348,8 +348,9 @@ def test_slices_add_up_to_the_run(tmp_path: Path) -> None:
         ({"number": ["a,b"]}, ["fair/a,b#0", "loaded/a,b#0"]),  # there is one that is called so
         ({"number": ["a,c"]}, ["fair/a#0", "fair/c#0", "loaded/a#0", "loaded/c#0"]),
         ({"name": ["loaded/a,b#0", "fair/c#0"]}, ["fair/c#0", "loaded/a,b#0"]),
+        ({"number": [7]}, ["fair/7#0", "loaded/7#0"]),
     ],
 )
-def test_a_slice_is_named_by_values_with_or_without_commas(only: dict[str, list[str]], expected: list[str]) -> None:
-    plan = own_kind.Dice().plan(dice(["a", "c", "a,b"], systems=["fair", "loaded"]))
+def test_a_slice_is_named_by_values_with_or_without_commas(only: dict[str, list[Any]], expected: list[str]) -> None:
+    plan = own_kind.Dice().plan(dice(["a", "c", "a,b", "7"], systems=["fair", "loaded"]))
     assert sorted(cell.name for cell in slice_of(plan, only)) == sorted(expected)

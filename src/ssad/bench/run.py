@@ -72,13 +72,13 @@ def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
         known = dict.fromkeys(row[field] for row in rows if field in row)
         if not known:
             raise unknown_name("field of cells", field, dict.fromkeys(key for row in rows for key in row))
-        wanted = [value for text in texts for value in ([text] if text in known else text.split(","))]
+        wanted = [value for text in map(str, texts) for value in ([text] if text in known else text.split(","))]
         for value in wanted:
             if value not in known:
                 raise unknown_name(field, value.strip(), known)
         chosen = [(cell, row) for cell, row in chosen if row.get(field) in wanted]
     if not chosen:
-        asked = " and ".join(f"{field}={','.join(texts)}" for field, texts in only.items())
+        asked = " and ".join(f"{field}={','.join(map(str, texts))}" for field, texts in only.items())
         raise ConfigError(f"no cell has {asked} at once")
     return [cell for cell, _ in chosen]
 

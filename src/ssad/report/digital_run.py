@@ -212,7 +212,7 @@ def lost_cell(run: DigitalRun, detector: str, setting: Setting, metric: str) -> 
         return Cell(math.nan)
     pairs = zip(replicates_of(clean, metric), replicates_of(own, metric), strict=True)
     value = 1.0 - own["metrics"][metric] / clean["metrics"][metric]
-    if value < -1.0:  # a share of the clean score less one of at most twice that: in [-1, 1], as differences of scores
+    if value < -1.0:  # else it lies in [-1, 1], as a difference of two scores does
         return Cell(100.0 * value)
     return _difference(value, [1.0 - after / before for before, after in pairs if before > 0], own)
 
