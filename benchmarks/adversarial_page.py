@@ -30,17 +30,40 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "adversarial"
 DOCUMENT = ROOT / "docs" / "generators.md"
 COLUMNS = {
-    "CR": "CR", "CR_any": "any collision", "off_road": "adversary off the road", "hit_others": "in others",
-    "moving": "ego moves", "impact_speed": "impact, m/s", "avoided_by_reg157": "R157 avoids",
-    "avoided_by_cc": "CC", "avoided_by_rss": "RSS", "avoided_by_fsm": "FSM", "avoided_by_limit": "a manoeuvre",
-    "attributable": "any careful driver", "within_limits": "within limits", "realism": "realism",
+    "CR": "CR",
+    "CR_any": "any collision",
+    "off_road": "adversary off the road",
+    "hit_others": "in others",
+    "moving": "ego moves",
+    "impact_speed": "impact, m/s",
+    "avoided_by_reg157": "R157 avoids",
+    "avoided_by_cc": "CC",
+    "avoided_by_rss": "RSS",
+    "avoided_by_fsm": "FSM",
+    "avoided_by_limit": "a manoeuvre",
+    "attributable": "any careful driver",
+    "within_limits": "within limits",
+    "realism": "realism",
     "seconds": "CPU s a base",
-}  # fmt: skip
+}
 """Metric of a record -> head of its column."""
 OF_ALL = (
-    "CR", "off_road", "hit_others", "moving", "impact_speed", "avoided_by_reg157", "avoided_by_cc", "avoided_by_rss",
-    "avoided_by_fsm", "avoided_by_limit", "attributable", "distinct", "within_limits", "realism", "seconds",
-)  # fmt: skip
+    "CR",
+    "off_road",
+    "hit_others",
+    "moving",
+    "impact_speed",
+    "avoided_by_reg157",
+    "avoided_by_cc",
+    "avoided_by_rss",
+    "avoided_by_fsm",
+    "avoided_by_limit",
+    "attributable",
+    "distinct",
+    "within_limits",
+    "realism",
+    "seconds",
+)
 """Columns of the tables of all generators, where bases have many rollouts."""
 HEADS = COLUMNS | {"CR": "CR within the budget", "distinct": "distinct"}
 SECTION = """### All generators
@@ -227,8 +250,10 @@ def careful(by_name: dict[str, list[dict[str, Any]]], shares: dict[str, float]) 
         moving = cases(by_name[name], "moving")
         if len(avoided) >= 5 and ways and moving:
             mean = [sum(case.value for case in group.values()) / len(group) for group in (avoided, ways, moving)]
-            parts.append(f"{mean[0]:.2f} of `{name}`'s collisions ({mean[1]:.2f} by some manoeuvre; "
-                         f"the ego moves in {mean[2]:.2f})")  # fmt: skip
+            parts.append(
+                f"{mean[0]:.2f} of `{name}`'s collisions ({mean[1]:.2f} by some manoeuvre; "
+                f"the ego moves in {mean[2]:.2f})"
+            )
     return f"The careful driver of UN Regulation 157 avoids {' and '.join(parts)}." if parts else ""
 
 

@@ -90,9 +90,13 @@ def beside_art(folder: Path, count: int, steps: int) -> dict[str, Any]:
     with steady(detector):
         wrapped = ForArt(detector, images, truth)
         estimator = PyTorchObjectDetector(
-            model=wrapped, input_shape=tuple(images.shape[1:]), clip_values=(0.0, 1.0), channels_first=True,
-            attack_losses=("box", "obj", "cls"), device_type="cpu",
-        )  # fmt: skip
+            model=wrapped,
+            input_shape=tuple(images.shape[1:]),
+            clip_values=(0.0, 1.0),
+            channels_first=True,
+            attack_losses=("box", "obj", "cls"),
+            device_type="cpu",
+        )
         labels = [
             {"boxes": t.box.numpy(), "labels": t.label.numpy(), "scores": np.ones(len(t.label), np.float32)}
             for t in truth
@@ -133,9 +137,13 @@ class Classifier(nn.Module):
         super().__init__()
         torch.manual_seed(0)
         self.net = nn.Sequential(
-            nn.Conv2d(3, 24, 3, padding=1), nn.ReLU(), nn.Conv2d(24, 48, 3, 2, 1), nn.ReLU(), nn.Flatten(),
+            nn.Conv2d(3, 24, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(24, 48, 3, 2, 1),
+            nn.ReLU(),
+            nn.Flatten(),
             nn.Linear(48 * 16, 10),
-        )  # fmt: skip
+        )
 
     def dense(self, images: Tensor, intrinsic: Tensor | None = None) -> Dense:
         """One location, no objectness."""
@@ -240,9 +248,12 @@ def overhead(folder: Path, count: int, repeats: int) -> dict[str, Any]:
         ratios.append(seconds["whole"] / seconds["bare"])
     ratios.sort()
     return {
-        "images": len(images), "repeats": repeats, "ratio": statistics.median(ratios), "ratios": ratios,
+        "images": len(images),
+        "repeats": repeats,
+        "ratio": statistics.median(ratios),
+        "ratios": ratios,
         "interval": [ratios[1], ratios[-2]],
-    }  # fmt: skip
+    }
 
 
 def precisions(folder: Path, count: int, steps: int, device: str, repeats: int) -> dict[str, Any]:
@@ -260,21 +271,39 @@ def precisions(folder: Path, count: int, steps: int, device: str, repeats: int) 
         for number, precision in product(range(repeats + 1), ("float32", "bfloat16")):
             began = time.perf_counter()
             found = run_attack(
-                make_attack("pgd", steps=steps), detector, images, truth, Budget(px(RADIUS)), objective=loss,
-                intrinsic=lens, precision=precision, check=False,
-            )  # fmt: skip
+                make_attack("pgd", steps=steps),
+                detector,
+                images,
+                truth,
+                Budget(px(RADIUS)),
+                objective=loss,
+                intrinsic=lens,
+                precision=precision,
+                check=False,
+            )
             reached[precision] = [float(found.before.mean()), float(found.after.mean())]
             if number:  # the first warms up
                 seconds[precision].append(time.perf_counter() - began)
         rows += [
-            {"detector": name, "loss": loss, "precision": precision, "before": reached[precision][0],
-             "after": reached[precision][1], "s": statistics.median(seconds[precision])}
+            {
+                "detector": name,
+                "loss": loss,
+                "precision": precision,
+                "before": reached[precision][0],
+                "after": reached[precision][1],
+                "s": statistics.median(seconds[precision]),
+            }
             for precision in seconds
-        ]  # fmt: skip
+        ]
     return {
-        "images": len(images), "radius_px": RADIUS, "steps": steps, "repeats": repeats, "rows": rows,
-        "device": torch.cuda.get_device_name() if device == "cuda" else device, "versions": _versions(),
-    }  # fmt: skip
+        "images": len(images),
+        "radius_px": RADIUS,
+        "steps": steps,
+        "repeats": repeats,
+        "rows": rows,
+        "device": torch.cuda.get_device_name() if device == "cuda" else device,
+        "versions": _versions(),
+    }
 
 
 def _versions() -> dict[str, str]:

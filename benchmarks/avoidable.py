@@ -232,16 +232,20 @@ def table(data: dict[str, Any]) -> list[str]:
     for ego in EGOS:
         measured = {name: data[name][ego] for name in TRIALS if name in data}
         survived = len(next(iter(measured.values()))["rows"])
-        lines += [f"`{ego}`, which survives {survived} of {SCENARIOS} scenarios in plain replay:", "",
-                  "| Adv.PPO | any collision | CR | graded | R157 avoids | ego moves | hit from behind | oncoming |",
-                  "|---|---|---|---:|---|---:|---:|---:|"]  # fmt: skip
+        lines += [
+            f"`{ego}`, which survives {survived} of {SCENARIOS} scenarios in plain replay:",
+            "",
+            "| Adv.PPO | any collision | CR | graded | R157 avoids | ego moves | hit from behind | oncoming |",
+            "|---|---|---|---:|---|---:|---:|---:|",
+        ]
         for name, one in measured.items():
             rows, hits = one["rows"], one["collisions"]
             parts = [share({who: row[k] for who, row in rows.items()}) for k in (0, 1)]
             kinds: Sequence[Any] = [
-                [row[1] for row in hits.values()], [row[2] < -2.0 for row in hits.values()],
+                [row[1] for row in hits.values()],
+                [row[2] < -2.0 for row in hits.values()],
                 [abs(row[3]) > np.radians(120.0) for row in hits.values()],
-            ]  # fmt: skip
+            ]
             means = [f"{np.mean(kind):.2f}" if hits else "" for kind in kinds]
             avoided = share({who: row[0] for who, row in hits.items()})
             lines.append(f"| {' | '.join([TRIALS[name].says, *parts, str(len(hits)), avoided, *means])} |")

@@ -118,14 +118,21 @@ def measured(name: str, *, device: str, seconds: float, warm: int, width: int, s
     stages = watch.seconds | {"rest": wall - sum(watch.seconds.values())}
     looks = seconds * rate
     return {
-        "case": name, "detector": detector, "cameras": len(cameras), "picture": [width, width * 9 // 16],
-        "scenes": scenes, "still running": running, "rate": rate, "simulated s": seconds, "wall s": round(wall, 3),
+        "case": name,
+        "detector": detector,
+        "cameras": len(cameras),
+        "picture": [width, width * 9 // 16],
+        "scenes": scenes,
+        "still running": running,
+        "rate": rate,
+        "simulated s": seconds,
+        "wall s": round(wall, 3),
         "times real time, all scenes at once": round(seconds / wall, 3),
         "times real time, scenes added up": round(scenes * seconds / wall, 2),
         "images/s": round(looks * scenes * len(cameras) / wall, 1),
         "ms a look": {stage: round(1e3 * taken / looks, 2) for stage, taken in stages.items()},
         "share": {stage: round(taken / wall, 3) for stage, taken in stages.items()},
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

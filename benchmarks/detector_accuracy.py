@@ -90,10 +90,16 @@ class Clips:
             self.folders += [folder.name] * len(data["images"])
             self.classes = tuple(c["name"] for c in sorted(data["categories"], key=lambda c: c["id"]))
             rows += [
-                (place[one["image_id"]], one["category_id"] - 1, *one["bbox"], one["iscrowd"], one["target"],
-                 one["distance"])
+                (
+                    place[one["image_id"]],
+                    one["category_id"] - 1,
+                    *one["bbox"],
+                    one["iscrowd"],
+                    one["target"],
+                    one["distance"],
+                )
                 for one in data["annotations"]
-            ]  # fmt: skip
+            ]
         table = np.array(rows, np.float64)
         self.image, self.label = table[:, 0].astype(np.int32), table[:, 1].astype(np.int32)
         self.box = np.concatenate([table[:, 2:4], table[:, 2:4] + table[:, 4:6]], 1)
@@ -279,8 +285,10 @@ def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
         result.setdefault("by light", {})[group] = numbers(scores, few=True) | {"scenes": len(members)}
         if group != "all":
             continue
-        result |= numbers(scores) | {"errors": scores.label_tp_errors, "truth": dict(Counter(
-            CLASSES[int(k)] for k in real.label))}  # fmt: skip
+        result |= numbers(scores) | {
+            "errors": scores.label_tp_errors,
+            "truth": dict(Counter(CLASSES[int(k)] for k in real.label)),
+        }
         result["pairs"] = pairs(real, seen)
         limits = scene_intervals(matches, truth.scene, generator=generator("accuracy", name), replicates=REPLICATES)
         result["intervals"] = {"mAP": limits["mean_ap"], "NDS": limits["nd_score"]}
@@ -290,9 +298,10 @@ def solid_tables(name: str, root: Path, device: str) -> dict[str, Any]:
             kept = [k for k, count in enumerate(own.truth) if count >= FEW]
             values = list(own.mean_dist_aps.values())
             result.setdefault("by distance", {})[f"{low:g}-{high:g}"] = {
-                "mAP": float(np.mean([values[k] for k in kept])), "AP_car": own.mean_dist_aps["car"],
+                "mAP": float(np.mean([values[k] for k in kept])),
+                "AP_car": own.mean_dist_aps["car"],
                 "objects": len(near.label),
-            }  # fmt: skip
+            }
     return result
 
 
@@ -357,10 +366,12 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
         one["by light"] = _with_all_but_night(one["by light"])
     scores, lights = (list(next(iter(parts.values()))[key].items()) for key in ("by score", "by light"))
     rows = [
-        [key.replace("-", " to ").replace("1.01", "1"),
-         *(f"{100 * one['by score'][key][what]:.0f}" for one in parts.values() for what in ("right", "recall"))]
+        [
+            key.replace("-", " to ").replace("1.01", "1"),
+            *(f"{100 * one['by score'][key][what]:.0f}" for one in parts.values() for what in ("right", "recall")),
+        ]
         for key, _ in scores
-    ]  # fmt: skip
+    ]
     lines = [
         f"### Cars below {SMALL:g} px",
         f"In percent. *Right*: share of the car boxes below {SMALL:g} px with a score in this range that lie on a car",
@@ -375,10 +386,13 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
     least = f"score {SCORES[-1]:g}"
     what = {"clear": f"score {CLEAR:g}", "any": least, "any, IoU 0.3": f"{least}, IoU 0.3"}
     rows = [
-        [light, *(f"{100 * one['by light'][light][key]:.0f}" for one in parts.values() for key in what),
-         str(row["objects"])]
+        [
+            light,
+            *(f"{100 * one['by light'][light][key]:.0f}" for one in parts.values() for key in what),
+            str(row["objects"]),
+        ]
         for light, row in lights
-    ]  # fmt: skip
+    ]
     lines += table(["light", *(f"{n}: {text}" for n in parts for text in what.values()), "cars"], rows)
     faint, others = (next(iter(parts.values()))["by contrast"][key]["objects"] for key in ("faint", "others"))
     shares = [
@@ -393,11 +407,15 @@ def small_lines(flat: dict[str, Any]) -> list[str]:
     ]
     first = next(iter(next(iter(flat.values()))["target"]))  # of the recordings
     rows = [
-        [name, width, *(f"{100 * score:.1f}" for score in (row["mean"], row["target"][first])),
-         *(f"{100 * row[key]:.0f}" for key in ("small", "small, any", "people"))]
+        [
+            name,
+            width,
+            *(f"{100 * score:.1f}" for score in (row["mean"], row["target"][first])),
+            *(f"{100 * row[key]:.0f}" for key in ("small", "small, any", "people")),
+        ]
         for name, one in flat.items()
         for width, row in one["enlarged"].items()
-    ]  # fmt: skip
+    ]
     columns = (
         "mean AP50",
         f"target of {first}",
@@ -451,11 +469,14 @@ def page() -> str:
     lines += table(
         ["light", *(f"{n}, {what}" for n in names for what in ("mean", "car")), "pictures"],
         [
-            [light, *(f"{100 * flat[n]['by light'][light][w]:.1f}" for n in names for w in ("mean", "car")),
-             str(row["pictures"])]
+            [
+                light,
+                *(f"{100 * flat[n]['by light'][light][w]:.1f}" for n in names for w in ("mean", "car")),
+                str(row["pictures"]),
+            ]
             for light, row in first["by light"].items()
         ],
-    )  # fmt: skip
+    )
     lines += [
         "Recall in percent: share of the objects that a detection with a score of 0.25 and an IoU of 0.5 finds. Size:",
         "the root of the box's area.",
@@ -469,8 +490,9 @@ def page() -> str:
             low, high = part.split("-")
             cells = [
                 f"{100 * flat[n][f'by {what}'][k][part]['recall']:.0f}" if part in flat[n][f"by {what}"][k] else ""
-                for k in kinds for n in names
-            ]  # fmt: skip
+                for k in kinds
+                for n in names
+            ]
             rows.append([f"{low} to {high} {unit}" if float(high) < 1e8 else f"{low} {unit} and more", *cells])
         lines += table([what, *(f"{k.replace('_', ' ')}, {n}" for k in kinds for n in names)], rows)
     lines += small_lines(flat)
@@ -490,13 +512,18 @@ def page() -> str:
     lines += table(
         ["class", *(f"{n}: {what}" for n in names for what in ("AP", "m", "rad", "m/s")), "objects"],
         [
-            [c.replace("_", " "),
-             *(text for n in names for text in
-               (f"{100 * solid[n][f'AP_{c}']:.1f}", *(number(solid[n]["errors"][c][e]) for e in shown))),
-             f"{solid[names[0]]['truth'].get(c, 0):,}"]
+            [
+                c.replace("_", " "),
+                *(
+                    text
+                    for n in names
+                    for text in (f"{100 * solid[n][f'AP_{c}']:.1f}", *(number(solid[n]["errors"][c][e]) for e in shown))
+                ),
+                f"{solid[names[0]]['truth'].get(c, 0):,}",
+            ]
             for c in CLASSES
         ],
-    )  # fmt: skip
+    )
     lines += turned_lines(solid)
     for what in ("light", "distance"):
         size = "scenes" if what == "light" else "objects"
@@ -504,11 +531,14 @@ def page() -> str:
         lines += table(
             [what, *(f"{n}: {s.replace('AP_car', 'AP of cars')}" for n in names for s in scores), size],
             [
-                [f"{group} m" if what == "distance" else group,
-                 *(f"{100 * solid[n][f'by {what}'][group][s]:.1f}" for n in names for s in scores), f"{row[size]:,}"]
+                [
+                    f"{group} m" if what == "distance" else group,
+                    *(f"{100 * solid[n][f'by {what}'][group][s]:.1f}" for n in names for s in scores),
+                    f"{row[size]:,}",
+                ]
                 for group, row in solid[names[0]][f"by {what}"].items()
             ],
-        )  # fmt: skip
+        )
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -26,9 +26,15 @@ from ssad.detectors import make_detector
 from ssad.detectors.adapters.torchvision_models import torchvision_detector
 
 CASES = {  # name -> height, width
-    "fcos3d-light": (450, 800), "pgd-det-light": (450, 800), "fcos3d": (450, 800), "pgd-det": (450, 800),
-    "yolov3-tiny": (640, 640), "yolov5n": (640, 640), "yolov5s": (640, 640), "yolov3": (640, 640),
-}  # fmt: skip
+    "fcos3d-light": (450, 800),
+    "pgd-det-light": (450, 800),
+    "fcos3d": (450, 800),
+    "pgd-det": (450, 800),
+    "yolov3-tiny": (640, 640),
+    "yolov5n": (640, 640),
+    "yolov5s": (640, 640),
+    "yolov3": (640, 640),
+}
 BESIDE = "torchvision:fcos_resnet50_fpn"
 
 

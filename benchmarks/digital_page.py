@@ -24,9 +24,18 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "digital"
 PAGE = ROOT / "docs" / "digital.md"
 TABLES = (
-    "digital", "lost", "halving", "transfer", "defences", "hardened", "blackbox", "targets", "distances", "classes",
+    "digital",
+    "lost",
+    "halving",
+    "transfer",
+    "defences",
+    "hardened",
+    "blackbox",
+    "targets",
+    "distances",
+    "classes",
     "audit",
-)  # fmt: skip
+)
 
 
 def store(folders: Sequence[Path]) -> None:

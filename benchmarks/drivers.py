@@ -34,8 +34,10 @@ RESULTS = ROOT / "benchmarks" / "results" / "drivers.json"
 DOCUMENT = ROOT / "docs" / "drivers.md"
 SYSTEMS = ("autopilot", "blind", *(name for name in LEARNED if name in REGISTERED))
 EGOS = ("autopilot", "ppo")
-PUBLISHED = {"autopilot": {"Town02": (0.01, 0.17), "Town05": (0.00, 0.21)},
-             "ppo": {"Town02": (0.34, 0.81), "Town05": (0.11, 0.59)}}  # fmt: skip
+PUBLISHED = {
+    "autopilot": {"Town02": (0.01, 0.17), "Town05": (0.00, 0.21)},
+    "ppo": {"Town02": (0.34, 0.81), "Town05": (0.11, 0.59)},
+}
 
 
 def episodes_of(name: str) -> tuple[list[Episode], dict[str, Any]]:
@@ -70,8 +72,13 @@ def drive(name: str) -> dict[str, Any]:
             "off": plain(estimate([case(e, r.off_road_fraction) for e, r in cases], "bounded")),
             "speed": float(np.mean([r.driven / r.time for r in rows])),
         }
-        print(name, system, {key: value for key, value in table[system].items() if key == "speed"},
-              *(f"{key} {text(table[system][key])}" for key in ("CR", "RC", "off")), flush=True)  # fmt: skip
+        print(
+            name,
+            system,
+            {key: value for key, value in table[system].items() if key == "speed"},
+            *(f"{key} {text(table[system][key])}" for key in ("CR", "RC", "off")),
+            flush=True,
+        )
     return table
 
 

@@ -48,20 +48,48 @@ RUNS = ("benign", "damage", "confirm", "signs")
 HALVED, SMALL = 0.5, 0.1  # falls of AP, as shares of the clean one
 UNCHANGED = 0.03  # CR within which an interval must lie
 KEPT = (
-    "case", "cause", "cluster", "family", "group", "key", "perturbation", "reason", "repaired", "severity", "status",
+    "case",
+    "cause",
+    "cluster",
+    "family",
+    "group",
+    "key",
+    "perturbation",
+    "reason",
+    "repaired",
+    "severity",
+    "status",
     "system",
-)  # fmt: skip
+)
 MEASURED = (
-    "AP", "recall", "missed_burst", "distance_share", "target_recall", "believed", "phantoms", "collision",
-    "route_completion", "min_ttc", "hard_braking", "impact_speed", "HOTA", "stop_signs", "sign_recall",
-    "sign_recall_5_20", "sign_recall_20_40", "sign_read_at",
-)  # fmt: skip
+    "AP",
+    "recall",
+    "missed_burst",
+    "distance_share",
+    "target_recall",
+    "believed",
+    "phantoms",
+    "collision",
+    "route_completion",
+    "min_ttc",
+    "hard_braking",
+    "impact_speed",
+    "HOTA",
+    "stop_signs",
+    "sign_recall",
+    "sign_recall_5_20",
+    "sign_recall_20_40",
+    "sign_read_at",
+)
 CEILING = "line-of-sight"
 NATURAL = ("Twinford", "Crossgate")  # groups of the sets of natural traffic
 COLUMNS = (
-    ("AP", "AP", "bounded"), ("target_recall", "recall of the object that matters", "bounded"),
-    ("HOTA", "HOTA", "bounded"), ("collision", "CR", "share"), ("route_completion", "RC", "bounded"),
-)  # fmt: skip
+    ("AP", "AP", "bounded"),
+    ("target_recall", "recall of the object that matters", "bounded"),
+    ("HOTA", "HOTA", "bounded"),
+    ("collision", "CR", "share"),
+    ("route_completion", "RC", "bounded"),
+)
 
 
 def keep(name: str, folder: Path, *, add: bool = False) -> None:
@@ -226,17 +254,27 @@ def figure(run: Run, path: Path) -> None:
         own = [(lost, rise) for (_, name, _), lost, rise in told if family[name] == kind]
         if own:
             axes.errorbar(
-                [lost for lost, _ in own], [rise.mean for _, rise in own],
+                [lost for lost, _ in own],
+                [rise.mean for _, rise in own],
                 yerr=[[rise.mean - rise.low for _, rise in own], [rise.high - rise.mean for _, rise in own]],
-                fmt="o", color=shade, label=kind, markersize=4.5, elinewidth=0.7, alpha=0.85,
-            )  # fmt: skip
+                fmt="o",
+                color=shade,
+                label=kind,
+                markersize=4.5,
+                elinewidth=0.7,
+                alpha=0.85,
+            )
     for (_, name, severity), lost, rise in _outstanding(run, told):
         text = f"{name.removeprefix('wear-').removesuffix('-yolov5n-twinford')} {severity}"
         left = lost > 0.75
         axes.annotate(
-            text, (lost, rise.mean), xytext=(-6 if left else 6, 5), textcoords="offset points", fontsize=8,
+            text,
+            (lost, rise.mean),
+            xytext=(-6 if left else 6, 5),
+            textcoords="offset points",
+            fontsize=8,
             ha="right" if left else "left",
-        )  # fmt: skip
+        )
     axes.set_xlabel("share of the AP that is lost, on the pictures of the drives")
     axes.set_ylabel("rise of the collision rate, in the same drives")
     axes.legend(frameon=False, loc="upper left")
@@ -283,11 +321,20 @@ def _damages(run: Run, runs: Mapping[str, Run]) -> list[str]:
     every = conditions(run)
     under = [c for c in every if c[2]]
     return [
-        "### Damage to the component and to the system", "",
-        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer(run)}", "",
-        f"![Share of AP lost against rise of the collision rate]({FIGURE.name})", "", _smaller(rank_table(run)), "",
-        *_examples(run), "", _smaller(drop_table(run)), "", _smaller(cause_table(run)),
-    ]  # fmt: skip
+        "### Damage to the component and to the system",
+        "",
+        f"{_measured(run)} {len(under)} conditions of {len({c[1] for c in under})} perturbations.{fewer(run)}",
+        "",
+        f"![Share of AP lost against rise of the collision rate]({FIGURE.name})",
+        "",
+        _smaller(rank_table(run)),
+        "",
+        *_examples(run),
+        "",
+        _smaller(drop_table(run)),
+        "",
+        _smaller(cause_table(run)),
+    ]
 
 
 def _examples(run: Run) -> list[str]:
@@ -328,8 +375,10 @@ def _speed() -> list[str]:
         return []
     told = json.loads(path.read_text())
     lines = ["", "### Speed of the loop", "", f"{told['device']}, `benchmarks/closed_loop_speed.py`:", ""]
-    lines += ["| detector | cameras | scenes | looks a second | times real time, all at once | pictures/s |",
-              "|---|---:|---:|---:|---:|---:|"]  # fmt: skip
+    lines += [
+        "| detector | cameras | scenes | looks a second | times real time, all at once | pictures/s |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
     for case in told["cases"]:
         speed = case["scenes"] * case["cameras"] * case["rate"] * case["simulated s"] / case["wall s"]
         lines.append(

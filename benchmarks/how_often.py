@@ -113,11 +113,20 @@ def coverage(given: argparse.Namespace) -> None:
             branching.append([branch.probability, branch.low, branch.high, branch.effective, branch.work])
         if number % 20 == 19 or number == given.repeats - 1:
             data = {
-                "scenario": SCENARIO, "noise": vars(noise_of(given)), "repeats": number + 1, "share": given.share,
-                "each": given.each, "device": given.device, "room": 1.0, "learning": learning,
-                "training": training, "seconds": time.perf_counter() - began, "columns": COLUMNS,
-                "importance": rounded(sampling), "splitting": rounded(branching),
-            }  # fmt: skip
+                "scenario": SCENARIO,
+                "noise": vars(noise_of(given)),
+                "repeats": number + 1,
+                "share": given.share,
+                "each": given.each,
+                "device": given.device,
+                "room": 1.0,
+                "learning": learning,
+                "training": training,
+                "seconds": time.perf_counter() - began,
+                "columns": COLUMNS,
+                "importance": rounded(sampling),
+                "splitting": rounded(branching),
+            }
             write(given.json, data)
             mean = float(np.mean(sampling, axis=0)[0])
             held = np.mean([low <= mean <= high for _, low, high, _, _ in sampling])

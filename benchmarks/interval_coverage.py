@@ -24,11 +24,20 @@ SHARES = (0.01, 0.05, 0.1, 0.3, 0.5, 0.8, 0.95)
 DESIGNS = ((8, 1), (32, 1), (150, 1), (5, 10), (8, 4), (32, 10), (150, 3))
 CORRELATIONS = (0.0, 0.3, 0.8, 1.0)
 STRATA = {
-    "all 0.01": [0.01] * 8, "all 0.05": [0.05] * 8, "all 0.1": [0.1] * 8, "all 0.3": [0.3] * 8, "all 0.5": [0.5] * 8,
-    "all 0.8": [0.8] * 8, "half 0, half 1": [0.0, 1.0] * 4, "half 0.05, half 0.95": [0.05, 0.95] * 4,
-    "half 0.2, half 0.8": [0.2, 0.8] * 4, "half 0.1, half 1": [0.1, 1.0] * 4, "one 0.5, others 0": [0.5] + [0.0] * 7,
-    "0.05 to 0.95": np.linspace(0.05, 0.95, 8).tolist(), "the paper's TD3": [1, 0.25, 0.75, 0, 1, 1, 1, 1],
-}  # fmt: skip
+    "all 0.01": [0.01] * 8,
+    "all 0.05": [0.05] * 8,
+    "all 0.1": [0.1] * 8,
+    "all 0.3": [0.3] * 8,
+    "all 0.5": [0.5] * 8,
+    "all 0.8": [0.8] * 8,
+    "half 0, half 1": [0.0, 1.0] * 4,
+    "half 0.05, half 0.95": [0.05, 0.95] * 4,
+    "half 0.2, half 0.8": [0.2, 0.8] * 4,
+    "half 0.1, half 1": [0.1, 1.0] * 4,
+    "one 0.5, others 0": [0.5] + [0.0] * 7,
+    "0.05 to 0.95": np.linspace(0.05, 0.95, 8).tolist(),
+    "the paper's TD3": [1, 0.25, 0.75, 0, 1, 1, 1, 1],
+}
 
 
 def design(clusters: int, cases: int, strata: int = 1) -> Clusters:
@@ -233,8 +242,10 @@ def exact_lines() -> list[str]:
     shares, counts = np.linspace(0.1, 0.9, 801), (5, 6, 8, 16, 32)
     lines = [
         "Few independent yes-or-no cases, computed: least–greatest coverage for p from 0.1 to 0.9. Last row: what no",
-        "interval can go below where it is 93 or more.", "", *head("Method", [f"{n} cases" for n in counts]),
-    ]  # fmt: skip
+        "interval can go below where it is 93 or more.",
+        "",
+        *head("Method", [f"{n} cases" for n in counts]),
+    ]
     for method in ("here", "Clopper-Pearson", "mid-P", "Wilson", "Jeffreys", "logit", "logit, Student"):
         found = [exact_coverage(n, *exact_limits(method, n), shares) for n in counts]
         lines.append(row(method, [f"{percent(one.min())}–{percent(one.max())}" for one in found]))
@@ -285,10 +296,12 @@ def tables(draws: int, detector_draws: int) -> list[str]:
         found = [share_coverage(each, design(4, cases, 8), c, draws) for cases, c in kinds]
         lines.append(row(name, [percent(value) for value in found]))
     lines += [
-        "", "Means. In brackets: percent of the data sets that have an interval, where not all have one; a dash: fewer",
-        "than 10. In the last rows the average of eight groups with four clusters each.", "",
+        "",
+        "Means. In brackets: percent of the data sets that have an interval, where not all have one; a dash: fewer",
+        "than 10. In the last rows the average of eight groups with four clusters each.",
+        "",
         *head("Data", list(MEANS)),
-    ]  # fmt: skip
+    ]
     for clusters, cases in DESIGNS:
         for correlation in (0.0, 0.3, 0.8) if cases > 1 else (0.0,):
             name = f"{clusters} x {cases}" + (f", correlation {correlation:g}" if cases > 1 else "")

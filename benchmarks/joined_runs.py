@@ -55,4 +55,4 @@ def summary_of(run: Run, place: Callable[[Mapping[str, Any]], Hashable]) -> dict
         "torch": sorted({line["versions"]["torch"] for line in run.lines if "torch" in line["versions"]}),
         "missing": [name for cell, name in names.items() if cell not in there],
         "failed": {names[place(line)]: line["reason"] for line in run.failures},
-    }  # fmt: skip
+    }

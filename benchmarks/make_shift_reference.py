@@ -38,10 +38,16 @@ def published(name: str, severity: int, image: np.ndarray, seed: int) -> np.ndar
     """A picture under a published shift."""
     if name == "rain":
         layer = iaa.RainLayer(
-            density=DENSITY[severity - 1], density_uniformity=(0.8, 1.0), drop_size=(0.4, 0.6),
-            drop_size_uniformity=(0.2, 0.5), angle=(-15, 15), speed=(0.04, 0.20), blur_sigma_fraction=(0.0001, 0.001),
-            blur_sigma_limits=(0.5, 3.75), seed=seed,
-        )  # fmt: skip
+            density=DENSITY[severity - 1],
+            density_uniformity=(0.8, 1.0),
+            drop_size=(0.4, 0.6),
+            drop_size_uniformity=(0.2, 0.5),
+            angle=(-15, 15),
+            speed=(0.04, 0.20),
+            blur_sigma_fraction=(0.0001, 0.001),
+            blur_sigma_limits=(0.5, 3.75),
+            seed=seed,
+        )
     else:
         kind = iaa.imgcorruptlike.Snow if name == "snow" else iaa.imgcorruptlike.Fog
         layer = kind(severity=severity, seed=seed)

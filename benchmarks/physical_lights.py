@@ -57,9 +57,17 @@ def rear(clip: LitClip) -> tuple[float, float]:
 def flood(clip: LitClip) -> SceneEdit:
     """The brightest lamp on the whole rear, white."""
     values = {
-        "lumens": 3000.0, "distance": 4.0, "height": 1.0, "aside": 0.0, "aim_left": 0.0,
-        "aim_up": 0.5 * clip.target.height, "beam": 0.3, "red": 1.0, "green": 1.0, "blue": 1.0,
-    }  # fmt: skip
+        "lumens": 3000.0,
+        "distance": 4.0,
+        "height": 1.0,
+        "aside": 0.0,
+        "aim_left": 0.0,
+        "aim_up": 0.5 * clip.target.height,
+        "beam": 0.3,
+        "red": 1.0,
+        "green": 1.0,
+        "blue": 1.0,
+    }
     return Flashlight().edit(values, clip.target)
 
 
@@ -96,11 +104,15 @@ def main() -> None:
         sun, lux = np.array([rear(clip) for clip in clips]).T
         none = SceneEdit(cards=(BLIND,))
         row: dict[str, Any] = {
-            "hour": hour, "pictures": len(clips), "drives": len({drive_of(clip.clip.row) for clip in clips}),
-            "sunlit": float((sun > SUNLIT).mean()), "sun": float(sun.max()), "lux": float(np.median(lux)),
+            "hour": hour,
+            "pictures": len(clips),
+            "drives": len({drive_of(clip.clip.row) for clip in clips}),
+            "sunlit": float((sun > SUNLIT).mean()),
+            "sun": float(sun.max()),
+            "lux": float(np.median(lux)),
             "clean": scores(pictures, clips, detector, lambda _: NO_EDIT),
             "flooded": scores(pictures, clips, detector, flood),
-        }  # fmt: skip
+        }
         if hour != "night":
             row["no_sun"] = scores(pictures, clips, detector, lambda _, none=none: none)
         rows.append(row)
@@ -109,10 +121,8 @@ def main() -> None:
     line = 2.0 * laser.fan * laser.distance
     lamps = {
         "laser": [laser.watts * 683.0 / (line * width) for width in laser.width[::-1]],
-        "flashlight": [
-            lamp.lumens / (np.pi * (away * lamp.beam[1]) ** 2) for away in lamp.distance[::-1]
-        ],
-    }  # fmt: skip
+        "flashlight": [lamp.lumens / (np.pi * (away * lamp.beam[1]) ** 2) for away in lamp.distance[::-1]],
+    }
     RESULTS.write_text(json.dumps({"rows": rows, "lux": lamps}, indent=1) + "\n")
 
 

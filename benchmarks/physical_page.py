@@ -26,13 +26,14 @@ RESULTS = ROOT / "benchmarks" / "results"
 PAGE = ROOT / "docs" / "physical_results.md"
 SUITES = {
     "physical": "ssad run physical --device cuda",
-    "physical-quick": "ssad run physical-quick", "physical-lights": "ssad run physical-lights",
+    "physical-quick": "ssad run physical-quick",
+    "physical-lights": "ssad run physical-lights",
     **{f"physical-{what}": f"ssad run physical-{what}" for what in ("sign", "walker", "road", "3d")},
     **{
         f"physical-{what}": f"ssad run benchmarks/physical-{what}.yaml"
         for what in ("around", "around-drives", "judges", "stealth")
     },
-}  # fmt: skip
+}
 NOTES = {
     "physical-around-drives": "Each pair of towns is a run of its own, with the textures that were trained in it.",
 }
@@ -99,13 +100,15 @@ def part(name: str) -> list[str]:
 def speed() -> list[str]:
     """What an attack step costs, where it was measured."""
     lines = [
-        "## What a step costs", "",
+        "## What a step costs",
+        "",
         "`python benchmarks/physical_speed.py [--device cuda] --out FILE`: showing a car at 20 m with a camouflage "
         "(print, light, lens, sensor, JPEG; forward and backward) and asking YOLOv5n, for a picture; and what the "
-        "paper's budget of 600 pictures x 200 epochs takes then.", "",
+        "paper's budget of 600 pictures x 200 epochs takes then.",
+        "",
         "| On | Shown | Pictures a step | Rendering, ms | Detector, ms | Share of rendering | Paper's budget, min |",
         "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     stages = []
     for path in sorted(RESULTS.glob("physical_speed*.json")):
         found = json.loads(path.read_text())
@@ -120,10 +123,14 @@ def speed() -> list[str]:
                 stages.append(f"| {found['device']} | {shown} | {times} |")
     if stages:
         lines += [
-            "", "Where it goes, ms a picture:", "",
+            "",
+            "Where it goes, ms a picture:",
+            "",
             "| On | Shown | Print | Light | Lens, sensor, JPEG | Detector, both ways | Back through these | "
-            "Back to the texture |", "|---|---|---|---|---|---|---|---|", *stages,
-        ]  # fmt: skip
+            "Back to the texture |",
+            "|---|---|---|---|---|---|---|---|",
+            *stages,
+        ]
     return [*lines, ""]
 
 
@@ -134,15 +141,17 @@ def patch() -> list[str]:
     if not rows:
         return []
     lines = [
-        "## What limits a patch", "",
+        "## What limits a patch",
+        "",
         "`python benchmarks/physical_patch.py`: Adv. Patch on the rear against YOLOv5n, trained on "
         f"{rows[0]['pictures']} pictures of Twinford for {rows[0]['epochs']} epochs, with one thing after the other "
         "made easier for it. Own: in the pictures of its training, the most that it can reach; test: in as many of "
         "Oldmarket, both printed exactly. AP50 and mean score of the target, and the share of its box that "
-        "the patch covers, in percent.", "",
+        "the patch covers, in percent.",
+        "",
         "| Adv. Patch | Covers | Own AP50 | Own score | Test AP50 | Test score | Random patch, score |",
         "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     columns = [
         ("own", "AP50"),
         ("own", "confidence"),
@@ -161,7 +170,8 @@ def light() -> list[str]:
     found = json.loads((RESULTS / "physical_lights.json").read_text())
     rows = found["rows"]
     lines = [
-        "## What lights have to work with", "",
+        "## What lights have to work with",
+        "",
         f"`python benchmarks/physical_lights.py`: {rows[0]['pictures']} pictures of {rows[0]['drives']} drives in "
         "Oldmarket. Sunlit: pictures in which the sun gives a fifth of the light on the target's rear or more, in the "
         "others a shadow there cannot be seen; no sun: all of it kept off the whole target, which no card can do; "
@@ -170,10 +180,13 @@ def light() -> list[str]:
         "| Hour | Sunlit | Light on the rear, lux | Clean AP50 | Clean score | No sun, AP50 | No sun, score "
         "| Flooded, AP50 | Flooded, score |",
         "|---|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for row in rows:
-        values = [row.get(group, {}).get(metric) for group in ("clean", "no_sun", "flooded")
-                  for metric in ("AP50", "confidence")]  # fmt: skip
+        values = [
+            row.get(group, {}).get(metric)
+            for group in ("clean", "no_sun", "flooded")
+            for metric in ("AP50", "confidence")
+        ]
         lines.append(
             f"| {row['hour']} | {percent(row['sunlit'])} | {row['lux']:.0f} | {' | '.join(map(percent, values))} |"
         )
@@ -189,10 +202,12 @@ def percent(value: float | None) -> str:
 def page() -> str:
     """The page."""
     lines = [
-        "# The shipped detectors under physical attacks", "",
+        "# The shipped detectors under physical attacks",
+        "",
         "`benchmarks/physical_page.py` makes this page from the tables that the commands below wrote, which are kept",
-        "in `benchmarks/results`. What the attacks, carriers and scores are: [physical.md](physical.md).", "",
-    ]  # fmt: skip
+        "in `benchmarks/results`. What the attacks, carriers and scores are: [physical.md](physical.md).",
+        "",
+    ]
     for name in SUITES:
         lines += part(name)
     return "\n".join(lines + patch() + light() + speed())

@@ -86,15 +86,20 @@ VARIANTS = {
     "small-steps": Variant("as it is, 4 pictures a step", settings={"batch": 4}),
     "one-box": Variant("as it is, the best box alone", settings={"objective": Hide()}),
     "whole-picture": Variant("as it is, trained on whole pictures", settings={"window": None}),
-    "alone": Variant("any colour, one patch for each picture, four times the epochs", settings=FREE, shown=any_light,
-                     longer=4, alone=True),
+    "alone": Variant(
+        "any colour, one patch for each picture, four times the epochs",
+        settings=FREE,
+        shown=any_light,
+        longer=4,
+        alone=True,
+    ),
     "wider": Variant("as it is, 1.4 x 0.6 m", 1.4, 0.6),
     "low": Variant("as it is, 1.9 x 0.5 m, the lower half", 1.9, 0.5, centre=(0.5, 0.7)),
     "rear": Variant("as it is, 1.9 x 0.86 m, the whole rear", 1.9, 0.86),
     "rear-longer": Variant("the whole rear, four times the epochs", 1.9, 0.86, longer=4),
     "rear-any-colour": Variant("the whole rear, any albedo, exact", 1.9, 0.86, settings=FREE, shown=any_light),
     "rear-slower": Variant("the whole rear, rate 0.01, four times the epochs", 1.9, 0.86, {"rate": 0.01}, longer=4),
-}  # fmt: skip
+}
 ORDER = {name: number for number, name in enumerate(VARIANTS)}
 
 
@@ -127,9 +132,16 @@ def measure(name: str, *, count: int, epochs: int, batch: int, home: Path, devic
 
     def train(pictures: list[View]) -> Tensor:
         return train_texture(
-            attack, detector, surface, pictures, start=control("grey", surface.size), printable=printable_colours(),
-            shown=variant.shown, key=("patch", name), device=device,
-        ).colour  # fmt: skip
+            attack,
+            detector,
+            surface,
+            pictures,
+            start=control("grey", surface.size),
+            printable=printable_colours(),
+            shown=variant.shown,
+            key=("patch", name),
+            device=device,
+        ).colour
 
     if variant.alone:
         views = views[:: max(1, len(views) // ALONE)]
@@ -141,9 +153,15 @@ def measure(name: str, *, count: int, epochs: int, batch: int, home: Path, devic
     boxes = [view.truth.box[0] for _, view in views]
     area = [float((box[2] - box[0]) * (box[3] - box[1])) for box in boxes]
     found: dict[str, Any] = {
-        "name": name, "about": variant.about, "pictures": count, "epochs": epochs, "batch": batch, "device": device,
-        "covers": sum(pixels) / sum(area), "seconds": round(time.perf_counter() - begin),
-    }  # fmt: skip
+        "name": name,
+        "about": variant.about,
+        "pictures": count,
+        "epochs": epochs,
+        "batch": batch,
+        "device": device,
+        "covers": sum(pixels) / sum(area),
+        "seconds": round(time.perf_counter() - begin),
+    }
 
     def scores(pictures: Iterator[tuple[str, Tensor, Truth]]) -> dict[str, float | None]:
         metrics = target_scores(list(sightings(detector, pictures)), replicates=0)["metrics"]

@@ -27,9 +27,13 @@ from ssad.scenarios.static.physical.shipped import load_texture
 OUT = Path(__file__).parents[1] / "docs" / "physical.jpg"
 TOWN, DETECTOR = "Oldmarket", "yolov5n"
 PANELS = {
-    "benign": None, "random patch": "adv-patch", "Adv. Patch": "adv-patch", "random camouflage": "das", "DAS": "das",
+    "benign": None,
+    "random patch": "adv-patch",
+    "Adv. Patch": "adv-patch",
+    "random camouflage": "das",
+    "DAS": "das",
     "TPA": "tpa",
-}  # fmt: skip
+}
 
 
 @torch.no_grad()

@@ -101,9 +101,12 @@ def measure(count: int, device: str) -> dict[str, Any]:
             }
             whole, detect = sum(stages.values()), stages["detector"]
             rows[name] = {
-                "render_ms": whole - detect, "detector_ms": detect, "share": 1.0 - detect / whole,
-                "paper_minutes": BUDGET * whole / 60e3, "stages_ms": stages,
-            }  # fmt: skip
+                "render_ms": whole - detect,
+                "detector_ms": detect,
+                "share": 1.0 - detect / whole,
+                "paper_minutes": BUDGET * whole / 60e3,
+                "stages_ms": stages,
+            }
     torch_device = torch.cuda.get_device_name() if device != "cpu" else f"CPU, {torch.get_num_threads()} thread"
     return {"device": torch_device, "images": count, "window": WINDOW, "batch": batch, "rows": rows}
 

@@ -36,19 +36,27 @@ def main() -> None:
     for run in range(options.runs):
         with tempfile.TemporaryDirectory() as folder:
             todo = Recording(
-                Path(folder) / "set", scenes=scenes, seconds=seconds, width=options.width, seed=run,
+                Path(folder) / "set",
+                scenes=scenes,
+                seconds=seconds,
+                width=options.width,
+                seed=run,
                 device=options.device,
-            )  # fmt: skip
+            )
             start = time.perf_counter()
             record_nuscenes(todo, workers=options.workers)
             times.append(time.perf_counter() - start)
             print(f"{times[-1]:.1f} s", flush=True)
     samples = scenes * each * len(TOWNS)
     found = {
-        "device": options.device, "machine": platform.machine(), "workers": options.workers, "width": options.width,
-        "samples": samples, "seconds": [round(t, 1) for t in times],
+        "device": options.device,
+        "machine": platform.machine(),
+        "workers": options.workers,
+        "width": options.width,
+        "samples": samples,
+        "seconds": [round(t, 1) for t in times],
         "s_per_1000": round(1000 * min(times) / samples, 1),
-    }  # fmt: skip
+    }
     print(json.dumps(found))
     if options.out:
         options.out.write_text(json.dumps(found, indent=1) + "\n")

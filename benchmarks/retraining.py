@@ -63,13 +63,22 @@ class Size:
 
 
 SMALL = Size(
-    seeds=2, steps=300_000, generators=("bayesian", "adv-ppo"), budget=8, every=2, attack=False,
+    seeds=2,
+    steps=300_000,
+    generators=("bayesian", "adv-ppo"),
+    budget=8,
+    every=2,
+    attack=False,
     changes=(("validate", 150_000),),
-)  # fmt: skip
+)
 TINY = Size(
-    seeds=2, steps=2048, generators=("random", "adv-ppo"), budget=4, every=16,
+    seeds=2,
+    steps=2048,
+    generators=("random", "adv-ppo"),
+    budget=4,
+    every=16,
     changes=(("scenes", 16), ("rollout", 64), ("batch", 256), ("validate", 1024), ("draws", 1)),
-)  # fmt: skip
+)
 
 
 def scenarios_of(refs: Sequence[str], every: int) -> tuple[list[Any], dict[str, Any]]:
@@ -92,9 +101,13 @@ def train(out: Path, size: Size, arm: str, seed: int) -> None:
     refs = [*LEARN, *(found_files(out, "learn", size) if arm == "after" else [])]
     changes = {**dict(size.changes), "steps": size.steps, "seed": seed if arm == "before" else 100 + seed}
     plan = DriverPlan(
-        "ppo", out / f"{arm}-{seed}", tuple(refs), (), tuple(changes.items()),
+        "ppo",
+        out / f"{arm}-{seed}",
+        tuple(refs),
+        (),
+        tuple(changes.items()),
         start=None if arm == "before" else out / f"before-{seed}",
-    )  # fmt: skip
+    )
     for line in run_driver_training(plan, say=lambda text: None):
         print(arm, seed, line.rpartition("/")[2], flush=True)
 
@@ -215,8 +228,9 @@ def work(out: Path, size: Size, function: Callable[..., None], arguments: tuple[
 
 def gather(out: Path, size: Size) -> dict[str, Any]:
     """All results in one: by base scenario, arm and seed."""
-    data: dict[str, Any] = {"size": {"seeds": size.seeds, "steps": size.steps, "generators": list(size.generators),
-                                     "budget": size.budget}}  # fmt: skip
+    data: dict[str, Any] = {
+        "size": {"seeds": size.seeds, "steps": size.steps, "generators": list(size.generators), "budget": size.budget}
+    }
     data["hunts"] = {
         path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted((out / "found").glob("*.json"))
     }

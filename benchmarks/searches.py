@@ -64,8 +64,12 @@ def table(data: dict[str, Any]) -> list[str]:
     """Generators by how much of the bases they break, and how much sooner than random search."""
     budget = data["budget"]
     parts = [budget // 4, budget]
-    heads = [*(f"CR within {n}" for n in parts), *(f"CR within {n}, less random's" for n in parts), "share of rollouts",
-             "share, less random's"]  # fmt: skip
+    heads = [
+        *(f"CR within {n}" for n in parts),
+        *(f"CR within {n}, less random's" for n in parts),
+        "share of rollouts",
+        "share, less random's",
+    ]
     lines = [f"| | {' | '.join(heads)} |", "|---|" + "---|" * len(heads)]
     measured = data["generators"]
     for name in measured:

@@ -36,9 +36,18 @@ from ssad.scenarios.static.shifts.batch import Batch, to_batch
 # images / s of 3D_Corruptions_AD (patched to run); scale: mean time of up 3.8 and down 1.0; motion blur: of zoom 0.38
 # and linear 4.2
 OTHERS = {
-    "snow": 2.3, "rain": 4.7, "fog": 3.6, "sunlight": 2.2, "uniform": 17, "gaussian": 9.5, "impulse": 9.0,
-    "scale": 2 / (1 / 3.8 + 1 / 1.0), "shear": 3.7, "rotation": 3.7, "motion_blur": 2 / (1 / 0.38 + 1 / 4.2),
-}  # fmt: skip
+    "snow": 2.3,
+    "rain": 4.7,
+    "fog": 3.6,
+    "sunlight": 2.2,
+    "uniform": 17,
+    "gaussian": 9.5,
+    "impulse": 9.0,
+    "scale": 2 / (1 / 3.8 + 1 / 1.0),
+    "shear": 3.7,
+    "rotation": 3.7,
+    "motion_blur": 2 / (1 / 0.38 + 1 / 4.2),
+}
 WIDTH, HEIGHT = 1600, 900
 
 

@@ -47,10 +47,17 @@ def ship(folder: Path, attacks: set[str]) -> list[str]:
             f"{pair['test_images']} in {pair['test']}; suite {suite['name']}, seed {suite['seed']}"
         )
         card = TextureCard(
-            spec["attack"], spec["carrier"], spec["options"], line["source"], weights[line["source"]],
-            suite["target"], data, run.command, int(line["epochs"]),
+            spec["attack"],
+            spec["carrier"],
+            spec["options"],
+            line["source"],
+            weights[line["source"]],
+            suite["target"],
+            data,
+            run.command,
+            int(line["epochs"]),
             {name: line["metrics"][name] for name in METRICS},
-        )  # fmt: skip
+        )
         made_for = "" if sort == "car" else f"-{sort.replace('_', '-')}"
         name = f"{attack}-{line['source']}{made_for}-{pair['train'].lower()}"
         if name in found:

@@ -30,10 +30,16 @@ PARTS = {
     "Reference": ("api", "stability", *TOP),
 }
 MORE = (  # beside the names of `ssad`
-    "ssad.core.driving.Driver", "ssad.core.driving.Observation", "ssad.core.driving.Simulator",
-    "ssad.core.protocols.Detector", "ssad.core.generators.Generator", "ssad.world.check.check_driver",
-    "ssad.world.check.check_simulator", "ssad.detectors.check.check_detector", "ssad.world.env.VectorEnv",
-)  # fmt: skip
+    "ssad.core.driving.Driver",
+    "ssad.core.driving.Observation",
+    "ssad.core.driving.Simulator",
+    "ssad.core.protocols.Detector",
+    "ssad.core.generators.Generator",
+    "ssad.world.check.check_driver",
+    "ssad.world.check.check_simulator",
+    "ssad.detectors.check.check_detector",
+    "ssad.world.env.VectorEnv",
+)
 SETTINGS = """site_name: SSAD
 site_description: A testbed for the safety and robustness of autonomous driving in safety-critical scenarios
 docs_dir: pages

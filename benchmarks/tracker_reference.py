@@ -71,17 +71,23 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
             body = (
                 np.array([[trace.x[step, agent], trace.y[step, agent], 0.5 * height]], float),
                 np.array([[trace.length[agent], trace.width[agent], height]], float),
-                np.array([trace.yaw[step, agent]], float), [int(trace.kind[agent])], np.zeros((1, 2)),
-            )  # fmt: skip
+                np.array([trace.yaw[step, agent]], float),
+                [int(trace.kind[agent])],
+                np.zeros((1, 2)),
+            )
             box = projected(body, to_camera, camera).box.numpy()
             if len(box):
                 there.append(box)
                 who.append(agent)
         road = one.label != len(detector.classes) - 1  # signs are no road users
         found.append(
-            (np.concatenate(there), np.array(who, np.int64), one.box[road].numpy().astype(float),
-             one.score[road].numpy().astype(float))
-        )  # fmt: skip
+            (
+                np.concatenate(there),
+                np.array(who, np.int64),
+                one.box[road].numpy().astype(float),
+                one.score[road].numpy().astype(float),
+            )
+        )
     return found
 
 
@@ -89,8 +95,12 @@ def save(drives: list[Frames]) -> None:
     """All drives in one file, in 16-bit pixels."""
     flat = [(d, k, *frame) for d, frames in enumerate(drives) for k, frame in enumerate(frames)]
     told: dict[str, Any] = {"frame": np.array([(d, k) for d, k, *_ in flat], np.int16)}
-    for name, at, kind in (("there", 2, np.float16), ("who", 3, np.int16), ("box", 4, np.float16),
-                           ("score", 5, np.float16)):  # fmt: skip
+    for name, at, kind in (
+        ("there", 2, np.float16),
+        ("who", 3, np.int16),
+        ("box", 4, np.float16),
+        ("score", 5, np.float16),
+    ):
         told[name] = np.concatenate([row[at] for row in flat]).astype(kind)
         told[f"{name}_count"] = np.array([len(row[at]) for row in flat], np.int16)
     BOXES.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +131,7 @@ def settings(density: float) -> Tracking:
     """Of SSAD's tracker in pixels."""
     return Tracking(
         confirm=CONFIRM, reserve=RESERVE, high=HIGH, low=LOW, stranger=0.0, density=density, speed=6.0 * SCALE
-    )  # fmt: skip
+    )
 
 
 def ours(frames: Frames, density: float = GROUND) -> Iterator[tuple[F64, I64]]:
@@ -133,9 +143,15 @@ def ours(frames: Frames, density: float = GROUND) -> Iterator[tuple[F64, I64]]:
         spread = np.zeros((n, 2, 2))
         spread[:, [0, 1], [0, 1]] = np.maximum(SHARE * side, LEAST) ** 2
         found = Objects(
-            np.zeros(n, np.int64), middle, spread, np.zeros(n), side, np.full((n, 2), np.nan),
-            np.full(n, int(AgentKind.CAR)), score,
-        )  # fmt: skip
+            np.zeros(n, np.int64),
+            middle,
+            spread,
+            np.zeros(n),
+            side,
+            np.full((n, 2), np.nan),
+            np.full(n, int(AgentKind.CAR)),
+            score,
+        )
         tracker.update(np.zeros(1, np.int64), np.array([k / RATE]), found)
         tracks = tracker.tracks.take((tracker.tracks.hits >= CONFIRM) & (tracker.tracks.missed == 0))
         # the box that a track was given is the one whose middle and score it took
@@ -213,9 +229,11 @@ def compare(drives: list[Frames]) -> dict[str, dict[str, Any]]:
     from trackers import ByteTrackTracker, SORTTracker
 
     same = {
-        "lost_track_buffer": round(30 * RESERVE / RATE), "frame_rate": RATE, "minimum_consecutive_frames": CONFIRM,
+        "lost_track_buffer": round(30 * RESERVE / RATE),
+        "frame_rate": RATE,
+        "minimum_consecutive_frames": CONFIRM,
         "track_activation_threshold": HIGH,
-    }  # fmt: skip
+    }
     methods = {
         "ours": ours,
         "ours, wider": lambda frames: ours(frames, WIDER),
@@ -224,10 +242,10 @@ def compare(drives: list[Frames]) -> dict[str, dict[str, Any]]:
     }
     own = links(drives, methods["ours"])
     return {
-        name: asdict(Mean.of(scored(drives, follow))) | {"links": len(links(drives, follow)), "links shared with ours":
-                                                         len(own & links(drives, follow))}
+        name: asdict(Mean.of(scored(drives, follow)))
+        | {"links": len(links(drives, follow)), "links shared with ours": len(own & links(drives, follow))}
         for name, follow in methods.items()
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
@@ -243,9 +261,11 @@ def main() -> None:
         return
     drives = load()
     told = {
-        "versions": {name: version(name) for name in ("trackers", "supervision", "numpy")}, "drives": len(drives),
-        "pictures": sum(map(len, drives)), "scores": compare(drives),
-    }  # fmt: skip
+        "versions": {name: version(name) for name in ("trackers", "supervision", "numpy")},
+        "drives": len(drives),
+        "pictures": sum(map(len, drives)),
+        "scores": compare(drives),
+    }
     RESULTS.write_text(json.dumps(told, indent=1) + "\n")
     print(json.dumps(told["scores"], indent=1))
 

@@ -43,8 +43,16 @@ from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
 from ssad.world.world import VERSION, World
 
-BODIES = {"car": 0.30, "suv": 0.20, "coupe": 0.10, "compact": 0.14, "van": 0.07, "motorcycle": 0.07, "truck": 0.07,
-          "bus": 0.05}  # fmt: skip
+BODIES = {
+    "car": 0.30,
+    "suv": 0.20,
+    "coupe": 0.10,
+    "compact": 0.14,
+    "van": 0.07,
+    "motorcycle": 0.07,
+    "truck": 0.07,
+    "bus": 0.05,
+}
 APART = 16.0  # m between two vehicles at the start
 ROUTES = 500  # of a town, from which each vehicle takes one
 LENGTH = 3500.0  # m of a route
@@ -132,9 +140,16 @@ def measure(graph: LaneGraph, episodes: Sequence[Episode], *, seconds: float, de
 
     def about(scene: int, agent: int) -> dict[str, Any]:
         x, y, yaw = world.array("pose")[scene, agent].tolist()
-        return {"scene": episodes[scene].key, "agent": agent, "body": episodes[scene].agents[agent].model, "time": now,
-                "x": round(x, 1), "y": round(y, 1), "yaw": round(yaw, 2),
-                "speed": round(float(world.array("speed")[scene, agent]), 1)}  # fmt: skip
+        return {
+            "scene": episodes[scene].key,
+            "agent": agent,
+            "body": episodes[scene].agents[agent].model,
+            "time": now,
+            "x": round(x, 1),
+            "y": round(y, 1),
+            "yaw": round(yaw, 2),
+            "speed": round(float(world.array("speed")[scene, agent]), 1),
+        }
 
     for step in range(1, int(seconds / world.dt) + 1):
         world.step()

@@ -24,9 +24,11 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPE
 
 # The same cases in every run and on every machine, however slow it is: what is drawn anew cannot hold a release up.
 settings.register_profile(
-    "same", deadline=None, derandomize=True,
+    "same",
+    deadline=None,
+    derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
-)  # fmt: skip
+)
 settings.load_profile("same")
 # Hypothesis also tries the numbers and words that it finds in our modules: in those that happen to be imported, which
 # is another set in each test worker.

@@ -22,8 +22,11 @@ def test_the_whole_suite_has_a_section_of_its_own(tmp_path: Path, monkeypatch: p
     run.mkdir()
     suite = {"scenarios": ["precrash"], "budget": 8, "keep": 3, "systems": ["autopilot", "ppo"]}
     (run / "run.json").write_text(json.dumps({"suite": suite, "cells": [{}] * 12}))
-    rows = [record(name, f"Case/{k}", float(name == "king" or k < 2), transfer={"ppo": {"found": 0.5, "base": 0.0}})
-            for name in ("random", "king") for k in range(5)]  # fmt: skip
+    rows = [
+        record(name, f"Case/{k}", float(name == "king" or k < 2), transfer={"ppo": {"found": 0.5, "base": 0.0}})
+        for name in ("random", "king")
+        for k in range(5)
+    ]
     rows[0]["metrics"]["survived"] = False
     rows.append(record("king", "natural/Here_1/02", 1.0) | {"status": "failed", "reason": "no"})
     (run / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

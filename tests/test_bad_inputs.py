@@ -14,31 +14,42 @@ SUITE = "name: a\nsystems: [blind]\nscenarios: [RightTurn]\n"
 SCENE = "- name: a\n  type: Custom\n  town: ProvingGround\n  route: [{x: 217, y: -5.25}, {x: 317, y: -5.25}]\n"
 ROUTE = "- name: a\n  type: Custom\n  town: ProvingGround\n  route: "
 FILES = {
-    "empty.yaml": "", "list.yaml": "- 1\n", "tabs.yaml": "name: a\n\tkind: driving\n",
-    "latin.yaml": b"name: caf\xe9\n", "twice.yaml": "name: a\nname: b\n",
+    "empty.yaml": "",
+    "list.yaml": "- 1\n",
+    "tabs.yaml": "name: a\n\tkind: driving\n",
+    "latin.yaml": b"name: caf\xe9\n",
+    "twice.yaml": "name: a\nname: b\n",
     "nan.yaml": f"{SUITE}timeout_s: .nan\n",
-    "less.yaml": f"{SUITE}repetitions: -3\n", "kinds.yaml": "kind: [driving]\n",
-    "bomb.yaml": "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
-        f"{n}: &{n} [{','.join([f'*{m}'] * 9)}]\n" for m, n in zip("abcd", "bcde", strict=True)
-    ),
-    "one.yaml": f"{ROUTE}[{{x: 217, y: -5.25}}]\n", "far.yaml": f"{ROUTE}[{{x: 1.0e9, y: 0}}, {{x: 1.0e9, y: 50}}]\n",
+    "less.yaml": f"{SUITE}repetitions: -3\n",
+    "kinds.yaml": "kind: [driving]\n",
+    "bomb.yaml": "a: &a [x,x,x,x,x,x,x,x,x]\n"
+    + "".join(f"{n}: &{n} [{','.join([f'*{m}'] * 9)}]\n" for m, n in zip("abcd", "bcde", strict=True)),
+    "one.yaml": f"{ROUTE}[{{x: 217, y: -5.25}}]\n",
+    "far.yaml": f"{ROUTE}[{{x: 1.0e9, y: 0}}, {{x: 1.0e9, y: 50}}]\n",
     "tank.yaml": f"{SCENE}  actors: [{{name: b, model: tank, pose: {{x: 250, y: -5}}}}]\n",
     "back.yaml": f"{SCENE}  actors: [{{name: b, model: suv, pose: {{x: 250, y: -5}}, "
     "trajectory: [[1, 250, -5, 0], [0, 260, -5, 0]]}]\n",
-    "mute.py": "class A:\n    def reset(self, episodes): ...\n", "boom.py": "raise ValueError('boom\\nagain')\n",
+    "mute.py": "class A:\n    def reset(self, episodes): ...\n",
+    "boom.py": "raise ValueError('boom\\nagain')\n",
     "ends.py": "import sys\nsys.exit(0)\n",
     "wants.py": "class A:\n    def __init__(self, need): ...\n    def reset(self, e): ...\n    def act(self, v): ...\n",
     "odd.py": "number = 3\ndef seven(): return 7\ndef trips(): raise ValueError('no\\nluck')\n"
     "class Mute:\n    name, access = 'mute', 'white-box'\n",
     "clear.png": cv2.imencode(".png", np.zeros((2, 2, 4), np.uint8))[1].tobytes(),
-    "run/run.json": '{"identity": 1}', "torn/run.json": "no json",
-    "odd/run.json": '{"identity": 1, "suite": {"name": "a"}, "kind": "driving"}', "odd/results.jsonl": '{"key": 3}\n',
-    "picture.jpg": "no picture", "zero.png": "",
-    "nus/v1.0-mini/sample_data.json": "[]", "folder/image_2/0.png": "no picture",
+    "run/run.json": '{"identity": 1}',
+    "torn/run.json": "no json",
+    "odd/run.json": '{"identity": 1, "suite": {"name": "a"}, "kind": "driving"}',
+    "odd/results.jsonl": '{"key": 3}\n',
+    "picture.jpg": "no picture",
+    "zero.png": "",
+    "nus/v1.0-mini/sample_data.json": "[]",
+    "folder/image_2/0.png": "no picture",
     "map.xodr": '<OpenDRIVE><road id="1"/></OpenDRIVE>',
     "entity.xodr": '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><OpenDRIVE>&x;</OpenDRIVE>',
-    "routes/a.xml": "<routes/>", "scene.xosc": "<OpenSCENARIO/>", "empty/.keep": "",
-}  # fmt: skip
+    "routes/a.xml": "<routes/>",
+    "scene.xosc": "<OpenSCENARIO/>",
+    "empty/.keep": "",
+}
 RUN = "run precrash --set"
 CASES = (
     ("run empty.yaml", "empty.yaml:1: a suite is a mapping"),

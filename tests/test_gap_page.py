@@ -22,23 +22,43 @@ DRIVES = 40
 def line(condition: tuple[str, int], drive: int, ap: float, *, crash: bool) -> dict[str, Any]:
     name, severity = condition
     return {
-        "key": f"{name}{severity}-{drive}", "system": "s", "perturbation": name, "severity": severity,
-        "family": "shift", "cluster": f"d{drive}", "group": "Twinford", "case": f"{name}{severity}{drive}",
-        "status": "ok", "reason": "",
-        "spec": {"repetition": 0}, "n": 1,
-        "metrics": {"AP": ap, "collision": crash, "route_completion": 1.0 - 0.5 * crash, "target_recall": ap,
-                    "recall": 0.7 + 0.2 * (drive % 2), "missed_burst": 2.0 + drive % 2, "phantoms": 0.1},
+        "key": f"{name}{severity}-{drive}",
+        "system": "s",
+        "perturbation": name,
+        "severity": severity,
+        "family": "shift",
+        "cluster": f"d{drive}",
+        "group": "Twinford",
+        "case": f"{name}{severity}{drive}",
+        "status": "ok",
+        "reason": "",
+        "spec": {"repetition": 0},
+        "n": 1,
+        "metrics": {
+            "AP": ap,
+            "collision": crash,
+            "route_completion": 1.0 - 0.5 * crash,
+            "target_recall": ap,
+            "recall": 0.7 + 0.2 * (drive % 2),
+            "missed_burst": 2.0 + drive % 2,
+            "phantoms": 0.1,
+        },
         "cause": {"cause": "missed", "unknown_s": 1.0} if crash else None,
         "repaired": {"collision": False, "same": drive % 2 == 0} if crash else None,
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
 def page(tmp_path: Path) -> dict[str, Any]:
     """The module, with a run: fog takes much AP and harms nobody, dirt little and harms many, rain both."""
     lines = []
-    for name, severity, share, crashes in (("none", 0, 1.0, 1), ("fog", 5, 0.4, 1), ("dirt", 3, 0.95, 13),
-                                           ("rain", 5, 0.3, 9), ("snow", 1, 0.97, 3)):  # fmt: skip
+    for name, severity, share, crashes in (
+        ("none", 0, 1.0, 1),
+        ("fog", 5, 0.4, 1),
+        ("dirt", 3, 0.95, 13),
+        ("rain", 5, 0.3, 9),
+        ("snow", 1, 0.97, 3),
+    ):
         for drive in range(DRIVES):
             ap = share * (0.5 + 0.01 * drive)
             lines.append(line((name, severity), drive, ap, crash=drive < crashes))
@@ -75,8 +95,9 @@ def test_a_later_run_adds_its_conditions_and_replaces_those_it_drove_again(
         for c in map(page["_condition"], after.lines)
     }
     assert count == {("s", name, k): DRIVES for name, k in (("none", 0), ("dirt", 3), ("rain", 5), ("snow", 1))} | {
-        ("s", "fog", 5): 1, ("s", "fog", 3): 1
-    }  # fmt: skip
+        ("s", "fog", 5): 1,
+        ("s", "fog", 3): 1,
+    }
     part = page["change"](after, ("s", "fog", 5), "collision")
     assert (part.n, part.failed) == (1, 0), "drives that a condition does not have have not failed"
     assert f"in 2 runs, {4 * DRIVES + 2} of {5 * DRIVES} drives" in page["_measured"](after)

@@ -150,8 +150,9 @@ def test_every_extra_that_a_text_names_exists() -> None:
         for file, pieces in {**texts(), **pages}.items()
         for piece in pieces
         for told in re.findall(r"extra `(\w+)`|extra '(\w+)'|--extra (\w+)|'\.\[(\w+)\]'", piece)
-        for name in told if name
-    }  # fmt: skip
+        for name in told
+        if name
+    }
     assert len(named) > 8
     assert [one for one in sorted(named) if one[1] not in extras] == []
 

@@ -32,10 +32,14 @@ def place(row: Mapping[str, Any]) -> str:
 
 def a_run(folder: Path, device: str, lines: list[dict[str, Any]], **about: Any) -> Path:
     header = {
-        "suite": {"name": "digital"}, "kind": "digital", "command": f"ssad run digital --device {device}",
-        "versions": {"device": device}, "weights": {"one": "a"}, "cells": [cell(name, device) for name in "abcd"],
+        "suite": {"name": "digital"},
+        "kind": "digital",
+        "command": f"ssad run digital --device {device}",
+        "versions": {"device": device},
+        "weights": {"one": "a"},
+        "cells": [cell(name, device) for name in "abcd"],
         **about,
-    }  # fmt: skip
+    }
     write_run(folder, header, lines)
     return folder
 
@@ -46,16 +50,21 @@ def test_what_failed_in_one_run_is_taken_from_the_other(tmp_path: Path) -> None:
     there = a_run(tmp_path / "b", "cpu", rest, weights={"one": "a", "two": "b"})
     run = joined([here, there], place)
     assert [(one["detector"], one["versions"]["device"]) for one in run.lines] == [
-        ("a", "cuda"), ("b", "cpu"), ("c", "cpu"),
-    ]  # fmt: skip
+        ("a", "cuda"),
+        ("b", "cpu"),
+        ("c", "cpu"),
+    ]
     told = summary_of(run, place)
     assert "cells" not in told
     assert told["command"] == ["ssad run digital --device cuda", "ssad run digital --device cpu"]
     assert told["torch"] == ["2.3", "2.4"]
     assert told["weights"] == {"one": "a", "two": "b"}
     assert (told["planned"], told["ran"], told["missing"], told["failed"]) == (
-        4, {"cuda": 1, "cpu": 1}, ["d"], {"c": "time"},
-    )  # fmt: skip
+        4,
+        {"cuda": 1, "cpu": 1},
+        ["d"],
+        {"c": "time"},
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,20 +16,57 @@ from ssad.core import errors
 ABSENT = "raise ModuleNotFoundError(f'No module named {__name__!r}', name=__name__)\n"
 # modules that nothing but perception, learning and gradients may need; whatever is not under them imports without torch
 NEEDS = (
-    "bench.kinds.detection", "bench.kinds.digital", "bench.kinds.gap", "bench.kinds.physical", "camera.texture",
-    "camera.torch_", "core.checkpoints", "core.eval_mode", "core.pickled", "detectors.", "drivers.perceiving",
-    "drivers.rl", "evaluation.", "recording.", "scenarios.dynamic.logged.near_miss", "scenarios.dynamic.policy",
-    "scenarios.dynamic.transition", "scenarios.static.digital", "scenarios.static.physical", "training.",
-    "world.policy", "world.sb3", "world.twin",
-)  # fmt: skip
+    "bench.kinds.detection",
+    "bench.kinds.digital",
+    "bench.kinds.gap",
+    "bench.kinds.physical",
+    "camera.texture",
+    "camera.torch_",
+    "core.checkpoints",
+    "core.eval_mode",
+    "core.pickled",
+    "detectors.",
+    "drivers.perceiving",
+    "drivers.rl",
+    "evaluation.",
+    "recording.",
+    "scenarios.dynamic.logged.near_miss",
+    "scenarios.dynamic.policy",
+    "scenarios.dynamic.transition",
+    "scenarios.static.digital",
+    "scenarios.static.physical",
+    "training.",
+    "world.policy",
+    "world.sb3",
+    "world.twin",
+)
 FREE = (
-    "cli", "doctor", "envs", "listing", "results", "bench.kinds.driving", "bench.kinds.adversarial",
-    "bench.kinds.how_often", "bench.kinds.tour", "drivers.careful.grade", "evaluation.score",
-    "evaluation.search_scores", "evaluation.failure_rate", "interchange.export", "recording.drives",
-    "recording.clips", "recording.run_pictures", "recording.closed_loop", "report.compare",
-    "scenarios.dynamic.generate", "scenarios.static.shifts", "toolbox.browse", "toolbox.write", "world.env",
+    "cli",
+    "doctor",
+    "envs",
+    "listing",
+    "results",
+    "bench.kinds.driving",
+    "bench.kinds.adversarial",
+    "bench.kinds.how_often",
+    "bench.kinds.tour",
+    "drivers.careful.grade",
+    "evaluation.score",
+    "evaluation.search_scores",
+    "evaluation.failure_rate",
+    "interchange.export",
+    "recording.drives",
+    "recording.clips",
+    "recording.run_pictures",
+    "recording.closed_loop",
+    "report.compare",
+    "scenarios.dynamic.generate",
+    "scenarios.static.shifts",
+    "toolbox.browse",
+    "toolbox.write",
+    "world.env",
     "world.rollout",
-)  # fmt: skip
+)
 WALK = """
 import importlib, json, pkgutil, ssad
 from ssad.core.errors import EXTRA_OF
@@ -135,8 +172,12 @@ def test_only_what_perceives_or_learns_needs_torch(without: dict[str, str]) -> N
 
 def test_the_hint_of_an_installed_wheel_names_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     """There the extra cannot be named: the distribution is on no index."""
-    stated = ["numpy>=1.26", "torch>=2.15.0; extra == 'perception'", 'torchvision>=0.29; extra == "perception"',
-              "carla==0.9.16; python_version < '3.13' and extra == 'carla'"]  # fmt: skip
+    stated = [
+        "numpy>=1.26",
+        "torch>=2.15.0; extra == 'perception'",
+        'torchvision>=0.29; extra == "perception"',
+        "carla==0.9.16; python_version < '3.13' and extra == 'carla'",
+    ]
     monkeypatch.setattr(errors, "__file__", "/env/lib/python3.12/site-packages/ssad/core/errors.py")
     monkeypatch.setattr(errors, "requires", lambda name: stated)
     monkeypatch.setattr(errors.importlib.util, "find_spec", lambda name: None)

@@ -80,8 +80,11 @@ def _torch() -> Finding:
     except Exception as error:
         missing = isinstance(error, ModuleNotFoundError) and error.name in EXTRA_OF
         why = "not installed" if missing else f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return Finding("perception", "missing", f"{why}; detectors, attacks and learned drivers need torch and "
-                       f"torchvision; {install_extra('perception')}")  # fmt: skip
+        return Finding(
+            "perception",
+            "missing",
+            f"{why}; detectors, attacks and learned drivers need torch and torchvision; {install_extra('perception')}",
+        )
     gpu = "with CUDA" if torch.cuda.is_available() else "on the CPU"
     return Finding("perception", "ok", f"torch {torch.__version__} {gpu}, torchvision {torchvision.__version__}")
 

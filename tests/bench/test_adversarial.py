@@ -34,9 +34,11 @@ def hit(offset: float = 0.0, *, speed: float = 8.0, **changes: Any) -> Outcome:
     """The ego meets who comes from the other side, `offset` m beside it."""
     contact = (np.arange(31) == 30).astype(np.uint8)
     trace = make_trace(
-        31, [(speed * STEP, 0.0, 0.0, speed), (50 - 8 * STEP, offset, np.pi, 8.0)], contact=contact,
+        31,
+        [(speed * STEP, 0.0, 0.0, speed), (50 - 8 * STEP, offset, np.pi, 8.0)],
+        contact=contact,
         contact_agent=np.where(contact, 1, -1).astype(np.int32),
-    )  # fmt: skip
+    )
     outcome = Outcome(Proposal(SCENARIO), trace=trace, adversaries=(1,), collision=True, time=3.0, gap=0.0)
     return dataclasses.replace(outcome, ego_speed=speed, impact_speed=16.0, **changes)
 
@@ -171,8 +173,20 @@ def test_what_a_run_finds_replays_as_a_plain_scenario(tmp_path: Path) -> None:
     assert 1 <= len(saved) <= 2
     assert saved[0].name.startswith(f"{found[0]['cluster']}/halton")
     plain = tmp_path / "plain"
-    again = ssad("run", "quick", "--set", f"scenarios={file}", "--set", "systems=autopilot", "--set", "pictures=[]",
-                 "--out", plain, "--workers", "1")  # fmt: skip
+    again = ssad(
+        "run",
+        "quick",
+        "--set",
+        f"scenarios={file}",
+        "--set",
+        "systems=autopilot",
+        "--set",
+        "pictures=[]",
+        "--out",
+        plain,
+        "--workers",
+        "1",
+    )
     assert again.returncode == 0, again.stderr
     replayed = list(read_lines(plain / "results.jsonl"))
     assert len(replayed) == len(saved)

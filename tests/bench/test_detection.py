@@ -66,9 +66,16 @@ def run_detection(plan: Plan, folder: Path, *, workers: int, retry: bool = False
 
 def suite_of(root: Path, **changes: Any) -> DetectionSuite:
     base: dict[str, Any] = {
-        "kind": "detection", "name": "t", "detectors": [ORACLE], "data": str(root), "split": "mini_val",
-        "reference": "shifts", "shifts": ["gaussian", "fog"], "severities": [1, 3, 5, "random"], "replicates": 20,
-    }  # fmt: skip
+        "kind": "detection",
+        "name": "t",
+        "detectors": [ORACLE],
+        "data": str(root),
+        "split": "mini_val",
+        "reference": "shifts",
+        "shifts": ["gaussian", "fog"],
+        "severities": [1, 3, 5, "random"],
+        "replicates": 20,
+    }
     return DetectionSuite.model_validate(base | changes)
 
 
@@ -241,8 +248,9 @@ def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None
     found = [b for path in sorted(folder.glob("detections/*/gaussian-3/*.npz")) for b in read_boxes(path)[0]]
     scores = match(
         filter_boxes(truth.boxes, points=truth.points, racks=truth.racks),
-        filter_boxes(box_table(found, truth), racks=truth.racks), samples=len(truth.samples),
-    ).scores()  # fmt: skip
+        filter_boxes(box_table(found, truth), racks=truth.racks),
+        samples=len(truth.samples),
+    ).scores()
     record = next(r for r in lines(folder) if (r["shift"], r["severity"]) == ("gaussian", 3))
     assert record["metrics"]["NDS"] == pytest.approx(scores.nd_score, abs=1e-6)
 
@@ -292,9 +300,11 @@ def test_a_detector_that_fails_fails_its_own_cells_alone(
 
 
 DEEDS = {
-    "dying": ("crashed", "exit code 9"), "hanging": ("timeout", "took longer than 12 s"),
-    "raising": ("failed", "ZeroDivisionError: on purpose"), "hungry": ("crashed", "out of memory"),
-}  # fmt: skip
+    "dying": ("crashed", "exit code 9"),
+    "hanging": ("timeout", "took longer than 12 s"),
+    "raising": ("failed", "ZeroDivisionError: on purpose"),
+    "hungry": ("crashed", "out of memory"),
+}
 
 
 def check_deadly_detectors(root: Path, folder: Path, out: Path, resources: Resources) -> None:
@@ -334,9 +344,11 @@ def start(root: Path, out: Path) -> subprocess.Popen[bytes]:
     paths = [str(Path(__file__).parent.parent), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"ORACLE_DATA": str(root), "PYTHONPATH": os.pathsep.join(paths)}
     return subprocess.Popen(
-        [sys.executable, "-c", code, str(root), str(out)], env=environment, stdout=subprocess.DEVNULL,
+        [sys.executable, "-c", code, str(root), str(out)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.slow
@@ -448,9 +460,12 @@ def test_the_shipped_suites_load_and_take_settings() -> None:
     assert changed.recorded.scenes == 3
     assert (changed.severities, changed.shifts) == ([2], ["fog"])
     for setting, words in (
-        ("severities=[6]", "severities"), ("systems=[blind]", "systems"), ("recorded.scenes=0", "scenes"),
-        ("recorded.town=[x]", "town"), ("split.x=1", "split"),
-    ):  # fmt: skip
+        ("severities=[6]", "severities"),
+        ("systems=[blind]", "systems"),
+        ("recorded.scenes=0", "scenes"),
+        ("recorded.town=[x]", "town"),
+        ("split.x=1", "split"),
+    ):
         with pytest.raises(ConfigError, match=words):
             load_suite("shifts", [setting])
 

@@ -22,8 +22,12 @@ from ssad.recording.scored_data import Recorded, recording_of
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 GOOD: dict[str, Any] = {
-    "kind": "detection", "name": "t", "detectors": ["one", "two"], "shifts": ["fog"], "severities": [1, 3, "random"],
-}  # fmt: skip
+    "kind": "detection",
+    "name": "t",
+    "detectors": ["one", "two"],
+    "shifts": ["fog"],
+    "severities": [1, 3, "random"],
+}
 SCENES = {f"scene-{k}": f"token-{k}" for k in range(5)}
 
 
@@ -48,9 +52,15 @@ def plan_of(device: str = "cpu", **changes: Any) -> Plan:
 
 def job(folder: Path, **changes: Any) -> Job:
     settings = {
-        "root": "/data", "version": "v1.0-mini", "detectors": {"one": "one.pth"}, "calibration": "physical", "seed": 7,
-        "replicates": 5, "scenes": SCENES, "threads": 3,
-    }  # fmt: skip
+        "root": "/data",
+        "version": "v1.0-mini",
+        "detectors": {"one": "one.pth"},
+        "calibration": "physical",
+        "seed": 7,
+        "replicates": 5,
+        "scenes": SCENES,
+        "threads": 3,
+    }
     return Job(folder, "cuda", settings | changes)
 
 
@@ -87,10 +97,16 @@ def test_what_a_suite_may_say(key: str, good: list[Any], bad: list[Any]) -> None
 @pytest.mark.parametrize(
     ("key", "good", "bad"),
     [
-        ("scenes", 1, 0), ("seconds", 0.5, 0.49), ("width", 64, 63), ("seed", 0, -1), ("towns", ["a"], []),
-        ("seconds", 1.0, float("inf")), ("scenes", 2, "2"), ("scenes", 2, 2.0),
+        ("scenes", 1, 0),
+        ("seconds", 0.5, 0.49),
+        ("width", 64, 63),
+        ("seed", 0, -1),
+        ("towns", ["a"], []),
+        ("seconds", 1.0, float("inf")),
+        ("scenes", 2, "2"),
+        ("scenes", 2, 2.0),
     ],
-)  # fmt: skip
+)
 def test_what_a_suite_may_say_of_its_recording(key: str, good: Any, bad: Any) -> None:
     assert getattr(suite(recorded={key: good}).recorded, key) == good
     for wrong in ({key: bad}, {"other": 1}):
@@ -116,9 +132,13 @@ def test_cells_are_the_clean_data_and_each_shift_and_severity() -> None:
     assert len({cell.key for cell in plan.cells}) == 8
     keys = {cell.key for cell in plan.cells}
     for changed in (
-        plan_of("cuda", seed=4), plan_of(seed=5), plan_of(seed=4, replicates=9), plan_of(seed=4, calibration="paper"),
-        plan_of(seed=4, split="all"), plan_of(seed=4, recorded={"scenes": 11}),
-    ):  # fmt: skip
+        plan_of("cuda", seed=4),
+        plan_of(seed=5),
+        plan_of(seed=4, replicates=9),
+        plan_of(seed=4, calibration="paper"),
+        plan_of(seed=4, split="all"),
+        plan_of(seed=4, recorded={"scenes": 11}),
+    ):
         assert not keys & {cell.key for cell in changed.cells}
 
 
@@ -180,10 +200,12 @@ def test_boxes_are_found_and_scored_with_what_the_job_says(tmp_path: Path, monke
     assert found[1:] == [(expected, ShiftedScene("fog", 3, scene), ["one"]) for scene in SCENES]
     assert results == {
         cell.key: {
-            "metrics": {"scenes": 5}, "replicates": 5, "system": "one",
+            "metrics": {"scenes": 5},
+            "replicates": 5,
+            "system": "one",
             "artefacts": {"detections": ["detections/one/fog-3"]},
         }
-    }  # fmt: skip
+    }
 
 
 class Data:
@@ -236,9 +258,15 @@ def test_where_none_is_given_a_data_set_is_recorded(
     assert recorded == [(recording_of(suite(), tmp_path / "data"), 3, "some cluster")]
     assert data == [(tmp_path / "data", None)]
     assert settings == {
-        "root": str(tmp_path / "data"), "version": "v1.0-found", "detectors": {"one": "one.pth", "two": "two.pth"},
-        "calibration": "physical", "seed": 4, "replicates": 100, "scenes": SCENES, "threads": 2,
-    }  # fmt: skip
+        "root": str(tmp_path / "data"),
+        "version": "v1.0-found",
+        "detectors": {"one": "one.pth", "two": "two.pth"},
+        "calibration": "physical",
+        "seed": 4,
+        "replicates": 100,
+        "scenes": SCENES,
+        "threads": 2,
+    }
     shown = resources.console.file.getvalue()  # type: ignore[attr-defined]
     assert shown.startswith("recording: 2/24 scenes")
     bars: list[tuple[Any, ...]] = []
@@ -293,9 +321,12 @@ def test_boxes_that_could_not_be_found_are_forgotten_when_they_are_tried_again(
     ("severities", "shown"), [([1, 3, 5], 3), ([1, 4], 4), ([5, 2], 2), (["random"], 3), ([1, "random"], 1)]
 )
 def test_the_picture_shows_the_middle_severity(
-    tmp_path: Path, data: list[tuple[Path, str | None]], monkeypatch: pytest.MonkeyPatch,
-    severities: list[Any], shown: int,
-) -> None:  # fmt: skip
+    tmp_path: Path,
+    data: list[tuple[Path, str | None]],
+    monkeypatch: pytest.MonkeyPatch,
+    severities: list[Any],
+    shown: int,
+) -> None:
     sheets = []
 
     def sheet(examination: Examination, split: str, shifts: Any, severity: int) -> str:

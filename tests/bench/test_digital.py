@@ -55,10 +55,16 @@ def known(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def suite_of(root: Path, **changes: Any) -> DigitalSuite:
     base: dict[str, Any] = {
-        "kind": "digital", "name": "t", "detectors": [LINEAR, BLIND], "data": str(root), "split": "mini_val",
-        "reference": "digital", "attacks": ["fgsm", {"name": "pgd", "steps": 3}], "replicates": 5,
+        "kind": "digital",
+        "name": "t",
+        "detectors": [LINEAR, BLIND],
+        "data": str(root),
+        "split": "mini_val",
+        "reference": "digital",
+        "attacks": ["fgsm", {"name": "pgd", "steps": 3}],
+        "replicates": 5,
         "sweeps": [{"name": "pgd", "radii": [0, 2], "options": {"steps": 3}}],
-    }  # fmt: skip
+    }
     return DigitalSuite.model_validate(base | changes)
 
 
@@ -90,9 +96,13 @@ def by_attack(folder: Path, detector: str) -> dict[tuple[str | None, float], dic
 def test_cells_are_the_clean_data_noise_of_each_size_the_table_and_the_curves(root: Path) -> None:
     plan = Digital().plan(suite_of(root, detectors=[LINEAR]))
     assert [cell.name.partition("/")[2] for cell in plan.cells] == [
-        "clean", "noise-full-linf-5", "noise-full-linf-2", "fgsm-full-linf-5", "pgd-full-linf-5-steps3",
+        "clean",
+        "noise-full-linf-5",
+        "noise-full-linf-2",
+        "fgsm-full-linf-5",
+        "pgd-full-linf-5-steps3",
         "pgd-full-linf-2-steps3",
-    ]  # fmt: skip
+    ]
     assert [cell.fields["row"] for cell in plan.cells] == [True, True, False, True, True, False]
     assert [cell.fields["steps"] for cell in plan.cells] == [0, 0, 0, 1, 3, 3]
     assert [plan.kind.order(cell) for cell in plan.cells] == [0, 1, 2, 1, 1, 2]
@@ -115,13 +125,18 @@ def test_a_plan_builds_each_detector_once(root: Path, monkeypatch: pytest.Monkey
 
 
 def test_attacks_of_the_kind_by_default(root: Path) -> None:
-    suite = DigitalSuite.model_validate({"kind": "digital", "name": "t", "detectors": [LINEAR], "data": str(root),
-                                         "split": "mini_val"})  # fmt: skip
+    suite = DigitalSuite.model_validate(
+        {"kind": "digital", "name": "t", "detectors": [LINEAR], "data": str(root), "split": "mini_val"}
+    )
     names = [cell.name.partition("/")[2] for cell in Digital().plan(suite).cells]
     assert names == [
-        "clean", "noise-full-linf-5", "fgsm-full-linf-5", "pgd-full-linf-5-steps10", "cw-margin-linf-5-steps10",
+        "clean",
+        "noise-full-linf-5",
+        "fgsm-full-linf-5",
+        "pgd-full-linf-5-steps10",
+        "cw-margin-linf-5-steps10",
         "pgd-margin-linf-5-steps10",
-    ]  # fmt: skip
+    ]
 
 
 def test_one_step_reaches_the_optimum_of_a_linear_detector(root: Path, folder: Path) -> None:
@@ -163,9 +178,13 @@ def test_scores_fall_under_attacks_and_not_under_noise(folder: Path) -> None:
 def test_a_detector_without_a_gradient_fails_its_white_box_cells_with_the_reason(folder: Path) -> None:
     found = by_attack(folder, BLIND)
     assert {key: r["status"] for key, r in found.items()} == {
-        (None, 0.0): "ok", ("noise", 5.0): "ok", ("noise", 2.0): "ok", ("fgsm", 5.0): "failed", ("pgd", 5.0): "failed",
+        (None, 0.0): "ok",
+        ("noise", 5.0): "ok",
+        ("noise", 2.0): "ok",
+        ("fgsm", 5.0): "failed",
+        ("pgd", 5.0): "failed",
         ("pgd", 2.0): "failed",
-    }  # fmt: skip
+    }
     assert "gives no gradient of loss 'full' to the image" in found["fgsm", 5.0]["reason"]
 
 
@@ -179,8 +198,15 @@ def test_the_report_has_the_papers_numbers_the_audit_and_the_failures(folder: Pa
     assert "mAP over the budget" in page
     assert 'src="data:image/jpeg' in page
     assert {path.stem for path in (folder / "tables").glob("*.csv")} == {
-        "digital", "lost", "audit", "effort", "cells", "classes", "distances", "halving",
-    }  # fmt: skip
+        "digital",
+        "lost",
+        "audit",
+        "effort",
+        "cells",
+        "classes",
+        "distances",
+        "halving",
+    }
     own = load_digital_run(load_run(folder))
     assert [row.head[0] for row in main_table(own).rows] == ["clean", "noise", "FGSM, full loss", "PGD, full loss"], (
         "the paper has no such detectors"
@@ -200,9 +226,10 @@ def test_published_rows_stand_beside_detectors_of_the_same_kind(folder: Path) ->
     table = main_table(run)
     rows = {row.head: [cell.mean for cell in row.cells] for row in table.rows if row.published}
     assert rows == {
-        ("clean", ""): [29.8, 37.7, 31.74, 39.34], ("FGSM", "5 px, 1 step"): [8.3, 21.44, 8.77, 17.99],
+        ("clean", ""): [29.8, 37.7, 31.74, 39.34],
+        ("FGSM", "5 px, 1 step"): [8.3, 21.44, 8.77, 17.99],
         ("PGD", "5 px, 10 steps"): [3.9, 18.73, 19.61, 31.42],
-    }  # fmt: skip
+    }
     heads = [row.head[0] for row in table.rows]
     assert heads == ["clean", "clean", "noise", "FGSM, full loss", "FGSM", "PGD, full loss", "PGD"], "each beside ours"
     lost = {row.head[0]: row.cells[0].mean for row in lost_table(run).rows if row.published}
@@ -366,17 +393,46 @@ def test_an_image_without_objects_is_left_as_it_is_by_a_loss_that_needs_some(roo
 
 def test_notes_of_scenes_are_put_together() -> None:
     one = {
-        "access": "white-box", "images": 3, "idle": 1, "gradients": 30, "queries": 6, "before": 3.0, "after": 9.0,
-        "used": 1.0, "change": 4.0, "batch": 2, "gradient_error": 0.1, "coupling": None, "halved": 2,
-    }  # fmt: skip
+        "access": "white-box",
+        "images": 3,
+        "idle": 1,
+        "gradients": 30,
+        "queries": 6,
+        "before": 3.0,
+        "after": 9.0,
+        "used": 1.0,
+        "change": 4.0,
+        "batch": 2,
+        "gradient_error": 0.1,
+        "coupling": None,
+        "halved": 2,
+    }
     empty = one | dict.fromkeys(("images", "idle", "gradients", "queries", "before", "after", "used", "batch"), 0)
-    other = one | {"images": 1, "idle": 0, "gradients": 10, "queries": 2, "used": 0.5, "change": 5.0, "batch": 1,
-                   "gradient_error": 0.3}  # fmt: skip
+    other = one | {
+        "images": 1,
+        "idle": 0,
+        "gradients": 10,
+        "queries": 2,
+        "used": 0.5,
+        "change": 5.0,
+        "batch": 1,
+        "gradient_error": 0.3,
+    }
     assert sum_notes([one, empty, other]) == {
-        "access": "white-box", "images": 4, "idle": 1, "gradients": 10.0, "queries": 2.0, "loss_before": 1.5,
-        "loss_after": 4.5, "used": 0.5, "change_px": 5.0, "batch": 2, "gradient_error": 0.3, "coupling": None,
+        "access": "white-box",
+        "images": 4,
+        "idle": 1,
+        "gradients": 10.0,
+        "queries": 2.0,
+        "loss_before": 1.5,
+        "loss_after": 4.5,
+        "used": 0.5,
+        "change_px": 5.0,
+        "batch": 2,
+        "gradient_error": 0.3,
+        "coupling": None,
         "halved": 4,
-    }  # fmt: skip
+    }
 
 
 def test_a_change_is_magnified_around_grey() -> None:
@@ -400,7 +456,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "twice in transfer": ({"transfer_detectors": [LINEAR]}, "appears twice"),
     "transfer of nothing": ({"transfer_detectors": ["yolov5n"]}, "transfer, and it is empty"),
     "a detector of nothing": ({"detectors": ["helpers.linear3d:build_stranger"]}, "none of the ten classes"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD.values(), ids=BAD.keys())
@@ -417,11 +473,17 @@ def test_bad_suites_end_in_one_line(
 @pytest.mark.parametrize(
     "changes",
     [
-        {"radius": 0}, {"radius": -1}, {"steps": 0}, {"batch": 0}, {"attacks": []}, {"attacks": [{"radius": 5}]},
-        {"attacks": [{"name": "pgd", "radius": -5}]}, {"attacks": [{"name": "pgd", "norm": "l1"}]},
+        {"radius": 0},
+        {"radius": -1},
+        {"steps": 0},
+        {"batch": 0},
+        {"attacks": []},
+        {"attacks": [{"radius": 5}]},
+        {"attacks": [{"name": "pgd", "radius": -5}]},
+        {"attacks": [{"name": "pgd", "norm": "l1"}]},
         {"sweeps": [{"name": "pgd", "radii": [-1]}]},
     ],
-)  # fmt: skip
+)
 def test_what_no_suite_may_say(root: Path, changes: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         suite_of(root, **changes)
@@ -445,8 +507,12 @@ def test_the_suite_digital_takes_100_000_passes_of_a_detector_at_most() -> None:
     plan = Digital().plan(suite)
     towns = {f"{town} {number}": town for town in suite.recorded.towns for number in range(suite.recorded.scenes)}
     job = Job(Path(), "cuda", {"scenes": towns, "towns": towns, "batch": 12})
-    every = {one.name + one.source: one for cell in plan.cells for one in Digital().scenes(cell, job)
-             if isinstance(one, AttackedScene)}  # fmt: skip
+    every = {
+        one.name + one.source: one
+        for cell in plan.cells
+        for one in Digital().scenes(cell, job)
+        if isinstance(one, AttackedScene)
+    }
     images = 6 * int(2 * suite.recorded.seconds)
     passes = sum(one.spec.passes_in(images) for one in every.values())
     assert 50_000 < passes / len(suite.detectors) <= 100_000

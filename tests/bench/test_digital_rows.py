@@ -53,18 +53,27 @@ def known(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def suite_of(root: Path, **changes: Any) -> DigitalSuite:
     base: dict[str, Any] = {
-        "kind": "digital", "name": "t", "detectors": [ONE, OTHER], "data": str(root), "split": "all", "replicates": 0,
+        "kind": "digital",
+        "name": "t",
+        "detectors": [ONE, OTHER],
+        "data": str(root),
+        "split": "all",
+        "replicates": 0,
         "attacks": [
-            "fgsm", PGD, {"name": "ensemble", "members": ["fgsm", PGD]},
-            {**PGD, "defence": "bits", "scenes": 1}, {**PGD, "defence": "bits", "aware": True, "scenes": 1},
+            "fgsm",
+            PGD,
+            {"name": "ensemble", "members": ["fgsm", PGD]},
+            {**PGD, "defence": "bits", "scenes": 1},
+            {**PGD, "defence": "bits", "aware": True, "scenes": 1},
             {**PGD, "defence": "resize", "scenes": 1},
             {**PGD, "defence": "resize", "aware": True, "draws": 2, "scenes": 1},
             {"name": "fgsm", "loss": "vanish", "classes": ["car"]},
             {"name": "fgsm", "loss": "vanish", "classes": ["truck"], "scenes": 1},
             {"name": "fgsm", "loss": "vanish", "object": "nearest", "scenes": 1, "precision": "bfloat16"},
         ],
-        "sweeps": [{"name": "pgd", "radii": [0, 1, 5], "scenes": 1, "options": {"steps": 2}}], "transfer": [PGD],
-    }  # fmt: skip
+        "sweeps": [{"name": "pgd", "radii": [0, 1, 5], "scenes": 1, "options": {"steps": 2}}],
+        "transfer": [PGD],
+    }
     return DigitalSuite.model_validate(base | changes)
 
 
@@ -150,9 +159,12 @@ def test_defences_are_scored_clean_unknown_and_known(folder: Path) -> None:
     rows = {row.head[:2]: [cell.mean for cell in row.cells] for row in table.rows}
     assert set(rows) == {(d, name) for d in (ONE, OTHER) for name in ("bit depth", "random resizing")}
     records = [
-        one(folder, attack=None, subset=1), one(folder, attack=None, subset=1, defence="bits"), one(folder, subset=1),
-        one(folder, subset=1, defence="bits"), one(folder, subset=1, defence="bits", aware=True),
-    ]  # fmt: skip
+        one(folder, attack=None, subset=1),
+        one(folder, attack=None, subset=1, defence="bits"),
+        one(folder, subset=1),
+        one(folder, subset=1, defence="bits"),
+        one(folder, subset=1, defence="bits", aware=True),
+    ]
     assert rows[ONE, "bit depth"] == pytest.approx([100 * r["metrics"]["mAP"] for r in records])
     assert records[3]["loss_after"] == records[2]["loss_after"], "the same pictures"
     known = one(folder, subset=1, defence="resize", aware=True)
@@ -169,8 +181,13 @@ def test_an_ensemble_leaves_no_more_than_any_member(folder: Path) -> None:
     assert worst["options"] == "of fgsm full, pgd full"
     heads = [row.head[0] for row in main_table(load_digital_run(load_run(folder))).rows]
     assert heads == [
-        "clean", "noise", "FGSM, full loss", "PGD, full loss", "worst of FGSM full, PGD full", "FGSM, vanish loss",
-    ]  # fmt: skip
+        "clean",
+        "noise",
+        "FGSM, full loss",
+        "PGD, full loss",
+        "worst of FGSM full, PGD full",
+        "FGSM, vanish loss",
+    ]
 
 
 def test_a_target_is_reached_where_the_car_is_gone(folder: Path, root: Path) -> None:
@@ -202,8 +219,11 @@ def test_of_all_objects_only_the_chosen_one_is_attacked(folder: Path, root: Path
     assert 0 < found["metrics"]["targets"] <= len(places) == len(scene.samples)
     assert found["metrics"]["success"] > 0
     assert found["metrics"]["kept"] > found["metrics"]["mAP"] > 0, "the others stay"
-    shows = [frame for frame in scene.frames if frame.modality == "camera" and frame.key_frame
-             and len(chosen_first(scene, frame, NEAREST))]  # fmt: skip
+    shows = [
+        frame
+        for frame in scene.frames
+        if frame.modality == "camera" and frame.key_frame and len(chosen_first(scene, frame, NEAREST))
+    ]
     assert found["images"] - found["idle"] == len(shows) < found["images"], "pictures without it are left as they are"
     row = target_table(load_digital_run(load_run(folder))).rows
     assert "nearest" in {r.head[3] for r in row}
@@ -316,9 +336,14 @@ def test_curves_may_run_on_fewer_scenes(root: Path, folder: Path) -> None:
     assert 1 < row.cells[0].mean < 5
     groups = {a.group for a in attempts_of(load_digital_run(load_run(folder)))}
     assert groups == {
-        "", "1 of each town", "car", "truck, 1 of each town", "nearest, 1 of each town", "bit depth, 1 of each town",
+        "",
+        "1 of each town",
+        "car",
+        "truck, 1 of each town",
+        "nearest, 1 of each town",
+        "bit depth, 1 of each town",
         "random resizing, 1 of each town",
-    }  # fmt: skip
+    }
 
 
 def test_scenes_are_the_first_of_each_town(root: Path) -> None:
@@ -369,9 +394,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "no members": ({"attacks": ["ensemble"]}, "an ensemble has members"),
     "members": ({"attacks": [{**PGD, "members": ["fgsm"]}]}, "an ensemble has members"),
     "budgets": (
-        {"attacks": [{"name": "ensemble", "members": ["fgsm", {"name": "pgd", "radius": 2}]}]}, "different budgets",
+        {"attacks": [{"name": "ensemble", "members": ["fgsm", {"name": "pgd", "radius": 2}]}]},
+        "different budgets",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD.values(), ids=BAD.keys())

@@ -41,10 +41,17 @@ def folder(tiny_set: Path, shared: Shared) -> Path:
 
 def suite_of(root: Path, **changes: Any) -> DigitalSuite:
     base: dict[str, Any] = {
-        "kind": "digital", "name": "t", "detectors": [THREE], "transfer_detectors": [TWO, OTHER], "data": str(root),
-        "split": "all", "replicates": 3, "transfer": ["fgsm"], "hardened": [f"{THREE}@{HARD}"],
+        "kind": "digital",
+        "name": "t",
+        "detectors": [THREE],
+        "transfer_detectors": [TWO, OTHER],
+        "data": str(root),
+        "split": "all",
+        "replicates": 3,
+        "transfer": ["fgsm"],
+        "hardened": [f"{THREE}@{HARD}"],
         "attacks": ["fgsm", *({"name": "universal", "steps": 3, "options": {"frames": 4, "over": o}} for o in OVER)],
-    }  # fmt: skip
+    }
     return DigitalSuite.model_validate(base | changes)
 
 
@@ -111,10 +118,18 @@ def test_2d_detectors_may_have_the_whole_table(tiny_set: Path, monkeypatch: pyte
     monkeypatch.setenv("LINEAR_DATA", str(tiny_set))
     members = [{"name": "fgsm"}, {"name": "fgsm", "radius": 5.0, "loss": "vanish"}]
     suite = suite_of(
-        tiny_set, detectors=[TWO], transfer_detectors=[], transfer=[], hardened=[], replicates=0,
-        attacks=[*members, {"name": "ensemble", "members": members}, {"name": "fgsm", "classes": ["car"],
-                 "loss": "vanish", "defence": "bits"}],
-    )  # fmt: skip
+        tiny_set,
+        detectors=[TWO],
+        transfer_detectors=[],
+        transfer=[],
+        hardened=[],
+        replicates=0,
+        attacks=[
+            *members,
+            {"name": "ensemble", "members": members},
+            {"name": "fgsm", "classes": ["car"], "loss": "vanish", "defence": "bits"},
+        ],
+    )
     plan = Digital().plan(suite)
     run(plan, tmp_path, Resources(0, console=Console(file=io.StringIO())))
     plan.kind.finish(plan, tmp_path)

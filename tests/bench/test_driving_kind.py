@@ -228,14 +228,21 @@ def test_a_record_has_what_was_driven(monkeypatch: pytest.MonkeyPatch, tmp_path:
     one, two = (found[cell.key] for cell in cells)
     path = f"traces/{cells[0].key}.npz"
     assert one == {
-        "metrics": {"speed": None, "avoided_by_cc": 1.0}, "artefacts": {"trace": path}, "case": "motion collision",
+        "metrics": {"speed": None, "avoided_by_cc": 1.0},
+        "artefacts": {"trace": path},
+        "case": "motion collision",
         "wall_s": 4.0 + 1.0,
         "episode": {
-            "scenario": "a", "repetition": 0, "town": "Nowhere", "end": "collision", "trace_hash": "hash collision",
-            "trace": path, "metrics": {"speed": None, "avoided_by_cc": 1.0},
+            "scenario": "a",
+            "repetition": 0,
+            "town": "Nowhere",
+            "end": "collision",
+            "trace_hash": "hash collision",
+            "trace": path,
+            "metrics": {"speed": None, "avoided_by_cc": 1.0},
         },
         "witness": {"danger": None},
-    }  # fmt: skip
+    }
     assert two["wall_s"] == 4.0 + 2.0
     assert "witness" not in two, "nothing was hit"
     assert [(given[0], given[1].end, given[2]) for given in asked] == [(episodes[0], "collision", "cpu")]

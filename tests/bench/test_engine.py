@@ -75,11 +75,15 @@ def test_result_does_not_depend_on_workers_or_batches(tmp_path: Path) -> None:
 
 
 BAD = {
-    "raise": ("failed", "ValueError: this one raises"), "exit": ("failed", "SystemExit: this one leaves"),
-    "die": ("crashed", "exit code 3): last words"), "segfault": ("crashed", "SIGSEGV"),
-    "liar": ("failed", "other cells"), "object": ("failed", "not plain data"), "nan": ("failed", "not plain data"),
+    "raise": ("failed", "ValueError: this one raises"),
+    "exit": ("failed", "SystemExit: this one leaves"),
+    "die": ("crashed", "exit code 3): last words"),
+    "segfault": ("crashed", "SIGSEGV"),
+    "liar": ("failed", "other cells"),
+    "object": ("failed", "not plain data"),
+    "nan": ("failed", "not plain data"),
     "memory": ("crashed", "out of memory: it held"),
-}  # fmt: skip
+}
 HANGING = dict.fromkeys(("hang", "spin"), ("timeout", "took longer than 5 s"))
 
 

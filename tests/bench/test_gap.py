@@ -73,9 +73,14 @@ def test_every_condition_meets_the_same_drive(folder: Path) -> None:
     found = load_run(folder)
     told = [(line["system"], line["perturbation"], line["severity"]) for line in found.lines]
     assert told == [
-        ("autopilot", "none", 0), ("line-of-sight", "none", 0), ("perfect", "none", 0), ("bright", "none", 0),
-        ("bright", "dropped", 5), ("bright", "blackout", 5), ("bright", "fog", 5),
-    ]  # fmt: skip
+        ("autopilot", "none", 0),
+        ("line-of-sight", "none", 0),
+        ("perfect", "none", 0),
+        ("bright", "none", 0),
+        ("bright", "dropped", 5),
+        ("bright", "blackout", 5),
+        ("bright", "fog", 5),
+    ]
     assert {line["status"] for line in found.lines} == {"ok"}
     assert len({line["seed"] for line in found.lines}) == 1
     traces = [load_trace(folder / line["artefacts"]["trace"]) for line in found.lines]
@@ -162,9 +167,11 @@ def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
     cells = Gap().plan(mixed).cells
     told = [(cell.fields["perturbation"], cell.fields["severity"], cell.fields["cluster"]) for cell in cells]
     assert told == [
-        ("none", 0, "short"), ("none", 0, "LaneChanging/00"), ("wear-grey", 1, "LaneChanging/00"),
+        ("none", 0, "short"),
+        ("none", 0, "LaneChanging/00"),
+        ("wear-grey", 1, "LaneChanging/00"),
         ("wear-das-yolov5n-twinford", 1, "LaneChanging/00"),
-    ]  # fmt: skip
+    ]
     assert perturbation_names()["wear-grey"] == "texture"
     cars = sorted(name for name, model in MODELS.items() if model.kind == AgentKind.CAR)
     for name in (name for name, family in perturbation_names().items() if family == "texture"):
@@ -176,9 +183,12 @@ def test_a_texture_is_worn_where_there_is_a_car(tmp_path: Path) -> None:
     lit = mixed.model_copy(update={"perturbations": ["night", "shine-laser", "shine-shadow"]})
     told = [(c.fields["perturbation"], c.fields["severity"], c.fields["cluster"]) for c in Gap().plan(lit).cells][2:]
     assert told == [
-        ("night", 1, "short"), ("night", 1, "LaneChanging/00"), ("shine-laser", 2, "LaneChanging/00"),
-        ("shine-laser", 5, "LaneChanging/00"), ("shine-shadow", 1, "LaneChanging/00"),
-    ]  # fmt: skip
+        ("night", 1, "short"),
+        ("night", 1, "LaneChanging/00"),
+        ("shine-laser", 2, "LaneChanging/00"),
+        ("shine-laser", 5, "LaneChanging/00"),
+        ("shine-shadow", 1, "LaneChanging/00"),
+    ]
     assert texture_version("wear-grey") == ""
     assert len(texture_version("wear-das-yolov5n-twinford")) == 64
 

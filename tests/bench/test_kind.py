@@ -61,8 +61,12 @@ def test_a_run_talks_on_standard_error() -> None:
 
 def test_the_key_of_a_cell_depends_on_all_that_it_is_made_of(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {
-        "name": "n", "system": "s", "seed": 1, "fields": {"a": (1, 2)}, "spec": {"b": Path("/x").name}
-    }  # fmt: skip
+        "name": "n",
+        "system": "s",
+        "seed": 1,
+        "fields": {"a": (1, 2)},
+        "spec": {"b": Path("/x").name},
+    }
 
     def key(*inputs: object, **changes: Any) -> str:
         return Least().make_cell(*(given | changes).values(), *inputs).key
@@ -73,9 +77,13 @@ def test_the_key_of_a_cell_depends_on_all_that_it_is_made_of(monkeypatch: pytest
     assert key("version") == one.key
     assert key("version", name="other") == one.key, "what people call it does not matter"
     others = [
-        key(), key("other"), key("version", system="t"), key("version", seed=2),
-        key("version", fields={"a": [1]}), key("version", spec={}),
-    ]  # fmt: skip
+        key(),
+        key("other"),
+        key("version", system="t"),
+        key("version", seed=2),
+        key("version", fields={"a": [1]}),
+        key("version", spec={}),
+    ]
     monkeypatch.setattr(Least, "code", "0" * 12)
     others.append(key("version"))
     assert len({one.key, *others}) == 8
@@ -108,10 +116,18 @@ GOOD = {"kind": "least", "name": "s"}
 @pytest.mark.parametrize(
     "change",
     [
-        {"name": ""}, {"name": "-x"}, {"name": "a/b"}, {"seed": -1}, {"seed": 1.0}, {"timeout_s": 0.0},
-        {"timeout_s": float("inf")}, {"timeout_s": "9"}, {"other": 1}, {"title": None},
+        {"name": ""},
+        {"name": "-x"},
+        {"name": "a/b"},
+        {"seed": -1},
+        {"seed": 1.0},
+        {"timeout_s": 0.0},
+        {"timeout_s": float("inf")},
+        {"timeout_s": "9"},
+        {"other": 1},
+        {"title": None},
     ],
-)  # fmt: skip
+)
 def test_what_no_suite_may_say(change: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         SuiteBase.model_validate(GOOD | change)

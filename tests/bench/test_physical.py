@@ -30,10 +30,18 @@ PAIR = {"train": "Twinford", "test": "Oldmarket", "train_images": 2, "test_image
 def suite(**changes: Any) -> PhysicalSuite:
     """A suite that takes seconds."""
     given: dict[str, Any] = {
-        "kind": "physical", "name": "small", "detectors": ["yolov5n"], "pairs": [PAIR], "epochs": 1, "seeds": 1,
-        "size": 320, "behind": 10.0, "replicates": 0, "floor": 0.0,
+        "kind": "physical",
+        "name": "small",
+        "detectors": ["yolov5n"],
+        "pairs": [PAIR],
+        "epochs": 1,
+        "seeds": 1,
+        "size": 320,
+        "behind": 10.0,
+        "replicates": 0,
+        "floor": 0.0,
         "attacks": [{"name": "random", "carrier": "patch"}, "vanishing", {"name": "shuffled", "of": "vanishing"}],
-    }  # fmt: skip
+    }
     return PhysicalSuite.model_validate(given | changes)
 
 
@@ -41,11 +49,15 @@ def test_cells_are_attacks_by_detector_and_towns() -> None:
     plan = Physical().plan(suite(detectors=["yolov5n", "yolov3-tiny"], transfer=True, seeds=2))
     rows = [(c.fields["detector"], c.fields["attack"], c.fields["source"], c.fields["number"]) for c in plan.cells]
     assert rows[:8] == [
-        ("yolov5n", "clean", "", 0), ("yolov5n", "random", "", 0), ("yolov5n", "random", "", 1),
-        ("yolov5n", "vanishing", "yolov5n", 0), ("yolov5n", "vanishing", "yolov3-tiny", 0),
-        ("yolov5n", "shuffled vanishing", "yolov5n", 0), ("yolov5n", "shuffled vanishing", "yolov5n", 1),
+        ("yolov5n", "clean", "", 0),
+        ("yolov5n", "random", "", 0),
+        ("yolov5n", "random", "", 1),
+        ("yolov5n", "vanishing", "yolov5n", 0),
+        ("yolov5n", "vanishing", "yolov3-tiny", 0),
+        ("yolov5n", "shuffled vanishing", "yolov5n", 0),
+        ("yolov5n", "shuffled vanishing", "yolov5n", 1),
         ("yolov3-tiny", "clean", "", 0),
-    ]  # fmt: skip
+    ]
     assert len({cell.key for cell in plan.cells}) == len(plan.cells) == 2 * 7
     trained = {TextureSpec.of_row(cell.spec).name for cell in plan.cells if cell.spec["source"]}
     assert len(trained) == 2, "a texture for each detector, shown to both and shuffled"
@@ -128,9 +140,12 @@ def test_titles_tell_textures_apart_that_are_shown_or_trained_from_more_sides() 
     assert usual == ["clean", "das", "das, all sides"]
     found = [cell.fields["attack"] for cell in Physical().plan(suite(attacks=rows + more)).cells]
     assert found == [
-        "clean", "das, texture das-yolov5n-twinford", "das, all sides, around 2",
-        "das, texture das-all-sides-yolov5n-twinford", "das, all sides, around 3",
-    ]  # fmt: skip
+        "clean",
+        "das, texture das-yolov5n-twinford",
+        "das, all sides, around 2",
+        "das, texture das-all-sides-yolov5n-twinford",
+        "das, all sides, around 3",
+    ]
 
 
 def test_titles_of_the_suites_whose_tables_are_kept_stay_as_they_are() -> None:
@@ -281,11 +296,15 @@ def test_lights_are_cells_with_a_clean_one_for_each_hour_and_random_ones_beside(
     plan = Physical().plan(suite(attacks=[], lights=rows, seeds=2))
     fields = [(c.fields["attack"], c.fields["carrier"], c.fields["source"], c.fields["number"]) for c in plan.cells]
     assert fields == [
-        ("clean", "light, night", "", 0), ("clean", "light, noon", "", 0), ("laser", "light, night", "yolov5n", 0),
-        ("random laser", "light, night", "", 0), ("random laser", "light, night", "", 1),
-        ("shadow", "light, noon", "yolov5n", 0), ("random shadow", "light, noon", "", 0),
+        ("clean", "light, night", "", 0),
+        ("clean", "light, noon", "", 0),
+        ("laser", "light, night", "yolov5n", 0),
+        ("random laser", "light, night", "", 0),
+        ("random laser", "light, night", "", 1),
+        ("shadow", "light, noon", "yolov5n", 0),
+        ("random shadow", "light, noon", "", 0),
         ("random shadow", "light, noon", "", 1),
-    ]  # fmt: skip
+    ]
     other = Physical().plan(suite(attacks=[], lights=[rows[0] | {"options": {"watts": 0.1}}, rows[1]], seeds=2))
     same = {cell.key for cell in plan.cells} & {cell.key for cell in other.cells}
     assert len(same) == len(plan.cells) - 3
@@ -300,9 +319,10 @@ def test_lights_are_cells_with_a_clean_one_for_each_hour_and_random_ones_beside(
 def test_a_run_of_lights_from_the_search_to_the_picture(tmp_path: Path) -> None:
     settings = {"settings": 4, "members": 2, "window": None}
     rows = [
-        {"name": "laser", "settings": settings}, {"name": "shadow", "hour": "noon", "settings": settings},
+        {"name": "laser", "settings": settings},
+        {"name": "shadow", "hour": "noon", "settings": settings},
         {"name": "projector", "options": {"lumens": 50.0}, "settings": {"epochs": 1, "window": None}},
-    ]  # fmt: skip
+    ]
     plan = Physical().plan(suite(attacks=[], lights=rows))
     records = run(plan, tmp_path, Resources(workers=2))
     assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * len(records)
@@ -379,9 +399,12 @@ def test_a_run_from_the_recording_to_the_picture(tmp_path: Path) -> None:
 def test_a_texture_is_trained_against_a_3d_detector(tmp_path: Path) -> None:
     """It is shown whole pictures with their camera, whatever the window; its loss on them rises."""
     given = suite(
-        detectors=["fcos3d-light"], attacks=[{"name": "vanishing", "settings": {"batch": 2}}], epochs=3, window=192,
+        detectors=["fcos3d-light"],
+        attacks=[{"name": "vanishing", "settings": {"batch": 2}}],
+        epochs=3,
+        window=192,
         pairs=[PAIR | {"test_images": 1}],
-    )  # fmt: skip
+    )
     plan = Physical().plan(given)
     records = run(plan, tmp_path, Resources(workers=1))
     assert [(record["reason"], record["status"]) for record in records] == [("", "ok")] * 2

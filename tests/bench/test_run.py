@@ -162,9 +162,16 @@ class Bench:
         return Pool(self.backend)
 
     def run(
-        self, systems: str, words: str, *, kind: type[Words] = Words, retry: bool = False, workers: int | None = 3,
-        device: str = "cpu", **changes: Any,
-    ) -> dict[str, dict[str, Any]]:  # fmt: skip
+        self,
+        systems: str,
+        words: str,
+        *,
+        kind: type[Words] = Words,
+        retry: bool = False,
+        workers: int | None = 3,
+        device: str = "cpu",
+        **changes: Any,
+    ) -> dict[str, dict[str, Any]]:
         suite = WordSuite(name="w", systems=systems.split(), words=words.split(), **changes)
         resources = Resources(workers, console=Console(file=io.StringIO()))
         records = run(kind().plan(suite, device=device), self.folder, resources, retry=retry)
@@ -196,14 +203,30 @@ def test_a_record_says_what_was_run_and_found(bench: Bench) -> None:
     record = records["b/three"]
     assert len(record["key"]) == 16
     assert record == {
-        "key": record["key"], "suite": "w", "system": "b", "word": "three", "seed": 4, "status": "ok", "reason": "",
-        "spec": {"n": 5}, "metrics": {"length": 5}, "n": 1,
-        "versions": {"ssad": "1", "device": "cpu", "dictionary": "3"}, "wall_s": 1.0, "artefacts": {}, "hashes": {},
-    }  # fmt: skip
+        "key": record["key"],
+        "suite": "w",
+        "system": "b",
+        "word": "three",
+        "seed": 4,
+        "status": "ok",
+        "reason": "",
+        "spec": {"n": 5},
+        "metrics": {"length": 5},
+        "n": 1,
+        "versions": {"ssad": "1", "device": "cpu", "dictionary": "3"},
+        "wall_s": 1.0,
+        "artefacts": {},
+        "hashes": {},
+    }
     assert read_lines(bench.folder / "results.jsonl")[-1] == record
     assert read_lines(bench.folder / "episodes.jsonl")[-1] == {
-        "key": record["key"], "suite": "w", "system": "b", "word": "three", "seed": 4, "said": True,
-    }  # fmt: skip
+        "key": record["key"],
+        "suite": "w",
+        "system": "b",
+        "word": "three",
+        "seed": 4,
+        "said": True,
+    }
     assert bench.backend.done == [("a/one b/one", 2 * TIMEOUT), ("a/three b/three", 2 * TIMEOUT)]
     assert (Bar.last.title, Bar.last.began, Bar.last.total) == ("w", 0, 4)
 
@@ -258,8 +281,11 @@ def test_a_batch_that_fails_is_run_one_by_one_at_once(bench: Bench) -> None:
     bench.fate = ends("a/one a/two", "a/two", **FAILED)
     records = bench.run("a", "one two six ten", batch=2)
     assert bench.backend.done == [
-        ("a/one a/two", 2 * TIMEOUT), ("a/one", TIMEOUT), ("a/two", TIMEOUT), ("a/six a/ten", 2 * TIMEOUT),
-    ]  # fmt: skip
+        ("a/one a/two", 2 * TIMEOUT),
+        ("a/one", TIMEOUT),
+        ("a/two", TIMEOUT),
+        ("a/six a/ten", 2 * TIMEOUT),
+    ]
     assert [record["status"] for record in records.values()] == ["ok", "failed", "ok", "ok"]
     lost = records["a/two"]
     assert (lost["reason"], lost["metrics"], lost["wall_s"], lost["n"]) == ("ValueError: no", {}, 1.0, 1)
@@ -287,8 +313,18 @@ def test_cells_run_when_all_their_pieces_are_there(bench: Bench, monkeypatch: py
     monkeypatch.setattr(Words, "shares", lambda word: [] if word == "one" else list(word))
     records = bench.run("a b c", "ab one b")
     assert bench.did == [
-        "a/one", "b/one", "c/one", "a for a b c", "b for a b c", "a/ab", "a/b", "b/ab", "b/b", "c/ab", "c/b",
-    ]  # fmt: skip
+        "a/one",
+        "b/one",
+        "c/one",
+        "a for a b c",
+        "b for a b c",
+        "a/ab",
+        "a/b",
+        "b/ab",
+        "b/b",
+        "c/ab",
+        "c/b",
+    ]
     assert dict(bench.backend.done)["a for a b c"] == TIMEOUT
     for system in "abc":
         assert records[f"{system}/one"]["wall_s"] == 6.0
@@ -306,9 +342,22 @@ def test_a_piece_that_fails_for_all_is_made_for_each_and_one_that_fails_alone_ma
     records = bench.run("a b c", "x y z")
     assert {record["status"] for record in records.values()} == {"ok"}
     assert bench.did == [
-        "x for a b c", "x for a", "x for b", "x for c", "a/x", "b/x", "b/y", "b/z", "c/x",
-        "y for a c", "a/y", "c/y", "z for a c", "a/z", "c/z",
-    ]  # fmt: skip
+        "x for a b c",
+        "x for a",
+        "x for b",
+        "x for c",
+        "a/x",
+        "b/x",
+        "b/y",
+        "b/z",
+        "c/x",
+        "y for a c",
+        "a/y",
+        "c/y",
+        "z for a c",
+        "a/z",
+        "c/z",
+    ]
 
 
 def test_a_system_that_failed_alone_is_left_out_when_a_piece_fails_that_was_at_work(

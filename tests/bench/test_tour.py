@@ -53,8 +53,10 @@ def test_every_part_is_a_run_of_its_own_and_the_front_page_leads_there(tmp_path:
     out = tmp_path / "out"
     records = go(tour_of(tmp_path), out)
     assert [(one["part"], one["status"], one["metrics"]["cells"]) for one in records] == [
-        ("first", "ok", 1.0), ("second", "ok", 1.0), ("third", "ok", 1.0),
-    ]  # fmt: skip
+        ("first", "ok", 1.0),
+        ("second", "ok", 1.0),
+        ("third", "ok", 1.0),
+    ]
     write_report(out)
     assert check_artefacts(out) == []
     page = (out / "report.html").read_text()
@@ -106,5 +108,10 @@ def test_what_is_wrong_is_one_line(tmp_path: Path) -> None:
 def test_the_shipped_tour_can_be_planned() -> None:
     plan = Tour().plan(load_suite("tour"), check=False)
     assert {part.kind.name for part in plan.details.values()} == {
-        "driving", "detection", "digital", "physical", "adversarial", "gap",
-    }  # fmt: skip
+        "driving",
+        "detection",
+        "digital",
+        "physical",
+        "adversarial",
+        "gap",
+    }

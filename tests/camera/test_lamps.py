@@ -60,9 +60,13 @@ def lamp_light(scene: Scene, view: View, **options: Any) -> Any:
 
 @settings(max_examples=6, deadline=None)
 @given(
-    height=st.floats(6.0, 14.0), across=st.floats(0.2, 0.7), down=st.floats(0.2, 0.7), soft=st.floats(0.0, 1.0),
-    square=st.booleans(), tilt=st.floats(-0.2, 0.2),
-)  # fmt: skip
+    height=st.floats(6.0, 14.0),
+    across=st.floats(0.2, 0.7),
+    down=st.floats(0.2, 0.7),
+    soft=st.floats(0.0, 1.0),
+    square=st.booleans(),
+    tilt=st.floats(-0.2, 0.2),
+)
 def test_the_power_of_a_lamp_is_what_arrives(
     scene: Scene, height: float, across: float, down: float, soft: float, square: bool, tilt: float
 ) -> None:
@@ -79,8 +83,13 @@ def test_the_power_of_a_lamp_is_what_arrives(
 def test_a_lamp_fades_with_its_reach_and_needs_sense() -> None:
     pose = at(0, 0, 5, DOWN)
     for wrong in (
-        {"power": -1.0}, {"power": np.nan}, {"spread": (0.0, 1.0)}, {"reach": 0.0}, {"soft": 2.0}, {"pose": np.eye(3)},
-    ):  # fmt: skip
+        {"power": -1.0},
+        {"power": np.nan},
+        {"spread": (0.0, 1.0)},
+        {"reach": 0.0},
+        {"soft": 2.0},
+        {"pose": np.eye(3)},
+    ):
         with pytest.raises(ConfigError, match="a lamp"):
             Lamp(**({"pose": pose, "power": 1.0} | wrong))  # type: ignore[arg-type]
 

@@ -161,12 +161,26 @@ def loose_street(count: int) -> Street:
     ends, none = len(near), np.zeros(0, np.float32)
     offset = np.array([[0, ends // 3, ends // 2, ends], [ends, count, count, count], [count] * 4])
     return Street(
-        "loose", "town", corners.reshape(-1, 3).astype(np.float32), faces,
-        np.full((count, 3, 3), 3**-0.5, np.float32), np.zeros((count, 3, 2), np.float32), np.zeros(count, np.int32),
-        (GREY,), 32.0, (-32.0, -32.0), 2, 1, np.concatenate([near, rest]).astype(np.int32), offset.astype(np.int32),
-        none.reshape(0, 4), none.reshape(0, 4), none.astype(np.int32), none.astype(np.int32).reshape(0, 3, 2),
+        "loose",
+        "town",
+        corners.reshape(-1, 3).astype(np.float32),
+        faces,
+        np.full((count, 3, 3), 3**-0.5, np.float32),
+        np.zeros((count, 3, 2), np.float32),
+        np.zeros(count, np.int32),
+        (GREY,),
+        32.0,
+        (-32.0, -32.0),
+        2,
+        1,
+        np.concatenate([near, rest]).astype(np.int32),
+        offset.astype(np.int32),
+        none.reshape(0, 4),
+        none.reshape(0, 4),
+        none.astype(np.int32),
+        none.astype(np.int32).reshape(0, 3, 2),
         none.reshape(0, 3),
-    )  # fmt: skip
+    )
 
 
 def test_a_street_equals_a_plain_search_over_its_triangles() -> None:

@@ -36,10 +36,20 @@ def visible(
         return wp.array(values, dtype=dtype, device="cpu")
 
     inputs = [
-        on(vertices, wp.vec3), on(faces, wp.int32), on(np.arange(count), wp.int32), on([0, count], wp.int32),
-        on([0], wp.int32), on([0], wp.int32), on(np.eye(4)[None], wp.mat44), on([[60, 60, 31.5, 23.5]], wp.vec4),
-        0.2, float(scale), 0, lanes, 1e30,
-    ]  # fmt: skip
+        on(vertices, wp.vec3),
+        on(faces, wp.int32),
+        on(np.arange(count), wp.int32),
+        on([0, count], wp.int32),
+        on([0], wp.int32),
+        on([0], wp.int32),
+        on(np.eye(4)[None], wp.mat44),
+        on([[60, 60, 31.5, 23.5]], wp.vec4),
+        0.2,
+        float(scale),
+        0,
+        lanes,
+        1e30,
+    ]
     owners = wp.empty(count, dtype=wp.vec2i, device="cpu")
     large, many = wp.empty(1, dtype=raster.Triangle, device="cpu"), wp.zeros(1, dtype=int, device="cpu")
     outputs = [owners, samples, large, many]

@@ -323,9 +323,12 @@ def pictures() -> dict[str, Any]:
     wedge = np.stack(np.broadcast_arrays(np.arange(48)[:, None] * 5, np.arange(64)[None] * 4, 90), -1)
     wedge[10:20, 15:40] = 250, 10, 20
     return {
-        "forms": forms(64, 96), "odd": forms(61, 45), "half": forms(56, 72), "wedge": wedge.astype(np.uint8),
+        "forms": forms(64, 96),
+        "odd": forms(61, 45),
+        "half": forms(56, 72),
+        "wedge": wedge.astype(np.uint8),
         "noise": rng.integers(0, 256, (34, 46, 3)).astype(np.uint8),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("quality", [30, 75, 92, 96])

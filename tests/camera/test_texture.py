@@ -202,10 +202,14 @@ def test_wrong_textures_are_refused_in_one_line(scene: Scene) -> None:
     with pytest.raises(ConfigError, match="mask"):
         taps_of(picture, 16, mask=np.zeros((16, 16), bool))
     for wrong_layer in (
-        lambda: Layer(-1), lambda: Layer(0, (0.5, 0.0, 0.5, 1.0)), lambda: Layer(0, opacity=1.5),
-        lambda: Layer(0, mask=np.full((2, 2), 2.0, np.float32)), lambda: Layer(0, mask=np.zeros(4, np.float32)),
-        lambda: Decal(0, np.eye(3), (1.0, 1.0)), lambda: Decal(0, np.eye(4), (0.0, 1.0)),
-    ):  # fmt: skip
+        lambda: Layer(-1),
+        lambda: Layer(0, (0.5, 0.0, 0.5, 1.0)),
+        lambda: Layer(0, opacity=1.5),
+        lambda: Layer(0, mask=np.full((2, 2), 2.0, np.float32)),
+        lambda: Layer(0, mask=np.zeros(4, np.float32)),
+        lambda: Decal(0, np.eye(3), (1.0, 1.0)),
+        lambda: Decal(0, np.eye(4), (0.0, 1.0)),
+    ):
         with pytest.raises(ConfigError):
             wrong_layer()
     low, high = PRINTABLE

@@ -72,8 +72,9 @@ def test_gradients_are_those_of_finite_differences(view: tuple[Scene, View]) -> 
     one, dark = lamp(soft=0.8), seen(view)
     assert dark.surface is not None
     some = np.flatnonzero(dark.tag.ravel() >= 0)[::97]
-    place, normal = (torch.tensor(v.reshape(-1, 3)[some], dtype=torch.float64)
-                     for v in (dark.surface.position, dark.surface.normal))  # fmt: skip
+    place, normal = (
+        torch.tensor(v.reshape(-1, 3)[some], dtype=torch.float64) for v in (dark.surface.position, dark.surface.normal)
+    )
     start = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (one.pose, one.power, one.spread)]
 
     def light(pose: Tensor, power: Tensor, spread: Tensor) -> Tensor:

@@ -109,10 +109,19 @@ def test_a_state_dict_is_found_where_it_is_nested(zipped: bool, nest: tuple[str,
 def test_what_pytorch_reads_is_read_alike(zipped: bool, tmp_path: Path) -> None:
     base = torch.arange(24.0)
     state = OrderedDict(
-        half=base.half(), bfloat=base.bfloat16(), double=base.double(), integer=base.long(), byte=base.byte(),
-        flag=base > 3, window=base[4:16].view(3, 4)[:, 1:3], shared=base[8:], scalar=base[5], none=torch.empty(0, 3),
-        parameter=nn.Parameter(base.view(4, 6).T, requires_grad=True), repeated=base.view(2, 12)[0],
-    )  # fmt: skip
+        half=base.half(),
+        bfloat=base.bfloat16(),
+        double=base.double(),
+        integer=base.long(),
+        byte=base.byte(),
+        flag=base > 3,
+        window=base[4:16].view(3, 4)[:, 1:3],
+        shared=base[8:],
+        scalar=base[5],
+        none=torch.empty(0, 3),
+        parameter=nn.Parameter(base.view(4, 6).T, requires_grad=True),
+        repeated=base.view(2, 12)[0],
+    )
     torch.save(state, tmp_path / "a.pt", _use_new_zipfile_serialization=zipped)
     expected = torch.load(tmp_path / "a.pt", weights_only=True)
     found = load_weights(tmp_path / "a.pt")
@@ -135,10 +144,18 @@ def test_a_pickled_module_gives_its_state_dict(zipped: bool, tmp_path: Path) -> 
 def test_foreign_classes_do_not_matter(zipped: bool, tmp_path: Path) -> None:
     state = defaultdict(list, toy().state_dict())
     tree = {
-        "meta": {"path": Path("a/b"), "array": np.arange(3), "scalar": np.float64(3), "kind": torch.float16,
-                 "device": torch.device("cpu"), "names": {"a", "b"}, "space": SimpleNamespace(a=1), "call": len},
+        "meta": {
+            "path": Path("a/b"),
+            "array": np.arange(3),
+            "scalar": np.float64(3),
+            "kind": torch.float16,
+            "device": torch.device("cpu"),
+            "names": {"a", "b"},
+            "space": SimpleNamespace(a=1),
+            "call": len,
+        },
         "state_dict": state,
-    }  # fmt: skip
+    }
     torch.save(tree, tmp_path / "a.ckpt", _use_new_zipfile_serialization=zipped)
     assert same(load_weights(tmp_path / "a.ckpt"), dict(state))
 
@@ -259,18 +276,20 @@ GREEDY = {  # small pickles that ask for much: of memory, of time, of the interp
     "the same, read again": (b"}q\x00h\x00r" + struct.pack("<I", 10**6), "byte 7 of .* as number 1,000,000"),
     "many bytes announced": (b"\x96" + struct.pack("<Q", 1 << 28), "268435456 bytes"),
     "a tuple far larger unfolded": (
-        b"})" + b"".join(b"q%ch%c\x86" % (k, k) for k in range(28)) + b"I1\ns", "more than 5,000,000 steps"
+        b"})" + b"".join(b"q%ch%c\x86" % (k, k) for k in range(28)) + b"I1\ns",
+        "more than 5,000,000 steps",
     ),
     "tuples deep inside each other": (b"})" + b"\x85" * 10_000 + b"I1\ns", "more than 5,000,000 steps"),
     "a list copied again and again": (
-        b"](" + b"I1\n" * 1000 + b"eq\x00"
-        + b"ctorch\nSize\nq\x01" + b"h\x01h\x00\x85R" * 6000, "more than 5,000,000 steps",
+        b"](" + b"I1\n" * 1000 + b"eq\x00" + b"ctorch\nSize\nq\x01" + b"h\x01h\x00\x85R" * 6000,
+        "more than 5,000,000 steps",
     ),
     "a class of every name": (
-        b"".join(b"ca\n%d\n" % k for k in range(12_000)), "more than 5,000,000 steps",
+        b"".join(b"ca\n%d\n" % k for k in range(12_000)),
+        "more than 5,000,000 steps",
     ),
     "nothing to take": (b"\x85", "byte 2 of .* a value that is not there"),
-}  # fmt: skip
+}
 
 
 @STREAMS
@@ -316,10 +335,15 @@ def test_other_files_are_one_line(tmp_path: Path) -> None:
     torch.save(toy().state_dict(), tmp_path / "named.safetensors")
     (tmp_path / "a.weights").write_bytes(b"x")
     expected = {
-        "plain.pth": "pickle, not a PyTorch", "empty.pth": "no state dict", "script.pt": "TorchScript",
-        "zip.pt": "not one that PyTorch", "named.safetensors": "pickle under the name", "a.weights": "weights are",
-        "emptie.pth": "closest: empty.pth", "none/x.safetensors": "no such file",
-    }  # fmt: skip
+        "plain.pth": "pickle, not a PyTorch",
+        "empty.pth": "no state dict",
+        "script.pt": "TorchScript",
+        "zip.pt": "not one that PyTorch",
+        "named.safetensors": "pickle under the name",
+        "a.weights": "weights are",
+        "emptie.pth": "closest: empty.pth",
+        "none/x.safetensors": "no such file",
+    }
     for name, text in expected.items():
         with pytest.raises(FormatError, match=text) as caught:
             load_weights(tmp_path / name)
@@ -365,8 +389,11 @@ def test_shards_of_older_weights_go(tmp_path: Path) -> None:
     assert same(load_weights(tmp_path / "toy.safetensors"), state)
     save_weights(tmp_path / "toy.safetensors", state, card=CARD)
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "toy-light.json", "toy-light.safetensors", "toy.json", "toy.safetensors"
-    ]  # fmt: skip
+        "toy-light.json",
+        "toy-light.safetensors",
+        "toy.json",
+        "toy.safetensors",
+    ]
     with pytest.raises(FormatError, match="2 sets of weights"):
         load_weights(tmp_path)
 

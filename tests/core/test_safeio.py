@@ -240,10 +240,14 @@ def test_limits(tmp_path: Path) -> None:
     mebibytes = {
         function: inspect.signature(function).parameters["limit"].default / 2**20
         for function in (
-            safeio.read_bytes, safeio.read_text, safeio.read_yaml_document, safeio.read_json,
-            safeio.read_xml, safeio.load_npz,
+            safeio.read_bytes,
+            safeio.read_text,
+            safeio.read_yaml_document,
+            safeio.read_json,
+            safeio.read_xml,
+            safeio.load_npz,
         )
-    }  # fmt: skip
+    }
     assert list(mebibytes.values()) == [64, 64, 16, 256, 256, 2048]
     with (tmp_path / "large").open("wb") as file:
         file.truncate(16 * 2**20 + 1)
@@ -347,10 +351,24 @@ def test_yaml_tags(text: str, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("0o17", 15), ("+7", 7), ("-0x1F", "-0x1F"), (".inf", np.inf), (".5", 0.5), ("1.", 1.0), ("1e3", 1000.0),
-     ("True", True), ("FALSE", False), ("Null", None), ("!!str 5", "5"), ("<<", "<<"), ("yes", "yes"),
-     ("1_000", "1_000"), ("0o8", "0o8")],
-)  # fmt: skip
+    [
+        ("0o17", 15),
+        ("+7", 7),
+        ("-0x1F", "-0x1F"),
+        (".inf", np.inf),
+        (".5", 0.5),
+        ("1.", 1.0),
+        ("1e3", 1000.0),
+        ("True", True),
+        ("FALSE", False),
+        ("Null", None),
+        ("!!str 5", "5"),
+        ("<<", "<<"),
+        ("yes", "yes"),
+        ("1_000", "1_000"),
+        ("0o8", "0o8"),
+    ],
+)
 def test_more_yaml_scalars(text: str, value: object) -> None:
     found = safeio.parse_yaml(text)
     assert found == value
@@ -367,8 +385,13 @@ def test_plain_data() -> None:
         "f": True,
     }
     assert safeio.plain(given) == {
-        "a": [1, [0.5, None]], "3": {"b": None}, "c": "text", "d": 4, "e": None, "f": True,
-    }  # fmt: skip
+        "a": [1, [0.5, None]],
+        "3": {"b": None},
+        "c": "text",
+        "d": 4,
+        "e": None,
+        "f": True,
+    }
     assert type(safeio.plain(np.int64(4))) is int
 
 

@@ -44,12 +44,17 @@ def test_a_version_has_12_digits(write: Write) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "import own_b", "import os, own_b", "import own_b as b, sys", "from own_b import x",
+        "import own_b",
+        "import os, own_b",
+        "import own_b as b, sys",
+        "from own_b import x",
         "if True:\n\timport own_b",
-        "  from own_b import (\n  x as y,\n  z)", "from  own_b  import *", "X = 'own_b.thing:name'",
+        "  from own_b import (\n  x as y,\n  z)",
+        "from  own_b  import *",
+        "X = 'own_b.thing:name'",
         'X = "own_b.thing"',
     ],
-)  # fmt: skip
+)
 def test_imports_are_followed_wherever_they_stand(write: Write, text: str) -> None:
     write({"own_a.py": f"VALUE = 1\n{text}\n", "own_b/__init__.py": "", "own_b/thing.py": ""})
     found = led_to("own_a")
@@ -64,10 +69,16 @@ def test_what_only_looks_like_an_import_is_none(write: Write, text: str) -> None
 
 
 PACKAGE = {
-    "own_p/__init__.py": "from own_p.unseen import x\n", "own_p/unseen.py": "", "own_p/top.py": "",
-    "own_p/sub/__init__.py": "from .near import x\n", "own_p/sub/near.py": "", "own_p/sub/other.py": "",
-    "own_p/sub/deep/__init__.py": "", "own_p/sub/deep/far.py": "", "own_p/sub/deep/_own.py": "",
-}  # fmt: skip
+    "own_p/__init__.py": "from own_p.unseen import x\n",
+    "own_p/unseen.py": "",
+    "own_p/top.py": "",
+    "own_p/sub/__init__.py": "from .near import x\n",
+    "own_p/sub/near.py": "",
+    "own_p/sub/other.py": "",
+    "own_p/sub/deep/__init__.py": "",
+    "own_p/sub/deep/far.py": "",
+    "own_p/sub/deep/_own.py": "",
+}
 
 
 @pytest.mark.parametrize(
@@ -103,16 +114,34 @@ def test_a_package_is_followed_from_its_own_place(write: Write) -> None:
 def test_the_source_of_a_cell_is_found() -> None:
     """What a drive depends on is in its key, and a report or a detector is not."""
     found = set(source_files("ssad.bench.kinds.driving"))
-    for name in ("core.safeio", "core.registry", "core.traces", "core.geometry", "metrics.driving",
-                 "metrics.criticality", "world.kernels.traffic", "drivers.careful.grade", "drivers.builtin",
-                 "roads.router",
-                 "scenarios.dynamic.knowledge.lane_changing", "scenarios.dynamic.knowledge._placing"):  # fmt: skip
+    for name in (
+        "core.safeio",
+        "core.registry",
+        "core.traces",
+        "core.geometry",
+        "metrics.driving",
+        "metrics.criticality",
+        "world.kernels.traffic",
+        "drivers.careful.grade",
+        "drivers.builtin",
+        "roads.router",
+        "scenarios.dynamic.knowledge.lane_changing",
+        "scenarios.dynamic.knowledge._placing",
+    ):
         assert f"ssad.{name}" in found, name
     assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
     seen = set(source_files("ssad.bench.kinds.detection"))
-    for name in ("detectors.mono3d.nms", "detectors.yolo.decode", "scenarios.static.shifts.kernels.falling",
-                 "metrics.detection_match", "evaluation.scene_boxes", "recording.drives", "camera.kernels.shade",
-                 "assets.street.palette", "datasets.nuscenes.truth"):  # fmt: skip
+    for name in (
+        "detectors.mono3d.nms",
+        "detectors.yolo.decode",
+        "scenarios.static.shifts.kernels.falling",
+        "metrics.detection_match",
+        "evaluation.scene_boxes",
+        "recording.drives",
+        "camera.kernels.shade",
+        "assets.street.palette",
+        "datasets.nuscenes.truth",
+    ):
         assert f"ssad.{name}" in seen, name
 
 
@@ -120,9 +149,14 @@ def test_any_changed_file_that_is_led_to_changes_the_version(tmp_path: Path, mon
     monkeypatch.syspath_prepend(str(tmp_path))
     files = {
         "one.py": "import two\nfrom pack import inner\nNAMES = {'x': 'pack.named:X'}\nimport numpy\n",
-        "two.py": "def f():\n    from three import (\n        g,\n    )\n", "three.py": "g = 1\n", "four.py": "h = 1\n",
-        "pack/__init__.py": "", "pack/inner.py": "from . import beside\n", "pack/beside.py": "", "pack/named.py": "",
-    }  # fmt: skip
+        "two.py": "def f():\n    from three import (\n        g,\n    )\n",
+        "three.py": "g = 1\n",
+        "four.py": "h = 1\n",
+        "pack/__init__.py": "",
+        "pack/inner.py": "from . import beside\n",
+        "pack/beside.py": "",
+        "pack/named.py": "",
+    }
     (tmp_path / "pack").mkdir()
     for name, text in files.items():
         (tmp_path / name).write_text(text)

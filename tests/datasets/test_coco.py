@@ -16,11 +16,18 @@ from ssad.datasets.coco import coco_data, read_coco
 
 CLASSES = ("car", "bus")
 ROWS: list[dict[str, Any]] = [
-    {"file_name": "a.jpg", "width": 64, "height": 48, "town": "Twinford", "objects": [
-        {"label": 0, "box": [1.0, 2.0, 11.0, 22.0], "pixels": 150, "crowd": False, "target": True, "visible": 0.9},
-        {"label": 1, "box": [5.0, 5.0, 7.0, 9.0], "pixels": 8, "crowd": True, "target": False, "visible": 0.2}]},
+    {
+        "file_name": "a.jpg",
+        "width": 64,
+        "height": 48,
+        "town": "Twinford",
+        "objects": [
+            {"label": 0, "box": [1.0, 2.0, 11.0, 22.0], "pixels": 150, "crowd": False, "target": True, "visible": 0.9},
+            {"label": 1, "box": [5.0, 5.0, 7.0, 9.0], "pixels": 8, "crowd": True, "target": False, "visible": 0.2},
+        ],
+    },
     {"file_name": "sub/b.jpg", "width": 32, "height": 32, "town": "Oldmarket", "objects": []},
-]  # fmt: skip
+]
 
 
 def write(folder: Path, data: Any) -> Path:
@@ -35,9 +42,15 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert data["info"] == {"seed": 3}
     assert [c["id"] for c in data["categories"]] == [1, 2]
     assert data["annotations"][0] == {
-        "id": 1, "image_id": 1, "category_id": 1, "bbox": [1.0, 2.0, 10.0, 20.0], "area": 150, "iscrowd": 0,
-        "target": True, "visible": 0.9,
-    }  # fmt: skip
+        "id": 1,
+        "image_id": 1,
+        "category_id": 1,
+        "bbox": [1.0, 2.0, 10.0, 20.0],
+        "area": 150,
+        "iscrowd": 0,
+        "target": True,
+        "visible": 0.9,
+    }
     page = write(tmp_path, data)
     found = read_coco(page)
     assert found.classes == CLASSES

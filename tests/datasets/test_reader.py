@@ -105,8 +105,10 @@ def test_scene_is_complete_and_in_order(tiny: Path) -> None:
 
 def test_frames_are_joined_with_calibration_and_pose(tiny: Path) -> None:
     data = NuScenes(tiny)
-    tables = {name: {row["token"]: row for row in json.loads((tiny / VERSION / f"{name}.json").read_text())}
-              for name in ("sample_data", "calibrated_sensor", "ego_pose", "sensor")}  # fmt: skip
+    tables = {
+        name: {row["token"]: row for row in json.loads((tiny / VERSION / f"{name}.json").read_text())}
+        for name in ("sample_data", "calibrated_sensor", "ego_pose", "sensor")
+    }
     for frame in data.scene("scene-0103").frames:
         row = tables["sample_data"][frame.token]
         calibration = tables["calibrated_sensor"][row["calibrated_sensor_token"]]
@@ -127,8 +129,14 @@ def test_frames_are_joined_with_calibration_and_pose(tiny: Path) -> None:
             assert frame.intrinsic.tolist() == calibration["camera_intrinsic"]
             assert (frame.width, frame.height) == (160, 90)
             forward = (frame.sensor_to_ego @ [0, 0, 1, 0])[:3]
-            yaw = {"CAM_FRONT": 0, "CAM_FRONT_LEFT": 55, "CAM_FRONT_RIGHT": -55.5, "CAM_BACK_LEFT": 110,
-                   "CAM_BACK_RIGHT": -110, "CAM_BACK": 180}[frame.channel]  # fmt: skip
+            yaw = {
+                "CAM_FRONT": 0,
+                "CAM_FRONT_LEFT": 55,
+                "CAM_FRONT_RIGHT": -55.5,
+                "CAM_BACK_LEFT": 110,
+                "CAM_BACK_RIGHT": -110,
+                "CAM_BACK": 180,
+            }[frame.channel]
             expected = [math.cos(math.radians(yaw)), math.sin(math.radians(yaw)), 0]
             np.testing.assert_allclose(forward, expected, atol=1e-12)
             np.testing.assert_allclose(frame.sensor_to_ego[:3, 1], [0, 0, -1], atol=1e-12)  # image down is ego down

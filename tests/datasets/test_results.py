@@ -47,9 +47,11 @@ def test_columns_are_those_of_the_file(tmp_path: Path) -> None:
     table = found.boxes
     assert [found.samples[i] for i in table.sample] == [token for token, _ in rows]
     columns = {
-        "translation": table.centre, "size": table.size_lwh[:, [1, 0, 2]], "rotation": table.rotation,
+        "translation": table.centre,
+        "size": table.size_lwh[:, [1, 0, 2]],
+        "rotation": table.rotation,
         "velocity": table.velocity,
-    }  # fmt: skip
+    }
     for name, values in columns.items():
         assert np.array_equal(values, np.array([b[name] for _, b in rows]), equal_nan=True), name
     assert [CLASSES[i] for i in table.label] == [b["detection_name"] for _, b in rows]

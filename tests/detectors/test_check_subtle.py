@@ -162,9 +162,14 @@ class WithTheBestPlacesOnly(Wrapped):
         rows = dense.quality[0].topk(self.count).indices.sort().values
         self.rows, self.whole = rows, dense
         return replace(
-            dense, logit=dense.logit[:, rows], quality=dense.quality[:, rows], box=dense.box[:, rows],
-            place=dense.place[rows], stride=dense.stride[rows], level=dense.level[rows],
-        )  # fmt: skip
+            dense,
+            logit=dense.logit[:, rows],
+            quality=dense.quality[:, rows],
+            box=dense.box[:, rows],
+            place=dense.place[rows],
+            stride=dense.stride[rows],
+            level=dense.level[rows],
+        )
 
 
 class WithHolesInTheGrid(WithTheBestPlacesOnly):
@@ -284,10 +289,13 @@ class WithEverythingWrong(WithFourBits, WithOneLossTurned, WithTheLogitsGradient
 def test_all_parts_are_tried() -> None:
     faults = find_faults(WithEverythingWrong(make("yolov5n")), size=SIZE)
     for promise in (
-        f"the gradient of Dense.logit {SLOPE}", 'losses["obj"] rises above 0', "the image is not quantised inside",
-        "Dense has places all over the picture", "Dense.box is in pixels of the picture",
+        f"the gradient of Dense.logit {SLOPE}",
+        'losses["obj"] rises above 0',
+        "the image is not quantised inside",
+        "Dense has places all over the picture",
+        "Dense.box is in pixels of the picture",
         "the boxes of predict are among those of dense",
-    ):  # fmt: skip
+    ):
         assert any(promise in fault for fault in faults), (promise, faults)
     faults = find_faults(WithAnotherConvention(make("fcos"), bottom), size=SIZE)
     assert len(faults) == 1, faults

@@ -23,9 +23,13 @@ def pixels(*shape: int, most: int = 255) -> np.ndarray:  # type: ignore[type-arg
 
 @settings(max_examples=60, deadline=None)
 @given(
-    height=st.integers(1, 9), width=st.integers(1, 9), channels=st.sampled_from([1, 3, 4]), batch=st.integers(1, 3),
-    kind=st.sampled_from(["uint8", "uint16", "float32", "float64", ">u2"]), tensor=st.booleans(),
-)  # fmt: skip
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    channels=st.sampled_from([1, 3, 4]),
+    batch=st.integers(1, 3),
+    kind=st.sampled_from(["uint8", "uint16", "float32", "float64", ">u2"]),
+    tensor=st.booleans(),
+)
 def test_every_form_means_the_same(  # type: ignore[no-untyped-def]
     height, width, channels, batch, kind, tensor
 ) -> None:

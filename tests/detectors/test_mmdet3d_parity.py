@@ -195,8 +195,10 @@ def run(out: Path, *arguments: str) -> Reference:
 
 
 @pytest.mark.skipif(PYTHON is None, reason="set SSAD_MMDET3D_PYTHON to an interpreter with mmdet3d 1.4.0")
-@pytest.mark.parametrize(("kind", "seed", "size"), [("fcos3d", 1, (416, 256)), ("fcos3d", 2, (333, 205)),
-                                                    ("pgd", 1, (416, 256)), ("pgd", 2, (333, 205))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "seed", "size"),
+    [("fcos3d", 1, (416, 256)), ("fcos3d", 2, (333, 205)), ("pgd", 1, (416, 256)), ("pgd", 2, (333, 205))],
+)
 def test_equals_mmdet3d_itself(kind: str, seed: int, size: tuple[int, int], tmp_path: Path) -> None:
     width, height = size
     reference = run(tmp_path, kind, str(tmp_path), "--seed", str(seed), "--size", str(width), str(height))

@@ -69,16 +69,22 @@ def test_weights_have_the_official_names_and_shapes(pgd: bool) -> None:
     assert set(state) == official_names(pgd=pgd)
     assert len(state) == (795 if pgd else 777)
     shapes = {
-        "backbone.conv1.weight": (64, 3, 7, 7), "backbone.layer1.0.downsample.0.weight": (256, 64, 1, 1),
+        "backbone.conv1.weight": (64, 3, 7, 7),
+        "backbone.layer1.0.downsample.0.weight": (256, 64, 1, 1),
         "backbone.layer3.22.conv2.weight": (256, 256, 3, 3),
         "backbone.layer3.22.conv2.conv_offset.weight": (27, 256, 3, 3),
-        "backbone.layer4.0.conv1.weight": (512, 1024, 1, 1), "neck.lateral_convs.2.conv.weight": (256, 2048, 1, 1),
-        "neck.fpn_convs.4.conv.weight": (256, 256, 3, 3), "bbox_head.cls_convs.1.conv.bias": (256,),
-        "bbox_head.conv_cls.weight": (10, 256, 1, 1), "bbox_head.conv_attr.bias": (9,),
-        "bbox_head.conv_dir_cls.weight": (2, 256, 1, 1), "bbox_head.conv_regs.4.weight": (2, 256, 1, 1),
-        "bbox_head.conv_centerness_prev.0.gn.weight": (64,), "bbox_head.conv_centerness.weight": (1, 64, 1, 1),
+        "backbone.layer4.0.conv1.weight": (512, 1024, 1, 1),
+        "neck.lateral_convs.2.conv.weight": (256, 2048, 1, 1),
+        "neck.fpn_convs.4.conv.weight": (256, 256, 3, 3),
+        "bbox_head.cls_convs.1.conv.bias": (256,),
+        "bbox_head.conv_cls.weight": (10, 256, 1, 1),
+        "bbox_head.conv_attr.bias": (9,),
+        "bbox_head.conv_dir_cls.weight": (2, 256, 1, 1),
+        "bbox_head.conv_regs.4.weight": (2, 256, 1, 1),
+        "bbox_head.conv_centerness_prev.0.gn.weight": (64,),
+        "bbox_head.conv_centerness.weight": (1, 64, 1, 1),
         "bbox_head.scales.0.0.scale": (),
-    }  # fmt: skip
+    }
     if pgd:
         shapes |= {"bbox_head.conv_regs.5.weight": (4, 256, 1, 1), "bbox_head.conv_depth_cls.weight": (6, 256, 1, 1)}
     assert {name: tuple(state[name].shape) for name in shapes} == shapes

@@ -24,9 +24,10 @@ VIRTUAL = 400 / 1.2  # the lens of `some_truth` has 1.2 times this focal length
 
 
 @pytest.mark.parametrize(
-    "config", [*ALL, replace(TINY, virtual_focal=VIRTUAL), replace(TINY_PGD, virtual_focal=VIRTUAL)],
+    "config",
+    [*ALL, replace(TINY, virtual_focal=VIRTUAL), replace(TINY_PGD, virtual_focal=VIRTUAL)],
     ids=[*NAMES, "fcos3d, other lens", "pgd, other lens"],
-)  # fmt: skip
+)
 def test_the_truth_costs_nothing(config: Mono3DConfig) -> None:
     detector = Mono3D(config).double()
     dense, assignment = perfect(detector, some_truth(), (225, 400))
@@ -170,9 +171,12 @@ def test_unknown_velocity_costs_and_moves_nothing() -> None:
 def test_a_box_that_reaches_behind_the_camera_has_a_loss() -> None:
     detector = lively(TINY_PGD, double=True)
     solid = Solids(
-        torch.tensor([[0.2, 0.1, 1.0]], dtype=torch.float64), torch.tensor([[12.0, 3.0, 2.5]], dtype=torch.float64),
-        torch.tensor([1.5], dtype=torch.float64), torch.zeros(1, 2), torch.tensor([5]),
-    )  # fmt: skip
+        torch.tensor([[0.2, 0.1, 1.0]], dtype=torch.float64),
+        torch.tensor([[12.0, 3.0, 2.5]], dtype=torch.float64),
+        torch.tensor([1.5], dtype=torch.float64),
+        torch.zeros(1, 2),
+        torch.tensor([5]),
+    )
     truth = Truth(torch.tensor([1]), torch.tensor([[0.0, 0, 160, 96]]), solid)
     images = torch.rand(1, 3, 96, 160, dtype=torch.float64).requires_grad_()
     dense = detector.dense(images, lens(100.0, (96, 160))[None])

@@ -43,10 +43,12 @@ def at(u: float, v: float, depth: float = 20.0) -> Tensor:
 def solids(*centres: Tensor, velocity: float = 1.0) -> Solids:
     n = len(centres)
     return Solids(
-        torch.stack(centres), torch.tensor([[4.0, 1.5, 2.0]], dtype=torch.float64).expand(n, 3),
-        torch.linspace(-3, 3, n, dtype=torch.float64), torch.full((n, 2), velocity, dtype=torch.float64),
+        torch.stack(centres),
+        torch.tensor([[4.0, 1.5, 2.0]], dtype=torch.float64).expand(n, 3),
+        torch.linspace(-3, 3, n, dtype=torch.float64),
+        torch.full((n, 2), velocity, dtype=torch.float64),
         torch.arange(n),
-    )  # fmt: skip
+    )
 
 
 def told(boxes: list[list[float]], centres: list[Tensor], **more: Tensor) -> Truth:
@@ -125,9 +127,13 @@ def test_what_does_not_count_is_nowhere() -> None:
 
 
 def test_nothing_is_assigned_to_no_object() -> None:
-    none = Truth(torch.zeros(0, dtype=torch.int64), torch.zeros(0, 4), Solids(
-        torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, dtype=torch.int64)
-    ))  # fmt: skip
+    none = Truth(
+        torch.zeros(0, dtype=torch.int64),
+        torch.zeros(0, 4),
+        Solids(
+            torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, dtype=torch.int64)
+        ),
+    )
     found = assign(FCOS3D, grid(), [none, some_truth()], torch.stack([K, K]), ONE)
     assert bool((found.label[0] == -1).all())
     assert bool((found.owner[0] == -1).all())
@@ -194,8 +200,12 @@ def test_yaw_comes_back_from_all_around(config: Mono3DConfig) -> None:
 
 
 @given(
-    st.floats(-10.0, 10.0), st.floats(0.1, 5.0), st.floats(0.1, 5.0), st.floats(-0.9, 0.9), st.floats(-0.9, 0.9),
-)  # fmt: skip
+    st.floats(-10.0, 10.0),
+    st.floats(0.1, 5.0),
+    st.floats(0.1, 5.0),
+    st.floats(-0.9, 0.9),
+    st.floats(-0.9, 0.9),
+)
 def test_yaw_of_vectors_has_no_border(yaw: float, length: float, length2: float, off: float, off2: float) -> None:
     """The axis errs by half of what the second pair errs, and any error below a quarter turn leaves the side."""
     true = torch.tensor(yaw, dtype=torch.float64)

@@ -324,10 +324,12 @@ def test_a_short_training_lowers_the_loss(spec) -> None:  # type: ignore[no-unty
 @pytest.mark.parametrize(
     ("spec", "steps"),
     [
-        pytest.param(TINY, 40, id="tiny"), pytest.param(replace(TINY, box_loss="squares"), 40, id="squares"),
-        pytest.param(V5, 140, id="v5", marks=pytest.mark.slow), pytest.param(V3, 100, id="v3", marks=pytest.mark.slow),
+        pytest.param(TINY, 40, id="tiny"),
+        pytest.param(replace(TINY, box_loss="squares"), 40, id="squares"),
+        pytest.param(V5, 140, id="v5", marks=pytest.mark.slow),
+        pytest.param(V3, 100, id="v3", marks=pytest.mark.slow),
     ],
-)  # fmt: skip
+)
 def test_training_from_nothing_finds_the_objects(spec, steps: int) -> None:  # type: ignore[no-untyped-def]
     images, objects = drawn()
     detector = Yolo(spec, CLASSES)
@@ -338,10 +340,15 @@ def test_training_from_nothing_finds_the_objects(spec, steps: int) -> None:  # t
 
 @pytest.mark.parametrize(
     "images",
-    [torch.zeros(3, 64, 64), torch.zeros(1, 1, 64, 64), torch.zeros(1, 3, 64, 64, dtype=torch.uint8),
-     torch.zeros(1, 3, 0, 64), torch.zeros(1, 3, 64, 64, dtype=torch.int16)],
+    [
+        torch.zeros(3, 64, 64),
+        torch.zeros(1, 1, 64, 64),
+        torch.zeros(1, 3, 64, 64, dtype=torch.uint8),
+        torch.zeros(1, 3, 0, 64),
+        torch.zeros(1, 3, 64, 64, dtype=torch.int16),
+    ],
     ids=["no batch", "greyscale", "8 bit", "empty", "16 bit"],
-)  # fmt: skip
+)
 def test_images_that_are_none_are_one_line(images: Tensor) -> None:
     with pytest.raises(ConfigError, match=r"\[B, 3, H, W\]") as caught:
         Yolo(TINY, CLASSES).predict(images)

@@ -22,11 +22,21 @@ NARROW_TINY = replace(YOLOV3_TINY, width=0.5)
 
 # the layer tables that darknet prints: filters kernel/stride, s: add the map so many layers back, r: join these
 V3_TABLE = (
-    "32 3/1  64 3/2 32 1/1 64 3/1 s3  128 3/2 " + "64 1/1 128 3/1 s3 " * 2 + "256 3/2 " + "128 1/1 256 3/1 s3 " * 8
-    + "512 3/2 " + "256 1/1 512 3/1 s3 " * 8 + "1024 3/2 " + "512 1/1 1024 3/1 s3 " * 4
-    + "512 1/1 1024 3/1 " * 3 + "out r-4 256 1/1 up r-1,61 " + "256 1/1 512 3/1 " * 3
-    + "out r-4 128 1/1 up r-1,36 " + "128 1/1 256 3/1 " * 3 + "out"
-)  # fmt: skip
+    "32 3/1  64 3/2 32 1/1 64 3/1 s3  128 3/2 "
+    + "64 1/1 128 3/1 s3 " * 2
+    + "256 3/2 "
+    + "128 1/1 256 3/1 s3 " * 8
+    + "512 3/2 "
+    + "256 1/1 512 3/1 s3 " * 8
+    + "1024 3/2 "
+    + "512 1/1 1024 3/1 s3 " * 4
+    + "512 1/1 1024 3/1 " * 3
+    + "out r-4 256 1/1 up r-1,61 "
+    + "256 1/1 512 3/1 " * 3
+    + "out r-4 128 1/1 up r-1,36 "
+    + "128 1/1 256 3/1 " * 3
+    + "out"
+)
 TINY_TABLE = (
     "16 3/1 max2 32 3/1 max2 64 3/1 max2 128 3/1 max2 256 3/1 max2 512 3/1 max1 1024 3/1 256 1/1 512 3/1 out "
     "r-4 128 1/1 up r-1,8 256 3/1 out"
@@ -201,9 +211,7 @@ def test_the_official_tiny_weights_have_their_anchors() -> None:
     assert detector.anchors[1].tolist() == yolov3_tiny(("car",)).anchors[1].tolist()
 
 
-@pytest.mark.parametrize(
-    ("spec", "epsilon"), [(YOLOV5N, 1e-3), (YOLOV3_TINY, 1e-5)], ids=["yolov5", "darknet"]
-)  # fmt: skip
+@pytest.mark.parametrize(("spec", "epsilon"), [(YOLOV5N, 1e-3), (YOLOV3_TINY, 1e-5)], ids=["yolov5", "darknet"])
 def test_batch_norms_have_the_published_epsilon(spec: YoloSpec, epsilon: float) -> None:
     """Where the variance is 0, a norm divides by the root of its epsilon and nothing else."""
     network = Yolo(replace(spec, width=0.125)).network
@@ -245,8 +253,14 @@ def test_yolov5_names_are_mapped_one_to_one(prefix: str) -> None:
         prefix + name: state[own].half() if state[own].is_floating_point() else state[own]
         for own, name in names.items()
     }
-    for known in ("model.0.conv.weight", "model.2.cv1.conv.weight", "model.2.m.0.cv2.bn.running_var",
-                  "model.9.cv2.conv.weight", "model.24.m.0.weight", "model.23.cv3.bn.bias"):  # fmt: skip
+    for known in (
+        "model.0.conv.weight",
+        "model.2.cv1.conv.weight",
+        "model.2.m.0.cv2.bn.running_var",
+        "model.9.cv2.conv.weight",
+        "model.24.m.0.weight",
+        "model.23.cv3.bn.bias",
+    ):
         assert prefix + known in foreign
     foreign[f"{prefix}model.24.anchors"] = detector.anchors.half() / torch.tensor([8.0, 16.0, 32.0]).view(3, 1, 1)
     mapped = from_yolov5_keys(foreign)
@@ -260,9 +274,18 @@ def test_yolov5_names_are_mapped_one_to_one(prefix: str) -> None:
 
 @pytest.mark.parametrize(
     "key",
-    ["model.0.weight", "model.11.conv.weight", "model.2.cv4.conv.weight", "model.9.m.0.cv1.conv.weight", "optimizer",
-     "model.24.cv2.0.0.conv.weight", "model.0.cv1.conv.weight", "model.2.conv.weight", "model.24.m.3.weight"],
-)  # fmt: skip
+    [
+        "model.0.weight",
+        "model.11.conv.weight",
+        "model.2.cv4.conv.weight",
+        "model.9.m.0.cv1.conv.weight",
+        "optimizer",
+        "model.24.cv2.0.0.conv.weight",
+        "model.0.cv1.conv.weight",
+        "model.2.conv.weight",
+        "model.24.m.3.weight",
+    ],
+)
 def test_a_foreign_yolov5_name_is_one_line(key: str) -> None:
     with pytest.raises(FormatError, match=r"no name of YOLOv5") as caught:
         from_yolov5_keys({key: torch.zeros(1)})
@@ -285,9 +308,15 @@ def test_fresh_weights_depend_on_the_seed_alone() -> None:
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"rule": "v8"}, "unknown rule"), ({"network": "vgg"}, "unknown network"), ({"box_loss": "l1"}, "box loss"),
-     ({"width": 0.0}, "width"), ({"strides": (8, 16)}, "each level"), ({"strides": (4, 8, 16)}, "strides")],
-)  # fmt: skip
+    [
+        ({"rule": "v8"}, "unknown rule"),
+        ({"network": "vgg"}, "unknown network"),
+        ({"box_loss": "l1"}, "box loss"),
+        ({"width": 0.0}, "width"),
+        ({"strides": (8, 16)}, "each level"),
+        ({"strides": (4, 8, 16)}, "strides"),
+    ],
+)
 def test_a_wrong_spec_is_one_line(change: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         replace(YOLOV3, **change)  # type: ignore[arg-type]

@@ -163,8 +163,12 @@ def slow_owner(detector: Yolo, grid: Grid, one: Truth) -> list[int]:
             row = min(max(int(y // stride), 0), rows - 1)
             cells = [(row, column)]
             if detector.spec.rule == "v5":
-                for dr, dc, near in ((0, -1, x / stride - column < 0.5), (0, 1, x / stride - column > 0.5),
-                                     (-1, 0, y / stride - row < 0.5), (1, 0, y / stride - row > 0.5)):  # fmt: skip
+                for dr, dc, near in (
+                    (0, -1, x / stride - column < 0.5),
+                    (0, 1, x / stride - column > 0.5),
+                    (-1, 0, y / stride - row < 0.5),
+                    (1, 0, y / stride - row > 0.5),
+                ):
                     if near and 0 <= row + dr < rows and 0 <= column + dc < columns:
                         cells.append((row + dr, column + dc))
             for r, c in cells:
@@ -359,9 +363,15 @@ def test_ciou_equals_torchvision() -> None:
 
 @pytest.mark.parametrize(
     ("label", "box"),
-    [([3], [[0, 0, 9, 9]]), ([-1], [[0, 0, 9, 9]]), ([0], [[9, 0, 9, 9]]), ([0], [[0, 0, float("nan"), 9]]),
-     ([0], [[0, 0, float("inf"), 9]]), ([0, 1], [[0, 0, 9, 9]])],
-)  # fmt: skip
+    [
+        ([3], [[0, 0, 9, 9]]),
+        ([-1], [[0, 0, 9, 9]]),
+        ([0], [[9, 0, 9, 9]]),
+        ([0], [[0, 0, float("nan"), 9]]),
+        ([0], [[0, 0, float("inf"), 9]]),
+        ([0, 1], [[0, 0, 9, 9]]),
+    ],
+)
 def test_truth_that_cannot_be_is_one_line(label: list[int], box: list[list[float]]) -> None:
     dense = TINY.dense(torch.zeros(2, 3, 32, 32))
     with pytest.raises(ConfigError, match="truth of image 1") as caught:

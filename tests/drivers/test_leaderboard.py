@@ -58,9 +58,19 @@ class Follower(AutonomousAgent):
 
 EYES = [
     {"type": "sensor.lidar.ray_cast", "id": "lidar", "x": 0.0, "y": 0.0, "z": 2.0, "roll": 0, "pitch": 0, "yaw": 0},
-    {"type": "sensor.other.radar", "id": "radar", "x": 2.45, "y": 0.0, "z": 0.7, "roll": 0, "pitch": 0, "yaw": 0,
-     "horizontal_fov": 30, "vertical_fov": 20},
-]  # fmt: skip
+    {
+        "type": "sensor.other.radar",
+        "id": "radar",
+        "x": 2.45,
+        "y": 0.0,
+        "z": 0.7,
+        "roll": 0,
+        "pitch": 0,
+        "yaw": 0,
+        "horizontal_fov": 30,
+        "vertical_fov": 20,
+    },
+]
 
 
 @pytest.fixture
@@ -90,9 +100,19 @@ def test_an_agent_of_thirty_lines_drives(agent: Path, every: int) -> None:
 @pytest.mark.slow
 def test_the_command_drives_it(agent: Path, tmp_path: Path) -> None:
     done = ssad(
-        "run", "precrash", "--out", tmp_path / "run", "--workers", "1", "--set", f"systems=[leaderboard:{agent}]",
-        "--set", "scenarios=[StraightObstacle/00]", "--set", "repetitions=1",
-    )  # fmt: skip
+        "run",
+        "precrash",
+        "--out",
+        tmp_path / "run",
+        "--workers",
+        "1",
+        "--set",
+        f"systems=[leaderboard:{agent}]",
+        "--set",
+        "scenarios=[StraightObstacle/00]",
+        "--set",
+        "repetitions=1",
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "run" / "report.html").is_file()
 
@@ -102,10 +122,17 @@ def _view(yaw: float, time: float, speed: float) -> Observation:
     pose = np.array([[30.0, 40.0, yaw]], np.float32)
     rest = dict.fromkeys(("route", "lane_offset", "heading_error", "others", "others_lane", "signal"))
     return Observation(
-        scene=np.zeros(1, np.int32), agent=np.zeros(1, np.int32), time=one * time, speed=one * speed, accel=one * 0.5,
-        pose=pose, target_speed=one * 8, done=np.zeros(1, bool),
-        readings={"front": np.arange(12, dtype=np.uint8).reshape(1, 3, 2, 2)}, **rest,
-    )  # fmt: skip
+        scene=np.zeros(1, np.int32),
+        agent=np.zeros(1, np.int32),
+        time=one * time,
+        speed=one * speed,
+        accel=one * 0.5,
+        pose=pose,
+        target_speed=one * 8,
+        done=np.zeros(1, bool),
+        readings={"front": np.arange(12, dtype=np.uint8).reshape(1, 3, 2, 2)},
+        **rest,
+    )
 
 
 def test_what_an_agent_is_told(tmp_path: Path) -> None:

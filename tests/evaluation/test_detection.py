@@ -132,8 +132,10 @@ def test_fewer_pictures_at_a_time_where_memory_is_short(recorded: Path) -> None:
         key = [f for f in scene.frames if f.modality == "camera" and f.key_frame]
         ordered = [
             camera_truth(f, scene.annotations(f.sample_token))
-            for s in scene.samples for f in key if f.sample_token == s.token
-        ]  # fmt: skip
+            for s in scene.samples
+            for f in key
+            if f.sample_token == s.token
+        ]
         whole = detect_scene(Oracle(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
         parts = detect_scene(Small(iter(ordered)), recorded, scene)  # type: ignore[arg-type]
         assert set(Small.calls) <= {1, 2}

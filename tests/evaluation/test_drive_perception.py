@@ -32,9 +32,15 @@ STEPS = 41
 def objects(*places: tuple[float, float], score: float = 0.9) -> Objects:
     n = len(places)
     return Objects(
-        np.zeros(n, np.int64), np.array(places, float).reshape(n, 2), np.tile(0.09 * np.eye(2), (n, 1, 1)), np.zeros(n),
-        np.tile([4.5, 1.9], (n, 1)), np.full((n, 2), np.nan), np.full(n, int(AgentKind.CAR)), np.full(n, score),
-    )  # fmt: skip
+        np.zeros(n, np.int64),
+        np.array(places, float).reshape(n, 2),
+        np.tile(0.09 * np.eye(2), (n, 1, 1)),
+        np.zeros(n),
+        np.tile([4.5, 1.9], (n, 1)),
+        np.full((n, 2), np.nan),
+        np.full(n, int(AgentKind.CAR)),
+        np.full(n, score),
+    )
 
 
 def tracks(*places: tuple[float, float]) -> Tracks:
@@ -77,8 +83,13 @@ def test_what_is_found_where_it_is_scores_one_and_what_is_not_found_zero() -> No
     good = component_metrics(trace, perceived(trace, lambda k: [(25.0, 0.0)], lambda k: [(25.0, 0.0)]), sure=0.3)
     assert good["AP"] == pytest.approx(1.0)
     assert [good[n] for n in ("recall", "target_recall", "distance_error", "phantoms", "believed", "switches")] == [
-        1.0, 1.0, 0.0, 0.0, 1.0, 0.0,
-    ]  # fmt: skip
+        1.0,
+        1.0,
+        0.0,
+        0.0,
+        1.0,
+        0.0,
+    ]
     assert good["target_recall_30_60"] is None
     assert good["target_recall_15_30"] == 1.0
     none = component_metrics(trace, perceived(trace, lambda k: [], lambda k: []), sure=0.3)

@@ -57,8 +57,9 @@ def matched(tiny_set: Path) -> tuple[PictureMatches, float]:
     boxes = Boxes2D(
         np.repeat(np.arange(len(flat)), [len(label) for _, label, *_ in flat]).astype(np.int32),
         np.concatenate([label for _, label, *_ in flat]).astype(np.int32),
-        np.concatenate([box for *_, box, _ in flat]), np.concatenate([score for *_, score in flat]),
-    )  # fmt: skip
+        np.concatenate([box for *_, box, _ in flat]),
+        np.concatenate([score for *_, score in flat]),
+    )
     truth = read_picture_truth(tiny_set, "v1.0-mini", names, tuple(tokens))
     expected = float(np.nanmean(average_precision(real, boxes, labels=len(MMDET3D_CLASSES))))
     return match_pictures(found, truth, MMDET3D_CLASSES), expected

@@ -23,12 +23,15 @@ def twice(truth: GroundTruth) -> GroundTruth:
     columns = {name: np.concatenate([getattr(truth.boxes, name)] * 2) for name in (f.name for f in fields(BoxTable))}
     columns["sample"][len(truth.boxes) :] += count
     return replace(
-        truth, samples=(*truth.samples, *(f"{token} again" for token in truth.samples)),
+        truth,
+        samples=(*truth.samples, *(f"{token} again" for token in truth.samples)),
         scene=np.concatenate([truth.scene, truth.scene + scenes]),
-        scenes=(*truth.scenes, *(f"{name} again" for name in truth.scenes)), ego=np.concatenate([truth.ego] * 2),
-        boxes=BoxTable(**columns), points=np.concatenate([truth.points] * 2),
+        scenes=(*truth.scenes, *(f"{name} again" for name in truth.scenes)),
+        ego=np.concatenate([truth.ego] * 2),
+        boxes=BoxTable(**columns),
+        points=np.concatenate([truth.points] * 2),
         visibility=np.concatenate([truth.visibility] * 2),
-    )  # fmt: skip
+    )
 
 
 def test_copies_of_a_drive_are_found(recorded: Path) -> None:

@@ -13,10 +13,17 @@ from typing import Any
 import pytest
 
 FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files", "--no-first-run",
-    "--disable-extensions", "--disable-background-networking", "--autoplay-policy=no-user-gesture-required",
-    "--enable-logging=stderr", "--v=0",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--allow-file-access-from-files",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--autoplay-policy=no-user-gesture-required",
+    "--enable-logging=stderr",
+    "--v=0",
+)
 
 
 def chromium() -> str:

@@ -22,9 +22,12 @@ def ssad(*words: str | Path) -> CompletedProcess[str]:
     argv = ["ssad", *map(str, words)]
     # a driving system of the user's is looked for in the working folder: not by the tests after this one
     with (
-        mock.patch.object(sys, "argv", argv), mock.patch.object(sys, "path", [*sys.path]),
-        contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors), pytest.raises(SystemExit) as end,
-    ):  # fmt: skip
+        mock.patch.object(sys, "argv", argv),
+        mock.patch.object(sys, "path", [*sys.path]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(errors),
+        pytest.raises(SystemExit) as end,
+    ):
         cli.main()
     code = end.value.code or 0
     assert isinstance(code, int)
@@ -35,5 +38,10 @@ def ssad_process(*words: str, cwd: Path | None = None, **environment: str) -> Co
     """Run as a user does: in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "ssad", *words],
-        capture_output=True, text=True, check=False, cwd=cwd, env=os.environ | environment, timeout=550,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=cwd,
+        env=os.environ | environment,
+        timeout=550,
+    )

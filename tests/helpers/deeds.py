@@ -32,7 +32,14 @@ def _die() -> None:
 
 
 DEEDS: dict[str, Any] = {
-    "raise": _raise, "exit": lambda: sys.exit("this one leaves"), "die": _die, "spin": _spin, "memory": _hold_memory,
-    "segfault": lambda: os.kill(os.getpid(), signal.SIGSEGV), "hang": lambda: time.sleep(1e6),
-    "object": object, "nan": lambda: float("nan"), "slow": lambda: time.sleep(0.03),
-}  # fmt: skip
+    "raise": _raise,
+    "exit": lambda: sys.exit("this one leaves"),
+    "die": _die,
+    "spin": _spin,
+    "memory": _hold_memory,
+    "segfault": lambda: os.kill(os.getpid(), signal.SIGSEGV),
+    "hang": lambda: time.sleep(1e6),
+    "object": object,
+    "nan": lambda: float("nan"),
+    "slow": lambda: time.sleep(0.03),
+}

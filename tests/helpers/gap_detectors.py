@@ -27,7 +27,7 @@ class Bright:
         one = torch.zeros(1)
         solid = Solids(
             torch.tensor([[0.0, 0.8, 14.0]]), torch.tensor([[4.5, 1.6, 1.9]]), one, torch.zeros(1, 2), one.long()
-        )  # fmt: skip
+        )
         return Detections(one + score, one.long(), torch.zeros(1, 4), solid)
 
 

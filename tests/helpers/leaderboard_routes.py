@@ -26,9 +26,10 @@ def place(tag: str, x: float, y: float) -> str:
 def flow(start: Point, end: Point, speed: float = 10.0, gaps: Point = (20.0, 35.0)) -> str:
     """The children of a flow."""
     return (
-        place("start_actor_flow", *start) + place("end_actor_flow", *end)
+        place("start_actor_flow", *start)
+        + place("end_actor_flow", *end)
         + f'<flow_speed value="{speed}"/><source_dist_interval from="{gaps[0]}" to="{gaps[1]}"/>'
-    )  # fmt: skip
+    )
 
 
 GAPS = '<flow_speed value="8"/><source_dist_interval from="20" to="28"/>'

@@ -58,9 +58,7 @@ class Linear(nn.Module):
         for k, row in enumerate(rows):
             label = self.known.truth[row].label
             value = CLEAN - gain[: len(label)] * pull[k]
-            logit = logit.index_put(
-                (torch.full_like(label, k), torch.arange(len(label)), label), value.to(logit)
-            )  # fmt: skip
+            logit = logit.index_put((torch.full_like(label, k), torch.arange(len(label)), label), value.to(logit))
         place = images.new_zeros(self.most, 2)
         return Dense(
             logit, None, images.new_zeros(len(images), self.most, 4), place, place[:, 0] + 8, place[:, 0].long(), {}

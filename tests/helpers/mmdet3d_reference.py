@@ -38,8 +38,18 @@ NAMES = {
     "fcos3d": ("cls_scores", "bbox_preds", "dir_cls_preds", "attr_preds", "centernesses"),
     "pgd": ("cls_scores", "bbox_preds", "dir_cls_preds", "depth_cls_preds", "weights", "attr_preds", "centernesses"),
 }
-CLASSES = ("car", "truck", "trailer", "bus", "construction_vehicle", "bicycle", "motorcycle", "pedestrian",
-           "traffic_cone", "barrier")  # fmt: skip
+CLASSES = (
+    "car",
+    "truck",
+    "trailer",
+    "bus",
+    "construction_vehicle",
+    "bicycle",
+    "motorcycle",
+    "pedestrian",
+    "traffic_cone",
+    "barrier",
+)
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 
 
@@ -68,25 +78,37 @@ def build(kind, seed, *, small):
 def sample(lens, size, truth=None):
     """What mmdetection3d knows of a picture: camera, size, and true objects."""
     found = Det3DDataSample()
-    found.set_metainfo({"cam2img": lens.tolist(), "scale_factor": (1.0, 1.0), "img_shape": size, "ori_shape": size,
-                        "box_type_3d": CameraInstance3DBoxes})  # fmt: skip
+    found.set_metainfo(
+        {
+            "cam2img": lens.tolist(),
+            "scale_factor": (1.0, 1.0),
+            "img_shape": size,
+            "ori_shape": size,
+            "box_type_3d": CameraInstance3DBoxes,
+        }
+    )
     if truth is None:
         return found
     t = {name: torch.from_numpy(value) for name, value in truth.items()}
     rows = torch.cat([t["centre"], t["size"], t["yaw"][:, None], t["velocity"]], 1)
     solid = CameraInstance3DBoxes(rows, box_dim=9, origin=(0.5, 0.5, 0.5))
     found.gt_instances_3d = InstanceData(
-        bboxes_3d=solid, labels_3d=t["label"], attr_labels=t["attribute"], centers_2d=t["centre2d"],
+        bboxes_3d=solid,
+        labels_3d=t["label"],
+        attr_labels=t["attribute"],
+        centers_2d=t["centre2d"],
         depths=t["centre"][:, 2].clone(),
-    )  # fmt: skip
+    )
     found.gt_instances = InstanceData(bboxes=t["box"], labels=t["label"])
     return found
 
 
 def prepare(model, pictures, samples):
     """The batch as the model's own preprocessing makes it."""
-    data = {"inputs": {"img": [torch.from_numpy(p.transpose(2, 0, 1).copy()) for p in pictures]},
-            "data_samples": samples}  # fmt: skip
+    data = {
+        "inputs": {"img": [torch.from_numpy(p.transpose(2, 0, 1).copy()) for p in pictures]},
+        "data_samples": samples,
+    }
     done = model.data_preprocessor(data, False)
     return done["inputs"]["imgs"], done["data_samples"]
 
@@ -167,8 +189,9 @@ def export(seed):
         t = {name: torch.from_numpy(value) for name, value in one.items()}
         values = torch.cat([t["centre"], t["size"], t["yaw"][:, None], t["velocity"]], 1)
         solid = CameraInstance3DBoxes(values, box_dim=9, origin=(0.5, 0.5, 0.5))
-        rows.append({"bboxes_3d": solid, "scores_3d": t["score"], "labels_3d": t["label"],
-                     "attr_labels": t["attribute"]})  # fmt: skip
+        rows.append(
+            {"bboxes_3d": solid, "scores_3d": t["score"], "labels_3d": t["label"], "attr_labels": t["attribute"]}
+        )
     with tempfile.TemporaryDirectory() as folder:
         path = metric._format_camera_bbox(rows, list(range(6)), CLASSES, folder)
         boxes = json.loads(Path(path).read_text())["results"]["one"]

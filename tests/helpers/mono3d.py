@@ -87,8 +87,9 @@ def perfect(detector: Mono3D, truth: Truth, size: tuple[int, int]) -> tuple[Dens
     found = detector.assign(blank, [truth])
     label, reg = found.label[0], found.extra["reg"][0].clone()
     owned = label >= 0
-    stride = torch.cat([torch.full((m[0, 0].numel(),), s) for m, s in zip(blank.maps["cls_scores"], config.strides,
-                                                                         strict=True)])  # fmt: skip
+    stride = torch.cat(
+        [torch.full((m[0, 0].numel(),), s) for m, s in zip(blank.maps["cls_scores"], config.strides, strict=True)]
+    )
     reg[:, :2] *= stride[:, None]
     reg[:, 9:] *= stride[:, None]
     turned = (reg[:, 6] - config.dir_offset) % (2 * math.pi)
@@ -100,9 +101,12 @@ def perfect(detector: Mono3D, truth: Truth, size: tuple[int, int]) -> tuple[Dens
     attribute = 60.0 * nn.functional.one_hot(found.extra["attribute"][0], 9) - 30.0
     centreness = torch.logit(found.extra["centreness"][0].clamp(1e-9, 1 - 1e-9))
     rows = {
-        "cls_scores": logit, "bbox_preds": reg[:, : 13 if config.pgd else 9], "dir_cls_preds": direction,
-        "attr_preds": attribute, "centernesses": centreness[:, None],
-    }  # fmt: skip
+        "cls_scores": logit,
+        "bbox_preds": reg[:, : 13 if config.pgd else 9],
+        "dir_cls_preds": direction,
+        "attr_preds": attribute,
+        "centernesses": centreness[:, None],
+    }
     if config.pgd:
         bins = torch.full((len(label), 6), -30.0, dtype=torch.float64)
         bins[:, 2] = 30.0

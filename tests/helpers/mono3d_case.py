@@ -122,15 +122,25 @@ def objects(width: int, height: int, *, seed: int, count: int = 12) -> dict[str,
     signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
     local = signs * size[:, None]
     cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    corners = np.stack([cos * local[..., 0] + sin * local[..., 2], local[..., 1],
-                        cos * local[..., 2] - sin * local[..., 0]], -1) + centre[:, None]  # fmt: skip
+    corners = (
+        np.stack(
+            [cos * local[..., 0] + sin * local[..., 2], local[..., 1], cos * local[..., 2] - sin * local[..., 0]], -1
+        )
+        + centre[:, None]
+    )
     corners[..., 2] = np.maximum(corners[..., 2], 0.2)
     shown = corners @ lens.T
     shown = np.clip(shown[..., :2] / shown[..., 2:], 0, [width, height])
     velocity = rng.random((count, 2)) * 8 - 4
     label, attribute = rng.integers(0, 10, count), rng.integers(0, 9, count)
-    reals = {"centre": centre, "size": size, "yaw": yaw, "velocity": velocity, "centre2d": centre2d,
-             "box": np.concatenate([shown.min(1), shown.max(1)], 1)}  # fmt: skip
+    reals = {
+        "centre": centre,
+        "size": size,
+        "yaw": yaw,
+        "velocity": velocity,
+        "centre2d": centre2d,
+        "box": np.concatenate([shown.min(1), shown.max(1)], 1),
+    }
     return {"label": label, "attribute": attribute, **{k: v.astype(np.float32) for k, v in reals.items()}}
 
 
@@ -175,10 +185,12 @@ def sightings(*, seed: int, count: int = 120) -> list[dict[str, npt.NDArray[Any]
         seen = (centre[:, 2] > 1.0) & (np.abs(centre[:, 0]) < 1.2 * centre[:, 2])
         heading = np.arctan2(to_ego[k, 1, 2], to_ego[k, 0, 2])
         values = {
-            "centre": centre, "size": size * (0.95 + 0.1 * rng.random((count, 3))),
-            "yaw": yaw + heading + 0.1 * rng.random(count), "velocity": rng.random((count, 2)) * 8 - 4,
+            "centre": centre,
+            "size": size * (0.95 + 0.1 * rng.random((count, 3))),
+            "yaw": yaw + heading + 0.1 * rng.random(count),
+            "velocity": rng.random((count, 2)) * 8 - 4,
             "score": rng.random(count) ** 2,
-        }  # fmt: skip
+        }
         one: dict[str, npt.NDArray[Any]] = {name: v[seen].astype(np.float32) for name, v in values.items()}
         found.append({**one, "label": label[seen], "attribute": rng.integers(0, 9, count)[seen]})
     return found

@@ -43,6 +43,9 @@ class Dice(Kind):
         path.parent.mkdir(exist_ok=True)
         path.write_text(repr(value))
         return {
-            "metrics": {"value": value}, "artefacts": {"die": f"dice/{cell.key}.txt"},
-            "episode": {"raw": repr(value)}, "case": repr(value), "cluster": cell.fields["number"],
-        }  # fmt: skip
+            "metrics": {"value": value},
+            "artefacts": {"die": f"dice/{cell.key}.txt"},
+            "episode": {"raw": repr(value)},
+            "case": repr(value),
+            "cluster": cell.fields["number"],
+        }

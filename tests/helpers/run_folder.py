@@ -13,9 +13,15 @@ from helpers.metric_traces import make_trace
 from ssad.metrics import episode_metrics
 
 GROUPS = (
-    "StraightObstacle", "TurningObstacle", "LaneChanging", "VehiclePassing", "RedlightRunning", "UnprotectedLeftTurn",
-    "RightTurn", "CrossingNegotiation",
-)  # fmt: skip
+    "StraightObstacle",
+    "TurningObstacle",
+    "LaneChanging",
+    "VehiclePassing",
+    "RedlightRunning",
+    "UnprotectedLeftTurn",
+    "RightTurn",
+    "CrossingNegotiation",
+)
 
 
 def write_run(folder: Path, header: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) -> Path:
@@ -36,10 +42,22 @@ def driving_line(
     values = episode_metrics(make_trace(5, driven=[0, 1, 2, 3, 4])).as_dict()
     plain = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()} | metrics
     return {
-        "key": key, "suite": "s", "system": system, "group": group, "seed": 0, "status": status, "reason": "",
-        "spec": {"scenario": scenario, "system": system, "repetition": 0}, "metrics": plain if status == "ok" else {},
-        "n": 1, "versions": {}, "wall_s": 0.0, "artefacts": {}, "cluster": cluster, "case": case or key,
-    }  # fmt: skip
+        "key": key,
+        "suite": "s",
+        "system": system,
+        "group": group,
+        "seed": 0,
+        "status": status,
+        "reason": "",
+        "spec": {"scenario": scenario, "system": system, "repetition": 0},
+        "metrics": plain if status == "ok" else {},
+        "n": 1,
+        "versions": {},
+        "wall_s": 0.0,
+        "artefacts": {},
+        "cluster": cluster,
+        "case": case or key,
+    }
 
 
 def driving_lines() -> list[dict[str, Any]]:

@@ -84,9 +84,13 @@ def _write_scene(writer: NuScenesWriter, number: int, *, samples: int, sweeps: i
     cameras = [rig_camera(channel, size[0]) for channel in RIG]
     for camera in cameras:
         writer.add_sensor(
-            scene, camera.channel, modality="camera", translation=camera.to_ego[:3, 3],
-            rotation=matrix_to_quaternion(camera.to_ego[:3, :3]), intrinsic=camera.intrinsic,
-        )  # fmt: skip
+            scene,
+            camera.channel,
+            modality="camera",
+            translation=camera.to_ego[:3, 3],
+            rotation=matrix_to_quaternion(camera.to_ego[:3, :3]),
+            intrinsic=camera.intrinsic,
+        )
     to_ego = HDL32E.to_ego
     rotation = matrix_to_quaternion(to_ego[:3, :3])
     writer.add_sensor(scene, LIDAR, modality="lidar", translation=to_ego[:3, 3], rotation=rotation)
@@ -104,9 +108,15 @@ def _write_scene(writer: NuScenesWriter, number: int, *, samples: int, sweeps: i
         for channel, late, data, pixels in files:
             place = (street @ ego_pose(offset + late))[:3, 3]
             writer.add_sensor_frame(
-                scene, channel, timestamp_us=start_us + offset + late, data=data, ego_translation=place,
-                ego_rotation=yaw_to_quaternion(heading), sample=sample, size=pixels,
-            )  # fmt: skip
+                scene,
+                channel,
+                timestamp_us=start_us + offset + late,
+                data=data,
+                ego_translation=place,
+                ego_rotation=yaw_to_quaternion(heading),
+                sample=sample,
+                size=pixels,
+            )
         if sample is None:
             continue
         place = ego_pose(offset) @ to_ego
@@ -114,10 +124,14 @@ def _write_scene(writer: NuScenesWriter, number: int, *, samples: int, sweeps: i
         for n, thing in enumerate(THINGS):
             turn = float(np.pi * (thing.speed < 0)) + heading
             writer.add_annotation(
-                sample, instances[n], translation=(street @ [*boxes.centre[n], 1.0])[:3], size=boxes.size_wlh[n],
-                rotation=yaw_to_quaternion(turn), attributes=(thing.attribute,) if thing.attribute else (),
+                sample,
+                instances[n],
+                translation=(street @ [*boxes.centre[n], 1.0])[:3],
+                size=boxes.size_wlh[n],
+                rotation=yaw_to_quaternion(turn),
+                attributes=(thing.attribute,) if thing.attribute else (),
                 lidar_points=int(counts[n]),
-            )  # fmt: skip
+            )
 
 
 def ego_pose(offset_us: int) -> F64:

@@ -87,11 +87,14 @@ def same(episodes: Sequence[Episode], system: str) -> None:
                 assert again[name] == pytest.approx(measured[name], rel=0.01, abs=0.05), (one.key, name)
 
 
-@pytest.mark.parametrize(("names", "system"), [
-    (FEW, "blind"),
-    pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
-    pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "system"),
+    [
+        (FEW, "blind"),
+        pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
+        pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
+    ],
+)
 def test_episodes_go_as_in_the_embedded_world(carla: ModuleType, names: Sequence[str], system: str) -> None:
     same(built([scenario for name in names for scenario in load_scenarios(name)]), system)
     assert carla.CALLS["Client.generate_opendrive_world"] + carla.CALLS["Client.load_world"] == 1  # one town, one load
@@ -338,14 +341,37 @@ def test_the_traffic_manager_drives_the_traffic(carla: ModuleType) -> None:
 
 
 FAULTS = (
-    "Client.get_server_version", "version", "Client.get_world", "Client.get_available_maps", "Client.load_world",
-    "World.get_map", "roads", "World.get_traffic_light_from_opendrive_id", "World.get_settings",
-    "World.apply_settings", "World.freeze_all_traffic_lights", "World.set_weather", "World.get_blueprint_library",
-    "World.try_spawn_actor", "nothing", "World.spawn_actor:3", "Sensor.listen", "World.tick", "World.tick:20",
-    "World.get_snapshot:7", "Vehicle.apply_control:9", "Walker.apply_control", "TrafficLight.set_state",
-    "Actor.destroy", "World.spawn_actor:4", "World.spawn_actor:5", "Sensor.listen:2", "Sensor.stop:2",
-    "gone sensor.other.lane_invasion", "gone sensor.other.collision",
-)  # fmt: skip
+    "Client.get_server_version",
+    "version",
+    "Client.get_world",
+    "Client.get_available_maps",
+    "Client.load_world",
+    "World.get_map",
+    "roads",
+    "World.get_traffic_light_from_opendrive_id",
+    "World.get_settings",
+    "World.apply_settings",
+    "World.freeze_all_traffic_lights",
+    "World.set_weather",
+    "World.get_blueprint_library",
+    "World.try_spawn_actor",
+    "nothing",
+    "World.spawn_actor:3",
+    "Sensor.listen",
+    "World.tick",
+    "World.tick:20",
+    "World.get_snapshot:7",
+    "Vehicle.apply_control:9",
+    "Walker.apply_control",
+    "TrafficLight.set_state",
+    "Actor.destroy",
+    "World.spawn_actor:4",
+    "World.spawn_actor:5",
+    "Sensor.listen:2",
+    "Sensor.stop:2",
+    "gone sensor.other.lane_invasion",
+    "gone sensor.other.collision",
+)
 
 
 QUICK = ("version", "nothing", "World.tick:20", "World.spawn_actor:5", "gone sensor.other.lane_invasion")
@@ -372,10 +398,19 @@ def test_a_server_that_fails_ends_in_a_line(carla: ModuleType, fault: str) -> No
 
 
 SENSOR_FAULTS = (
-    "silent sensors", "broken sensors", "World.spawn_actor:7", "Sensor.listen:3", "Sensor.stop:3", "Actor.destroy:3",
-    "Client.get_trafficmanager", "TrafficManager.set_synchronous_mode", "TrafficManager.set_random_device_seed",
-    "Vehicle.set_autopilot", "TrafficManager.set_desired_speed", "TrafficManager.set_path",
-)  # fmt: skip
+    "silent sensors",
+    "broken sensors",
+    "World.spawn_actor:7",
+    "Sensor.listen:3",
+    "Sensor.stop:3",
+    "Actor.destroy:3",
+    "Client.get_trafficmanager",
+    "TrafficManager.set_synchronous_mode",
+    "TrafficManager.set_random_device_seed",
+    "Vehicle.set_autopilot",
+    "TrafficManager.set_desired_speed",
+    "TrafficManager.set_path",
+)
 
 
 @pytest.mark.parametrize("fault", others_slow(SENSOR_FAULTS, ("silent sensors", "TrafficManager.set_path")))
@@ -430,18 +465,35 @@ def test_a_batch_and_a_bad_address_are_refused(carla: ModuleType) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "code", "more"), [
-    ("", 0, ""), ("World.tick:100", 1, ""), ("version", 2, ""), ("Client.get_server_version", 2, ""),
-    ("", 0, "?sensors=carla&traffic=manager"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("fault", "code", "more"),
+    [
+        ("", 0, ""),
+        ("World.tick:100", 1, ""),
+        ("version", 2, ""),
+        ("Client.get_server_version", 2, ""),
+        ("", 0, "?sensors=carla&traffic=manager"),
+    ],
+)
 def test_a_run_goes_on(fault: str, code: int, more: str, tmp_path: Path) -> None:
     """Through the command: a server that dies fails episodes, and one that never answers is a line."""
     path = f"{STAND_IN}:{Path(adapter.__file__).parent.parent.parent}"
     done = ssad_process(
-        "run", "precrash", "--out", str(tmp_path / "run"), "--set", f"simulator=carla://here:2000{more}",
-        "--set", "systems=[blind]", "--set", "scenarios=[StraightObstacle]", "--set", "repetitions=1",
-        PYTHONPATH=path, CARLA_STAND_IN_FAULT=fault,
-    )  # fmt: skip
+        "run",
+        "precrash",
+        "--out",
+        str(tmp_path / "run"),
+        "--set",
+        f"simulator=carla://here:2000{more}",
+        "--set",
+        "systems=[blind]",
+        "--set",
+        "scenarios=[StraightObstacle]",
+        "--set",
+        "repetitions=1",
+        PYTHONPATH=path,
+        CARLA_STAND_IN_FAULT=fault,
+    )
     assert done.returncode == code, done.stdout + done.stderr
     if code == 2:
         assert len(done.stderr.splitlines()) == 1
@@ -471,13 +523,21 @@ def _wheel() -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("part", "old", "new", "code"), [
-    ("carla", "hand_brake=", "hand_brake=", 0), ("carla", "hand_brake=", "handbrake=", 1),
-    ("carla", "set_target_velocity(", "set_speed(", 1), ("carla_sensors", "a", "a", 0),
-    ("carla_sensors", "raw_data", "data", 1), ("carla_traffic", "a", "a", 0), ("carla_server", "a", "a", 0),
-    ("carla_events", "a", "a", 0), ("carla_events", "crossed_lane_markings", "markings", 1),
-    ("carla_traffic", "set_path", "set_way", 1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("part", "old", "new", "code"),
+    [
+        ("carla", "hand_brake=", "hand_brake=", 0),
+        ("carla", "hand_brake=", "handbrake=", 1),
+        ("carla", "set_target_velocity(", "set_speed(", 1),
+        ("carla_sensors", "a", "a", 0),
+        ("carla_sensors", "raw_data", "data", 1),
+        ("carla_traffic", "a", "a", 0),
+        ("carla_server", "a", "a", 0),
+        ("carla_events", "a", "a", 0),
+        ("carla_events", "crossed_lane_markings", "markings", 1),
+        ("carla_traffic", "set_path", "set_way", 1),
+    ],
+)
 def test_mypy_checks_the_stubs(part: str, old: str, new: str, code: int, tmp_path: Path) -> None:
     """Every class, method, argument and attribute; mypy does not find the wheel's stubs by itself."""
     place = tmp_path / "stubs" / "carla"
@@ -492,8 +552,12 @@ def test_mypy_checks_the_stubs(part: str, old: str, new: str, code: int, tmp_pat
     path = f"{tmp_path / 'stubs'}:{source.parent.parent.parent}"
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml"), *words],
-        env=os.environ | {"MYPYPATH": path}, capture_output=True, text=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
+        env=os.environ | {"MYPYPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=tmp_path,
+    )
     assert done.returncode == code, done.stdout + done.stderr
 
 
@@ -536,8 +600,11 @@ def test_the_stand_in_has_nothing_that_the_wheel_has_not() -> None:
     sys.modules["carla_stand_in"] = module
     spec.loader.exec_module(module)
     del sys.modules["carla_stand_in"]
-    own = {name: kind for name, kind in vars(module).items()
-           if inspect.isclass(kind) and kind.__module__ == "carla_stand_in"}  # fmt: skip
+    own = {
+        name: kind
+        for name, kind in vars(module).items()
+        if inspect.isclass(kind) and kind.__module__ == "carla_stand_in"
+    }
     assert len(own) > 20
     checked = 0
     for name, kind in own.items():

@@ -66,13 +66,16 @@ def same_drives(before: Sequence[Episode], after: Sequence[Episode], system: str
             assert again[name] == near, (one.key, name)
 
 
-@pytest.mark.parametrize(("names", "system"), [
-    (FEW, "autopilot"),
-    pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
-    pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
-    pytest.param((), "blind", marks=pytest.mark.slow),
-    pytest.param((), "autopilot", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "system"),
+    [
+        (FEW, "autopilot"),
+        pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
+        pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
+        pytest.param((), "blind", marks=pytest.mark.slow),
+        pytest.param((), "autopilot", marks=pytest.mark.slow),
+    ],
+)
 def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: str, tmp_path: Path) -> None:
     """Without names: 20 that generators have found."""
     scenarios = [scenario for name in names for scenario in load_scenarios(name)] if names else generated()
@@ -102,10 +105,17 @@ def test_who_comes_later_leaves_or_stands_comes_back(tmp_path: Path) -> None:
         for k, name in enumerate(("bus", "cone", "walker", "barrier", "bicycle", "vending_machine", "truck", "van"))
     )
     scenario = replace(
-        base, name="stood", type="Custom", trigger=None, placements=(), parameters={"ego_speed": 3.0},
-        actors=(things[0], late, *things[1:], early), signals=SignalPlan("red", "green"),
-        limits=Limits(max_steps=60, contact="count"), target_speed=6.5,
-    )  # fmt: skip
+        base,
+        name="stood",
+        type="Custom",
+        trigger=None,
+        placements=(),
+        parameters={"ego_speed": 3.0},
+        actors=(things[0], late, *things[1:], early),
+        signals=SignalPlan("red", "green"),
+        limits=Limits(max_steps=60, contact="count"),
+        target_speed=6.5,
+    )
     (again,) = returned([scenario], tmp_path, "autopilot")
     assert (again.limits.contact, again.target_speed, again.signals) == ("count", 6.5, scenario.signals)
     same_drives(built([scenario]), built([again]), "autopilot")
@@ -163,9 +173,11 @@ def test_commands(tmp_path: Path) -> None:
 
 def _lanelet(number: int, y: float, links: str) -> str:
     bounds = "".join(
-        f"<{side}Bound>" + "".join(f"<point><x>{x}</x><y>{y + o}</y></point>" for x in (0, 60, 120, 200))
-        + f"<lineMarking>dashed</lineMarking></{side}Bound>" for side, o in (("left", 1.75), ("right", -1.75))
-    )  # fmt: skip
+        f"<{side}Bound>"
+        + "".join(f"<point><x>{x}</x><y>{y + o}</y></point>" for x in (0, 60, 120, 200))
+        + f"<lineMarking>dashed</lineMarking></{side}Bound>"
+        for side, o in (("left", 1.75), ("right", -1.75))
+    )
     return (
         f'<lanelet id="{number}">{bounds}{links}<laneletType>highway</laneletType><trafficSignRef ref="9"/></lanelet>'
     )
@@ -174,8 +186,9 @@ def _lanelet(number: int, y: float, links: str) -> str:
 def _states(*rows: tuple[int, float, float]) -> str:
     return "".join(
         f"<state><position><point><x>{x}</x><y>{y}</y></point></position><orientation><exact>0</exact></orientation>"
-        f"<time><exact>{t}</exact></time><velocity><exact>8</exact></velocity></state>" for t, x, y in rows
-    )  # fmt: skip
+        f"<time><exact>{t}</exact></time><velocity><exact>8</exact></velocity></state>"
+        for t, x, y in rows
+    )
 
 
 FOREIGN = f"""<?xml version="1.0"?>
@@ -265,7 +278,7 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "off the road": (_cut("<x>10</x><y>0</y>", "<x>10</x><y>90</y>"), "the way of the ego"),
     "no time": (_cut("<intervalEnd>60", "<intervalEnd>0"), "interval from 20 to 0"),
     "in the ego": (_cut("<x>150</x><y>3.5</y>", "<x>10</x><y>0</y>"), "stands in the ego at the start"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

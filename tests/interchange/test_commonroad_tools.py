@@ -34,8 +34,10 @@ TOUCHING = 1e-4  # m within which float32 poses may differ over whether bodies t
 def driven(scenarios: list[Scenario], folder: Path) -> Iterator[tuple[Path, EpisodeTrace]]:
     """Files, and what happens in what they hold when `blind` drives."""
     files, _ = export_commonroad(scenarios, folder, system="blind")
-    episodes = [build_episode(read_commonroad(path).scenario, load_town(s.town), seed=0)
-                for path, s in zip(files, scenarios, strict=True)]  # fmt: skip
+    episodes = [
+        build_episode(read_commonroad(path).scenario, load_town(s.town), seed=0)
+        for path, s in zip(files, scenarios, strict=True)
+    ]
     world = World(episodes, {s.town: load_town(s.town) for s in scenarios})
     yield from zip(files, rollout(world, make_system("blind")), strict=True)
 
@@ -103,12 +105,18 @@ def with_ego(scenario: Any, trace: EpisodeTrace) -> Any:
     shape = Rectangle(float(trace.length[0]), float(trace.width[0]))
     states = [
         KSState(time_step=k, position=row[:2], orientation=row[2], velocity=row[3], steering_angle=0.0)
-        for k, row in enumerate(rows) if k
-    ]  # fmt: skip
+        for k, row in enumerate(rows)
+        if k
+    ]
     start = InitialState(
-        time_step=0, position=rows[0, :2], orientation=rows[0, 2], velocity=rows[0, 3], acceleration=0.0, yaw_rate=0.0,
+        time_step=0,
+        position=rows[0, :2],
+        orientation=rows[0, 2],
+        velocity=rows[0, 3],
+        acceleration=0.0,
+        yaw_rate=0.0,
         slip_angle=0.0,
-    )  # fmt: skip
+    )
     ego = DynamicObstacle(EGO, ObstacleType.CAR, shape, start, TrajectoryPrediction(Trajectory(1, states), shape))
     scenario.add_objects(ego)
     scenario.assign_obstacles_to_lanelets(obstacle_ids={EGO})
@@ -143,17 +151,25 @@ def test_time_to_collision_is_that_of_crime_behind_a_slower_car(tmp_path: Path) 
     speed, ahead = 3.0, 45.0
     graph = load_town("ProvingGround")
     lane = next(
-        k for k in range(graph.lanes)
-        if graph.kind[k] == 1 and graph.length[k] > 140.0 and np.ptp(graph.yaw[graph.points(k)]) < 1e-3
+        k
+        for k in range(graph.lanes)
+        if graph.kind[k] == 1
+        and graph.length[k] > 140.0
+        and np.ptp(graph.yaw[graph.points(k)]) < 1e-3
         and abs(float(graph.yaw[graph.offset[k]])) < 1e-3
-    )  # fmt: skip
+    )
     x, y, *_ = graph.at(lane, 10.0)
     rows = tuple((t, x + ahead + speed * t, y, 0.0) for t in (0.0, 20.0))
     scenario = Scenario(
-        "behind", "Custom", "ProvingGround", (Pose(x, y), Pose(x + 110.0, y)), parameters={"ego_speed": 8.0},
-        actors=(Actor("slow", "suv", Pose(*rows[0][1:]), trajectory=rows),), limits=Limits(max_steps=70),
+        "behind",
+        "Custom",
+        "ProvingGround",
+        (Pose(x, y), Pose(x + 110.0, y)),
+        parameters={"ego_speed": 8.0},
+        actors=(Actor("slow", "suv", Pose(*rows[0][1:]), trajectory=rows),),
+        limits=Limits(max_steps=70),
         target_speed=8.0,
-    )  # fmt: skip
+    )
     ((path, trace),) = driven([scenario], tmp_path)
     ours = criticality.ttc(trace)[:, 0]
     found = opened(path)

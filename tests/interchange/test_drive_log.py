@@ -139,9 +139,14 @@ def write(root: Path, things: list[Thing], ego: Place = east, yaw: float = 0.0) 
             time = 5_000_000 + 500_000 * k
             samples.append(writer.add_sample(scene, time))
             writer.add_sensor_frame(
-                scene, "LIDAR_TOP", timestamp_us=time, data=b"", ego_translation=(*ego(0.5 * k), 0.0),
-                ego_rotation=turned(yaw), sample=samples[-1],
-            )  # fmt: skip
+                scene,
+                "LIDAR_TOP",
+                timestamp_us=time,
+                data=b"",
+                ego_translation=(*ego(0.5 * k), 0.0),
+                ego_rotation=turned(yaw),
+                sample=samples[-1],
+            )
         for number, (category, size, place, frames) in enumerate(things):
             instance = writer.add_instance(scene, f"thing-{number}", category=category)
             for k in frames:
@@ -163,13 +168,18 @@ def still(x: float, y: float) -> Place:
 
 
 def test_tracks_begin_end_and_break_off_in_mid_drive(tmp_path: Path) -> None:
-    drive = opened(write(tmp_path, [
-        ("vehicle.car", CAR, still(120.0, 57.0), list(range(13))),
-        ("vehicle.car", CAR, lambda t: (90.0 + 4.0 * t, 46.5), [4, 5, 6]),
-        ("human.pedestrian.adult", (0.6, 0.6, 1.7), lambda t: (130.0, 58.0 + t), [0, 1, 2, 6, 7]),
-        ("movable_object.trafficcone", (0.4, 0.4, 0.8), still(140.0, 53.0), [3]),
-        ("animal", (0.4, 0.8, 0.5), still(150.0, 55.0), [2, 3]),
-    ]))  # fmt: skip
+    drive = opened(
+        write(
+            tmp_path,
+            [
+                ("vehicle.car", CAR, still(120.0, 57.0), list(range(13))),
+                ("vehicle.car", CAR, lambda t: (90.0 + 4.0 * t, 46.5), [4, 5, 6]),
+                ("human.pedestrian.adult", (0.6, 0.6, 1.7), lambda t: (130.0, 58.0 + t), [0, 1, 2, 6, 7]),
+                ("movable_object.trafficcone", (0.4, 0.4, 0.8), still(140.0, 53.0), [3]),
+                ("animal", (0.4, 0.8, 0.5), still(150.0, 55.0), [2, 3]),
+            ],
+        )
+    )
     actors = {actor.name: actor for actor in drive.scenario.actors}
     assert list(actors) == ["car-1", "adult-1", "adult-1-2", "trafficcone-1", "car-2"]
     assert actors["car-1"].trajectory == ((0.0, 120.0, 57.0, 0.3), (6.0, 120.0, 57.0, 0.3))
@@ -216,16 +226,23 @@ def test_who_appears_later_may_appear_where_the_ego_began(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("category", "size", "model"),
     [
-        ("vehicle.car", (4.9, 2.0, 1.5), "car"), ("vehicle.car", (3.6, 1.8, 1.5), "compact"),
-        ("vehicle.car", (5.4, 2.0, 2.4), "van"), ("vehicle.truck", (8.0, 2.5, 3.3), "truck"),
-        ("vehicle.truck", (5.5, 2.1, 2.2), "van"), ("vehicle.bus.rigid", (12.0, 2.9, 3.5), "bus"),
-        ("vehicle.trailer", (12.0, 2.9, 3.8), "bus"), ("vehicle.emergency.police", (4.8, 1.9, 1.5), "car"),
-        ("vehicle.motorcycle", (2.1, 0.8, 1.5), "motorcycle"), ("vehicle.bicycle", (1.8, 0.6, 1.3), "bicycle"),
+        ("vehicle.car", (4.9, 2.0, 1.5), "car"),
+        ("vehicle.car", (3.6, 1.8, 1.5), "compact"),
+        ("vehicle.car", (5.4, 2.0, 2.4), "van"),
+        ("vehicle.truck", (8.0, 2.5, 3.3), "truck"),
+        ("vehicle.truck", (5.5, 2.1, 2.2), "van"),
+        ("vehicle.bus.rigid", (12.0, 2.9, 3.5), "bus"),
+        ("vehicle.trailer", (12.0, 2.9, 3.8), "bus"),
+        ("vehicle.emergency.police", (4.8, 1.9, 1.5), "car"),
+        ("vehicle.motorcycle", (2.1, 0.8, 1.5), "motorcycle"),
+        ("vehicle.bicycle", (1.8, 0.6, 1.3), "bicycle"),
         ("human.pedestrian.wheelchair", (1.0, 0.6, 1.4), "walker"),
-        ("movable_object.barrier", (0.5, 2.5, 1.0), "barrier"), ("movable_object.debris", (1.0, 1.0, 0.3), None),
-        ("static_object.bicycle_rack", (8.0, 2.0, 1.2), None), ("animal", (0.8, 0.3, 0.5), None),
+        ("movable_object.barrier", (0.5, 2.5, 1.0), "barrier"),
+        ("movable_object.debris", (1.0, 1.0, 0.3), None),
+        ("static_object.bicycle_rack", (8.0, 2.0, 1.2), None),
+        ("animal", (0.8, 0.3, 0.5), None),
     ],
-)  # fmt: skip
+)
 def test_objects_get_the_model_most_like_them(category: str, size: tuple[float, ...], model: str | None) -> None:
     assert model_of(category, np.array(size)) == model
 

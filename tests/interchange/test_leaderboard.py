@@ -101,8 +101,11 @@ def test_what_is_not_played_is_named(tmp_path: Path) -> None:
     assert (walker.trigger.x, walker.trigger.y, walker.trigger.yaw) == (227.0, -5.25, 0.0)
     assert [actor.model for actor in walker.actors] == ["walker", "vending_machine"]
     assert red.actors == ()
-    for line in ("type ControlLoss: it disturbs the ego's own controls", "weather of a route",
-                 "speed of DynamicObjectCrossing"):  # fmt: skip
+    for line in (
+        "type ControlLoss: it disturbs the ego's own controls",
+        "weather of a route",
+        "speed of DynamicObjectCrossing",
+    ):
         assert f"not carried over: {line}" in done.stdout
 
 

@@ -21,11 +21,21 @@ from ssad.world.world import World
 
 BENCH2DRIVE = 44
 FLOWS = (
-    "CrossingBicycleFlow", "EnterActorFlow", "HighwayExit", "InterurbanActorFlow", "InterurbanAdvancedActorFlow",
-    "InvadingTurn", "MergerIntoSlowTraffic", "MergerIntoSlowTrafficV2", "NonSignalizedJunctionLeftTurn",
-    "NonSignalizedJunctionLeftTurnEnterFlow", "NonSignalizedJunctionRightTurn", "SignalizedJunctionLeftTurn",
-    "SignalizedJunctionLeftTurnEnterFlow", "SignalizedJunctionRightTurn",
-)  # fmt: skip
+    "CrossingBicycleFlow",
+    "EnterActorFlow",
+    "HighwayExit",
+    "InterurbanActorFlow",
+    "InterurbanAdvancedActorFlow",
+    "InvadingTurn",
+    "MergerIntoSlowTraffic",
+    "MergerIntoSlowTrafficV2",
+    "NonSignalizedJunctionLeftTurn",
+    "NonSignalizedJunctionLeftTurnEnterFlow",
+    "NonSignalizedJunctionRightTurn",
+    "SignalizedJunctionLeftTurn",
+    "SignalizedJunctionLeftTurnEnterFlow",
+    "SignalizedJunctionRightTurn",
+)
 ALONE = ("SequentialLaneChange", "T_Junction", *(kind for kind in ROUTES if kind.startswith("Vanilla")))
 
 
@@ -48,18 +58,29 @@ def test_all_types_are_played_or_named(played: dict[str, tuple[Scenario, Episode
         assert trace.driven[-1] > 15.0, kind
 
 
-@pytest.mark.parametrize(("kind", "bodies"), [
-    ("Accident", "cone car compact compact"), ("BlockedIntersection", "*"),
-    ("DynamicObjectCrossing", "walker vending_machine"),
-    ("ConstructionObstacle", "cone barrier" + " cone" * 8), ("HardBreakRoute", "*"),
-    ("HazardAtSideLane", "bicycle bicycle"), ("HighwayCutIn", "*"), ("OppositeVehicleRunningRedLight", "*"),
-    ("OppositeVehicleTakingPriority", "*"), ("ParkedObstacle", "cone *"),
-    ("ParkingCrossingPedestrian", "walker compact"),
-    ("ParkingCutIn", "compact compact"), ("PedestrianCrossing", "walker walker walker"),
-    ("StaticCutIn", "compact compact compact compact compact compact"), ("VehicleTurningRoute", "bicycle"),
-    ("VehicleTurningRoutePedestrian", "walker"), ("YieldToEmergencyVehicle", "*"),
-    *((kind, "") for kind in ALONE),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "bodies"),
+    [
+        ("Accident", "cone car compact compact"),
+        ("BlockedIntersection", "*"),
+        ("DynamicObjectCrossing", "walker vending_machine"),
+        ("ConstructionObstacle", "cone barrier" + " cone" * 8),
+        ("HardBreakRoute", "*"),
+        ("HazardAtSideLane", "bicycle bicycle"),
+        ("HighwayCutIn", "*"),
+        ("OppositeVehicleRunningRedLight", "*"),
+        ("OppositeVehicleTakingPriority", "*"),
+        ("ParkedObstacle", "cone *"),
+        ("ParkingCrossingPedestrian", "walker compact"),
+        ("ParkingCutIn", "compact compact"),
+        ("PedestrianCrossing", "walker walker walker"),
+        ("StaticCutIn", "compact compact compact compact compact compact"),
+        ("VehicleTurningRoute", "bicycle"),
+        ("VehicleTurningRoutePedestrian", "walker"),
+        ("YieldToEmergencyVehicle", "*"),
+        *((kind, "") for kind in ALONE),
+    ],
+)
 def test_who_takes_part(kind: str, bodies: str, played: dict[str, tuple[Scenario, EpisodeTrace]]) -> None:
     """Models in order; * is any car."""
     told = [actor.model for actor in played[kind][0].actors]
@@ -78,14 +99,19 @@ def begins(trace: EpisodeTrace, name: str) -> float:
 
 
 # where the ego is, m on its route, when somebody sets out: the place that they meet at less seconds times 8 m/s
-@pytest.mark.parametrize(("kind", "name", "metres"), [
-    ("DynamicObjectCrossing", "walker", 10 + 43 - 8 * 2.2),
-    ("ParkingCrossingPedestrian", "walker", 10 + 45 - 8 * 2.15),
-    ("HazardAtSideLane", "cyclist 0", 10), ("HazardAtSideLane", "cyclist 1", 10),
-    ("HazardAtSideLaneTwoWays", "cyclist 0", 10),
-    ("ParkingCutIn", "adversary", 10 + 35 - 8 * 2.35), ("StaticCutIn", "adversary", 10 + 42 + 22 - 8 * 2.7),
-    ("HardBreakRoute", "car ahead", 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "name", "metres"),
+    [
+        ("DynamicObjectCrossing", "walker", 10 + 43 - 8 * 2.2),
+        ("ParkingCrossingPedestrian", "walker", 10 + 45 - 8 * 2.15),
+        ("HazardAtSideLane", "cyclist 0", 10),
+        ("HazardAtSideLane", "cyclist 1", 10),
+        ("HazardAtSideLaneTwoWays", "cyclist 0", 10),
+        ("ParkingCutIn", "adversary", 10 + 35 - 8 * 2.35),
+        ("StaticCutIn", "adversary", 10 + 42 + 22 - 8 * 2.7),
+        ("HardBreakRoute", "car ahead", 0),
+    ],
+)
 def test_what_sets_them_off(
     kind: str, name: str, metres: float, played: dict[str, tuple[Scenario, EpisodeTrace]]
 ) -> None:
@@ -164,9 +190,11 @@ def test_flows(kind: str, played: dict[str, tuple[Scenario, EpisodeTrace]]) -> N
     scenario, _ = played[kind]
     told = ROUTES[kind].children
     speed = float(told.split('flow_speed value="')[1].split('"')[0]) if "flow_speed" in told else 8.0
-    low, high = (40.0, 40.0) if kind == "InvadingTurn" else [
-        float(told.split(f'{key}="')[-1].split('"')[0]) for key in ("from", "to")
-    ]  # fmt: skip
+    low, high = (
+        (40.0, 40.0)
+        if kind == "InvadingTurn"
+        else [float(told.split(f'{key}="')[-1].split('"')[0]) for key in ("from", "to")]
+    )
     flows: dict[tuple[float, float], list[F64]] = {}
     for actor in scenario.actors:
         if actor.trajectory:
@@ -188,8 +216,9 @@ def test_a_flow_is_in_the_ego_s_way(played: dict[str, tuple[Scenario, EpisodeTra
         scenario, trace = played[kind]
         near = min(
             float(np.hypot(*(np.array(a.trajectory)[:, None, 1:3] - trace.route[None]).transpose(2, 0, 1)).min())
-            for a in scenario.actors if a.trajectory
-        )  # fmt: skip
+            for a in scenario.actors
+            if a.trajectory
+        )
         assert near < (4.0 if kind == "InvadingTurn" else 10.5), kind  # rows lie up to 20 m apart
 
 
@@ -236,15 +265,22 @@ def test_polite_drivers_get_by(tmp_path: Path) -> None:
     assert walker.speed[30:, 0].min() < 1.0
 
 
-@pytest.mark.parametrize(("kind", "route", "message"), [
-    ("AccidentTwoWays", Route("ProvingGround", ROUTES["Accident"].points), "needs an oncoming lane"),
-    ("BlockedIntersection", ROUTES["Accident"], "passes no junction"),
-    ("ParkedObstacle", Route("ProvingGround", ROUTES["Accident"].points, '<distance value="400"/>'), "the route ends"),
-    ("HighwayExit", Route("Longreach", ROUTES["HighwayExit"].points, ""), "has no start_actor_flow"),
-    ("HighwayExit", ROUTES["HighwayExit"]._replace(children=flow((600.0, -9.4), (220.0, 7.625))), "its flow has"),
-    ("T_Junction", Route("ProvingGround", ((217.0, -1.75), (219.0, 1.75))), "the lanes that join them"),
-    ("SignalizedJunctionRightTurn", ROUTES["NonSignalizedJunctionLeftTurn"], "no lane comes into junction"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("kind", "route", "message"),
+    [
+        ("AccidentTwoWays", Route("ProvingGround", ROUTES["Accident"].points), "needs an oncoming lane"),
+        ("BlockedIntersection", ROUTES["Accident"], "passes no junction"),
+        (
+            "ParkedObstacle",
+            Route("ProvingGround", ROUTES["Accident"].points, '<distance value="400"/>'),
+            "the route ends",
+        ),
+        ("HighwayExit", Route("Longreach", ROUTES["HighwayExit"].points, ""), "has no start_actor_flow"),
+        ("HighwayExit", ROUTES["HighwayExit"]._replace(children=flow((600.0, -9.4), (220.0, 7.625))), "its flow has"),
+        ("T_Junction", Route("ProvingGround", ((217.0, -1.75), (219.0, 1.75))), "the lanes that join them"),
+        ("SignalizedJunctionRightTurn", ROUTES["NonSignalizedJunctionLeftTurn"], "no lane comes into junction"),
+    ],
+)
 def test_a_place_that_does_not_fit_is_named(kind: str, route: Route, message: str, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=message):
         read_leaderboard(write_routes(tmp_path / "routes.xml", [kind], {kind: route}))

@@ -58,11 +58,14 @@ def built(scenarios: Sequence[Scenario]) -> list[Episode]:
     return [build_episode(scenario, load_town(scenario.town), seed=0) for scenario in scenarios]
 
 
-@pytest.mark.parametrize(("names", "system"), [
-    (FEW, "blind"),
-    pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
-    pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("names", "system"),
+    [
+        (FEW, "blind"),
+        pytest.param(("precrash",), "blind", marks=pytest.mark.slow),
+        pytest.param(("precrash",), "autopilot", marks=pytest.mark.slow),
+    ],
+)
 def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: str, tmp_path: Path) -> None:
     scenarios = [scenario for name in names for scenario in load_scenarios(name)]
     again = returned(scenarios, tmp_path)
@@ -73,9 +76,11 @@ def test_a_scenario_comes_back_as_the_same_drive(names: Sequence[str], system: s
 def waiting(first: Condition) -> Scenario:
     """Somebody who goes by the ego, 1.5 s later slower, and stands 2 s after that."""
     phases = (
-        Phase(0.0, first), Phase(6.0, Condition("after", 1.5)), Phase(1.0, Condition("after", 2.0)),
+        Phase(0.0, first),
+        Phase(6.0, Condition("after", 1.5)),
+        Phase(1.0, Condition("after", 2.0)),
         Phase(0.0, Condition("after", 2.5)),
-    )  # fmt: skip
+    )
     car = Actor("car", "suv", Pose(242.0, -1.75, 0.0), phases=phases)
     route = (Pose(217.0, -5.25), Pose(317.0, -5.25))
     return Scenario("waits/00", "Custom", "ProvingGround", route, actors=(car,), limits=Limits(max_steps=160))
@@ -127,8 +132,10 @@ def test_commands(tmp_path: Path) -> None:
     done = ssad("export", "RedlightRunning/00", "LaneChanging/00", out, "--format", "openscenario")
     assert done.returncode == 0, done.stderr
     assert sorted(p.name for p in out.iterdir()) == [
-        "LaneChanging-00.xosc", "ProvingGround.xodr", "RedlightRunning-00.xosc",
-    ]  # fmt: skip
+        "LaneChanging-00.xosc",
+        "ProvingGround.xodr",
+        "RedlightRunning-00.xosc",
+    ]
     assert "not carried over: the programme of 25 other signals" in done.stdout
     done = ssad("import", "openscenario", out / "RedlightRunning-00.xosc", tmp_path / "a.yaml")
     assert done.returncode == 0, done.stderr
@@ -141,9 +148,13 @@ def test_commands(tmp_path: Path) -> None:
         assert len(refused.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize(("tool", "bundle", "suffix"), [
-    ("qc_openscenario", "xoscBundle", "xosc"), ("qc_opendrive", "xodrBundle", "xodr"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("tool", "bundle", "suffix"),
+    [
+        ("qc_openscenario", "xoscBundle", "xosc"),
+        ("qc_opendrive", "xodrBundle", "xodr"),
+    ],
+)
 @pytest.mark.parametrize("names", ["RedlightRunning/00", pytest.param("precrash", marks=pytest.mark.slow)])
 def test_asam_checkers_find_nothing(tool: str, bundle: str, suffix: str, names: str, tmp_path: Path) -> None:
     """The pre-crash scenarios and 20 that generators found, with the maps of their towns."""
@@ -304,8 +315,12 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
     found = read_openscenario(path)
     assert found.scenario.actors == (actor,)
     assert any("is counted from where the event before begins" in line for line in found.lost)
-    timed = re.sub("(?s)<ByEntityCondition>.*?</ByEntityCondition>", '<ByValueCondition><SimulationTimeCondition '
-                   'value="1.5" rule="greaterThan"/></ByValueCondition>', text, count=1)  # fmt: skip
+    timed = re.sub(
+        "(?s)<ByEntityCondition>.*?</ByEntityCondition>",
+        '<ByValueCondition><SimulationTimeCondition value="1.5" rule="greaterThan"/></ByValueCondition>',
+        text,
+        count=1,
+    )
     path.write_text(timed)
     assert read_openscenario(path).scenario.actors[0].phases[0] == Phase(9.0, Condition("time", 3.5))
     path.write_text(text.replace('delay="2"', 'delay="soon"'))
@@ -313,9 +328,14 @@ def test_delays_of_triggers_are_kept(tmp_path: Path) -> None:
         read_openscenario(path)
 
 
-@pytest.mark.parametrize(("place", "x", "y"), [
-    ('dLane="1" ds="-8"', 209.0, -1.75), ('dLane="2" ds="20"', 237.0, 1.75), ('dLane="3" ds="20"', 237.0, 5.25),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("place", "x", "y"),
+    [
+        ('dLane="1" ds="-8"', 209.0, -1.75),
+        ('dLane="2" ds="20"', 237.0, 1.75),
+        ('dLane="3" ds="20"', 237.0, 5.25),
+    ],
+)
 def test_places_behind_and_across_the_road(place: str, x: float, y: float, tmp_path: Path) -> None:
     path = tmp_path / "behind.xosc"
     path.write_text(FOREIGN.replace('dLane="1" ds="20"', place))
@@ -358,7 +378,7 @@ HOSTILE: dict[str, tuple[Callable[[str], str], str]] = {
     "in a ring": (_cut('entityRef="hero" dLane', 'entityRef="adversary" dLane'), "depends on itself"),
     "off the road": (_cut('y="5.25"', 'y="70"'), "does not stand on a road"),
     "empty condition": (lambda text: re.sub("<RelativeDistanceCondition.*?/>", "", text, flags=re.DOTALL), "is empty"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

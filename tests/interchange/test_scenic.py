@@ -119,9 +119,13 @@ def test_bodies_move_as_the_world_moves_them(tmp_path: Path) -> None:
     rows = np.stack(drive.rows)
     assert len(rows) == 31
     start = Pose(*rows[0, 0, :3].tolist())
-    line = build_episode(
-        Scenario("x", "Custom", TOWN, (start, Pose(*load_town(TOWN).at(0, 40.0)[:3]))), load_town(TOWN), seed=0
-    ).agents[0].route  # fmt: skip
+    line = (
+        build_episode(
+            Scenario("x", "Custom", TOWN, (start, Pose(*load_town(TOWN).at(0, 40.0)[:3]))), load_town(TOWN), seed=0
+        )
+        .agents[0]
+        .route
+    )
     ego = EpisodeAgent("ego", "car", Controller.EXTERNAL, start, route=line)
     scenario = Scenario("x", "Custom", TOWN, (start, start))
     limits = Limits(max_steps=400, contact="count")
@@ -167,24 +171,27 @@ HOSTILE: dict[str, tuple[str, str]] = {
     "the end": (HEAD + "import sys\nsys.exit(0)\n", "bad.scenic:3: SystemExit"),
     "impossible": (HEAD + "ego = new Car\nrequire ego.position.x > 1e9\n", "none of 40 scenes"),
     "broken on the way": (
-        HEAD + "behavior B():\n    take SetThrottleAction(7)\nego = new Car with behavior B()\n", "range [0.0, 1.0]"
+        HEAD + "behavior B():\n    take SetThrottleAction(7)\nego = new Car with behavior B()\n",
+        "range [0.0, 1.0]",
     ),
     "an impossible drive": (HEAD + "ego = new Car\nrequire eventually ego.speed > 500\n", "none of 10 simulations"),
     "no such action": (
-        HEAD + "behavior B():\n    take SetSteerAction(0)\nego = new Car\nnew Pedestrian with behavior B()\n", "action"
+        HEAD + "behavior B():\n    take SetSteerAction(0)\nego = new Car\nnew Pedestrian with behavior B()\n",
+        "action",
     ),
     "another step": (HEAD + "param timestep = 0.5\nego = new Car\n", "a step has 0.1 s"),
     "too many": (
         HEAD + LINE + "ego = new Car\nfor k in range(80):\n    new Pedestrian with regionContainedIn None, "
-        "at (5000 + 5*k) @ 5000\n", "81 objects, at most"
+        "at (5000 + 5*k) @ 5000\n",
+        "81 objects, at most",
     ),
     "off the road": (HEAD + "ego = new Car at 5000 @ 5000, with regionContainedIn None\n", "road"),
     "later": (
         HEAD + "scenario Sub():\n    setup:\n        new Pedestrian with regionContainedIn None, at 5000 @ 5000\n"
         "scenario Main():\n    setup:\n        ego = new Car\n    compose:\n        wait\n        do Sub()\n",
-        "cannot appear while"
+        "cannot appear while",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -12,18 +12,39 @@ from ssad.report.kinds.digital import published_attempts
 
 CLEAN = 0.3
 BASE = Attempt(
-    "eye", "pgd", 0.02, CLEAN, "full", "linf", 5.0, 10, "white-box", "", (), before=1.0, after=9.0, gradient_error=1e-3,
-    coupling=1e-7, used=0.7, change=5.0,
-)  # fmt: skip
+    "eye",
+    "pgd",
+    0.02,
+    CLEAN,
+    "full",
+    "linf",
+    5.0,
+    10,
+    "white-box",
+    "",
+    (),
+    before=1.0,
+    after=9.0,
+    gradient_error=1e-3,
+    coupling=1e-7,
+    used=0.7,
+    change=5.0,
+)
 NOISE = replace(BASE, attack="noise", score=0.29, steps=0, access="none", used=1.0, gradient_error=None, coupling=None)
 FGSM = replace(BASE, attack="fgsm", score=0.06, steps=1, used=1.0)
 SOUND = [
-    NOISE, FGSM, BASE, replace(BASE, radius=2.0, score=0.1, change=2.0), replace(BASE, steps=20, score=0.01),
-    replace(BASE, options="restarts=2", score=0.018), replace(BASE, radius=255.0, score=0.0, change=255.0, used=0.3),
+    NOISE,
+    FGSM,
+    BASE,
+    replace(BASE, radius=2.0, score=0.1, change=2.0),
+    replace(BASE, steps=20, score=0.01),
+    replace(BASE, options="restarts=2", score=0.018),
+    replace(BASE, radius=255.0, score=0.0, change=255.0, used=0.3),
     replace(BASE, attack="square", access="black-box", score=0.1, steps=0, gradient_error=None),
-    replace(BASE, attack="cw", loss="margin", score=0.0), replace(BASE, loss="depth", score=0.2),
+    replace(BASE, attack="cw", loss="margin", score=0.0),
+    replace(BASE, loss="depth", score=0.2),
     replace(BASE, source="other", score=0.25, gradient_error=None),
-]  # fmt: skip
+]
 
 
 def rules(verdict: Verdict) -> list[str]:
@@ -70,19 +91,25 @@ ORDER: dict[str, tuple[list[Attempt], str, str]] = {
     "a larger budget": ([BASE, replace(BASE, radius=8.0, score=0.1)], "radius", "at 8 px leaves 10.00 mAP"),
     "ten steps and one": ([FGSM, replace(BASE, score=0.1)], "iterated", "weaker than a single step is mis-tuned"),
     "many steps and one on another loss": (
-        [FGSM, replace(BASE, attack="cw", loss="margin", steps=5, score=0.1)], "losses", "even on another loss",
+        [FGSM, replace(BASE, attack="cw", loss="margin", steps=5, score=0.1)],
+        "losses",
+        "even on another loss",
     ),
     "a black-box attack": (
-        [BASE, replace(BASE, attack="square", access="black-box", score=0.0, loss="margin")], "access", "masked",
+        [BASE, replace(BASE, attack="square", access="black-box", score=0.0, loss="margin")],
+        "access",
+        "masked",
     ),
     "transfer": ([replace(BASE, score=0.1), replace(BASE, source="other")], "transfer", "against other"),
     "restarts that lose": ([BASE, replace(BASE, options="restarts=3", score=0.1)], "restarts", "start is not kept"),
     "restarts that gain": (
-        [replace(BASE, score=0.1), replace(BASE, options="restarts=3", score=0.02)], "restarts", "restarts gain much",
+        [replace(BASE, score=0.1), replace(BASE, options="restarts=3", score=0.02)],
+        "restarts",
+        "restarts gain much",
     ),
     "noise": ([NOISE, replace(BASE, score=0.29)], "noise", "random noise of the same size 29.00 mAP"),
     "a flat loss": ([replace(BASE, after=1.0)], "loss", "did not move"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", ORDER.values(), ids=ORDER.keys())
@@ -96,8 +123,11 @@ def test_attacks_in_the_wrong_order_are_named(case: tuple[list[Attempt], str, st
 def test_detectors_losses_norms_and_sizes_are_not_mixed() -> None:
     worse = replace(BASE, score=0.1)
     for changed in (
-        {"detector": "other"}, {"loss": "margin"}, {"norm": "l2", "change": 1.0}, {"radius": 3.0, "change": 3.0},
-    ):  # fmt: skip
+        {"detector": "other"},
+        {"loss": "margin"},
+        {"norm": "l2", "change": 1.0},
+        {"radius": 3.0, "change": 3.0},
+    ):
         assert audit([FGSM, replace(worse, **changed)]).compared["iterated"] == 0
     assert audit([BASE, replace(worse, attack="apgd")]).faults == ()
 
@@ -108,9 +138,14 @@ def test_what_may_be_weaker_than_a_single_step_on_another_loss() -> None:
     paired = {"draws": (0.02, 0.14, 0.05, 0.2)}
     noisy = replace(worse, draws=(0.2, 0.02, 0.15, 0.03))
     for sound in (
-        replace(worse, loss="depth"), replace(worse, steps=2), replace(worse, radius=2.0, change=2.0),
-        replace(worse, norm="l2", change=1.0), replace(worse, score=0.065), replace(worse, source="other"), noisy,
-    ):  # fmt: skip
+        replace(worse, loss="depth"),
+        replace(worse, steps=2),
+        replace(worse, radius=2.0, change=2.0),
+        replace(worse, norm="l2", change=1.0),
+        replace(worse, score=0.065),
+        replace(worse, source="other"),
+        noisy,
+    ):
         assert audit([replace(FGSM, **paired), sound]).faults == ()
 
 

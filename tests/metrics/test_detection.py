@@ -378,12 +378,25 @@ def test_pairs_come_in_parts(most: int, monkeypatch: pytest.MonkeyPatch) -> None
 def test_the_settings_as_the_devkit_writes_them() -> None:
     assert CVPR_2019.serialize() == {
         "class_range": {
-            "car": 50, "truck": 50, "bus": 50, "trailer": 50, "construction_vehicle": 50, "pedestrian": 40,
-            "motorcycle": 40, "bicycle": 40, "traffic_cone": 30, "barrier": 30,
+            "car": 50,
+            "truck": 50,
+            "bus": 50,
+            "trailer": 50,
+            "construction_vehicle": 50,
+            "pedestrian": 40,
+            "motorcycle": 40,
+            "bicycle": 40,
+            "traffic_cone": 30,
+            "barrier": 30,
         },
-        "dist_fcn": "center_distance", "dist_ths": [0.5, 1.0, 2.0, 4.0], "dist_th_tp": 2.0, "min_recall": 0.1,
-        "min_precision": 0.1, "max_boxes_per_sample": 500, "mean_ap_weight": 5,
-    }  # fmt: skip
+        "dist_fcn": "center_distance",
+        "dist_ths": [0.5, 1.0, 2.0, 4.0],
+        "dist_th_tp": 2.0,
+        "min_recall": 0.1,
+        "min_precision": 0.1,
+        "max_boxes_per_sample": 500,
+        "mean_ap_weight": 5,
+    }
     found = DetectionConfig(class_range={"car": 12.5, "bus": 8.0}).serialize()["class_range"]
     assert found == {"car": 12.5, "bus": 8}
     assert [type(v) for v in found.values()] == [float, int]

@@ -191,9 +191,13 @@ def test_the_numbers_of_safebench_frea_and_the_leaderboard():
     assert DIVISORS == {"CR": 1.0, "OR": 10.0, "DR": 5.0, "IR": 1.0, "TS": 30.0, "ACC": 8.0, "YV": 1.0}
     assert WEIGHTS == {"CR": 0.4, "OR": 0.1, "DR": 0.1, "IR": 0.3, "TS": 0.1}
     assert PENALTIES == {
-        "collisions_walker": 0.5, "collisions_cyclist": 0.6, "collisions_vehicle": 0.6, "collisions_static": 0.65,
-        "red_lights": 0.7, "stop_signs": 0.8,
-    }  # fmt: skip
+        "collisions_walker": 0.5,
+        "collisions_cyclist": 0.6,
+        "collisions_vehicle": 0.6,
+        "collisions_static": 0.65,
+        "red_lights": 0.7,
+        "stop_signs": 0.8,
+    }
 
 
 @pytest.mark.parametrize(

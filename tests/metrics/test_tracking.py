@@ -70,10 +70,16 @@ def tracker_frames() -> list[TrackedFrame]:
         found = np.concatenate([found + draws.normal(0, 0.4, found.shape), draws.uniform(-30, 30, (1, 2))])
         n = len(found)
         objects = replace(
-            no_objects(), scene=np.zeros(n, np.int64), place=found, spread=np.tile(0.2 * np.eye(2), (n, 1, 1)),
-            yaw=np.zeros(n), size=np.tile([4.5, 1.9], (n, 1)), velocity=np.full((n, 2), np.nan),
-            kind=np.ones(n, np.int64), score=np.full(n, 0.8),
-        )  # fmt: skip
+            no_objects(),
+            scene=np.zeros(n, np.int64),
+            place=found,
+            spread=np.tile(0.2 * np.eye(2), (n, 1, 1)),
+            yaw=np.zeros(n),
+            size=np.tile([4.5, 1.9], (n, 1)),
+            velocity=np.full((n, 2), np.nan),
+            kind=np.ones(n, np.int64),
+            score=np.full(n, 0.8),
+        )
         tracker.update(np.array([0]), np.array([time]), objects)
         tracks = tracker.confirmed(np.array([0]), np.array([time]))
         frames.append(TrackedFrame(np.arange(8), tracks.ident, similarity_of(place, tracks.mean[:, :2], 4.0)))
@@ -106,12 +112,15 @@ def test_scores_are_those_of_trackeval(seed: int | None) -> None:
     assert own is not None
     names = [np.unique(np.concatenate([getattr(f, part) for f in frames])) for part in ("objects", "tracks")]
     data = {
-        "num_timesteps": len(frames), "num_gt_ids": len(names[0]), "num_tracker_ids": len(names[1]),
-        "num_gt_dets": sum(len(f.objects) for f in frames), "num_tracker_dets": sum(len(f.tracks) for f in frames),
+        "num_timesteps": len(frames),
+        "num_gt_ids": len(names[0]),
+        "num_tracker_ids": len(names[1]),
+        "num_gt_dets": sum(len(f.objects) for f in frames),
+        "num_tracker_dets": sum(len(f.tracks) for f in frames),
         "gt_ids": [np.searchsorted(names[0], f.objects) for f in frames],
         "tracker_ids": [np.searchsorted(names[1], f.tracks) for f in frames],
         "similarity_scores": [f.similarity for f in frames],
-    }  # fmt: skip
+    }
     hota, clear, identity = (
         made.eval_sequence(data) for made in (HOTA(), CLEAR({"PRINT_CONFIG": False}), Identity({"PRINT_CONFIG": False}))
     )

@@ -251,10 +251,13 @@ def test_a_target_before_a_level_camera_has_its_3d_box() -> None:
     row = {
         "pose": [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]],  # z of the camera is x of the world
         "target_pose": [
-            [np.cos(turn), -np.sin(turn), 0, 20], [np.sin(turn), np.cos(turn), 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]
+            [np.cos(turn), -np.sin(turn), 0, 20],
+            [np.sin(turn), np.cos(turn), 0, 0],
+            [0, 0, 1, 0],
+            [0, 0, 0, 1],
         ],
         "target_size": [4.0, 1.8, 1.4],
-    }  # fmt: skip
+    }
     given = Truth(torch.tensor([3, 3]), torch.tensor([[1.0, 2.0, 3.0, 4.0]] * 2), intrinsic=torch.eye(3))
     truth = solid_target(row, given)
     assert truth.label.tolist() == [3], "the target alone"

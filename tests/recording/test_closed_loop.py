@@ -64,7 +64,9 @@ def test_the_version_of_a_town_depends_on_every_array() -> None:
     assert len(first) == 12
     assert version(index=[3]) == first, "what is no array does not count"
     others = [
-        version(xy=np.ones((2, 3))), version(xy=np.zeros((3, 2))), version(xy=np.zeros((2, 3), np.int64)),
+        version(xy=np.ones((2, 3))),
+        version(xy=np.zeros((3, 2))),
+        version(xy=np.zeros((2, 3), np.int64)),
         version(more=np.zeros(1)),
-    ]  # fmt: skip
+    ]
     assert len({first, *others}) == 5

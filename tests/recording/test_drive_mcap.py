@@ -50,9 +50,14 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
             told.setdefault(channel.topic, []).append((message.log_time * 1e-9, decoded))
     steps = len(trace.x)
     assert {topic: len(some) for topic, some in told.items() if topic not in ("/detections", "/tf")} == {
-        "/map": 1, "/truth": steps, "/plan": steps, "/tracks": len(seen.perceived.known), "/camera": 5,
-        "/camera/calibration": 5, "/above": steps,
-    }  # fmt: skip
+        "/map": 1,
+        "/truth": steps,
+        "/plan": steps,
+        "/tracks": len(seen.perceived.known),
+        "/camera": 5,
+        "/camera/calibration": 5,
+        "/above": steps,
+    }
     for picture, (time, message) in zip(seen.shots, told["/camera"], strict=True):
         shown = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
         assert message.format == "jpeg"
@@ -61,9 +66,7 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
     ego = [(t, m) for t, m in told["/tf"] if m.child_frame_id == "ego"]
     for step, (time, message) in enumerate(ego):
         assert abs(time - step * trace.dt) < 1e-6
-        np.testing.assert_allclose(
-            [message.translation.x, message.translation.y], [trace.x[step, 0], trace.y[step, 0]]
-        )  # fmt: skip
+        np.testing.assert_allclose([message.translation.x, message.translation.y], [trace.x[step, 0], trace.y[step, 0]])
         np.testing.assert_allclose(message.rotation.z, yaw_to_quaternion(trace.yaw[step, 0])[3])
     (first, *_) = told["/truth"]
     assert len(first[1].entities[0].cubes) == int(trace.active[0].sum())
@@ -79,10 +82,16 @@ def test_a_recording_has_what_the_driver_saw_found_and_believed(tmp_path: Path) 
     assert max(believed) > 0
     ((_, streets),) = told["/map"]
     assert len(streets.entities[0].lines) == int((town.kind == LaneType.DRIVING).sum())
-    assert path.read_bytes() == write_mcap(
-        tmp_path / "again.mcap", trace, town, seen=seen,
-        above=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
-    ).read_bytes()  # fmt: skip
+    assert (
+        path.read_bytes()
+        == write_mcap(
+            tmp_path / "again.mcap",
+            trace,
+            town,
+            seen=seen,
+            above=(np.full((40, 60, 3), 90, np.uint8) for _ in range(steps)),
+        ).read_bytes()
+    )
 
 
 def test_without_the_extra_it_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,8 +154,9 @@ def test_cameras_that_are_read_together_are_rendered_at_once_and_show_the_same(
 
 def test_only_what_is_asked_for_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     views, turns = [], []
-    monkeypatch.setattr(loop_sensors, "render", lambda scene, asked, **more: views.append(len(asked)) or render(
-        scene, asked, **more))  # fmt: skip
+    monkeypatch.setattr(
+        loop_sensors, "render", lambda scene, asked, **more: views.append(len(asked)) or render(scene, asked, **more)
+    )
     sweep = loop_sensors.sweep
     monkeypatch.setattr(loop_sensors, "sweep", lambda *a, **more: turns.append(1) or sweep(*a, **more))
     monkeypatch.setattr(loop_sensors, "AT_ONCE", 64)
@@ -333,9 +334,12 @@ def patched(mesh: Mesh) -> SceneEdit:
     pose = np.array([[0.0, 0, 1, -8], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
     lamp = Lamp(pose, 2000.0, (0.2, 0.2))
     return SceneEdit(
-        (surface.layer,), (lamp,), cards=(Card(np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 2]])),),
-        textures={0: torch.rand((3, *surface.size), generator=draws)}, masks={0: surface.mask},
-    )  # fmt: skip
+        (surface.layer,),
+        (lamp,),
+        cards=(Card(np.array([[0.0, -1, 0], [0, 1, 0], [0, 0, 2]])),),
+        textures={0: torch.rand((3, *surface.size), generator=draws)},
+        masks={0: surface.mask},
+    )
 
 
 def test_an_attack_in_the_loop_is_what_is_rendered_from_the_trace() -> None:

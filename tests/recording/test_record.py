@@ -340,11 +340,17 @@ def test_the_official_toolkit_scores_true_boxes_as_perfect(recorded: Path, tmp_p
                     continue
                 there[name] += 1
                 own.append(
-                    {"sample_token": sample.token, "translation": found.centre[n].tolist(),
-                     "size": found.size_wlh[n].tolist(), "rotation": found.rotation[n].tolist(),
-                     "velocity": np.nan_to_num(found.velocity[n, :2]).tolist(), "detection_name": name,
-                     "detection_score": 1.0, "attribute_name": (*found.attributes[n], "")[0]}
-                )  # fmt: skip
+                    {
+                        "sample_token": sample.token,
+                        "translation": found.centre[n].tolist(),
+                        "size": found.size_wlh[n].tolist(),
+                        "rotation": found.rotation[n].tolist(),
+                        "velocity": np.nan_to_num(found.velocity[n, :2]).tolist(),
+                        "detection_name": name,
+                        "detection_score": 1.0,
+                        "attribute_name": (*found.attributes[n], "")[0],
+                    }
+                )
     meta = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
     (copy / "results.json").write_text(json.dumps({"meta": meta, "results": rows}))
     script = Path(__file__).parents[1] / "helpers" / "devkit_eval.py"

@@ -40,12 +40,16 @@ def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
     trace = tmp_path / "traces" / "ab12.npz"
     fakes: dict[str, Any] = {
-        "Recording": recording, "record_nuscenes": record, "write_sheets": sheets, "pick_trace": lambda folder: trace,
+        "Recording": recording,
+        "record_nuscenes": record,
+        "write_sheets": sheets,
+        "pick_trace": lambda folder: trace,
         "write_gallery": lambda folder: {"camera-rig.jpg": f"In {folder.name}."},
-        "onboard_sheet": lambda trace, graph: f"{trace.town} {graph}", "save_picture": save,
+        "onboard_sheet": lambda trace, graph: f"{trace.town} {graph}",
+        "save_picture": save,
         "load_trace": lambda path: {trace: SimpleNamespace(town="Nowhere")}[path],
         "load_graph": lambda path: path.relative_to(tmp_path).as_posix(),
-    }  # fmt: skip
+    }
     for name, fake in fakes.items():
         monkeypatch.setattr(run_pictures, name, fake)
     write_pictures([], tmp_path)

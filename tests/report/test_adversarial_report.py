@@ -31,9 +31,16 @@ def line(generator: str, base: int, first: int | None, *, survived: bool = True,
     if survived:
         metrics |= {"CR": first is not None, "rollouts": first, "distinct": 1 if first else 0, "moving": None}
     return {
-        "generator": generator, "system": "autopilot", "group": "A" if base < 6 else "B", "cluster": f"base {base}",
-        "key": f"{generator}{base}", "status": "ok", "reason": "", "metrics": metrics, "spec": {"repetition": 0},
-    } | changes  # fmt: skip
+        "generator": generator,
+        "system": "autopilot",
+        "group": "A" if base < 6 else "B",
+        "cluster": f"base {base}",
+        "key": f"{generator}{base}",
+        "status": "ok",
+        "reason": "",
+        "metrics": metrics,
+        "spec": {"repetition": 0},
+    } | changes
 
 
 def run(lines: list[dict[str, Any]]) -> Run:

@@ -32,12 +32,19 @@ def scores(folder: Path, value: float, *, seed: int = 0, detector: str = "d") ->
     """A run of another kind: one detector under two shifts, with replicates of ten scenes."""
     lines = [
         {
-            "key": f"{folder.name}{shift}", "detector": detector, "status": "ok", "reason": "", "n": 60, "scenes": 10,
-            "metrics": {"mAP": value - k / 10}, "artefacts": {}, "spec": {},
+            "key": f"{folder.name}{shift}",
+            "detector": detector,
+            "status": "ok",
+            "reason": "",
+            "n": 60,
+            "scenes": 10,
+            "metrics": {"mAP": value - k / 10},
+            "artefacts": {},
+            "spec": {},
             "replicates": {"mAP": [value - k / 10 + d / 100 for d in range(-9, 10)]},
         }
         for k, shift in enumerate(("fog", "rain"))
-    ]  # fmt: skip
+    ]
     cells = [
         {"key": line["key"], "name": f"{detector}/{shift}"} for line, shift in zip(lines, ("fog", "rain"), strict=True)
     ]

@@ -209,8 +209,10 @@ def test_traces_without_hashes_are_held_against_their_episodes(tmp_path: Path) -
     save_trace(tmp_path / "traces" / "k1.npz", make_trace(9))
     (tmp_path / "traces" / "k2.npz").write_bytes(b"torn")
     assert check_artefacts(tmp_path) == [
-        "traces/k0.npz is missing", "traces/k1.npz is not as the run left it", "traces/k2.npz is damaged",
-    ]  # fmt: skip
+        "traces/k0.npz is missing",
+        "traces/k1.npz is not as the run left it",
+        "traces/k2.npz is damaged",
+    ]
 
 
 def detector_line(key: str, detector: str, attack: str, **more: Any) -> dict[str, Any]:
@@ -233,9 +235,12 @@ def test_a_kind_without_a_section_gets_a_page(tmp_path: Path) -> None:
         detector_line("dead", "fcos3d", "fgsm", status="crash", reason="it <died>", metrics={}),
     ]
     header = {
-        "kind": "adversarial_patch", "command": "ssad run patch", "columns": columns, "factors": ["detector", "attack"],
+        "kind": "adversarial_patch",
+        "command": "ssad run patch",
+        "columns": columns,
+        "factors": ["detector", "attack"],
         "suite": {"name": "patch", "title": "Patches", "seed": 3},
-    }  # fmt: skip
+    }
     write_run(tmp_path, header, lines)
     (tmp_path / "pictures").mkdir()
     Image.new("RGB", (4, 4)).save(tmp_path / "pictures" / "one.png")
@@ -277,11 +282,20 @@ def detection_line(shift: str | None, severity: Any, scenes: int) -> dict[str, A
     names = ("mAP", "NDS", "AP_car")
     family = "clean" if shift is None else "environment"
     return {
-        "key": f"{shift}{severity}", "status": "ok", "reason": "", "detector": "d", "shift": shift,
-        "severity": severity, "family": family, "metrics": dict.fromkeys(names, score), "n": 8 * scenes,
-        "scenes": scenes, "replicates": dict.fromkeys(names, draws), "applied": {},
+        "key": f"{shift}{severity}",
+        "status": "ok",
+        "reason": "",
+        "detector": "d",
+        "shift": shift,
+        "severity": severity,
+        "family": family,
+        "metrics": dict.fromkeys(names, score),
+        "n": 8 * scenes,
+        "scenes": scenes,
+        "replicates": dict.fromkeys(names, draws),
+        "applied": {},
         "intervals": {name: [0.9 * score, 1.1 * score] for name in names},
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("scenes", [4, 24])

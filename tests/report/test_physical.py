@@ -29,11 +29,20 @@ from ssad.report.paper import PHYSICAL
 def line(attack: str, carrier: str, ap: float, **changes: Any) -> dict[str, Any]:
     """A record."""
     found: dict[str, Any] = {
-        "attack": attack, "carrier": carrier, "source": "", "test": "Oldmarket", "train": "Twinford", "view": "drive",
-        "detector": "yolov5n", "number": 0, "status": "ok", "n": 40, "drives": 8,
+        "attack": attack,
+        "carrier": carrier,
+        "source": "",
+        "test": "Oldmarket",
+        "train": "Twinford",
+        "view": "drive",
+        "detector": "yolov5n",
+        "number": 0,
+        "status": "ok",
+        "n": 40,
+        "drives": 8,
         "metrics": {"AP50": ap, "AP50_25": ap, "ASR_25": None if attack == "clean" else 1 - ap, "confidence": ap},
         "intervals": {"AP50": [max(ap - 0.05, 0.0), min(ap + 0.05, 1.0)]},
-    }  # fmt: skip
+    }
     found |= changes
     told = (found[key] for key in ("attack", "carrier", "source", "view", "detector", "number"))
     return found | {"key": "-".join(str(part) for part in told)}
@@ -53,19 +62,26 @@ def grid(ap: float | None, worst: list[float] | None) -> dict[str, Any]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     lines = [
-        line("clean", "", 0.99), line("random", "patch", 0.98), line("random", "patch", 0.90, number=1),
+        line("clean", "", 0.99),
+        line("random", "patch", 0.98),
+        line("random", "patch", 0.90, number=1),
         line("adv-patch", "patch", 0.60, source="yolov5n", epochs=12, loss_before=-2.0, loss_after=-0.5),
-        line("grey", "camouflage", 0.97), line("shuffled das", "camouflage", 0.5, source="yolov5n"),
+        line("grey", "camouflage", 0.97),
+        line("shuffled das", "camouflage", 0.5, source="yolov5n"),
         line("das", "camouflage", 0.48, source="yolov5n", epochs=12, loss_before=-2.0, loss_after=-0.5),
         line("das", "camouflage", 0.88, source="yolov5n", detector="fcos3d-light"),
         line("clean", "", 0.9, **grid(None, [5.0, 180.0, 0.2])),
         line("das", "camouflage", 0.4, source="yolov5n", **grid(0.35, [5.0, 0.0, 0.35])),
         line("tpa", "camouflage", 0.0, source="yolov5n", status="failed", reason="the texture is never in view"),
-    ]  # fmt: skip
+    ]
     suite = {
-        "name": "t", "kind": "physical", "title": "T", "detectors": ["yolov5n"], "behind": 20.0,
+        "name": "t",
+        "kind": "physical",
+        "title": "T",
+        "detectors": ["yolov5n"],
+        "behind": 20.0,
         "reference": "physical",
-    }  # fmt: skip
+    }
     (tmp_path / "run.json").write_text(json.dumps({"kind": "physical", "suite": suite, "cells": []}))
     (tmp_path / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     return tmp_path
@@ -74,9 +90,19 @@ def folder(tmp_path: Path) -> Path:
 def test_the_papers_rows_stand_below_ours(folder: Path) -> None:
     rows = main_table(PhysicalRun(load_run(folder)), 0).rows
     assert [row.head[0] for row in rows] == [
-        "clean", "Benign, Town04", "random patch", "Random patch, Town04", "Adv. Patch", "Adv. Patch, Town04",
-        "grey camouflage", "shuffled DAS", "DAS", "DAS, Town04", "TPA", "TPA, Town04",
-    ]  # fmt: skip
+        "clean",
+        "Benign, Town04",
+        "random patch",
+        "Random patch, Town04",
+        "Adv. Patch",
+        "Adv. Patch, Town04",
+        "grey camouflage",
+        "shuffled DAS",
+        "DAS",
+        "DAS, Town04",
+        "TPA",
+        "TPA, Town04",
+    ]
     text = {row.head[0]: [cell.text for cell in row.cells] for row in rows}
     assert text["DAS, Town04"] == ["56.20", "n/a", "80.30"]
     assert text["DAS"] == ["48.00", "48.00", "52.00"]
@@ -129,7 +155,7 @@ def test_a_control_that_is_worse_on_average_can_come_nearer(folder: Path) -> Non
         line("das", "camouflage", 0.50, source="yolov5n", replicates={"AP50": (0.50 + draws).tolist()}),
         line("grey", "camouflage", 0.60, replicates={"AP50": (0.60 + draws).tolist()}),
         line("random", "camouflage", 0.62, replicates={"AP50": (0.62 - draws).tolist()}),
-    ]  # fmt: skip
+    ]
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[3] == "random camouflage"
@@ -149,7 +175,7 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
         line("tpa", "camouflage", 0.40, replicates={"AP50": (0.40 + draws + 0.01 * np.sign(draws)).tolist()}, **own),
         line("adv-patch", "patch", 0.2, replicates={"AP50": (0.2 + draws).tolist()}, **own),
         line("random", "camouflage", 0.1),
-    ]  # fmt: skip
+    ]
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (row,) = comparison_table(PhysicalRun(load_run(folder))).rows
     assert row.head == ("Oldmarket", "behind", "yolov5n", "TPA", "DAS"), "of one carrier, and no control"
@@ -167,9 +193,11 @@ def test_attacks_are_compared_draw_by_draw_of_the_same_drives(folder: Path) -> N
 
 def test_the_first_screen_shows_the_clean_pictures_of_the_hour_of_the_strongest_light(folder: Path) -> None:
     lines = [
-        line("clean", "light, night", 0.3), line("clean", "light, noon", 0.9), line("shadow", "light, noon", 0.2),
+        line("clean", "light, night", 0.3),
+        line("clean", "light, noon", 0.9),
+        line("shadow", "light, noon", 0.2),
         line("laser", "light, night, watts 10.0", 0.25),
-    ]  # fmt: skip
+    ]
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (tile,) = tiles(PhysicalRun(load_run(folder)))
     assert (tile["worst"], tile["clean"].mean, tile["left"].mean) == ("shadow, noon", 90.0, 20.0)
@@ -182,9 +210,11 @@ def test_a_light_is_held_against_random_settings_of_its_own_kind(folder: Path) -
     """A random projector hides more than a random laser; a laser need not be better than that."""
     night = "light, night"
     lines = [
-        line("laser", night, 0.70, source="yolov5n"), line("random laser", night, 0.90),
-        line("random laser", night, 0.94, number=1), line("random projector", night, 0.40),
-    ]  # fmt: skip
+        line("laser", night, 0.70, source="yolov5n"),
+        line("random laser", night, 0.90),
+        line("random laser", night, 0.94, number=1),
+        line("random projector", night, 0.40),
+    ]
     (folder / "results.jsonl").write_text("".join(json.dumps(one) + "\n" for one in lines))
     (row,) = margin_table(PhysicalRun(load_run(folder))).rows
     assert row.head[2:] == ("laser, night", "random laser, night")

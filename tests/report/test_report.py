@@ -279,10 +279,12 @@ def test_the_first_screen_says_what_was_found_when_where_and_with_which_table(tm
     lines = driving_lines()
     header = {
         "suite": {"name": "quick", "kind": "driving", "title": "Stock title", "description": "Stock text."},
-        "kind": "driving", "command": "ssad run quick --set 'scenarios=[RightTurn]' --set pictures=[]", "code": "c0de",
+        "kind": "driving",
+        "command": "ssad run quick --set 'scenarios=[RightTurn]' --set pictures=[]",
+        "code": "c0de",
         "started": "2026-01-02T03:04:05+00:00",
         "machine": {"processor": "Some CPU", "cores": "2", "system": "Linux x86_64"},
-    }  # fmt: skip
+    }
     page = write_report(write_run(tmp_path / "a", header, lines)).read_text()
     first = page[: page.index("<main>")]
     hit = sum(bool(line["metrics"].get("collision")) for line in lines if line["system"] == "a")

@@ -17,12 +17,34 @@ def estimate(
     method: str, rate: float, low: float | None, high: float | None, *, events: int = 5, effective: float = 2.0
 ) -> dict[str, Any]:
     """A line of kind how-often."""
-    metrics = {"per_million": rate, "low": low, "high": high, "events": events, "effective": effective,
-               "episodes": 6000, "per_hour": rate * 0.45}  # fmt: skip
+    metrics = {
+        "per_million": rate,
+        "low": low,
+        "high": high,
+        "events": events,
+        "effective": effective,
+        "episodes": 6000,
+        "per_hour": rate * 0.45,
+    }
     spec = {"scenario": {"name": "lane-traffic/05"}}
-    return {"key": method, "system": "autopilot", "group": "lane-traffic", "method": method, "status": "ok",
-            "reason": "", "spec": spec, "metrics": metrics, "n": 6000, "seed": 0, "suite": "h", "versions": {},
-            "artefacts": {}, "case": method, "cluster": "lane-traffic/05", "wall_s": 1.0}  # fmt: skip
+    return {
+        "key": method,
+        "system": "autopilot",
+        "group": "lane-traffic",
+        "method": method,
+        "status": "ok",
+        "reason": "",
+        "spec": spec,
+        "metrics": metrics,
+        "n": 6000,
+        "seed": 0,
+        "suite": "h",
+        "versions": {},
+        "artefacts": {},
+        "case": method,
+        "cluster": "lane-traffic/05",
+        "wall_s": 1.0,
+    }
 
 
 NONE = estimate("monte-carlo", 0.0, 0.0, 614.6, events=0, effective=0.0)
@@ -73,10 +95,23 @@ def test_how_rare_collisions_are(lines: list[dict[str, Any]], said: str, tmp_pat
 def told(folder: Path, kind: str, rows: list[dict[str, Any]], *, planned: int = 0) -> str:
     """The verdict on lines with these fields."""
     lines = [
-        {"key": str(k), "status": "ok", "reason": "", "n": 1, "seed": 0, "suite": "s", "versions": {}, "wall_s": 0.0,
-         "artefacts": {}, "spec": {}, "case": str(k), "cluster": str(k), **row}
+        {
+            "key": str(k),
+            "status": "ok",
+            "reason": "",
+            "n": 1,
+            "seed": 0,
+            "suite": "s",
+            "versions": {},
+            "wall_s": 0.0,
+            "artefacts": {},
+            "spec": {},
+            "case": str(k),
+            "cluster": str(k),
+            **row,
+        }
         for k, row in enumerate(rows)
-    ]  # fmt: skip
+    ]
     header = {"suite": {"name": "s", "kind": kind}, "identity": "x"}
     header |= {"cells": [{"key": str(k)} for k in range(planned)]} if planned else {}
     return " ".join(verdict(load_run(write_run(folder, header, lines))))
@@ -86,9 +121,12 @@ def test_searches_of_one_system_share_a_sentence(tmp_path: Path) -> None:
     rows = [
         {"system": "autopilot", "generator": generator, "metrics": {"survived": alive, "CR": hit if alive else None}}
         for generator, alive, hit in (
-            ("random", True, False), ("random", True, True), ("king", True, True), ("king", False, None),
+            ("random", True, False),
+            ("random", True, True),
+            ("king", True, True),
+            ("king", False, None),
         )
-    ]  # fmt: skip
+    ]
     assert told(tmp_path, "adversarial", rows) == (
         "autopilot is made to collide in scenarios that it survives unchanged: random in 1 of 2, king in 1 of 1."
     )
@@ -98,8 +136,9 @@ def test_of_many_generators_the_best_are_named_beside_random_search(tmp_path: Pa
     hits = {"random": 1, "grid": 0, "king": 4, "cat": 3, "l2c": 2}
     rows = [
         {"system": "autopilot", "generator": name, "metrics": {"survived": True, "CR": k < count}}
-        for name, count in hits.items() for k in range(4)
-    ]  # fmt: skip
+        for name, count in hits.items()
+        for k in range(4)
+    ]
     rows += [{"system": "blind", "generator": "random", "metrics": {"survived": False, "CR": None}}]
     said = told(tmp_path, "adversarial", rows)
     assert "king in 4 of 4, cat in 3 of 4, l2c in 2 of 4, random in 1 of 4 (the best three of 5" in said
@@ -121,11 +160,19 @@ def test_noise_is_held_against_attacks_that_were_run(tmp_path: Path, noise: floa
 
 def test_what_harms_the_system_most_is_said_first(tmp_path: Path) -> None:
     rows = [
-        {"system": "s", "perturbation": name, "severity": severity, "family": name, "cluster": f"d{k}", "case": f"d{k}",
-         "spec": {"repetition": 0}, "metrics": {"AP": ap, "collision": k < hits}}
+        {
+            "system": "s",
+            "perturbation": name,
+            "severity": severity,
+            "family": name,
+            "cluster": f"d{k}",
+            "case": f"d{k}",
+            "spec": {"repetition": 0},
+            "metrics": {"AP": ap, "collision": k < hits},
+        }
         for name, severity, ap, hits in (("none", 0, 0.5, 0), ("fog", 5, 0.1, 0), ("blackout", 5, 0.2, 6))
         for k in range(12)
-    ]  # fmt: skip
+    ]
     said = told(tmp_path, "gap", rows)
     assert said.index("s collided in 0 of 12") < said.index("blackout 5 changes") < said.index("fog 5 changes")
 
@@ -150,9 +197,13 @@ def test_what_learns_nothing_is_no_attack_however_much_it_hides(tmp_path: Path) 
 
 def test_an_attack_is_held_against_controls_of_its_own_pictures(tmp_path: Path) -> None:
     rows = [
-        texture("das", 0.9), texture("grey", 0.0), texture("das", 0.6, test="Larkhill"),
-        texture("grey", 0.5, test="Larkhill"), texture("grey", 0.7, view="grid"), texture("grey", 0.3, carrier="patch"),
-    ]  # fmt: skip
+        texture("das", 0.9),
+        texture("grey", 0.0),
+        texture("das", 0.6, test="Larkhill"),
+        texture("grey", 0.5, test="Larkhill"),
+        texture("grey", 0.7, view="grid"),
+        texture("grey", 0.3, carrier="patch"),
+    ]
     assert told(tmp_path, "physical", rows) == (
         "das hides 90% of the targets from d in Oldmarket. The strongest control (grey) hides 0%."
     )
@@ -162,10 +213,13 @@ def test_of_rows_of_one_attack_the_strongest_counts_beside_noise_of_its_size(tmp
     rows = [
         {"detector": "d", "attack": attack, "loss": None, "norm": norm, "radius": radius, "metrics": {"mAP": score}}
         for attack, norm, radius, score in (
-            (None, None, 0.0, 0.5), ("noise", "linf", 5.0, 0.45), ("noise", "l2", 900.0, 0.2),
-            ("pgd", "linf", 5.0, 0.3), ("pgd", "l2", 900.0, 0.4),
+            (None, None, 0.0, 0.5),
+            ("noise", "linf", 5.0, 0.45),
+            ("noise", "l2", 900.0, 0.2),
+            ("pgd", "linf", 5.0, 0.3),
+            ("pgd", "l2", 900.0, 0.4),
         )
-    ]  # fmt: skip
+    ]
     said = told(tmp_path / "many", "digital", rows)
     assert "costs most is pgd, which leaves 30%" in said
     assert "leaves d an mAP of 45%: what lies between is the attack's" in said

@@ -77,8 +77,9 @@ def test_who_enters_a_roundabout_waits_for_the_ring() -> None:
     One that enters may stop with its nose on the ring (1 of the 21 starts): who is on the ring waits, then goes on.
     """
     graph = built_in("Ringmere")
-    round_it = route_along(graph, [Pose(218.25, 300.0, -0.5 * np.pi), Pose(200.0, 161.0, -1.1), (222.0, 148.0),
-                                   Pose(260.0, 168.25, 0.0)])  # fmt: skip
+    round_it = route_along(
+        graph, [Pose(218.25, 300.0, -0.5 * np.pi), Pose(200.0, 161.0, -1.1), (222.0, 148.0), Pose(260.0, 168.25, 0.0)]
+    )
     enter = route_along(graph, [Pose(150.0, 168.25, 0.0), (222.0, 148.0), Pose(260.0, 168.25, 0.0)])
     episodes = []
     for start in np.linspace(40.0, 140.0, 21).round().astype(int).tolist():

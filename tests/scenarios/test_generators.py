@@ -52,8 +52,9 @@ def test_a_generator_keeps_its_promises(name: str, bases: list[Base]) -> None:
             assert set(proposal.adversaries) <= {agent.name for agent in episode.agents[1:]}
             # the ego's start and its wishes are not the generator's
             assert (episode.agents[0].pose, episode.agents[0].speed) == (
-                base.episode.agents[0].pose, base.episode.agents[0].speed,
-            )  # fmt: skip
+                base.episode.agents[0].pose,
+                base.episode.agents[0].speed,
+            )
             assert proposal.scenario.target_speed == base.scenario.target_speed
             assert proposal.scenario.route == base.scenario.route
     if name not in ("adv-ppo", "frea", "adv-ddpg"):  # policies, which have one proposal

@@ -247,8 +247,10 @@ def test_names_groups_and_sources(tmp_path: Path) -> None:
     assert all(s.placements == () and s.trigger is not None for s in found)
     (one,) = import_routes(listed(tmp_path / "b", 1, [(0, 0)], "DynamicObjectCrossing"))
     assert (one.name, one.group, one.source) == (
-        "safebench/StraightObstacle/00", "StraightObstacle", "SafeBench scenario 1 route 00",
-    )  # fmt: skip
+        "safebench/StraightObstacle/00",
+        "StraightObstacle",
+        "SafeBench scenario 1 route 00",
+    )
     assert one.placements == ()  # it puts its own actors
 
 
@@ -334,10 +336,13 @@ def test_leaderboard_scenarios_that_need_an_actor_and_routes_without_a_number(tm
         f"leaderboard/a_{route}/{kind}"
         for route in (0, 1)
         for kind in (
-            "StraightObstacle_00", "RedlightRunning_00", "StraightObstacle_01", "RedlightRunning_01",
+            "StraightObstacle_00",
+            "RedlightRunning_00",
+            "StraightObstacle_01",
+            "RedlightRunning_01",
             "StraightObstacle_02",
         )
-    ]  # fmt: skip
+    ]
     assert [len(s.placements) for s in found[:5]] == [0, 2, 0, 2, 0]
     assert (found[0].group, found[0].source) == ("StraightObstacle", "leaderboard route 0 of a.xml")
     (tmp_path / "t.json").write_text(json.dumps(table).replace('"T"', '"Elsewhere"'))
@@ -441,7 +446,7 @@ def test_a_whole_checkout_comes_in_and_what_cannot_is_named(tmp_path: Path) -> N
     entries = [
         {"data_id": k, "scenario_id": number, "route_id": route, "parameters": told}
         for k, (number, route, told) in enumerate(rows)
-    ]  # fmt: skip
+    ]
     (inside / "config" / "scenario_type" / "standard.json").write_text(json.dumps(entries))
     left_out: list[str] = []
     found = import_routes(tmp_path / "SafeBench", left_out=left_out)
@@ -473,8 +478,9 @@ def test_lists_with_parameters_are_read_and_the_one_without_is_what_a_folder_sta
     left_out: list[str] = []
     found = import_routes(lists / "human.json", left_out=left_out)
     assert [s.parameters for s in found] == [
-        {"speed": 8.0, "trigger_distance": 31.0}, {"speed": 12.5, "trigger_distance": 39.0}
-    ]  # fmt: skip
+        {"speed": 8.0, "trigger_distance": 31.0},
+        {"speed": 12.5, "trigger_distance": 39.0},
+    ]
     assert [s.name for s in found] == ["safebench/RedlightRunning/03/00", "safebench/RedlightRunning/03/01"]
     assert "entry 2: RedlightRunning: parameter trigger_distance: 99 is outside" in left_out[0]
     assert ["parameters should be the numbers speed, trigger_distance" in line for line in left_out[1:]] == [True] * 3

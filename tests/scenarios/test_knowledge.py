@@ -202,8 +202,11 @@ def test_the_assumed_ego_keeps_9_m_s_and_slows_down_for_bends() -> None:
 def test_signals_of_the_ego_and_of_the_others(crossroads: LaneGraph, routes: Any) -> None:
     red, green, off = SignalState.RED, SignalState.GREEN, SignalState.OFF
     assert forced_signals(crossroads, routes.straight, scenario_type("RedlightRunning").signals) == {
-        0: red, 1: red, 2: red, 3: green,
-    }  # fmt: skip
+        0: red,
+        1: red,
+        2: red,
+        3: green,
+    }
     assert forced_signals(crossroads, routes.right, scenario_type("RightTurn").signals)[3] == red
     assert set(forced_signals(crossroads, routes.left, SignalPlan("off", "off")).values()) == {off}
     assert forced_signals(crossroads, routes.left, SignalPlan()) == {}
@@ -312,9 +315,14 @@ def test_of_all_places_the_one_with_the_least_wait_is_taken(
 ) -> None:
     route = routes.straight
     found = meeting_place(
-        crossroads, scenario("RedlightRunning"), route, sides=(FROM_LEFT,), trigger_distance=trigger, speed=speed,
+        crossroads,
+        scenario("RedlightRunning"),
+        route,
+        sides=(FROM_LEFT,),
+        trigger_distance=trigger,
+        speed=speed,
         body="coupe",
-    )  # fmt: skip
+    )
     # the car comes along y = -1.75 or -5.25 and the ego along x = 1.75: they meet at (1.75, y)
     times, xy = ego_times(route), route.xy.astype(float)
 
@@ -557,11 +565,21 @@ def test_a_class_has_its_own_parameters_and_those_of_the_start() -> None:
     kind = ScenarioType("A", "a", "a", lambda s, g, r, n: [], (Parameter("height", 1.0, 9.0, 5.0, "m", ""),))
     assert list(kind.box) == ["height", "ego_speed", "ego_longitudinal", "ego_lateral", "ego_heading"]
     assert kind.values({"height": 2}) == {
-        "height": 2.0, "ego_speed": 0.0, "ego_longitudinal": 0.0, "ego_lateral": 0.0, "ego_heading": 0.0,
-    }  # fmt: skip
+        "height": 2.0,
+        "ego_speed": 0.0,
+        "ego_longitudinal": 0.0,
+        "ego_lateral": 0.0,
+        "ego_heading": 0.0,
+    }
     assert (kind.max_distance, kind.whole_town, kind.traffic) == (1.0e9, False, None)
     assert {name: scenario_type(name).max_distance for name in SCENARIOS} == {
-        "StraightObstacle": 150.0, "TurningObstacle": 180.0, "LaneChanging": 200.0, "VehiclePassing": 200.0,
-        "RedlightRunning": 150.0, "UnprotectedLeftTurn": 150.0, "RightTurn": 150.0, "CrossingNegotiation": 150.0,
+        "StraightObstacle": 150.0,
+        "TurningObstacle": 180.0,
+        "LaneChanging": 200.0,
+        "VehiclePassing": 200.0,
+        "RedlightRunning": 150.0,
+        "UnprotectedLeftTurn": 150.0,
+        "RightTurn": 150.0,
+        "CrossingNegotiation": 150.0,
         "NaturalJunction": 1.0e9,
-    }  # fmt: skip
+    }

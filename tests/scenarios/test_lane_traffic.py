@@ -25,9 +25,11 @@ def test_columns_stand_on_the_lanes_of_the_egos_direction_and_keep_apart() -> No
     (base, *_) = load_scenarios("lane-traffic")
     for draw in range(8):
         scenario = replace(
-            base, town=graph.name, route=(Pose(*start[:3]), Pose(*end[:3])),
+            base,
+            town=graph.name,
+            route=(Pose(*start[:3]), Pose(*end[:3])),
             traffic=TrafficPlan(minimum=0, maximum=12, wake_distance=0.0, draw=draw),
-        )  # fmt: skip
+        )
         made = build_episode(scenario, graph, seed=0)
         assert 4 <= len(made.agents) - 1 <= 12
         lanes: dict[int, list[tuple[float, float]]] = {}

@@ -98,9 +98,12 @@ def test_draws_are_reproducible_and_differ_by_seed(crossroads: LaneGraph, routes
 
 def test_a_route_off_the_graph_is_an_error(crossroads: LaneGraph, routes: Any) -> None:
     lost = Route(
-        routes.straight.xy, routes.straight.yaw, np.full_like(routes.straight.lane, -1),
-        routes.straight.speed_limit, routes.straight.width,
-    )  # fmt: skip
+        routes.straight.xy,
+        routes.straight.yaw,
+        np.full_like(routes.straight.lane, -1),
+        routes.straight.speed_limit,
+        routes.straight.width,
+    )
     with pytest.raises(RouteError, match="nowhere on the lane graph"):
         traffic(crossroads, lost)
 
@@ -200,9 +203,15 @@ def test_long_vehicles_turn_only_where_they_can() -> None:
 
 def test_the_mix_of_vehicles() -> None:
     assert natural._MIX == {
-        "car": 0.30, "suv": 0.20, "coupe": 0.12, "compact": 0.18, "van": 0.06, "motorcycle": 0.07, "truck": 0.04,
+        "car": 0.30,
+        "suv": 0.20,
+        "coupe": 0.12,
+        "compact": 0.18,
+        "van": 0.06,
+        "motorcycle": 0.07,
+        "truck": 0.04,
         "bus": 0.03,
-    }  # fmt: skip
+    }
 
 
 def test_speeds_are_those_of_the_parameters_and_of_the_road(crossroads: LaneGraph, routes: Any) -> None:

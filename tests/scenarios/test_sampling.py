@@ -143,9 +143,13 @@ def test_no_spread_is_the_default(scenario: Scenario) -> None:
 
 def test_the_box_lies_around_the_scenarios_own_values_and_inside_the_limits() -> None:
     scenario = Scenario(
-        "a", "StraightObstacle", "T", (Pose(0, 0), Pose(1, 0)),
-        parameters={"trigger_distance": 16.0, "walker_speed": 1.0, "ego_lateral": 0.2}, target_speed=10.0,
-    )  # fmt: skip
+        "a",
+        "StraightObstacle",
+        "T",
+        (Pose(0, 0), Pose(1, 0)),
+        parameters={"trigger_distance": 16.0, "walker_speed": 1.0, "ego_lateral": 0.2},
+        target_speed=10.0,
+    )
     ranges = sampling_ranges(scenario)
     box = scenario_type(scenario.type).box
     assert set(ranges) == {*box, "target_speed"}
@@ -202,12 +206,16 @@ def test_a_draw_is_the_same_everywhere() -> None:
     drawn = build(scenario, 7).scenario
     assert drawn.parameters == pytest.approx(
         {
-            "trigger_distance": 35.972973619, "speed": 12.488395077, "longitudinal": 0.725879497,
-            "ego_speed": 0.577529987, "ego_longitudinal": 1.023869727, "ego_lateral": -0.180276523,
+            "trigger_distance": 35.972973619,
+            "speed": 12.488395077,
+            "longitudinal": 0.725879497,
+            "ego_speed": 0.577529987,
+            "ego_longitudinal": 1.023869727,
+            "ego_lateral": -0.180276523,
             "ego_heading": -0.016329455,
         },
         abs=1e-8,
-    )  # fmt: skip
+    )
     assert drawn.target_speed == pytest.approx(7.580674734, abs=1e-8)
 
 
@@ -244,9 +252,12 @@ def test_the_ego_starts_where_its_parameters_say() -> None:
     assert (ego.pose.x, ego.pose.y, ego.pose.yaw) == pytest.approx((219.5, -4.75, 0.1))  # the route runs east
     # half way between two points of a bend, on its chord
     bend = Route(
-        np.array([[0, 0], [1, 0], [1, 1]], np.float32), np.array([3.0, -3.0, -2.0], np.float32), np.zeros(3, np.int32),
-        np.ones(3, np.float32), np.ones(3, np.float32),
-    )  # fmt: skip
+        np.array([[0, 0], [1, 0], [1, 1]], np.float32),
+        np.array([3.0, -3.0, -2.0], np.float32),
+        np.zeros(3, np.int32),
+        np.ones(3, np.float32),
+        np.ones(3, np.float32),
+    )
     pose = _start(bend, 0.5, 0.0, 0.0)
     assert (pose.x, pose.y, abs(pose.yaw)) == pytest.approx((0.5, 0.0, math.pi), abs=1e-6)
     assert _start(bend, 99.0, 0.0, 0.0) == Pose(1.0, 1.0, -2.0)

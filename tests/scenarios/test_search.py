@@ -78,8 +78,9 @@ def test_halton_points_are_more_even_than_random_ones(base: Base) -> None:
     from scipy.stats import qmc
 
     def unevenness(name: str) -> float:
-        return float(np.mean([qmc.discrepancy(np.array(run(name, base, lambda x: 0.0, budget=64, seed=s)))
-                              for s in range(5)]))  # fmt: skip
+        return float(
+            np.mean([qmc.discrepancy(np.array(run(name, base, lambda x: 0.0, budget=64, seed=s))) for s in range(5)])
+        )
 
     assert unevenness("halton") < 0.5 * unevenness("random")
 

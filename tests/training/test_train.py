@@ -172,9 +172,16 @@ def test_a_3d_detector_learns_from_several_data_sets(drives: Path) -> None:
 
 def test_the_command_can_be_given_to_a_shell() -> None:
     plan = Plan(
-        "yolov5n", (Path("a b"), Path("c")), Path("out"), split="night", val="day", seconds=60.0, gpus=2,
-        changes=(("zoom", (0.8, 1.3)), ("epochs", 3)), weights=Path("w.pt"),
-    )  # fmt: skip
+        "yolov5n",
+        (Path("a b"), Path("c")),
+        Path("out"),
+        split="night",
+        val="day",
+        seconds=60.0,
+        gpus=2,
+        changes=(("zoom", (0.8, 1.3)), ("epochs", 3)),
+        weights=Path("w.pt"),
+    )
     assert command_of(plan) == (
         "ssad train detector yolov5n --data 'a b' --more c --split night --val day --weights w.pt --gpus 2 "
         "--seconds 60.0 --set 'zoom=[0.8,1.3]' --set epochs=3"

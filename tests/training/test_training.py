@@ -541,11 +541,34 @@ def test_a_recipe_that_is_unknown_or_wrong_is_one_line() -> None:
         find_recipe("yolov5n", epoch=3)
     with pytest.raises(ConfigError, match="no setting 'detector'"):
         find_recipe("yolov5n", detector="yolov3")
-    numbers = ({"epochs": 0}, {"lr": 0.0}, {"zoom": (0.0, 1.0)}, {"average": 1.0}, {"validate": 0}, {"clip": -1.0},
-               {"jitter": 5}, {"momentum": 2}, {"seed": -1}, {"lr": math.nan}, {"warmup": -5})  # fmt: skip
-    kinds = ({"lr": "abc"}, {"epochs": 1.5}, {"epochs": True}, {"zoom": 1}, {"zoom": (1.0,)}, {"zoom": ("a", "b")},
-             {"rare": "abc"}, {"optimizer": "adam"}, {"schedule": "foo"}, {"amp": "maybe"}, {"steps": 8},
-             {"epochs": None}, {"freeze": "backbone"})  # fmt: skip
+    numbers = (
+        {"epochs": 0},
+        {"lr": 0.0},
+        {"zoom": (0.0, 1.0)},
+        {"average": 1.0},
+        {"validate": 0},
+        {"clip": -1.0},
+        {"jitter": 5},
+        {"momentum": 2},
+        {"seed": -1},
+        {"lr": math.nan},
+        {"warmup": -5},
+    )
+    kinds = (
+        {"lr": "abc"},
+        {"epochs": 1.5},
+        {"epochs": True},
+        {"zoom": 1},
+        {"zoom": (1.0,)},
+        {"zoom": ("a", "b")},
+        {"rare": "abc"},
+        {"optimizer": "adam"},
+        {"schedule": "foo"},
+        {"amp": "maybe"},
+        {"steps": 8},
+        {"epochs": None},
+        {"freeze": "backbone"},
+    )
     for wrong in (*numbers, *kinds):
         with pytest.raises(ConfigError, match="recipe yolov5n") as error:
             find_recipe("yolov5n", **wrong)  # type: ignore[arg-type]

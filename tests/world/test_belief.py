@@ -345,12 +345,16 @@ def test_who_is_on_a_bridge_is_neither_met_nor_touched(height: float, driver) ->
     xy[points] = np.stack([np.full(201, 100.0), np.arange(-100.0, 301.0, 2.0)], 1)
     z[points], yaw[points] = height, np.pi / 2
     north = replace(
-        line_route(-60.0, 200.0), lane=np.ones(261, np.int32), yaw=np.full(261, np.pi / 2, np.float32),
+        line_route(-60.0, 200.0),
+        lane=np.ones(261, np.int32),
+        yaw=np.full(261, np.pi / 2, np.float32),
         xy=np.stack([np.full(261, 100.0), np.arange(-60.0, 201.0)], 1).astype(np.float32),
-    )  # fmt: skip
+    )
     other = ego(speed=8.0, controller=Controller.FOLLOW, name="other", pose=Pose(100.0, -60.0, np.pi / 2), route=north)
-    world = World([episode(ego(x=40.0, speed=8.0, controller=Controller.AUTOPILOT), other)],
-                  {"Straight": replace(road, xy=xy, z=z, yaw=yaw)})  # fmt: skip
+    world = World(
+        [episode(ego(x=40.0, speed=8.0, controller=Controller.AUTOPILOT), other)],
+        {"Straight": replace(road, xy=xy, z=z, yaw=yaw)},
+    )
     speed = rollout(world, driver)[0].speed[:, 0]
     assert (speed[5:100].min() > 7.5) == (height > 0.0)
     assert world.ended()[0] == ENDS.index("complete")

@@ -49,8 +49,16 @@ def autopilot(x: float = 10.0, *, to: float = 300.0, **more) -> EpisodeAgent:
 
 def steady(name: str, x: float, y: float, speed: float, yaw: float = 0.0) -> EpisodeAgent:
     """Drives straight on at one speed and sees nobody."""
-    return EpisodeAgent(name, "car", Controller.SCRIPT, Pose(x, y, yaw), speed, speed, (Phase(speed),),
-                        line_route(x, x + (1.0 if yaw == 0.0 else -1.0) * 390.0, y))  # fmt: skip
+    return EpisodeAgent(
+        name,
+        "car",
+        Controller.SCRIPT,
+        Pose(x, y, yaw),
+        speed,
+        speed,
+        (Phase(speed),),
+        line_route(x, x + (1.0 if yaw == 0.0 else -1.0) * 390.0, y),
+    )
 
 
 def two_lanes(ends: float = 400.0) -> LaneGraph:

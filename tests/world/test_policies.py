@@ -33,9 +33,13 @@ def scenario(name: str = "one", **changes: object) -> Scenario:
     parked = Actor("parked", "van", Pose(290.0, -12.0))
     route = (Pose(217.0, -5.25), Pose(317.0, -5.25))
     made = Scenario(
-        f"Policies/{name}", "Custom", TOWN.name, route, actors=(parked, replace(car, **changes)),
+        f"Policies/{name}",
+        "Custom",
+        TOWN.name,
+        route,
+        actors=(parked, replace(car, **changes)),
         limits=Limits(max_steps=60),
-    )  # fmt: skip
+    )
     check(made)
     return made
 

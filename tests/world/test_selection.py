@@ -65,8 +65,9 @@ class Pusher:
 def loop_of(*agents: EpisodeAgent, driver: Pusher, speed: float = 8.0, batch: int = 1, **settings) -> Loop:
     world = World(
         [episode(ego(100.0, speed, Controller.FOLLOW, target_speed=speed), *agents, limits=Limits(max_steps=400))],
-        GRAPHS, assign=[0] * batch,
-    )  # fmt: skip
+        GRAPHS,
+        assign=[0] * batch,
+    )
     loop = Loop(world, {FreaSelection(**settings): driver})
     loop.reset()
     return loop

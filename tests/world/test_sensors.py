@@ -173,8 +173,13 @@ def test_a_contact_is_paid_if_a_careful_driver_would_have_avoided_it() -> None:
     paid = rewards.feasible(world.state(), who, before, np.array([True, False, True]))
     np.testing.assert_allclose(paid, 0.15 + np.array([30.0, -10.0, -15.0]), atol=1e-6)
     off = after_a_step(episode(ego(), car(40.0, -30.0)))
-    cost = rewards.feasible(off.state(), agents((0, 1)), rewards.distance_to_goal(off.state(), agents((0, 1))),
-                            np.array([False]), off_road=0.5)  # fmt: skip
+    cost = rewards.feasible(
+        off.state(),
+        agents((0, 1)),
+        rewards.distance_to_goal(off.state(), agents((0, 1))),
+        np.array([False]),
+        off_road=0.5,
+    )
     assert cost[0] == pytest.approx(-0.5)
 
 

@@ -27,8 +27,10 @@ def curve(until: float = 6.0, spacing: float = 0.5, begin: float = 0.0) -> list[
     """A bend of 20 m radius at 5 m/s, far from the ego, through a heading of 180 degrees."""
     times = np.arange(begin, until + 1e-9, spacing)
     angle = 0.25 * times + 2.8
-    return [(t, 200 + 20 * np.sin(a), 60 - 20 * np.cos(a), float(np.angle(np.exp(1j * a)))) for t, a in
-            zip(times.tolist(), angle.tolist(), strict=True)]  # fmt: skip
+    return [
+        (t, 200 + 20 * np.sin(a), 60 - 20 * np.cos(a), float(np.angle(np.exp(1j * a))))
+        for t, a in zip(times.tolist(), angle.tolist(), strict=True)
+    ]
 
 
 def test_it_is_where_its_rows_have_it() -> None:

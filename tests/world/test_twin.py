@@ -20,9 +20,7 @@ from ssad.world.world import World
 from .worlds import GRAPHS, ego, episode, straight_graph
 
 STEPS = 80
-BOX = st.tuples(
-    st.floats(-8, 8), st.floats(-8, 8), st.floats(-3.1, 3.1), st.floats(0.4, 9), st.floats(0.4, 3)
-)  # fmt: skip
+BOX = st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-3.1, 3.1), st.floats(0.4, 9), st.floats(0.4, 3))
 
 
 def controls(seed: int, count: int) -> np.ndarray:

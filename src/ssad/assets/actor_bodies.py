@@ -11,19 +11,31 @@ from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 # model of the world -> kind of body and its styles, the usual one first (twice: drawn twice as often); what is not here
 # is a plain box
 ACTOR_BODIES: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
-    "car": ("car", ("sedan", "estate", "sedan", "suv")), "suv": ("car", ("suv",)),
-    "coupe": ("car", ("sedan", "hatchback")), "compact": ("car", ("hatchback",)), "van": ("car", ("van", "pickup")),
-    "truck": ("truck", ("box", "flatbed", "tipper", "box")), "bus": ("bus", ("city", "coach")),
-    "motorcycle": ("motorcycle", ("ridden",)), "bicycle": ("bicycle", ("ridden",)),
-    "walker": ("pedestrian", ("adult",)), "cone": ("traffic_cone", ("cone",)),
-}  # fmt: skip
+    "car": ("car", ("sedan", "estate", "sedan", "suv")),
+    "suv": ("car", ("suv",)),
+    "coupe": ("car", ("sedan", "hatchback")),
+    "compact": ("car", ("hatchback",)),
+    "van": ("car", ("van", "pickup")),
+    "truck": ("truck", ("box", "flatbed", "tipper", "box")),
+    "bus": ("bus", ("city", "coach")),
+    "motorcycle": ("motorcycle", ("ridden",)),
+    "bicycle": ("bicycle", ("ridden",)),
+    "walker": ("pedestrian", ("adult",)),
+    "cone": ("traffic_cone", ("cone",)),
+}
 # kind of body -> its category in nuScenes; other kinds are no objects of the detection task
 BODY_CATEGORIES: Final[Mapping[str, str]] = {
-    "car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "trailer": "vehicle.trailer",
-    "construction": "vehicle.construction", "motorcycle": "vehicle.motorcycle", "bicycle": "vehicle.bicycle",
-    "pedestrian": "human.pedestrian.adult", "traffic_cone": "movable_object.trafficcone",
+    "car": "vehicle.car",
+    "truck": "vehicle.truck",
+    "bus": "vehicle.bus.rigid",
+    "trailer": "vehicle.trailer",
+    "construction": "vehicle.construction",
+    "motorcycle": "vehicle.motorcycle",
+    "bicycle": "vehicle.bicycle",
+    "pedestrian": "human.pedestrian.adult",
+    "traffic_cone": "movable_object.trafficcone",
     "barrier": "movable_object.barrier",
-}  # fmt: skip
+}
 
 
 # kinds that 2D detectors learn beside the classes of nuScenes; the others are background to them

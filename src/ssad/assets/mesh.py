@@ -197,9 +197,13 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
 def part_of(mesh: Mesh, faces: npt.NDArray[np.bool_]) -> Mesh:
     """The mesh with some of its faces [F] alone, in the place and with the atlas of the whole."""
     return replace(
-        mesh, faces=mesh.faces[faces], normals=mesh.normals[faces], uv=mesh.uv[faces], material=mesh.material[faces],
+        mesh,
+        faces=mesh.faces[faces],
+        normals=mesh.normals[faces],
+        uv=mesh.uv[faces],
+        material=mesh.material[faces],
         panel=mesh.panel[faces],
-    )  # fmt: skip
+    )
 
 
 def corner_normals(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, smooth: float = SMOOTH) -> F64:

@@ -255,10 +255,20 @@ class _Schedule:
         """A line for results.jsonl, and one for episodes.jsonl when the kind has one."""
         common: dict[str, Any] = {"key": cell.key, "suite": self.plan.suite.name, **cell.fields, "seed": cell.seed}
         episode = result.pop("episode", None)
-        record = common | {
-            "status": status, "reason": reason, "spec": dict(cell.spec), "metrics": {}, "n": 1,
-            "versions": dict(self.versions), "wall_s": round(seconds, 4), "artefacts": {},
-        } | result  # fmt: skip
+        record = (
+            common
+            | {
+                "status": status,
+                "reason": reason,
+                "spec": dict(cell.spec),
+                "metrics": {},
+                "n": 1,
+                "versions": dict(self.versions),
+                "wall_s": round(seconds, 4),
+                "artefacts": {},
+            }
+            | result
+        )
         self.store.append(record, None if episode is None else common | episode)
         self.live.advance(status == "ok")
 

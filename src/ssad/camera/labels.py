@@ -204,11 +204,20 @@ def _alone(
     samples = wp.zeros((len(crops), side, side), dtype=wp.uint64, device=device)
     lanes = FACE_LANES if device != "cpu" else 1
     inputs = [
-        stage.vertices, stage.faces, stage.listed, wp.array(starts, dtype=int, device=device),
-        wp.array(firsts, dtype=int, device=device), wp.array(views, dtype=int, device=device),
+        stage.vertices,
+        stage.faces,
+        stage.listed,
+        wp.array(starts, dtype=int, device=device),
+        wp.array(firsts, dtype=int, device=device),
+        wp.array(views, dtype=int, device=device),
         wp.array(matrices.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(lens, dtype=wp.vec4, device=device), NEAR, float(scale), 0, lanes, 1e30,
-    ]  # fmt: skip
+        wp.array(lens, dtype=wp.vec4, device=device),
+        NEAR,
+        float(scale),
+        0,
+        lanes,
+        1e30,
+    ]
     owners = wp.empty(total, dtype=wp.vec2i, device=device)
     large = wp.empty(1, dtype=raster.Triangle, device=device)
     many = wp.zeros(1, dtype=int, device=device)

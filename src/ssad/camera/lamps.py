@@ -99,9 +99,7 @@ def lamp_strength(sun_height: float) -> float:
     return float(np.clip((0.08 - sun_height) / 0.15, 0, 1))
 
 
-def near_of(
-    scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool = True, contact: bool = True
-) -> Any:  # fmt: skip
+def near_of(scene: Scene, views: Sequence[View], bodies: Bodies, *, lamps: bool = True, contact: bool = True) -> Any:
     """Lamps and occluders of B views with their grids, as the kernels read them, without shadow maps.
 
     Args:
@@ -274,9 +272,18 @@ def _lamp_row(lamp: Lamp, layer: int) -> tuple[Any, ...]:
     light = np.asarray(lamp.colour) * lamp.power / lamp.area()
     inner = (1.0 - lamp.soft) ** 2 - 1e-6  # its fade is as wide as this, also where it has none
     return (
-        tuple(place), tuple(turn[:, 0] / across), tuple(turn[:, 1] / down), tuple(turn[:, 2]), tuple(light),
-        inner, int(lamp.is_square), lamp.reach, layer, lamp.texture, 4.0 * across * down,
-    )  # fmt: skip
+        tuple(place),
+        tuple(turn[:, 0] / across),
+        tuple(turn[:, 1] / down),
+        tuple(turn[:, 2]),
+        tuple(light),
+        inner,
+        int(lamp.is_square),
+        lamp.reach,
+        layer,
+        lamp.texture,
+        4.0 * across * down,
+    )
 
 
 def lit_circle(lamp: Lamp) -> tuple[F64, float]:

@@ -197,11 +197,21 @@ def sweep(
 
     results = [wp.zeros(shape, dtype=d, device=device) for d in (float, float, float, int)]
     inputs = [
-        scene.street.id if scene.street is not None else wp.uint64(0), wp.vec3(*eye), on(rows, kernels.Target),
-        on(listed, int), on(starts, int), on(directions, wp.vec3), on(offsets.astype(np.float32), wp.vec3),
-        on(times.astype(np.float32), float), scene.materials(), scene.echo, scene.clear, on(chance, float), GLASS,
+        scene.street.id if scene.street is not None else wp.uint64(0),
+        wp.vec3(*eye),
+        on(rows, kernels.Target),
+        on(listed, int),
+        on(starts, int),
+        on(directions, wp.vec3),
+        on(offsets.astype(np.float32), wp.vec3),
+        on(times.astype(np.float32), float),
+        scene.materials(),
+        scene.echo,
+        scene.clear,
+        on(chance, float),
+        GLASS,
         float(lidar.reach),
-    ]  # fmt: skip
+    ]
     wp.launch(kernels.cast, dim=shape, inputs=inputs, outputs=results, device=device)
     distance, cosine, albedo, tag = (r.numpy() for r in results)
     keep = distance > lidar.blind

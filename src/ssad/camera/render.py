@@ -168,9 +168,17 @@ def light_of(weather: Weather) -> tuple[tuple[Any, ...], float]:
         0.30 * (0.9 * sun_colour.mean() * max(sun[2], 0.1) + zenith.mean() + 0.6 * horizon.mean()) + 0.05 * lamps
     )
     light = (
-        sun, tuple(sun_colour), tuple(zenith), tuple(horizon), tuple(ground), weather.fog, weather.clouds, weather.wet,
-        lamps, weather.turn,
-    )  # fmt: skip
+        sun,
+        tuple(sun_colour),
+        tuple(zenith),
+        tuple(horizon),
+        tuple(ground),
+        weather.fog,
+        weather.clouds,
+        weather.wet,
+        lamps,
+        weather.turn,
+    )
     return light, 0.40 / max(bright, 0.004) * 2.0**weather.exposure
 
 
@@ -202,9 +210,16 @@ class _Pass:
     """One visibility pass over all views: draws, slots, samples."""
 
     def __init__(
-        self, stage: Scene, draws: Draws, lens: F32, *, ortho: bool, size: tuple[int, int], scale: int,
+        self,
+        stage: Scene,
+        draws: Draws,
+        lens: F32,
+        *,
+        ortho: bool,
+        size: tuple[int, int],
+        scale: int,
         near: float = NEAR,
-    ) -> None:  # fmt: skip
+    ) -> None:
         device = stage.device
         total = int(draws.counts.sum())
         drawn = shade.Drawn()
@@ -229,9 +244,20 @@ class _Pass:
         many = wp.zeros(1, dtype=int, device=device)
         lanes = FACE_LANES if gpu else 1
         inputs = [
-            stage.vertices, stage.faces, stage.listed, starts, firsts, views, drawn.matrices, self.lens,
-            near, float(scale), int(ortho), lanes, 256.0 if gpu else 1e30,
-        ]  # fmt: skip
+            stage.vertices,
+            stage.faces,
+            stage.listed,
+            starts,
+            firsts,
+            views,
+            drawn.matrices,
+            self.lens,
+            near,
+            float(scale),
+            int(ortho),
+            lanes,
+            256.0 if gpu else 1e30,
+        ]
         outputs = [drawn.owners, self.samples, large, many]
         wp.launch(raster.fill, dim=(len(draws.counts), lanes), inputs=inputs, outputs=outputs, device=device)
         if gpu:
@@ -282,9 +308,13 @@ def render(
     bodies = collect([v.things for v in views])
     far = np.array([min(FAR, 6.0 / v.weather.fog) if v.weather.fog > 0 else FAR for v in views])
     draws = stage.gather(
-        np.asarray(np.linalg.inv(poses), np.float64), bodies, eyes=poses[:, :3, 3], axes=poses[:, :3, 2],
-        reach=(70.0, 180.0), far=far,
-    )  # fmt: skip
+        np.asarray(np.linalg.inv(poses), np.float64),
+        bodies,
+        eyes=poses[:, :3, 3],
+        axes=poses[:, :3, 2],
+        reach=(70.0, 180.0),
+        far=far,
+    )
     seen = _Pass(stage, draws, np.array(lens, np.float32), ortho=False, size=size, scale=scale)
     shadows = _sun_shadows(stage, views, bodies, [light[0] for light in lights], quality)
     near = _near(stage, views, bodies, quality)
@@ -303,11 +333,19 @@ def render(
         setattr(out, name, wp.zeros(shape if surface else (1, 1, 1), dtype=wp.vec3, device=device))
     lanes = 1 if device == "cpu" else shape[2]
     inputs = [
-        stage.geometry, seen.drawn, layers, seen.lens,
+        stage.geometry,
+        seen.drawn,
+        layers,
+        seen.lens,
         wp.array(poses.astype(np.float32), dtype=wp.mat44, device=device),
-        wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device), shadows, near,
-        int(projecting), scale, lanes, out,
-    ]  # fmt: skip
+        wp.array(struct_array(sky.Light, lights), dtype=sky.Light, device=device),
+        shadows,
+        near,
+        int(projecting),
+        scale,
+        lanes,
+        out,
+    ]
     wp.launch(shade.shade, dim=(*shape[:2], lanes), inputs=inputs, device=device)
     fragments: Any = np.zeros(0, layer_kernels.Fragment.numpy_dtype())  # type: ignore[attr-defined]
     if layers.any or projecting:
@@ -333,9 +371,13 @@ def _surface(out: Any, lens: F64, poses: F64) -> Surface:
     depth = out.depth.numpy()
     y, x = np.mgrid[0 : depth.shape[1], 0 : depth.shape[2]]
     ray = np.stack(
-        [(x - lens[:, 2, None, None]) / lens[:, 0, None, None], (y - lens[:, 3, None, None]) / lens[:, 1, None, None],
-         np.ones(depth.shape)], -1,
-    )  # fmt: skip
+        [
+            (x - lens[:, 2, None, None]) / lens[:, 0, None, None],
+            (y - lens[:, 3, None, None]) / lens[:, 1, None, None],
+            np.ones(depth.shape),
+        ],
+        -1,
+    )
     solid = np.isfinite(depth)
     local = ray * np.where(solid, depth, 0.0)[..., None]
     position = np.einsum("bij,bhwj->bhwi", poses[:, :3, :3], local) + poses[:, None, None, :3, 3]
@@ -381,9 +423,15 @@ def _sun_map(  # noqa: PLR0917
     # as far as what casts a shadow into the map can be away; small things of the street near its middle alone
     far = 1.4 * reach + 11.0
     casting = stage.gather(
-        to_light, bodies, eyes=middles, axes=None, reach=(0.4 * reach, far),
-        far=np.full(len(middles), far), horizon=False, casting=True,
-    )  # fmt: skip
+        to_light,
+        bodies,
+        eyes=middles,
+        axes=None,
+        reach=(0.4 * reach, far),
+        far=np.full(len(middles), far),
+        horizon=False,
+        casting=True,
+    )
     return _Pass(stage, casting, around, ortho=True, size=(size, size), scale=1).samples, matrices, texel
 
 
@@ -403,9 +451,19 @@ def _layers(draws: Draws, views: Sequence[View], device: str) -> Any:
     for decal in (d for view in views for d in view.decals):
         (width, height), turn = decal.size, decal.pose[:3, :3]
         decals.append(
-            (decal.texture, tuple(decal.pose[:3, 3]), tuple(turn[:, 0] * 2 / width), tuple(turn[:, 1] * 2 / height),
-             tuple(turn[:, 2]), decal.depth, width * height, decal.tag, decal.opacity, *mask_of(decal))
-        )  # fmt: skip
+            (
+                decal.texture,
+                tuple(decal.pose[:3, 3]),
+                tuple(turn[:, 0] * 2 / width),
+                tuple(turn[:, 1] * 2 / height),
+                tuple(turn[:, 2]),
+                decal.depth,
+                width * height,
+                decal.tag,
+                decal.opacity,
+                *mask_of(decal),
+            )
+        )
     table = layer_kernels.Layers()
     tables: Any = (("layers", layer_kernels.Layer, layers), ("decals", layer_kernels.Decal, decals))
     for name, struct, rows in tables:
@@ -428,10 +486,15 @@ def _near(stage: Scene, views: Sequence[View], bodies: Bodies, quality: Quality)
     poses = np.array([lamp.pose for _, lamp in casting], np.float64)
     around = collect([view.things for view, _ in casting])
     draws = stage.gather(
-        np.asarray(np.linalg.inv(poses), np.float64), around, eyes=poses[:, :3, 3],
-        axes=poses[:, :3, 2], reach=(70.0, 180.0), far=np.array([lamp.reach for _, lamp in casting]), horizon=False,
+        np.asarray(np.linalg.inv(poses), np.float64),
+        around,
+        eyes=poses[:, :3, 3],
+        axes=poses[:, :3, 2],
+        reach=(70.0, 180.0),
+        far=np.array([lamp.reach for _, lamp in casting]),
+        horizon=False,
         casting=True,
-    )  # fmt: skip
+    )
     lens = np.array([lamp_lens(lamp) for _, lamp in casting], np.float32)
     size = (LAMP_SHADOWS, LAMP_SHADOWS)
     near.shadows = _Pass(stage, draws, lens, ortho=False, size=size, scale=1, near=LAMP_NEAR).samples

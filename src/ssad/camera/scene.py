@@ -19,14 +19,35 @@ from ssad.jobs.machine import quiet_warp
 
 # pattern of a material by its name; others are plain
 PATTERNS = {
-    "asphalt": matter.GRAIN, "asphalt_patch": matter.GRAIN, "asphalt_worn": matter.GRAIN, "driveway": matter.GRAIN,
-    "kerb": matter.GRAIN, "stone": matter.GRAIN, "plaster": matter.GRAIN, "soil": matter.GRAIN,
-    "roofing_felt": matter.GRAIN, "cobbles": matter.SLAB, "paving": matter.SLAB, "brick": matter.BRICK,
-    "grass": matter.LEAF, "dry_grass": matter.LEAF, "lawn": matter.LEAF, "meadow": matter.LEAF,
-    "hedge": matter.LEAF, "forest": matter.LEAF, "hills": matter.LEAF, "leaves_round": matter.LEAF,
-    "leaves_tall": matter.LEAF, "leaves_birch": matter.LEAF, "leaves_conifer": matter.LEAF, "bark": matter.GRAIN,
-    "roof_tiles": matter.TILE, "boards": matter.TILE, "window": matter.GLASS, "shop_window": matter.GLASS,
-}  # fmt: skip
+    "asphalt": matter.GRAIN,
+    "asphalt_patch": matter.GRAIN,
+    "asphalt_worn": matter.GRAIN,
+    "driveway": matter.GRAIN,
+    "kerb": matter.GRAIN,
+    "stone": matter.GRAIN,
+    "plaster": matter.GRAIN,
+    "soil": matter.GRAIN,
+    "roofing_felt": matter.GRAIN,
+    "cobbles": matter.SLAB,
+    "paving": matter.SLAB,
+    "brick": matter.BRICK,
+    "grass": matter.LEAF,
+    "dry_grass": matter.LEAF,
+    "lawn": matter.LEAF,
+    "meadow": matter.LEAF,
+    "hedge": matter.LEAF,
+    "forest": matter.LEAF,
+    "hills": matter.LEAF,
+    "leaves_round": matter.LEAF,
+    "leaves_tall": matter.LEAF,
+    "leaves_birch": matter.LEAF,
+    "leaves_conifer": matter.LEAF,
+    "bark": matter.GRAIN,
+    "roof_tiles": matter.TILE,
+    "boards": matter.TILE,
+    "window": matter.GLASS,
+    "shop_window": matter.GLASS,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,18 +180,26 @@ def collect(things: Sequence[Sequence[Thing]]) -> Bodies:
     """
     flat = tuple(thing for row in things for thing in row)
     return Bodies(
-        flat, np.repeat(np.arange(len(things), dtype=np.int32), [len(row) for row in things]),
-        np.array([t.mesh for t in flat], np.int32), np.array([t.pose for t in flat], np.float64).reshape(-1, 4, 4),
-        np.array([t.paint for t in flat], np.float32).reshape(-1, 3), np.array([t.tag for t in flat], np.int32),
-        np.array([t.lit for t in flat], bool), np.array([t.hidden for t in flat], bool),
-    )  # fmt: skip
+        flat,
+        np.repeat(np.arange(len(things), dtype=np.int32), [len(row) for row in things]),
+        np.array([t.mesh for t in flat], np.int32),
+        np.array([t.pose for t in flat], np.float64).reshape(-1, 4, 4),
+        np.array([t.paint for t in flat], np.float32).reshape(-1, 3),
+        np.array([t.tag for t in flat], np.int32),
+        np.array([t.lit for t in flat], bool),
+        np.array([t.hidden for t in flat], bool),
+    )
 
 
 LAMPS = ("head_lamp", "tail_lamp")
 NIGHT = {  # what the night adds to the emission of a material while lamps are on
-    "head_lamp": 2.0, "tail_lamp": 0.8, "lamp_light": 4.0, "street_light": 4.0, "window_blind": 0.3,
+    "head_lamp": 2.0,
+    "tail_lamp": 0.8,
+    "lamp_light": 4.0,
+    "street_light": 4.0,
+    "window_blind": 0.3,
     "shop_window": 0.5,
-}  # fmt: skip
+}
 
 
 class Scene:
@@ -360,9 +389,15 @@ def surface(material: Material) -> tuple[Any, ...]:
     pattern = PATTERNS.get(material.name, matter.PLAIN)
     night, lamp = NIGHT.get(material.name, 0.0), int(material.name in LAMPS)
     return (
-        material.colour, material.specular, material.gloss, material.emission, night, int(material.paint), lamp,
+        material.colour,
+        material.specular,
+        material.gloss,
+        material.emission,
+        night,
+        int(material.paint),
+        lamp,
         int(pattern),
-    )  # fmt: skip
+    )
 
 
 def _standing(body: Mesh) -> tuple[F64, F64, float, float]:

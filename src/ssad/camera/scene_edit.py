@@ -109,18 +109,19 @@ class SceneEdit:
         decals = (replace(one, pose=target.pose @ one.pose, tag=tag if one.tag > 0 else one.tag) for one in self.decals)
         things = [*view.things, *hung]
         things[at] = replace(target, layers=(*target.layers, *self.layers))
-        return replace(
-            view, things=tuple(things), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals)
-        )  # fmt: skip
+        return replace(view, things=tuple(things), lamps=(*view.lamps, *lamps), decals=(*view.decals, *decals))
 
 
 NO_EDIT = SceneEdit()
 
 
 def render_with(
-    scene: Scene, views: Sequence[View], textures: Mapping[int, Tensor], masks: Mapping[int, Bool] | None = None,
+    scene: Scene,
+    views: Sequence[View],
+    textures: Mapping[int, Tensor],
+    masks: Mapping[int, Bool] | None = None,
     **options: Any,
-) -> Picture:  # fmt: skip
+) -> Picture:
     """Render views with textures on what shows them. Where none is seen, nothing differs from `render`.
 
     Args:

@@ -99,9 +99,13 @@ class Seen(Protocol):
 
 
 def taps_of(
-    picture: Seen, size: int | tuple[int, int], *, texture: int = 0, mask: Bool | None = None,
+    picture: Seen,
+    size: int | tuple[int, int],
+    *,
+    texture: int = 0,
+    mask: Bool | None = None,
     dtype: torch.dtype = torch.float32,
-) -> Taps:  # fmt: skip
+) -> Taps:
     """The taps of one texture in a picture.
 
     Args:

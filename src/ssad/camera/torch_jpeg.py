@@ -160,10 +160,18 @@ def _accurate_pass(*, first: bool) -> list[np.ndarray]:
     shared = (d[3] + d[1] + d[2] + d[0]) * 9633
     z1, z2 = (d[3] + d[0]) * -7373, (d[2] + d[1]) * -20995
     z3, z4 = (d[3] + d[1]) * -16069 + shared, (d[2] + d[0]) * -3196 + shared
-    rows = np.stack([
-        even + odd, d[0] * 12299 + z1 + z4, turned + low * 6270, d[1] * 25172 + z2 + z3,
-        even - odd, d[2] * 16819 + z2 + z4, turned - high * 15137, d[3] * 2446 + z1 + z3,
-    ])  # fmt: skip
+    rows = np.stack(
+        [
+            even + odd,
+            d[0] * 12299 + z1 + z4,
+            turned + low * 6270,
+            d[1] * 25172 + z2 + z3,
+            even - odd,
+            d[2] * 16819 + z2 + z4,
+            turned - high * 15137,
+            d[3] * 2446 + z1 + z3,
+        ]
+    )
     bits = np.array([-2 if first else 2, *[11 if first else 15] * 3] * 2, float)[:, None]
     bias = np.where(bits > 0, 0.5, 0.0)
     return [np.zeros((0, 8)), rows / 2**bits, np.zeros((8, 0)), bias]

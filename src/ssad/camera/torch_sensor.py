@@ -385,9 +385,14 @@ class Window:
             need = [_grown((low, min(high, most)), sensor.reach, most) for low, high in blocks]
             read.append(_alike(need, most, 2 if sensor.mosaic else 1))
         return Window(
-            (count, height, width), sensor, tuple(changed), tuple(zip(*read, strict=True)),
-            tuple(zip(*coded, strict=True)), quality, subsampling,
-        )  # fmt: skip
+            (count, height, width),
+            sensor,
+            tuple(changed),
+            tuple(zip(*read, strict=True)),
+            tuple(zip(*coded, strict=True)),
+            quality,
+            subsampling,
+        )
 
     def crop(self, picture: Tensor) -> Tensor:
         """What the window reads of radiance or noise.

@@ -55,9 +55,16 @@ def about(
 
 
 for command in (
-    running.run, running.report, running.compare, running.replay, looking.detect, looking.show, data.shift, data.score,
+    running.run,
+    running.report,
+    running.compare,
+    running.replay,
+    looking.detect,
+    looking.show,
+    data.shift,
+    data.score,
     data.record,
-):  # fmt: skip
+):
     app.command()(command)
 app.add_typer(train_app, name="train")
 

@@ -86,10 +86,15 @@ def shift(
                 raise ConfigError(f"{name} is for a nuScenes folder; {source} has no VERSION/sample_data.json")
         raise typer.Exit(
             shift_picture_folder(
-                source, out, shifts=names, severity=severity, workers=workers, ray=ray,
+                source,
+                out,
+                shifts=names,
+                severity=severity,
+                workers=workers,
+                ray=ray,
                 settings={"seed": seed, "calibration": calibration, "quality": quality, "subsampling": subsampling},
             )
-        )  # fmt: skip
+        )
     code = shift_folder(
         source,
         out,
@@ -101,10 +106,15 @@ def shift(
         workers=workers,
         ray=ray,
         settings={
-            "seed": seed, "calibration": calibration, "labels": labels, "sweeps": sweeps, "lidar": lidar,
-            "quality": quality, "subsampling": subsampling,
+            "seed": seed,
+            "calibration": calibration,
+            "labels": labels,
+            "sweeps": sweeps,
+            "lidar": lidar,
+            "quality": quality,
+            "subsampling": subsampling,
         },
-    )  # fmt: skip
+    )
     raise typer.Exit(code)
 
 
@@ -194,16 +204,30 @@ def record(
 
             pairs = pair_images(names(towns), names(images))
             todo = Clips(
-                out, pairs, names(held_out), clips, target=parse_target(target) if target else None, seed=seed,  # type: ignore[arg-type]
-                device=pick_device(device), streets=streets,
-            )  # fmt: skip
+                out,
+                pairs,
+                names(held_out),
+                clips,
+                target=parse_target(target) if target else None,
+                seed=seed,  # type: ignore[arg-type]
+                device=pick_device(device),
+                streets=streets,
+            )
             record_clips(todo, workers=workers, ray=ray, progress=live.show)
             text = f"{out}: {sum(count for _, count in pairs)} images, annotations train.json, test.json and all.json"
         else:
             drives = Recording(
-                out, names(towns), names(held_out), scenes=scenes, seconds=seconds, width=width, sweeps=sweeps,
-                seed=seed, device=pick_device(device), streets=streets,
-            )  # fmt: skip
+                out,
+                names(towns),
+                names(held_out),
+                scenes=scenes,
+                seconds=seconds,
+                width=width,
+                sweeps=sweeps,
+                seed=seed,
+                device=pick_device(device),
+                streets=streets,
+            )
             record_nuscenes(drives, workers=workers, ray=ray, progress=live.show)
             text = f"{out}: {len(drives.towns) * scenes} scenes, version {drives.version}, splits train and val"
     print(text)

@@ -67,9 +67,7 @@ def detect(
 
     root = folders[0]
     manifest = "clean" if read_manifest(root) is None else manifest_digest(root)
-    with (
-        NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as live
-    ):  # fmt: skip
+    with NuScenes(root, version) as data, Live("detect", 1, 0, console=Console(stderr=True), unit="scenes") as live:
         path, samples, boxes = detect_dataset(
             made, data, out, split=split, manifest=manifest, device=where, progress=live.show
         )

@@ -211,11 +211,17 @@ def no_signals() -> dict[str, Any]:
     """The arrays of a `LaneGraph` without signals, stop lines and crosswalks, by name."""
     none = np.zeros(0, np.int32)
     return {
-        "signal_xy": np.zeros((0, 2), np.float32), "signal_yaw": np.zeros(0, np.float32), "signal_junction": none,
-        "signal_phase": none, "signal_virtual": np.zeros(0, bool), "stop_signal": none, "stop_lane": none,
-        "stop_s": np.zeros(0, np.float32), "crosswalk_offset": np.zeros(1, np.int32),
+        "signal_xy": np.zeros((0, 2), np.float32),
+        "signal_yaw": np.zeros(0, np.float32),
+        "signal_junction": none,
+        "signal_phase": none,
+        "signal_virtual": np.zeros(0, bool),
+        "stop_signal": none,
+        "stop_lane": none,
+        "stop_s": np.zeros(0, np.float32),
+        "crosswalk_offset": np.zeros(1, np.int32),
         "crosswalk_xy": np.zeros((0, 2), np.float32),
-    }  # fmt: skip
+    }
 
 
 _DTYPES = array_dtypes(LaneGraph)
@@ -242,9 +248,13 @@ def _check(graph: LaneGraph) -> None:
         value = getattr(graph, name)
         require(value.ndim == 2 and value.shape[1] == 2, f"{name} is not [n, 2]")
     size = {
-        "P": len(graph.xy), "L": len(graph.kind), "S": len(graph.signal_xy), "K": len(graph.stop_signal),
-        "G": len(graph.sign_xy), "R": len(graph.rule_sign),
-    }  # fmt: skip
+        "P": len(graph.xy),
+        "L": len(graph.kind),
+        "S": len(graph.signal_xy),
+        "K": len(graph.stop_signal),
+        "G": len(graph.sign_xy),
+        "R": len(graph.rule_sign),
+    }
     for letter, names in _PER.items():
         for name in names:
             require(getattr(graph, name).shape == (size[letter],), f"{name} does not have {size[letter]} rows")

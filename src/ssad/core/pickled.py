@@ -38,11 +38,18 @@ CONVERT = "convert it where it was made: safetensors.torch.save_file(model.state
 NESTS = ("ema", "average", "state_dict", "model_state_dict", "model", "module", "net", "weights")
 
 _KINDS = {
-    "DoubleStorage": torch.float64, "FloatStorage": torch.float32, "HalfStorage": torch.float16,
-    "BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32,
-    "ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
+    "DoubleStorage": torch.float64,
+    "FloatStorage": torch.float32,
+    "HalfStorage": torch.float16,
+    "BFloat16Storage": torch.bfloat16,
+    "LongStorage": torch.int64,
+    "IntStorage": torch.int32,
+    "ShortStorage": torch.int16,
+    "CharStorage": torch.int8,
+    "ByteStorage": torch.uint8,
+    "BoolStorage": torch.bool,
     "UntypedStorage": torch.uint8,
-}  # fmt: skip
+}
 _ATTACKS = frozenset({"os", "posix", "nt", "subprocess", "sys", "shutil", "socket", "runpy", "importlib", "ctypes"})
 _ATTACK_CALLS = frozenset({"eval", "exec", "compile", "__import__", "open", "input", "breakpoint"})
 

@@ -69,9 +69,16 @@ def coco_data(classes: Sequence[str], images: Sequence[Mapping[str, Any]], about
             x1, y1, x2, y2 = thing["box"]
             extra = {k: v for k, v in thing.items() if k not in ("label", "box", "pixels", "crowd")}
             boxes.append(
-                {"id": len(boxes) + 1, "image_id": number, "category_id": thing["label"] + 1,
-                 "bbox": [x1, y1, x2 - x1, y2 - y1], "area": thing["pixels"], "iscrowd": int(thing["crowd"])} | extra
-            )  # fmt: skip
+                {
+                    "id": len(boxes) + 1,
+                    "image_id": number,
+                    "category_id": thing["label"] + 1,
+                    "bbox": [x1, y1, x2 - x1, y2 - y1],
+                    "area": thing["pixels"],
+                    "iscrowd": int(thing["crowd"]),
+                }
+                | extra
+            )
     kinds = [{"id": k + 1, "name": name, "supercategory": "road"} for k, name in enumerate(classes)]
     return {"info": dict(about), "images": rows, "annotations": boxes, "categories": kinds}
 
@@ -132,8 +139,12 @@ def _image(
         raise ValueError(f"{what}: a box without width or height, or not finite")
     about = {k: v for k, v in row.items() if k not in ("id", "file_name", "width", "height")}
     return CocoImage(
-        folder / file, width, height, about, box,
+        folder / file,
+        width,
+        height,
+        about,
+        box,
         np.array([label_of[r["category_id"]] for r in own], np.int32),
         np.array([bool(r.get("iscrowd", 0)) for r in own], bool),
         np.array([bool(r.get("target", False)) for r in own], bool),
-    )  # fmt: skip
+    )

@@ -65,10 +65,22 @@ def each_fault(detector: Any, *, intrinsic: Tensor | None = None, size: tuple[in
         return
     trial = CheckCase(detector, size, intrinsic)
     for part in (
-        _check_names, _check_dense, check_places, _check_gradient, _check_predict, check_boxes, check_solids,
-        _check_batch, _check_losses, check_loss_signs, check_slopes, check_small_changes, _check_modes, _check_sizes,
+        _check_names,
+        _check_dense,
+        check_places,
+        _check_gradient,
+        _check_predict,
+        check_boxes,
+        check_solids,
+        _check_batch,
+        _check_losses,
+        check_loss_signs,
+        check_slopes,
+        check_small_changes,
+        _check_modes,
+        _check_sizes,
         _check_refusals,
-    ):  # fmt: skip
+    ):
         told = len(trial.faults)
         name = part.__name__.strip("_").removeprefix("check_").replace("_", " ")
         with trial.guarded(name), torch.random.fork_rng(devices=[]):

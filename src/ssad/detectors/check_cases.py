@@ -155,9 +155,11 @@ class State:
         self.grads = {name: (value.requires_grad, value.grad is None) for name, value in tensors}
         self.values = {name: value.detach().clone() for name, value in tensors}
         self.settings = (
-            torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.get_default_dtype(),
+            torch.is_grad_enabled(),
+            torch.is_inference_mode_enabled(),
+            torch.get_default_dtype(),
             torch.get_num_threads(),
-        )  # fmt: skip
+        )
         self.draws = torch.get_rng_state()
 
     def changed(self, detector: Any) -> list[str]:

@@ -22,9 +22,11 @@ MAX_FILE = 256 * MIB
 MAX_PIXELS = 1 << 26
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "PPM")
 HINTS = {
-    torch.int16: "; 16-bit pictures are uint16", torch.int32: "; convert to uint8 or uint16",
-    torch.int64: "; convert to uint8 or uint16", torch.bool: "; a mask is no picture",
-}  # fmt: skip
+    torch.int16: "; 16-bit pictures are uint16",
+    torch.int32: "; convert to uint8 or uint16",
+    torch.int64: "; convert to uint8 or uint16",
+    torch.bool: "; a mask is no picture",
+}
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,8 @@ def infer(
     bottom = bottom_centre(centre, solid.size_lhw)
     boxes = {
         "bboxes_3d": torch.cat([bottom, solid.size_lhw, solid.yaw[:, None], solid.velocity], 1),
-        "scores_3d": found.score, "labels_3d": found.label, "attr_labels": solid.attribute,
-    }  # fmt: skip
+        "scores_3d": found.score,
+        "labels_3d": found.label,
+        "attr_labels": solid.attribute,
+    }
     return {name: dense.maps[name] for name in _NAMES if name in dense.maps}, boxes

@@ -30,9 +30,25 @@ YOLOV5S = replace(YOLOV5N, name="yolov5s", width=0.5)
 
 # the layers of the published table that have weights
 LAYERS = {
-    0: "stem", 1: "down2", 2: "stage2", 3: "down3", 4: "stage3", 5: "down4", 6: "stage4", 7: "down5", 8: "stage5",
-    9: "pool", 10: "lateral5", 13: "top4", 14: "lateral4", 17: "neck3", 18: "up4", 20: "neck4", 21: "up5", 23: "neck5",
-}  # fmt: skip
+    0: "stem",
+    1: "down2",
+    2: "stage2",
+    3: "down3",
+    4: "stage3",
+    5: "down4",
+    6: "stage4",
+    7: "down5",
+    8: "stage5",
+    9: "pool",
+    10: "lateral5",
+    13: "top4",
+    14: "lateral4",
+    17: "neck3",
+    18: "up4",
+    20: "neck4",
+    21: "up5",
+    23: "neck5",
+}
 HEADS = 24
 _PARTS = {"cv1": "through", "cv2": "past", "cv3": "merge"}
 _POOL_PARTS = {"cv1": "reduce", "cv2": "merge"}

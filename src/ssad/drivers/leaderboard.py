@@ -292,9 +292,15 @@ class VehicleControl:
     """What an agent answers where `carla` is not installed."""
 
     def __init__(  # noqa: PLR0917
-        self, throttle: float = 0.0, steer: float = 0.0, brake: float = 0.0, hand_brake: bool = False,
-        reverse: bool = False, manual_gear_shift: bool = False, gear: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        throttle: float = 0.0,
+        steer: float = 0.0,
+        brake: float = 0.0,
+        hand_brake: bool = False,
+        reverse: bool = False,
+        manual_gear_shift: bool = False,
+        gear: int = 0,
+    ) -> None:
         self.throttle, self.steer, self.brake = throttle, steer, brake
         self.hand_brake, self.reverse = hand_brake, reverse
         self.manual_gear_shift, self.gear = manual_gear_shift, gear

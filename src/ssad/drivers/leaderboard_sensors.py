@@ -24,8 +24,14 @@ LIDAR: Final = "sensor.lidar.ray_cast"
 RADAR: Final = "sensor.other.radar"
 MAP: Final = "sensor.opendrive_map"
 LIMITS: Final[Mapping[str, int]] = {
-    CAMERA: 8, LIDAR: 2, RADAR: 4, "sensor.other.gnss": 1, "sensor.other.imu": 1, MAP: 1, "sensor.speedometer": 1,
-}  # fmt: skip
+    CAMERA: 8,
+    LIDAR: 2,
+    RADAR: 4,
+    "sensor.other.gnss": 1,
+    "sensor.other.imu": 1,
+    MAP: 1,
+    "sensor.speedometer": 1,
+}
 """Kinds of sensors -> how many of one an agent may have."""
 _FADE: Final = 0.004  # 1/m by which the intensity of a LiDAR's points falls
 _RANGE, _REACH = 85.0, 100.0  # m, of LiDAR and radar

@@ -99,13 +99,20 @@ def sum_notes(notes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return float(f"{max(known):.6g}") if known else None
 
     return {
-        "access": notes[0]["access"] if notes else "", "images": images, "idle": images - active,
-        "gradients": mean("gradients", images), "queries": mean("queries", images),
-        "loss_before": mean("before", images), "loss_after": mean("after", images), "used": mean("used", active),
-        "change_px": largest("change"), "batch": max((one["batch"] for one in some), default=0),
+        "access": notes[0]["access"] if notes else "",
+        "images": images,
+        "idle": images - active,
+        "gradients": mean("gradients", images),
+        "queries": mean("queries", images),
+        "loss_before": mean("before", images),
+        "loss_after": mean("after", images),
+        "used": mean("used", active),
+        "change_px": largest("change"),
+        "batch": max((one["batch"] for one in some), default=0),
         "halved": sum(one["halved"] for one in some),
-        "gradient_error": largest("gradient_error"), "coupling": largest("coupling"),
-    }  # fmt: skip
+        "gradient_error": largest("gradient_error"),
+        "coupling": largest("coupling"),
+    }
 
 
 def sum_members(noted: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, Any]:

@@ -327,10 +327,18 @@ class SceneAttacker:
             return out
         own = images[active]
         found = run_attack(
-            self.attack, self.watched.detector, own, [truth[k] for k in active], budget, objective=spec.loss,
-            aim=spec.aim, intrinsic=lens[active], check=False, precision=spec.precision,
+            self.attack,
+            self.watched.detector,
+            own,
+            [truth[k] for k in active],
+            budget,
+            objective=spec.loss,
+            aim=spec.aim,
+            intrinsic=lens[active],
+            check=False,
+            precision=spec.precision,
             keys=[(self.examination.seed, frames[k].token) for k in active],
-        )  # fmt: skip
+        )
         taken = Tally(self.attack.access)
         taken.add(found, own, budget)
         self.tally.absorb(taken.notes())
@@ -372,9 +380,18 @@ class SceneAttacker:
             return
         own, spec = self.examination, self.view.spec
         asked = (
-            str(own.root), own.version, own.detectors, own.device, self.view.source, self.scene.record.name, spec.loss,
-            spec.classes, spec.becomes, spec.object, self.attack.access,
-        )  # fmt: skip
+            str(own.root),
+            own.version,
+            own.detectors,
+            own.device,
+            self.view.source,
+            self.scene.record.name,
+            spec.loss,
+            spec.classes,
+            spec.becomes,
+            spec.object,
+            self.attack.access,
+        )
         if asked not in _INSPECTED:
             _INSPECTED[asked] = self._inspected(frames)
         self.tally.gradient_error, self.tally.coupling = _INSPECTED[asked]
@@ -403,7 +420,7 @@ class SceneAttacker:
                     try:
                         victim = Victim(
                             detector, images, truth, objective, intrinsic=lens, aim=spec.aim, precision=spec.precision
-                        )  # fmt: skip
+                        )
                     except NothingToAttackError:
                         continue
                     if self.tally.gradient_error is None:

@@ -59,9 +59,12 @@ def camera_truth(frame: SensorFrame, found: Annotations, *, hit: bool = True) ->
         return torch.from_numpy(np.array(values, np.float32))
 
     solid = Solids(
-        floats(centre[rows]), floats(own.size_lwh[:, size_columns("lwh", "lhw")]), floats(camera_yaw(ahead)),
-        floats(speed[:, [0, 2]]), torch.tensor(attribute, dtype=torch.int64),
-    )  # fmt: skip
+        floats(centre[rows]),
+        floats(own.size_lwh[:, size_columns("lwh", "lhw")]),
+        floats(camera_yaw(ahead)),
+        floats(speed[:, [0, 2]]),
+        torch.tensor(attribute, dtype=torch.int64),
+    )
     return Truth(torch.tensor(label, dtype=torch.int64), floats(box), solid, floats(frame.intrinsic))
 
 

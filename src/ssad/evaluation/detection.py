@@ -33,8 +33,12 @@ _ATTRIBUTE = {"": -1} | {name: k for k, name in enumerate(ATTRIBUTES)}
 AT_ONCE = 6  # samples that a GPU is shown at once
 FLOOR = 0.001  # least score that counts for AP of 2D boxes
 ERRORS: Mapping[str, str] = {
-    "mATE": "trans_err", "mASE": "scale_err", "mAOE": "orient_err", "mAVE": "vel_err", "mAAE": "attr_err",
-}  # fmt: skip
+    "mATE": "trans_err",
+    "mASE": "scale_err",
+    "mAOE": "orient_err",
+    "mAVE": "vel_err",
+    "mAAE": "attr_err",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +101,15 @@ def detect_scene(
 
 
 def detect_with(
-    detectors: Sequence[Detector], root: Path, scene: SceneData, *, device: str = "cpu", look: Look | None = None,
-    ahead: bool = True, at_once: int = AT_ONCE,
-) -> list[list[Any]]:  # fmt: skip
+    detectors: Sequence[Detector],
+    root: Path,
+    scene: SceneData,
+    *,
+    device: str = "cpu",
+    look: Look | None = None,
+    ahead: bool = True,
+    at_once: int = AT_ONCE,
+) -> list[list[Any]]:
     """As `detect_scene`, for several detectors that are shown the same pictures.
 
     Args:
@@ -209,10 +219,15 @@ def box_table(found: Sequence[SampleBoxes], truth: GroundTruth) -> BoxTable:
     attributes = [_ATTRIBUTE[name] for p in parts for name in p.attribute]
     table = BoxTable(
         sample=np.repeat([place[one.token] for one in chosen], [len(p) for p in parts]).astype(np.int32),
-        label=LABEL[column("label").astype(int)].astype(np.int8), centre=column("centre"),
-        size_lwh=column("size_lwh"), rotation=column("rotation"), velocity=column("velocity"),
-        attribute=np.array(attributes, np.int8), score=column("score"), ego_distance=np.full(len(attributes), np.nan),
-    )  # fmt: skip
+        label=LABEL[column("label").astype(int)].astype(np.int8),
+        centre=column("centre"),
+        size_lwh=column("size_lwh"),
+        rotation=column("rotation"),
+        velocity=column("velocity"),
+        attribute=np.array(attributes, np.int8),
+        score=column("score"),
+        ego_distance=np.full(len(attributes), np.nan),
+    )
     return with_ego(table, truth.ego)
 
 
@@ -276,9 +291,10 @@ def detect_2d(detector: Detector, batches: Iterable[torch.Tensor], *, device: st
         found += detector.predict(images, threshold=FLOOR)
     return Boxes2D(
         np.repeat(np.arange(len(found)), [len(one.score) for one in found]).astype(np.int32),
-        _rows([one.label for one in found]).astype(np.int32), _rows([one.box for one in found], 4),
+        _rows([one.label for one in found]).astype(np.int32),
+        _rows([one.box for one in found], 4),
         _rows([one.score for one in found]),
-    )  # fmt: skip
+    )
 
 
 def _rows(values: Sequence[torch.Tensor], width: int | None = None) -> F64:

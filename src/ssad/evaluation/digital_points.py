@@ -184,17 +184,26 @@ class Point:
     def fields(self) -> dict[str, Any]:
         """Columns of a record that tell what its system was shown."""
         about = {
-            "source": self.source, "defence": self.defence.text if self.defence else "", "aware": self.aware,
-            "subset": self.scenes, "row": self.row,
-        }  # fmt: skip
+            "source": self.source,
+            "defence": self.defence.text if self.defence else "",
+            "aware": self.aware,
+            "subset": self.scenes,
+            "row": self.row,
+        }
         if not self.specs:
             none = dict.fromkeys(("attack", "loss", "norm"))
             return {**none, "radius": 0.0, "steps": 0, "options": "", "target": "", **about}
         spec = self.specs[0]
         found = {
-            "attack": spec.attack, "loss": spec.loss if spec.attack != "noise" else None, "norm": spec.norm,
-            "radius": spec.radius, "steps": spec.steps, "options": _options(spec), "target": spec.target, **about,
-        }  # fmt: skip
+            "attack": spec.attack,
+            "loss": spec.loss if spec.attack != "noise" else None,
+            "norm": spec.norm,
+            "radius": spec.radius,
+            "steps": spec.steps,
+            "options": _options(spec),
+            "target": spec.target,
+            **about,
+        }
         if len(self.specs) > 1:
             members = ", ".join(" ".join(filter(None, [one.attack, one.loss, _options(one)])) for one in self.specs)
             found |= {"attack": ENSEMBLE, "loss": None, "steps": 0, "options": f"of {members}"}
@@ -246,9 +255,12 @@ def rows_of(suite: AttackTable) -> list[Point]:
             if becomes and (one.loss or default_loss(one.name)) != "mislabel":
                 raise ConfigError(f"suite {suite.name}: attack {one.name}: becomes needs loss: mislabel")
             spec = replace(
-                _spec(suite, one, one.radius, one.steps), classes=classes, becomes=becomes, draws=draws,
+                _spec(suite, one, one.radius, one.steps),
+                classes=classes,
+                becomes=becomes,
+                draws=draws,
                 object=one.object or "",
-            )  # fmt: skip
+            )
             if not spec.aim.everything and spec.loss in UNDIVIDED:
                 raise ConfigError(
                     f"suite {suite.name}: attack {one.name}: loss {spec.loss} is of all objects; to attack some "
@@ -275,8 +287,9 @@ def points_of(suite: AttackTable) -> list[Point]:
     rows, curves, moved = rows_of(suite), _swept(suite, suite.sweeps), transfers_of(suite)
     bare = [
         replace(one, specs=(replace(one.specs[0], draws=0),), defence=None, aware=False, row=False)
-        for one in rows if one.defence
-    ]  # fmt: skip
+        for one in rows
+        if one.defence
+    ]
     return _with_controls([*rows, *curves, *bare, *moved])
 
 
@@ -284,8 +297,9 @@ def _with_controls(points: Sequence[Point]) -> list[Point]:
     """Clean data and noise that points are compared with, and then these, each once."""
     noise = [
         replace(one, specs=(AttackSpec("noise", default_loss("noise"), one.specs[0].norm, one.specs[0].radius),))
-        for one in points if one.defence is None
-    ]  # fmt: skip
+        for one in points
+        if one.defence is None
+    ]
     clean = [Point(scenes=one.scenes, defence=one.defence) for one in points]
     return list(dict.fromkeys([Point(row=True), *clean, *noise, *points]))
 

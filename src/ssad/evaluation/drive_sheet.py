@@ -17,8 +17,14 @@ from ssad.evaluation.drive_perception import Perceived, in_view
 
 WIDTH, TALL, SCALE, BEHIND = 360, 360, 6.0, 8.0  # pixels, pixels a metre, m behind the ego
 GROUND, LANE, THERE, UNSEEN, FOUND, KNOWN, EGO = (
-    (34, 36, 40), (70, 73, 80), (205, 205, 205), (110, 110, 110), (255, 150, 30), (80, 170, 255), (90, 220, 120),
-)  # fmt: skip
+    (34, 36, 40),
+    (70, 73, 80),
+    (205, 205, 205),
+    (110, 110, 110),
+    (255, 150, 30),
+    (80, 170, 255),
+    (90, 220, 120),
+)
 LEGEND = "grey: there (dark: out of view), orange: found, blue: believed"
 
 

@@ -129,9 +129,17 @@ class ChanceEpisode:
         hours, km = self.usual()
         driven = found.work * process.world.dt / 3600.0 / process.world.agents
         metrics = {
-            "per_million": 1e6 * found.probability, "low": 1e6 * found.low, "high": 1e6 * found.high,
-            "effective": found.effective, "events": found.events, "episodes": found.episodes,
-            "work": found.work / 1e6, "training": found.training / 1e6, "hours": driven, "km": driven * km / hours,
-            "per_hour": 1e3 * found.probability / hours, "per_km": 1e3 * found.probability / km,
-        }  # fmt: skip
+            "per_million": 1e6 * found.probability,
+            "low": 1e6 * found.low,
+            "high": 1e6 * found.high,
+            "effective": found.effective,
+            "events": found.events,
+            "episodes": found.episodes,
+            "work": found.work / 1e6,
+            "training": found.training / 1e6,
+            "hours": driven,
+            "km": driven * km / hours,
+            "per_hour": 1e3 * found.probability / hours,
+            "per_km": 1e3 * found.probability / km,
+        }
         return metrics, crash

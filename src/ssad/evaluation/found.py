@@ -70,9 +70,14 @@ def draw_found(picture: U8, found: Detections, classes: Sequence[str], intrinsic
 
 
 def detect_pictures(
-    detector: Detector, files: Sequence[Path], out: Path, *, threshold: float = 0.3, focal: float | None = None,
+    detector: Detector,
+    files: Sequence[Path],
+    out: Path,
+    *,
+    threshold: float = 0.3,
+    focal: float | None = None,
     device: str = "cpu",
-) -> list[Marked]:  # fmt: skip
+) -> list[Marked]:
     """Draw what a detector finds in pictures, and write all boxes to OUT/detections.json.
 
     Args:
@@ -132,9 +137,15 @@ def _rows(found: Detections, classes: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def detect_dataset(
-    detector: Detector, data: NuScenes, out: Path, *, split: str | None = None, manifest: str = "clean",
-    device: str = "cpu", progress: Callable[[int, int], None] = lambda done, of: None,
-) -> tuple[Path, int, int]:  # fmt: skip
+    detector: Detector,
+    data: NuScenes,
+    out: Path,
+    *,
+    split: str | None = None,
+    manifest: str = "clean",
+    device: str = "cpu",
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> tuple[Path, int, int]:
     """Write the official results file of the nuScenes detection task for a data set: OUT/results.json.
 
     Args:
@@ -176,13 +187,17 @@ def results_rows(found: SampleBoxes) -> list[dict[str, Any]]:
     boxes = found.boxes
     return [
         {
-            "sample_token": found.token, "translation": boxes.centre[n].tolist(), "size": boxes.size_wlh[n].tolist(),
-            "rotation": boxes.rotation[n].tolist(), "velocity": np.nan_to_num(boxes.velocity[n, :2]).tolist(),
-            "detection_name": MMDET3D_CLASSES[int(boxes.label[n])], "detection_score": float(boxes.score[n]),
+            "sample_token": found.token,
+            "translation": boxes.centre[n].tolist(),
+            "size": boxes.size_wlh[n].tolist(),
+            "rotation": boxes.rotation[n].tolist(),
+            "velocity": np.nan_to_num(boxes.velocity[n, :2]).tolist(),
+            "detection_name": MMDET3D_CLASSES[int(boxes.label[n])],
+            "detection_score": float(boxes.score[n]),
             "attribute_name": boxes.attribute[n],
         }
         for n in range(len(boxes.score))
-    ]  # fmt: skip
+    ]
 
 
 def is_dataset(path: Path) -> bool:

@@ -15,8 +15,12 @@ from ssad.core.types import Episode, Scenario
 from ssad.evaluation.search_scores import MOVING, distinct
 
 AVOIDERS = {
-    "cc": "CC", "reg157": "Reg157", "rss": "RSS", "fsm": "FSM", "limit": "a manoeuvre",
-}  # fmt: skip
+    "cc": "CC",
+    "reg157": "Reg157",
+    "rss": "RSS",
+    "fsm": "FSM",
+    "limit": "a manoeuvre",
+}
 """Short name in a grade -> who avoids a collision: the careful drivers, and the kinematic limit."""
 
 
@@ -96,8 +100,10 @@ def transfer(
     from ssad.scenarios.dynamic.generate import Trials
 
     rows: list[dict[str, dict[str, float]]] = [{} for _ in bases]
-    groups = [[(one, base.graph, seed) for one in (base.scenario, *found)]
-              for base, found, seed in zip(bases, made, seeds, strict=True)]  # fmt: skip
+    groups = [
+        [(one, base.graph, seed) for one in (base.scenario, *found)]
+        for base, found, seed in zip(bases, made, seeds, strict=True)
+    ]
     for name in systems:
         trials = Trials(partial(make_system, name), make_system, device=device)
         driven = iter(trials.bases([one for group in groups for one in group]))

@@ -272,9 +272,14 @@ def find_boxes(examination: Examination, scene: Condition, detectors: Sequence[s
         shown = scene.shown(examination, data, watched)
         eyes: list[Any] = list(watched)
         found = detect_with(
-            eyes, examination.root, data.scene(scene.scene), device=examination.device, look=shown.look,
-            ahead=shown.ahead, at_once=shown.at_once,
-        )  # fmt: skip
+            eyes,
+            examination.root,
+            data.scene(scene.scene),
+            device=examination.device,
+            look=shown.look,
+            ahead=shown.ahead,
+            at_once=shown.at_once,
+        )
     for name, samples, one in zip(names, found, watched, strict=True):
         _write(boxes_path(folder, name, scene), samples, one.reason, shown.notes(), flat=one.task == "2d")
     shown.done()
@@ -483,8 +488,10 @@ def _resampled(examination: Examination, figures: Figures, truth: GroundTruth, r
     return {
         "metrics": metrics,
         "intervals": {k: [round(e.low, 5), round(e.high, 5)] for k, e in limits.items() if np.isfinite(e.low)},
-        "replicates": values, "n": samples, "scenes": count,
-    }  # fmt: skip
+        "replicates": values,
+        "n": samples,
+        "scenes": count,
+    }
 
 
 def distinct_scenes(truth: GroundTruth) -> Any:

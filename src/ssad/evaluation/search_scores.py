@@ -39,14 +39,19 @@ def summary(row: Sequence[Outcome]) -> dict[str, Any]:
         return float(np.mean(known)) if known else None
 
     return {
-        "CR": bool(valid), "CR_any": any(o.collision for o in row), "rollouts": first,
-        "share": mean([o.valid for o in row]), "distinct": len(distinct(valid)),
-        "off_road": mean([o.off_road for o in ran]), "hit_others": mean([o.hit_others for o in ran]),
+        "CR": bool(valid),
+        "CR_any": any(o.collision for o in row),
+        "rollouts": first,
+        "share": mean([o.valid for o in row]),
+        "distinct": len(distinct(valid)),
+        "off_road": mean([o.off_road for o in ran]),
+        "hit_others": mean([o.hit_others for o in ran]),
         "moving": mean([o.ego_speed is not None and o.ego_speed > MOVING for o in valid]),
         "impact_speed": mean([o.impact_speed for o in valid]),
-        "acceleration": mean([o.acceleration for o in valid]), "jerk": mean([o.jerk for o in valid]),
+        "acceleration": mean([o.acceleration for o in valid]),
+        "jerk": mean([o.jerk for o in valid]),
         "within_limits": mean([o.within_limits for o in valid]),
-    }  # fmt: skip
+    }
 
 
 def distinct(outcomes: Sequence[Outcome]) -> list[Outcome]:

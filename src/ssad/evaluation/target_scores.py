@@ -89,9 +89,13 @@ def sighting(drive: str, found: Detections, truth: Truth) -> Sighting:
     real = truth.box.cpu().double().numpy()
     crowd = np.zeros(len(truth.label), np.bool_) if truth.crowd is None else truth.crowd.cpu().numpy().astype(np.bool_)
     return Sighting(
-        drive, box[own.numpy()], score[own.numpy()], real[same.numpy()], crowd[same.numpy()],
+        drive,
+        box[own.numpy()],
+        score[own.numpy()],
+        real[same.numpy()],
+        crowd[same.numpy()],
         _on_target(box, score, real),
-    )  # fmt: skip
+    )
 
 
 def sightings(detector: Detector, pictures: Iterable[tuple[str, Tensor, Truth]]) -> Iterator[Sighting]:
@@ -174,8 +178,12 @@ def target_scores(
     kept = {name: limits for name, limits in intervals.items() if limits is not None}
     rounded = {name: None if value is None else round(value, 6) for name, value in metrics.items()}
     return {
-        "metrics": rounded, "intervals": kept, "replicates": drawn, "n": len(sightings), "drives": len(drives),
-    }  # fmt: skip
+        "metrics": rounded,
+        "intervals": kept,
+        "replicates": drawn,
+        "n": len(sightings),
+        "drives": len(drives),
+    }
 
 
 def precision(sightings: Sequence[Sighting], *, target_only: bool = True, least: float = 0.0) -> float | None:
@@ -239,9 +247,12 @@ def _boxes(
 ) -> Boxes2D:
     image: I32 = np.repeat(np.arange(len(boxes), dtype=np.int32), [len(b) for b in boxes])
     return Boxes2D(
-        image, np.zeros(len(image), np.int32), np.concatenate(boxes), None if score is None else np.concatenate(score),
+        image,
+        np.zeros(len(image), np.int32),
+        np.concatenate(boxes),
+        None if score is None else np.concatenate(score),
         None if ignore is None else np.concatenate(ignore),
-    )  # fmt: skip
+    )
 
 
 def _share(event: Bool, counted: Bool, drive: I32) -> tuple[float | None, list[float] | None]:

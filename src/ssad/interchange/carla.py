@@ -171,9 +171,13 @@ class Carla(Mirrored):
             self.world = self._ask(f"load the map {town}", lambda: self.client.load_world(town))
         else:
             rules = carla.OpendriveGenerationParameters(
-                vertex_distance=2.0, max_road_length=50.0, wall_height=0.0, additional_width=0.6, smooth_junctions=True,
+                vertex_distance=2.0,
+                max_road_length=50.0,
+                wall_height=0.0,
+                additional_width=0.6,
+                smooth_junctions=True,
                 enable_mesh_visibility=True,
-            )  # fmt: skip
+            )
             self.world = self._ask(
                 f"make a world of the map of {town}", lambda: self.client.generate_opendrive_world(text, rules)
             )
@@ -281,9 +285,11 @@ class Carla(Mirrored):
 
         lamp = carla.TrafficLightState
         shows = {
-            SignalState.RED: lamp.Red, SignalState.YELLOW: lamp.Yellow, SignalState.GREEN: lamp.Green,
+            SignalState.RED: lamp.Red,
+            SignalState.YELLOW: lamp.Yellow,
+            SignalState.GREEN: lamp.Green,
             SignalState.OFF: lamp.Off,
-        }  # fmt: skip
+        }
         states = self.mirror.state().signal[0]
         for signal, light in self._lights.items():
             state = int(states[signal])
@@ -323,10 +329,13 @@ class Carla(Mirrored):
         throttle, brake, steer, reverse = (float(v) for v in control)
         cast("carla.Vehicle", self._bodies[i]).apply_control(
             carla.VehicleControl(
-                throttle=min(max(throttle, 0.0), 1.0), steer=-min(max(steer, -1.0), 1.0),
-                brake=min(max(brake, 0.0), 1.0), hand_brake=False, reverse=reverse > 0.5,
+                throttle=min(max(throttle, 0.0), 1.0),
+                steer=-min(max(steer, -1.0), 1.0),
+                brake=min(max(brake, 0.0), 1.0),
+                hand_brake=False,
+                reverse=reverse > 0.5,
             )
-        )  # fmt: skip
+        )
 
     def _walk(self, i: int, control: F32, yaw: float, who: Controller) -> None:
         import carla

@@ -88,11 +88,16 @@ def lidar_eye(lidar: Lidar, dt: float) -> Eye:
         return out
 
     told = {
-        "channels": len(beams), "range": lidar.reach, "points_per_second": round(room / dt),
-        "rotation_frequency": 1 / dt, "upper_fov": math.degrees(beams[-1]), "lower_fov": math.degrees(beams[0]),
-        "horizontal_fov": min(math.degrees(lidar.width), 360.0), "noise_stddev": lidar.noise,
+        "channels": len(beams),
+        "range": lidar.reach,
+        "points_per_second": round(room / dt),
+        "rotation_frequency": 1 / dt,
+        "upper_fov": math.degrees(beams[-1]),
+        "lower_fov": math.degrees(beams[0]),
+        "horizontal_fov": min(math.degrees(lidar.width), 360.0),
+        "noise_stddev": lidar.noise,
         "dropoff_general_rate": lidar.lost,
-    }  # fmt: skip
+    }
     return Eye("sensor.lidar.ray_cast", _words(told), _place(lidar.to_ego, _LIDAR_AXES), read, empty)
 
 
@@ -109,9 +114,11 @@ def radar_eye(radar: Lidar, dt: float) -> Eye:
         return out
 
     told = {
-        "horizontal_fov": math.degrees(radar.width), "vertical_fov": math.degrees(high), "range": radar.reach,
+        "horizontal_fov": math.degrees(radar.width),
+        "vertical_fov": math.degrees(high),
+        "range": radar.reach,
         "points_per_second": round(room / dt),
-    }  # fmt: skip
+    }
     return Eye("sensor.other.radar", _words(told), _place(radar.to_ego, _LIDAR_AXES), read, empty)
 
 

@@ -21,14 +21,22 @@ _ADDRESS = re.compile(
     r"^carla://(?P<host>[A-Za-z0-9_.\-]+|\[[0-9A-Fa-f:]+\])(:(?P<port>\d{1,5}))?/?(\?(?P<more>[A-Za-z=&]*))?$"
 )
 WEATHERS: Final = (
-    *(f"{kind}{hour}" for hour in ("Noon", "Sunset", "Night")
-      for kind in ("Clear", "Cloudy", "Wet", "WetCloudy", "SoftRain", "HardRain")),
-    "MidRainyNoon", "MidRainSunset", "MidRainyNight", "DustStorm",
-)  # fmt: skip
+    *(
+        f"{kind}{hour}"
+        for hour in ("Noon", "Sunset", "Night")
+        for kind in ("Clear", "Cloudy", "Wet", "WetCloudy", "SoftRain", "HardRain")
+    ),
+    "MidRainyNoon",
+    "MidRainSunset",
+    "MidRainyNight",
+    "DustStorm",
+)
 """Presets of `carla.WeatherParameters`."""
 _CHOICES: Final[Mapping[str, tuple[str, ...]]] = {
-    "sensors": ("mirror", "carla"), "traffic": ("autopilot", "manager"), "weather": WEATHERS,
-}  # fmt: skip
+    "sensors": ("mirror", "carla"),
+    "traffic": ("autopilot", "manager"),
+    "weather": WEATHERS,
+}
 
 
 @dataclass(frozen=True)
@@ -111,8 +119,11 @@ def probe(server: Server) -> None:
     try:
         done = subprocess.run(
             [sys.executable, "-c", code, server.host, str(server.port)],
-            capture_output=True, text=True, check=False, timeout=3.0 * server.timeout,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=3.0 * server.timeout,
+        )
     except subprocess.TimeoutExpired:
         raise ConfigError(f"{server}: no answer in {3.0 * server.timeout:g} s") from None
     if done.returncode == 2:

@@ -63,9 +63,11 @@ def export_scenarios(
 
     chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
     writers: dict[Format, Callable[..., tuple[list[Path], list[str]]]] = {
-        Format.openscenario: export_openscenario, Format.leaderboard: export_leaderboard,
-        Format.leaderboard1: export_leaderboard1, Format.commonroad: partial(export_commonroad, system=system),
-    }  # fmt: skip
+        Format.openscenario: export_openscenario,
+        Format.leaderboard: export_leaderboard,
+        Format.leaderboard1: export_leaderboard1,
+        Format.commonroad: partial(export_commonroad, system=system),
+    }
     written, lost = writers[to](chosen, out, seed=seed)
     print(f"{len(chosen)} scenarios: {len(written)} files written to {out}")
     told("not carried over", lost)

@@ -97,10 +97,14 @@ class _Lanes:
         marks = [self._marks(element) for element in self.lanes]
         limits = self._limits(root)
         places = [
-            np.concatenate([self.texts.points(w.find("leftBound"), w, "leftBound"),
-                            self.texts.points(w.find("rightBound"), w, "rightBound")[::-1]])[:, :2]
+            np.concatenate(
+                [
+                    self.texts.points(w.find("leftBound"), w, "leftBound"),
+                    self.texts.points(w.find("rightBound"), w, "rightBound")[::-1],
+                ]
+            )[:, :2]
             for w in walks
-        ]  # fmt: skip
+        ]
         self.graph = LaneGraph(
             name=name,
             xy=np.concatenate([shape[:, :2] for shape in shapes]).astype(np.float32),
@@ -251,8 +255,14 @@ class _Lanes:
         for sign in root.iterfind(tag):
             names = [part.findtext("trafficSignID") or "" for part in sign.iterfind("trafficSignElement")]
             lanes = ruled.get(self.texts.whole(sign.get("id"), sign, "id"), [])
-            kind = next((SignKind.STOP if n in (xml.STOP, "R1-1") else SignKind.YIELD
-                         for n in names if n in (xml.STOP, xml.YIELD, "R1-1", "R1-2")), None)  # fmt: skip
+            kind = next(
+                (
+                    SignKind.STOP if n in (xml.STOP, "R1-1") else SignKind.YIELD
+                    for n in names
+                    if n in (xml.STOP, xml.YIELD, "R1-1", "R1-2")
+                ),
+                None,
+            )
             other = sorted(set(names) - {xml.STOP, xml.YIELD, xml.TOP_SPEED, "R1-1", "R1-2", "R2-1"})
             for name in other:
                 self.lost[f"traffic sign {name[:20]}"] += 1
@@ -266,9 +276,13 @@ class _Lanes:
             yaws.append(float(wrap_angle(end[3])))
         table = np.array(rules, np.float64).reshape(-1, 3)
         return {
-            "sign_kind": np.array(kinds, np.uint8), "sign_xy": np.array(places).reshape(-1, 2),
-            "sign_yaw": np.array(yaws), "rule_sign": table[:, 0], "rule_lane": table[:, 1], "rule_s": table[:, 2],
-        }  # fmt: skip
+            "sign_kind": np.array(kinds, np.uint8),
+            "sign_xy": np.array(places).reshape(-1, 2),
+            "sign_yaw": np.array(yaws),
+            "rule_sign": table[:, 0],
+            "rule_lane": table[:, 1],
+            "rule_s": table[:, 2],
+        }
 
     def _signals(self, root: Element, shapes: list[F64], junction: Any, follow: list[list[int]]) -> dict[str, Any]:
         ruled = self._ruled("trafficLightRef")
@@ -295,10 +309,15 @@ class _Lanes:
             stops += [(number, lane, shapes[lane][-1, 5] if s is None else s) for lane, s in lanes]
         table, line = np.array(rows, np.float64).reshape(-1, 5), np.array(stops, np.float64).reshape(-1, 3)
         return {
-            "signal_xy": table[:, :2], "signal_yaw": table[:, 2], "signal_junction": table[:, 3],
-            "signal_phase": table[:, 4], "signal_virtual": np.zeros(len(table), bool),
-            "stop_signal": line[:, 0], "stop_lane": line[:, 1], "stop_s": line[:, 2],
-        }  # fmt: skip
+            "signal_xy": table[:, :2],
+            "signal_yaw": table[:, 2],
+            "signal_junction": table[:, 3],
+            "signal_phase": table[:, 4],
+            "signal_virtual": np.zeros(len(table), bool),
+            "stop_signal": line[:, 0],
+            "stop_lane": line[:, 1],
+            "stop_s": line[:, 2],
+        }
 
     def _cycle(self, light: Element) -> tuple[tuple[int, str], ...]:
         """Duration in steps and colour of the parts of a cycle, and its offset."""

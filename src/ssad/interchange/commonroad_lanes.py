@@ -90,9 +90,14 @@ def _bounds(graph: LaneGraph, lane: int, high: bool) -> list[F64]:
 
 
 def _lanelet(  # noqa: PLR0917
-    root: Element, graph: LaneGraph, lane: int, speed: int, lights: list[tuple[float, int]],
-    signs: list[tuple[float, int]], high: bool,
-) -> None:  # fmt: skip
+    root: Element,
+    graph: LaneGraph,
+    lane: int,
+    speed: int,
+    lights: list[tuple[float, int]],
+    signs: list[tuple[float, int]],
+    high: bool,
+) -> None:
     element = node(root, "lanelet", id=lane + 1)
     marks = graph.left_marking[lane], graph.right_marking[lane]
     for tag, side, mark in zip(("leftBound", "rightBound"), _bounds(graph, lane, high), marks, strict=True):

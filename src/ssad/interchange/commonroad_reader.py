@@ -105,12 +105,18 @@ class _Reader:
         route, line = self._route(graph, start, goal)
         told = scenario_name(self.own.get("name", "")) or scenario_name(self.root.get("benchmarkID", ""))
         scenario = Scenario(
-            name=told or scenario_name(stem) or "imported", type="Custom", town=name, route=route,
-            parameters=start_parameters(line, start, speed, digits=6), limits=limits, target_speed=target,
-            group=self.own.get("group", ""), actors=self.obstacles.read(self.root, start, limits),
+            name=told or scenario_name(stem) or "imported",
+            type="Custom",
+            town=name,
+            route=route,
+            parameters=start_parameters(line, start, speed, digits=6),
+            limits=limits,
+            target_speed=target,
+            group=self.own.get("group", ""),
+            actors=self.obstacles.read(self.root, start, limits),
             signals=self._signals(lanes, graph, line, limits),
             source=f"CommonRoad {Path(self.texts.where).name}",
-        )  # fmt: skip
+        )
         for tag in ("phantomObstacle", "environmentObstacle", "location/environment"):
             if count := len(self.root.findall(tag)):
                 self.lost[tag] += count

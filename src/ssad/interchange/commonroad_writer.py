@@ -74,11 +74,18 @@ class _Writer:
             "max_distance": episode.limits.max_distance,
             "signals_until": episode.override_until,
         }
-        root = Element("commonRoad", {
-            "timeStepSize": decimal(self.dt), "commonRoadVersion": VERSION, "author": "SSAD", "affiliation": "",
-            "source": own_source(own.items()), "date": DATE,
-            "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
-        })  # fmt: skip
+        root = Element(
+            "commonRoad",
+            {
+                "timeStepSize": decimal(self.dt),
+                "commonRoadVersion": VERSION,
+                "author": "SSAD",
+                "affiliation": "",
+                "source": own_source(own.items()),
+                "date": DATE,
+                "benchmarkID": f"ZAM_{benchmark_map(scenario.town)}-{number}_1{'_T-1' if recorded else ''}",
+            },
+        )
         place = node(root, "location")
         for tag, value in (("geoNameId", -999), ("gpsLatitude", 999), ("gpsLongitude", 999)):  # a made-up place
             node(place, tag, value)

@@ -31,8 +31,9 @@ LANE_TYPES: Final[dict[LaneType, str]] = {
     LaneType.NONE: "restricted",
 }
 LANE_TYPE_OF: Final[dict[str, LaneType]] = {name: kind for kind, name in LANE_TYPES.items()} | {
-    "busStop": LaneType.SHOULDER, "restricted_area": LaneType.NONE,
-}  # fmt: skip
+    "busStop": LaneType.SHOULDER,
+    "restricted_area": LaneType.NONE,
+}
 """laneletType -> kind of lane; every other one (urban, country, highway, interstate, ...) is for driving."""
 MARKINGS: Final[dict[Marking, str]] = {
     Marking.NONE: "no_marking",
@@ -43,9 +44,13 @@ MARKINGS: Final[dict[Marking, str]] = {
     Marking.OTHER: "unknown",
 }
 MARKING_OF: Final[dict[str, Marking]] = {name: mark for mark, name in MARKINGS.items()} | {
-    "dashed_dashed": Marking.BROKEN, "broad_dashed": Marking.BROKEN, "broad_solid": Marking.SOLID,
-    "lowered_curb": Marking.CURB, "solid_dashed": Marking.OTHER, "dashed_solid": Marking.OTHER,
-}  # fmt: skip
+    "dashed_dashed": Marking.BROKEN,
+    "broad_dashed": Marking.BROKEN,
+    "broad_solid": Marking.SOLID,
+    "lowered_curb": Marking.CURB,
+    "solid_dashed": Marking.OTHER,
+    "dashed_solid": Marking.OTHER,
+}
 COLOURS: Final[dict[SignalState, str]] = {
     SignalState.OFF: "inactive",
     SignalState.RED: "red",

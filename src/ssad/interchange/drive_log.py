@@ -39,11 +39,18 @@ CARS: Final = ("car", "suv", "coupe", "compact", "van")
 LARGE: Final = ("truck", "bus", "van")
 # nuScenes category (or what it begins with) -> the models that may play it, by size
 MODELS_OF: Final[Mapping[str, tuple[str, ...]]] = {
-    "vehicle.car": CARS, "vehicle.emergency": CARS, "vehicle.truck": LARGE, "vehicle.bus": LARGE,
-    "vehicle.trailer": LARGE, "vehicle.construction": LARGE, "vehicle.motorcycle": ("motorcycle",),
-    "vehicle.bicycle": ("bicycle",), "human.pedestrian": ("walker",), "movable_object.barrier": ("barrier",),
+    "vehicle.car": CARS,
+    "vehicle.emergency": CARS,
+    "vehicle.truck": LARGE,
+    "vehicle.bus": LARGE,
+    "vehicle.trailer": LARGE,
+    "vehicle.construction": LARGE,
+    "vehicle.motorcycle": ("motorcycle",),
+    "vehicle.bicycle": ("bicycle",),
+    "human.pedestrian": ("walker",),
+    "movable_object.barrier": ("barrier",),
     "movable_object.trafficcone": ("cone",),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,13 +259,18 @@ def _scenario(  # noqa: PLR0917
     steps = math.ceil(2 * seconds / STEP) + 100
     location = f" in {scene.log.location}" if scene.log is not None and scene.log.location else ""
     return Scenario(
-        name=name, type="Custom", town=graph.name, route=points, parameters=parameters,
+        name=name,
+        type="Custom",
+        town=graph.name,
+        route=points,
+        parameters=parameters,
         actors=tuple(_actor(track) for track in tracks),
         signals=SignalPlan("green", "red", until=steps * STEP),  # a log does not say what they showed
         limits=Limits(max_steps=steps, max_time=round(steps * STEP, 1)),
-        target_speed=round(float(np.clip(_fastest(way), 3.0, 60.0)), 2), group="log",
+        target_speed=round(float(np.clip(_fastest(way), 3.0, 60.0)), 2),
+        group="log",
         source=f"nuScenes schema {version}, {scene.record.name}{location}",
-    )  # fmt: skip
+    )
 
 
 def _key_points(way: F64) -> tuple[Pose, ...]:

@@ -209,9 +209,14 @@ def highway_episode(scenario: Scenario, seed: int | None = None) -> Episode:
     env = _gymnasium(place, seed)
     x, y, yaw = _pose(env.vehicle)
     ego = EpisodeAgent(
-        "ego", "car", Controller.FOLLOW, Pose(x, y, yaw), float(env.vehicle.speed), place.target_speed,
+        "ego",
+        "car",
+        Controller.FOLLOW,
+        Pose(x, y, yaw),
+        float(env.vehicle.speed),
+        place.target_speed,
         route=_ego_route(env, place),
-    )  # fmt: skip
+    )
     others = [v for v in env.road.vehicles if v is not env.vehicle]
     agents = [
         EpisodeAgent(f"vehicle {k}", "car", Controller.PLACED, Pose(*_pose(v)), float(v.speed))

@@ -94,9 +94,14 @@ def read_leaderboard(path: Path) -> tuple[tuple[Scenario, ...], tuple[str, ...]]
         for number, item in enumerate(told):
             kind = values.text(item, "type")
             base = Scenario(
-                f"leaderboard/{ident}/{kind}_{number:02d}", CUSTOM, town, points, limits=LIMITS, group=kind,
+                f"leaderboard/{ident}/{kind}_{number:02d}",
+                CUSTOM,
+                town,
+                points,
+                limits=LIMITS,
+                group=kind,
                 source=f"leaderboard route {ident} of {path.name}",
-            )  # fmt: skip
+            )
             own = item.find(OWN)
             if own is None and kind not in TYPES:
                 lost[f"type {kind}: {UNPLAYED.get(kind, 'it is not known here')}"] += 1

@@ -97,8 +97,13 @@ def blocked(site: Site) -> None:
     pose = site.pose(index)
     site.signals = SignalPlan("green", "red")
     near = site.reaches(enter - 12, pose)  # who waits for its exit to be free comes no further
-    site.add("stopped car", site.car(), pose, (Phase(0.0, near), Phase(SPEED, Condition("after", 10.0))),
-             lane_path(site.graph, site.place(index), 120.0))  # fmt: skip
+    site.add(
+        "stopped car",
+        site.car(),
+        pose,
+        (Phase(0.0, near), Phase(SPEED, Condition("after", 10.0))),
+        lane_path(site.graph, site.place(index), 120.0),
+    )
 
 
 def hard_brake(site: Site) -> None:
@@ -113,8 +118,19 @@ def hard_brake(site: Site) -> None:
 # ---------------------------------------------------------------- people and bicycles that cross
 
 
-def _crossing(site: Site, name: str, model: str, pose: Pose, index: int, *, way: float, speed: float,
-              seconds: float, least: float, idle: float = 0.0) -> None:  # fmt: skip
+def _crossing(
+    site: Site,
+    name: str,
+    model: str,
+    pose: Pose,
+    index: int,
+    *,
+    way: float,
+    speed: float,
+    seconds: float,
+    least: float,
+    idle: float = 0.0,
+) -> None:
     """Somebody who goes straight across `idle` s after the ego is near route point `index`; stops behind the road."""
     near, gone = site.seconds_before(index, seconds, least, pose), Phase(0.0, Condition("travelled", way))
     waits = (Phase(0.0, near), Phase(speed, Condition("after", idle))) if idle else (Phase(speed, near),)
@@ -132,8 +148,11 @@ def walker(site: Site, *, vehicle: bool) -> None:
     """A walker steps onto the road from behind something that stands at its edge."""
     angle = site.number("crossing_angle", 0.0, -90.0, 90.0)
     side, index = site.side(), site.point(site.number("distance", 12.0, 0.0, 500.0), in_junction=True)
-    body = "compact" if vehicle or "vehicle" in site.word("blocker_model", "static.prop.vendingmachine") \
-        else "vending_machine"  # fmt: skip
+    body = (
+        "compact"
+        if vehicle or "vehicle" in site.word("blocker_model", "static.prop.vendingmachine")
+        else "vending_machine"
+    )
     half = 0.5 * (MODELS[body].length if body == "compact" else MODELS[body].width)
     aside = site.edge(index, side) + 0.5 * MODELS[body].width + 0.2
     there = min(index + math.ceil(half + 0.5), len(site.route.xy) - 1)
@@ -151,8 +170,18 @@ def pedestrians(site: Site) -> None:
         pose, across = _from_side(site, index, 1.0, aside)
         pose = Pose(pose.x + ahead * math.cos(pose.yaw - RIGHT), pose.y + ahead * math.sin(pose.yaw - RIGHT), pose.yaw)
         idle, speed = float(site.random.uniform(0.0, 1.5)), float(site.random.uniform(1.3, 2.0))
-        _crossing(site, f"walker {k}", "walker", pose, index, way=1.15 * across, speed=round(speed, 3),
-                  seconds=3.5, least=12.0, idle=round(idle, 3))  # fmt: skip
+        _crossing(
+            site,
+            f"walker {k}",
+            "walker",
+            pose,
+            index,
+            way=1.15 * across,
+            speed=round(speed, 3),
+            seconds=3.5,
+            least=12.0,
+            idle=round(idle, 3),
+        )
 
 
 def turning(site: Site, *, model: str) -> None:
@@ -309,8 +338,9 @@ def taking_priority(site: Site, *, signals: SignalPlan) -> None:
     told = site.word("direction", "right", ("left", "right", "opposite"))
     side = {"left": LEFT, "right": RIGHT, "opposite": ONCOMING}[told]
     speed = 60.0 * KMH
-    place = meeting_place(site.graph, site.scenario, site.route, sides=(side,), trigger_distance=35.0, speed=speed,
-                          body="coupe")  # fmt: skip
+    place = meeting_place(
+        site.graph, site.scenario, site.route, sides=(side,), trigger_distance=35.0, speed=speed, body="coupe"
+    )
     site.signals = signals
     when = Condition("ego_distance", 35.0, len(site.actors))
     way = lane_path(site.graph, place, 150.0)

@@ -134,11 +134,16 @@ class _Reader:
         name = scenario_name(self.about.removeprefix("CARLA:")) or scenario_name(stem) or "imported"
         speed = self.ego.target_speed or self.ego.speed or Scenario.target_speed
         scenario = Scenario(
-            name=name, type="Custom", town=self.town, route=route,
+            name=name,
+            type="Custom",
+            town=self.town,
+            route=route,
             parameters=start_parameters(line, start, self.ego.speed, digits=6),
-            limits=limits, target_speed=min(speed, MAX_SPEED), group=self.own.get("group", ""),
+            limits=limits,
+            target_speed=min(speed, MAX_SPEED),
+            group=self.own.get("group", ""),
             source=f"OpenSCENARIO {Path(self.values.where).name}",
-        )  # fmt: skip
+        )
         scenario = replace(scenario, actors=tuple(self._actors(limits)), signals=self._plan(line, forced))
         build_episode(scenario, self.graph, seed=0)  # whatever is still wrong with it is said now
         return Imported(scenario, tuple(f"{text}{f' ({n} times)' if n > 1 else ''}" for text, n in self.lost.items()))

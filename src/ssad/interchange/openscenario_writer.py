@@ -276,9 +276,12 @@ class _Writer:
                     delay = phase.when.value if phase.when.kind == "after" else 0.0
                     by = _node(_condition(group, f"{name} {k} after {k - 1}", delay), "ByValueCondition")
                     _node(
-                        by, "StoryboardElementStateCondition", storyboardElementType="event",
-                        storyboardElementRef=before, state=state,
-                    )  # fmt: skip
+                        by,
+                        "StoryboardElementStateCondition",
+                        storyboardElementType="event",
+                        storyboardElementRef=before,
+                        state=state,
+                    )
             speed, before = phase.speed, f"{name} phase {k}"
 
     def _event(self, maneuver: Element, name: str, priority: str) -> Element:
@@ -307,9 +310,15 @@ class _Writer:
             _node(entity, "SpeedCondition", value=float(when.value), rule="greaterThan")
         else:
             _node(
-                entity, "RelativeDistanceCondition", entityRef=self.names[1 + when.actor], value=float(when.value),
-                relativeDistanceType="euclidianDistance", freespace=False, rule="lessThan", coordinateSystem="entity",
-            )  # fmt: skip
+                entity,
+                "RelativeDistanceCondition",
+                entityRef=self.names[1 + when.actor],
+                value=float(when.value),
+                relativeDistanceType="euclidianDistance",
+                freespace=False,
+                rule="lessThan",
+                coordinateSystem="entity",
+            )
 
     def _stop(self, trigger: Element) -> None:
         limits: Limits = self.episode.limits
@@ -343,15 +352,23 @@ def _unique(names: list[str]) -> list[str]:
 
 def _vehicle(item: Element, body: Model) -> None:
     _node(
-        item, "Performance", maxSpeed=float(body.max_speed), maxAcceleration=float(body.max_accel),
+        item,
+        "Performance",
+        maxSpeed=float(body.max_speed),
+        maxAcceleration=float(body.max_accel),
         maxDeceleration=float(body.max_brake),
-    )  # fmt: skip
+    )
     axles = _node(item, "Axles")
     for tag, steer, x in (("FrontAxle", body.max_steer, 0.5), ("RearAxle", 0.0, -0.5)):
         _node(
-            axles, tag, maxSteering=float(steer), wheelDiameter=0.7, trackWidth=0.85 * body.width,
-            positionX=x * body.wheelbase, positionZ=0.35,
-        )  # fmt: skip
+            axles,
+            tag,
+            maxSteering=float(steer),
+            wheelDiameter=0.7,
+            trackWidth=0.85 * body.width,
+            positionX=x * body.wheelbase,
+            positionZ=0.35,
+        )
 
 
 def _position(parent: Element, pose: Pose) -> None:

@@ -246,12 +246,17 @@ def _scenario(program: Program, drive: Any, name: str, seed: int) -> Sampled:
     start = Pose(*ego[0, :3].tolist())
     target = float(np.clip(np.abs(ego[:, 3]).max(), 0.0, _MOST))
     scenario = Scenario(
-        name=name, type="Custom", town=program.town, route=route,
+        name=name,
+        type="Custom",
+        town=program.town,
+        route=route,
         parameters=start_parameters(line, start, max(speed, 0.0), digits=6),
         actors=tuple(_actor(drive, rows, k, until) for k in range(1, rows.shape[1])),
-        limits=Limits(max_steps=len(rows) + 100), target_speed=round(target, 2) if target >= 1.0 else 8.0,
-        group=scenario_name(program.path.stem), source=f"Scenic {program.path.name}, seed {seed}",
-    )  # fmt: skip
+        limits=Limits(max_steps=len(rows) + 100),
+        target_speed=round(target, 2) if target >= 1.0 else 8.0,
+        group=scenario_name(program.path.stem),
+        source=f"Scenic {program.path.name}, seed {seed}",
+    )
     build_episode(scenario, program.graph, seed=0)
     for k, body in enumerate(drive.models):
         size = drive.sizes[k]

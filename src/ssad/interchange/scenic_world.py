@@ -99,12 +99,15 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         bodies = list(self._bodies.values())
         agents = [
             EpisodeAgent(
-                body.name, body.name,
+                body.name,
+                body.name,
                 Controller.PLACED if body.model.kind in _MOVES else Controller.EXTERNAL,
-                body.pose, speed=body.speed, route=_nowhere(body.pose) if k == 0 else None,
+                body.pose,
+                speed=body.speed,
+                route=_nowhere(body.pose) if k == 0 else None,
             )
             for k, body in enumerate(bodies)
-        ]  # fmt: skip
+        ]
         limits = Limits(max_steps=100_000, max_time=1e9, contact="count")
         town = self.graph.name
         scenario = Scenario("scenic", "Custom", town, (bodies[0].pose, bodies[0].pose))
@@ -124,9 +127,17 @@ class ScenicDrive(DrivingSimulation):  # type: ignore[misc]
         name = "ego" if not self._bodies else f"{type(obj).__name__}-{number}"
         wheelbase = like.wheelbase / like.length * float(obj.length)
         model = Model(
-            name, like.kind, float(obj.length), float(obj.width), float(obj.height), wheelbase, like.max_steer,
-            like.max_accel, like.max_brake, like.max_speed,
-        )  # fmt: skip
+            name,
+            like.kind,
+            float(obj.length),
+            float(obj.width),
+            float(obj.height),
+            wheelbase,
+            like.max_steer,
+            like.max_accel,
+            like.max_brake,
+            like.max_speed,
+        )
         yaw = float(wrap_angle(float(obj.heading) + _QUARTER))
         velocity = np.array([float(obj.velocity.x), float(obj.velocity.y)])
         along = float(velocity @ (math.cos(yaw), math.sin(yaw)))
@@ -243,6 +254,9 @@ def _nowhere(pose: Pose) -> Route:
     """A route that its owner never gets to."""
     xy = np.array([[pose.x + _FAR + k, pose.y] for k in range(3)], np.float32)
     return Route(
-        xy=xy, yaw=np.zeros(3, np.float32), lane=np.full(3, -1, np.int32), speed_limit=np.full(3, 30.0, np.float32),
+        xy=xy,
+        yaw=np.zeros(3, np.float32),
+        lane=np.full(3, -1, np.int32),
+        speed_limit=np.full(3, 30.0, np.float32),
         width=np.full(3, 3.5, np.float32),
-    )  # fmt: skip
+    )

@@ -16,9 +16,15 @@ from ssad.metrics.driving import DIVISORS, WEIGHTS, EpisodeMetrics, overall_scor
 from ssad.metrics.uncertainty import NOTHING, CaseValue, Estimate, Kind, estimate
 
 PRECRASH_GROUPS = (
-    "StraightObstacle", "TurningObstacle", "LaneChanging", "VehiclePassing", "RedlightRunning", "UnprotectedLeftTurn",
-    "RightTurn", "CrossingNegotiation",
-)  # fmt: skip
+    "StraightObstacle",
+    "TurningObstacle",
+    "LaneChanging",
+    "VehiclePassing",
+    "RedlightRunning",
+    "UnprotectedLeftTurn",
+    "RightTurn",
+    "CrossingNegotiation",
+)
 """The eight scenarios of the paper's table of pre-crash scenarios, whose mean is its column Avg."""
 
 FAMILIES = {"pre-crash": "Avg.", "natural": "Avg. natural", "other": "Avg. other"}
@@ -111,9 +117,12 @@ class Outcome:
         group = str(line["group"])
         natural = "natural" if scenario.get("type") == "NaturalJunction" else "other"
         return cls(
-            metrics, group, str(line.get("cluster") or scenario["name"]),
-            str(line.get("case") or trace_hash or line["key"]), "pre-crash" if group in PRECRASH_GROUPS else natural,
-        )  # fmt: skip
+            metrics,
+            group,
+            str(line.get("cluster") or scenario["name"]),
+            str(line.get("case") or trace_hash or line["key"]),
+            "pre-crash" if group in PRECRASH_GROUPS else natural,
+        )
 
 
 @dataclass(frozen=True)

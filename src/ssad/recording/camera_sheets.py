@@ -103,7 +103,7 @@ def weather_sheet(width: int = 480) -> U8:
     views = [
         View(camera, ego @ camera.to_ego, things, weather, lamps=own_lamps(ego, weather))
         for weather in WEATHERS.values()
-    ]  # fmt: skip
+    ]
     images = [render(stage, [view]).image[0] for view in views]
     panels = [captioned(image, name, width) for image, name in zip(images, WEATHERS, strict=True)]
     return np.vstack([np.hstack(panels[k : k + 3]) for k in range(0, len(panels), 3)])

@@ -250,12 +250,18 @@ def _take(
                 continue
             target = around[-1].body
             row = {
-                "width": clips.size, "height": clips.size, "time": shot.time,
-                "weather": weather_name(shot.weather), "light": asdict(shot.weather),
-                "intrinsic": camera.intrinsic.tolist(), "pose": shot.camera.tolist(),
-                "target_pose": shot.target.tolist(), "target_style": target.style,
-                "target_size": [round(v, 3) for v in target.size], "objects": objects,
-            }  # fmt: skip
+                "width": clips.size,
+                "height": clips.size,
+                "time": shot.time,
+                "weather": weather_name(shot.weather),
+                "light": asdict(shot.weather),
+                "intrinsic": camera.intrinsic.tolist(),
+                "pose": shot.camera.tolist(),
+                "target_pose": shot.target.tolist(),
+                "target_style": target.style,
+                "target_size": [round(v, 3) for v in target.size],
+                "objects": objects,
+            }
             yield n, row | shot.about, picture.image[index]
 
 
@@ -324,11 +330,17 @@ def _annotate(
             middle = who.pose[:3, 3] + [0.0, 0.0, tall]
             x1, y1, x2, y2 = _hull(view, who.pose, who.body.size).tolist()
             objects.append(
-                {"label": label, "box": labels.box[n].tolist(),
-                 "pixels": int(labels.pixels[n]), "crowd": bool(crowd[n]), "target": tag == TARGET,
-                 "hull": [x1, y1, x2 - x1, y2 - y1], "visible": round(float(labels.share[n]), 3),
-                 "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2)}
-            )  # fmt: skip
+                {
+                    "label": label,
+                    "box": labels.box[n].tolist(),
+                    "pixels": int(labels.pixels[n]),
+                    "crowd": bool(crowd[n]),
+                    "target": tag == TARGET,
+                    "hull": [x1, y1, x2 - x1, y2 - y1],
+                    "visible": round(float(labels.share[n]), 3),
+                    "distance": round(float(np.linalg.norm(middle - view.pose[:3, 3])), 2),
+                }
+            )
     return objects, ""
 
 
@@ -372,10 +384,13 @@ def record_all(
     tasks: list[list[tuple[Clips, str, int, int, str]]] = []
     for clips in recordings:
         _check_other(clips)
-        tasks.append([
-            (clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}")
-            for town, count in clips.images for number, start in enumerate(range(0, count, EACH))
-        ])  # fmt: skip
+        tasks.append(
+            [
+                (clips, town, number, min(EACH, count - start), f"{clips.mode}-{town.lower()}-{number:03d}")
+                for town, count in clips.images
+                for number, start in enumerate(range(0, count, EACH))
+            ]
+        )
     every = [task for own in tasks for task in own]
     with ExitStack() as held:
         for clips in recordings:
@@ -400,8 +415,11 @@ def _check_other(clips: Clips) -> None:
 
 def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]) -> None:
     """annotations/{train,test,all}.json of parts that are all there."""
-    splits = {"train": [t for t in tasks if t[1] not in clips.held_out],
-              "test": [t for t in tasks if t[1] in clips.held_out], "all": tasks}  # fmt: skip
+    splits = {
+        "train": [t for t in tasks if t[1] not in clips.held_out],
+        "test": [t for t in tasks if t[1] in clips.held_out],
+        "all": tasks,
+    }
     for split, members in splits.items():
         rows: list[dict[str, Any]] = []
         skipped: Counter[str] = Counter()
@@ -411,10 +429,14 @@ def _write_pages(clips: Clips, tasks: Sequence[tuple[Clips, str, int, int, str]]
             skipped.update(part["skipped"])
         counts = Counter(CLASSES[o["label"]] for row in rows for o in row["objects"] if not o["crowd"])
         about = {
-            "recording": clips.identity(), "split": split, "towns": sorted({t[1] for t in members}),
-            "images": len(rows), "objects": counts, "weathers": Counter(row["weather"] for row in rows),
+            "recording": clips.identity(),
+            "split": split,
+            "towns": sorted({t[1] for t in members}),
+            "images": len(rows),
+            "objects": counts,
+            "weathers": Counter(row["weather"] for row in rows),
             "skipped": skipped,
-        }  # fmt: skip
+        }
         page = safeio.dump_json(coco_data(CLASSES, rows, about)) + "\n"
         safeio.write_atomic(clips.out / "annotations" / f"{split}.json", page)
 

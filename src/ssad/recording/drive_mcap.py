@@ -28,9 +28,12 @@ WORLD, EGO, ABOVE = "world", "ego", "above"
 AHEAD: Final = 50.0  # m of the route that are shown as the plan
 QUALITY: Final = 90  # of JPEG
 COLOURS: Final = {
-    "truth": (0.8, 0.8, 0.8, 0.4), "detections": (1.0, 0.6, 0.1, 0.6), "tracks": (0.3, 0.65, 1.0, 0.6),
-    "plan": (0.35, 0.85, 0.45, 1.0), "map": (0.45, 0.47, 0.5, 1.0),
-}  # fmt: skip
+    "truth": (0.8, 0.8, 0.8, 0.4),
+    "detections": (1.0, 0.6, 0.1, 0.6),
+    "tracks": (0.3, 0.65, 1.0, 0.6),
+    "plan": (0.35, 0.85, 0.45, 1.0),
+    "map": (0.45, 0.47, 0.5, 1.0),
+}
 Message = tuple[int, str, Any]  # ns, topic, message
 
 
@@ -157,9 +160,7 @@ def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
     for (x, y, _), (length, width), turn, one in zip(pose.tolist(), size.tolist(), turns, kind, strict=True):
         height = float(SIZES[min(int(one), len(AgentKind) - 1), 2])
         place = _new("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(turn))
-        found.append(
-            _new("CubePrimitive", pose=place, size=_vector([length, width, height]), color=_colour(name))
-        )  # fmt: skip
+        found.append(_new("CubePrimitive", pose=place, size=_vector([length, width, height]), color=_colour(name)))
     return found
 
 
@@ -189,15 +190,25 @@ def _quaternion(turn: F64) -> Any:
 
 def _transform(time: int, parent: str, child: str, place: Sequence[float], turn: F64) -> Any:
     return _new(
-        "FrameTransform", time, parent_frame_id=parent, child_frame_id=child, translation=_vector(place),
+        "FrameTransform",
+        time,
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(place),
         rotation=_quaternion(turn),
-    )  # fmt: skip
+    )
 
 
 def _calibration(time: int, name: str, camera: Camera) -> Any:
     lens = camera.intrinsic
     projection = np.column_stack([lens, np.zeros(3)])
     return _new(
-        "CameraCalibration", time, frame_id=name, width=camera.width, height=camera.height,
-        K=lens.ravel().tolist(), P=projection.ravel().tolist(), R=np.eye(3).ravel().tolist(),
-    )  # fmt: skip
+        "CameraCalibration",
+        time,
+        frame_id=name,
+        width=camera.width,
+        height=camera.height,
+        K=lens.ravel().tolist(),
+        P=projection.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+    )

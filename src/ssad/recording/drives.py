@@ -25,9 +25,16 @@ FAST = 21.0  # m/s: on roads with a higher limit everybody wants to drive faster
 TRIES = 8  # ways that are tried for a long vehicle, whose nose must stay in its lane
 # body -> share; long vehicles and two-wheelers are more frequent than on real roads, so that each class is seen
 MIX = {
-    "car": 0.25, "suv": 0.14, "coupe": 0.06, "compact": 0.13, "van": 0.06, "motorcycle": 0.10, "bicycle": 0.09,
-    "truck": 0.10, "bus": 0.07,
-}  # fmt: skip
+    "car": 0.25,
+    "suv": 0.14,
+    "coupe": 0.06,
+    "compact": 0.13,
+    "van": 0.06,
+    "motorcycle": 0.10,
+    "bicycle": 0.09,
+    "truck": 0.10,
+    "bus": 0.07,
+}
 CARS = ("car", "suv", "coupe", "compact", "van")
 FEWER = 0.4  # times as many cars, against all else, where streets are "any": a detector sees enough of them
 
@@ -104,9 +111,16 @@ def make_drive(graph: LaneGraph, *, key: tuple[object, ...], seconds: float, str
         limit = float(graph.speed_limit[lane])
         pose = Pose(x, y, yaw)
         agents.append(
-            EpisodeAgent(f"{body} {len(agents)}", body, Controller.AUTOPILOT, pose, min(wanted, limit) * 0.6,
-                         min(wanted, limit), route=path)
-        )  # fmt: skip
+            EpisodeAgent(
+                f"{body} {len(agents)}",
+                body,
+                Controller.AUTOPILOT,
+                pose,
+                min(wanted, limit) * 0.6,
+                min(wanted, limit),
+                route=path,
+            )
+        )
     name = "/".join(str(part) for part in key)
     ends = (agents[0].pose, Pose(float(route.xy[-1, 0]), float(route.xy[-1, 1]), float(route.yaw[-1])))
     steps = math.ceil(seconds / 0.1) + 2

@@ -32,8 +32,10 @@ CYCLED: Final = ("pedestrian", "bicycle")  # kinds of body that have a walking c
 LENS: Final = 0.11  # m, radius of a signal's lens
 LENSES: Final = {SignalState.RED: 0.31, SignalState.YELLOW: 0.0, SignalState.GREEN: -0.31}  # m above a head's middle
 LIGHTS: Final = {
-    SignalState.RED: (1.0, 0.04, 0.02), SignalState.YELLOW: (1.0, 0.45, 0.02), SignalState.GREEN: (0.03, 1.0, 0.45),
-}  # fmt: skip
+    SignalState.RED: (1.0, 0.04, 0.02),
+    SignalState.YELLOW: (1.0, 0.45, 0.02),
+    SignalState.GREEN: (0.03, 1.0, 0.45),
+}
 BRIGHT: Final = 1.3  # emission of a lit lens
 SIGNALS_WITHIN: Final = 150.0  # m from the eye
 
@@ -59,9 +61,7 @@ def body_of(model: str, variant: int, phase: int = 0) -> Mesh:
     kind, styles = ACTOR_BODIES[model]
     style = styles[int(generator("body style", model, variant).integers(len(styles)))]
     turn = 2 * np.pi * phase / PHASES if kind in CYCLED else None
-    return make_body(
-        kind, style=style, size=size, generator=generator("body", model, variant), detail=1, phase=turn
-    )  # fmt: skip
+    return make_body(kind, style=style, size=size, generator=generator("body", model, variant), detail=1, phase=turn)
 
 
 @lru_cache(maxsize=3)
@@ -210,9 +210,14 @@ class EpisodeScene:
         strides = np.array([generator("stride", key, a).uniform(0, STRIDE) for a in agents])
         near = [n for n, at in enumerate(self._sign_poses) if np.hypot(*(way - at[:2, 3]).T).min() < REACH]
         return Looks(
-            key, models, tuple(int(generator("variant", key, a).integers(VARIANTS)) for a in agents),
-            tuple(draw_paint(generator("paint", key, a)) for a in agents), strides, signals, tuple(near),
-        )  # fmt: skip
+            key,
+            models,
+            tuple(int(generator("variant", key, a).integers(VARIANTS)) for a in agents),
+            tuple(draw_paint(generator("paint", key, a)) for a in agents),
+            strides,
+            signals,
+            tuple(near),
+        )
 
     def things(self, looks: Looks, moment: Moment, *, without: int | None = None) -> tuple[Thing, ...]:
         """Bodies of agents at a moment, with the signs along the way; agent a has the tag a + 1.

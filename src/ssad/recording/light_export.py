@@ -79,9 +79,13 @@ def export_light(out: Path, made: Shining, *, name: str = "") -> list[Path]:
     """
     attack = make_light(made.attack, made.options)
     about: dict[str, Any] = {
-        "name": name, "attack": made.attack, "options": dict(made.options), "hour": made.hour, "target": made.target,
+        "name": name,
+        "attack": made.attack,
+        "options": dict(made.options),
+        "hour": made.hour,
+        "target": made.target,
         "values": dict(made.values),
-    }  # fmt: skip
+    }
     safeio.make_folder(out)
     written = [out / "light.json"]
     if made.colour is not None:

@@ -91,16 +91,20 @@ class LitClip:
         corner = int(arrays["corner"][0]), int(arrays["corner"][1])
         image = decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
         return TexturedClip(
-            self.clip.file, self.clip.row, self.clip.objects, image, corner, arrays["radiance"],
-            float(arrays["exposure"]), arrays["fragments"],
-        )  # fmt: skip
+            self.clip.file,
+            self.clip.row,
+            self.clip.objects,
+            image,
+            corner,
+            arrays["radiance"],
+            float(arrays["exposure"]),
+            arrays["fragments"],
+        )
 
     def lit(self, device: str | torch.device = "cpu") -> LitPicture:
         """The picture as a function of the light on its target."""
         rows, columns = _part(self.clip)
-        return lit_picture(
-            self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device
-        )  # fmt: skip
+        return lit_picture(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
 
 
 def _part(clip: ClipView) -> tuple[slice, slice]:

@@ -57,12 +57,16 @@ STEPS: Final = 5  # where it does not; docs/gap.md: two steps of 16 code values 
 def perturbation_names() -> Mapping[str, str]:
     """All perturbations -> their family: fault, shift, attack, texture or light; lights that were found have none."""
     attacks = [name for name in ATTACKS if not needs(name)]
-    return MappingProxyType({
-        NONE: "none", **dict.fromkeys(FAULTS, "fault"), **dict.fromkeys(LOOP_SHIFTS, "shift"),
-        **dict.fromkeys((f"{ATTACK}{name}" for name in attacks), "attack"),
-        **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
-        **dict.fromkeys(LIT, LIGHT),
-    })  # fmt: skip
+    return MappingProxyType(
+        {
+            NONE: "none",
+            **dict.fromkeys(FAULTS, "fault"),
+            **dict.fromkeys(LOOP_SHIFTS, "shift"),
+            **dict.fromkeys((f"{ATTACK}{name}" for name in attacks), "attack"),
+            **dict.fromkeys((f"{WEAR}{name}" for name in (GREY, GREY_SIGN, *shipped_textures())), TEXTURE),
+            **dict.fromkeys(LIT, LIGHT),
+        }
+    )
 
 
 def family_of(name: str) -> str:
@@ -220,7 +224,5 @@ def perturbed(
             at_once = AT_ONCE if onboard.device == "cpu" else AT_ONCE_GPU
             if isinstance(attack, UniversalFit):
                 attack = universal(attack, detector, camera, budget, device=onboard.device, batch=at_once)
-            changes[channel] = LiveAttack(
-                attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=at_once
-            )  # fmt: skip
+            changes[channel] = LiveAttack(attack, budget, detector=detector, intrinsic=camera.intrinsic, batch=at_once)
     return sensors, changes

@@ -50,9 +50,7 @@ class ShiftedCamera:
             images = picture.image.numpy()  # type: ignore[attr-defined]
             depth = picture.depth.numpy()  # type: ignore[attr-defined]
             scenes = [int(agents[sight.row, 0]) for sight in part]
-            frames = [
-                self._frame(sight, depth[k], speed[scenes[k]], simulator.dt) for k, sight in enumerate(part)
-            ]  # fmt: skip
+            frames = [self._frame(sight, depth[k], speed[scenes[k]], simulator.dt) for k, sight in enumerate(part)]
             episodes = [simulator.episodes[simulator.assigned[scene]] for scene in scenes]
             self._learn(part, frames, images, episodes)
             device = self.camera.onboard.device  # where it is fast: pictures and depths were brought to the host
@@ -94,9 +92,7 @@ def boxes_of(sight: Sight, speed: F32) -> tuple[TrackedBoxes, F64]:
     sizes = sizes.reshape(-1, 3).astype(np.float64)
     centre = np.column_stack([pose[rows, :2], 0.5 * sizes[:, 2]]).reshape(-1, 3)
     names = tuple(str(k) for k in rows)
-    boxes = TrackedBoxes(
-        centre, sizes, yaw_to_quaternion(pose[rows, 2]), velocity[rows], names, np.ones(len(rows))
-    )  # fmt: skip
+    boxes = TrackedBoxes(centre, sizes, yaw_to_quaternion(pose[rows, 2]), velocity[rows], names, np.ones(len(rows)))
     return boxes, velocity[sight.agent]
 
 

@@ -55,9 +55,13 @@ DRAWN: Final = 140.0  # m within which things are drawn
 PART: Final = "part.json"
 # s by which each camera fires before the LiDAR's sweep ends, as in nuScenes
 AHEAD: Final = {
-    "CAM_FRONT_LEFT": 0.0431, "CAM_FRONT": 0.0355, "CAM_FRONT_RIGHT": 0.0276, "CAM_BACK_RIGHT": 0.0201,
-    "CAM_BACK": 0.0104, "CAM_BACK_LEFT": 0.0005,
-}  # fmt: skip
+    "CAM_FRONT_LEFT": 0.0431,
+    "CAM_FRONT": 0.0355,
+    "CAM_FRONT_RIGHT": 0.0276,
+    "CAM_BACK_RIGHT": 0.0201,
+    "CAM_BACK": 0.0104,
+    "CAM_BACK_LEFT": 0.0005,
+}
 SENSOR: Final = Sensor(noise=0.012)
 FIRST: Final = 0.1  # s, when the first sweep ends
 PART_S: Final = 7200.0  # s that a part may take
@@ -219,9 +223,14 @@ def _scene(recording: Recording, town: str, number: int) -> None:
                 boxes = _annotate([s for s in around if s.body.kind], ego, points, shares)
                 samples.append({"time": moment_of(number, now), "sweep": moment.step, "boxes": boxes})
     part = {
-        "name": name, "town": town, "drive": episode.key, "samples": samples, "frames": files.rows,
-        "weather": weather_words(weather), "sensors": _sensors(cameras),
-    }  # fmt: skip
+        "name": name,
+        "town": town,
+        "drive": episode.key,
+        "samples": samples,
+        "frames": files.rows,
+        "weather": weather_words(weather),
+        "sensors": _sensors(cameras),
+    }
     safeio.write_atomic(folder / PART, safeio.dump_json(part) + "\n")
 
 
@@ -295,9 +304,14 @@ def _look(
                 for tag, share in visible_share(stage, view, picture, n).items():
                     shares[tag] = max(shares.get(tag, 0.0), share)
             files.picture(
-                view.camera, picture.image[n], picture.depth[n], sweep=moment.step,
-                moment=moment_of(number, moment.times[c]), on_key=moment.on_key, ego=moment.egos[c],
-            )  # fmt: skip
+                view.camera,
+                picture.image[n],
+                picture.depth[n],
+                sweep=moment.step,
+                moment=moment_of(number, moment.times[c]),
+                on_key=moment.on_key,
+                ego=moment.egos[c],
+            )
     yield from zip(moments, found, strict=True)
 
 
@@ -330,16 +344,28 @@ class _Files:
         name = f"{camera.channel}_{moment}"
         safeio.write_atomic(self.folder / f"{name}.depth.png", depth_bytes(depth))
         self._write(
-            f"{name}.jpg", encode_jpeg(image, self.quality, "420"), channel=camera.channel, time=moment, key=on_key,
-            size=[camera.width, camera.height], sweep=sweep, ego=ego.tolist(),
-        )  # fmt: skip
+            f"{name}.jpg",
+            encode_jpeg(image, self.quality, "420"),
+            channel=camera.channel,
+            time=moment,
+            key=on_key,
+            size=[camera.width, camera.height],
+            sweep=sweep,
+            ego=ego.tolist(),
+        )
 
     def cloud(self, points: Any, *, sweep: int, moment: int, on_key: bool, ego: F64) -> None:
         """One sweep."""
         self._write(
-            f"LIDAR_TOP_{moment}.pcd.bin", points_bytes(points), channel="LIDAR_TOP", time=moment, key=on_key,
-            size=[0, 0], sweep=sweep, ego=ego.tolist(),
-        )  # fmt: skip
+            f"LIDAR_TOP_{moment}.pcd.bin",
+            points_bytes(points),
+            channel="LIDAR_TOP",
+            time=moment,
+            key=on_key,
+            size=[0, 0],
+            sweep=sweep,
+            ego=ego.tolist(),
+        )
 
     def _write(self, name: str, data: bytes, **row: Any) -> None:
         safeio.write_atomic(self.folder / name, data)
@@ -363,10 +389,17 @@ def _annotate(around: list[PlacedObject], ego: F64, points: Any, shares: dict[in
         share = shares.get(who.body.tag, 0.0)
         if counts[n] or share > 0:
             found.append(
-                {"tag": who.body.tag, "category": BODY_CATEGORIES[who.body.kind],
-                 "attributes": list(attributes_of(who)), "centre": centre[n].tolist(), "size": size[n].tolist(),
-                 "rotation": list(rotation[n]), "points": int(counts[n]), "visibility": visibility_token(share)}
-            )  # fmt: skip
+                {
+                    "tag": who.body.tag,
+                    "category": BODY_CATEGORIES[who.body.kind],
+                    "attributes": list(attributes_of(who)),
+                    "centre": centre[n].tolist(),
+                    "size": size[n].tolist(),
+                    "rotation": list(rotation[n]),
+                    "points": int(counts[n]),
+                    "visibility": visibility_token(share),
+                }
+            )
     return found
 
 
@@ -445,19 +478,28 @@ def _merge(recording: Recording, names: list[str]) -> None:
             for sensor in part["sensors"]:
                 pose = np.array(sensor["pose"])
                 writer.add_sensor(
-                    scene, sensor["channel"], modality=sensor["modality"], translation=tuple(pose[:3, 3]),
-                    rotation=tuple(matrix_to_quaternion(pose[:3, :3])), intrinsic=sensor["intrinsic"],
-                )  # fmt: skip
+                    scene,
+                    sensor["channel"],
+                    modality=sensor["modality"],
+                    translation=tuple(pose[:3, 3]),
+                    rotation=tuple(matrix_to_quaternion(pose[:3, :3])),
+                    intrinsic=sensor["intrinsic"],
+                )
             times = {}
             for sample in part["samples"]:
                 times[sample["sweep"]] = writer.add_sample(scene, sample["time"])
             for frame in part["frames"]:
                 ego = np.array(frame["ego"])
                 token = writer.add_sensor_frame(
-                    scene, frame["channel"], timestamp_us=frame["time"], data=folder / frame["file"],
-                    ego_translation=tuple(ego[:3, 3]), ego_rotation=tuple(matrix_to_quaternion(ego[:3, :3])),
-                    sample=times[frame["sweep"]] if frame["key"] else None, size=tuple(frame["size"]),
-                )  # fmt: skip
+                    scene,
+                    frame["channel"],
+                    timestamp_us=frame["time"],
+                    data=folder / frame["file"],
+                    ego_translation=tuple(ego[:3, 3]),
+                    ego_rotation=tuple(matrix_to_quaternion(ego[:3, :3])),
+                    sample=times[frame["sweep"]] if frame["key"] else None,
+                    size=tuple(frame["size"]),
+                )
                 depth = folder / f"{frame['file'].removesuffix('.jpg')}.depth.png"
                 if depth.is_file():
                     place_file(out / "depth" / frame["channel"] / f"{token}.png", depth)
@@ -467,9 +509,14 @@ def _merge(recording: Recording, names: list[str]) -> None:
                     if box["tag"] not in known:
                         known[box["tag"]] = writer.add_instance(scene, f"thing-{box['tag']}", category=box["category"])
                     writer.add_annotation(
-                        times[sample["sweep"]], known[box["tag"]], translation=box["centre"], size=box["size"],
-                        rotation=box["rotation"], visibility=box["visibility"], attributes=box["attributes"],
+                        times[sample["sweep"]],
+                        known[box["tag"]],
+                        translation=box["centre"],
+                        size=box["size"],
+                        rotation=box["rotation"],
+                        visibility=box["visibility"],
+                        attributes=box["attributes"],
                         lidar_points=box["points"],
-                    )  # fmt: skip
+                    )
         for split, members in splits.items():
             writer.set_split(split, members)

@@ -83,9 +83,7 @@ class PerceivingSystem(Schema):
     @property
     def tracking(self) -> Tracking:
         """Settings of the tracker, with the scores that suit the detector unless others are said."""
-        return tracking_of(
-            self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve
-        )  # fmt: skip
+        return tracking_of(self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve)
 
     def check(self) -> None:
         """ConfigError: scores cross, settings of stop signs do not fit, or its detector knows no stop signs."""
@@ -110,9 +108,7 @@ class PerceivingSystem(Schema):
         cameras, tracking = front(self.width, self.cameras), self.tracking
         eyes: CameraEyes | PerfectEyes
         if self.perfect:
-            eyes = PerfectEyes(
-                cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms
-            )  # fmt: skip
+            eyes = PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
         else:
             detector = _detector(self.detector, self.weights, self.input_width, device)
             eyes = CameraEyes(detector, cameras, threshold=tracking.low, device=device)
@@ -120,7 +116,7 @@ class PerceivingSystem(Schema):
         signs = SignReading(confirm=self.confirm, memory=memory, score=tracking.high) if self.reads_signs else None
         return Perceiving(
             eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
-        )  # fmt: skip
+        )
 
 
 def drive_perceiving(
@@ -177,10 +173,12 @@ def drive_repaired(
     repair = Repair(dict(enumerate(hit.values())))
     _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair, every=None)
     return {
-        k: {"collision": bool(episode_metrics(one, stop_signs=False).collision),
-            "same": bool((one.contact_agent == agent).any())}
+        k: {
+            "collision": bool(episode_metrics(one, stop_signs=False).collision),
+            "same": bool((one.contact_agent == agent).any()),
+        }
         for (k, agent), one in zip(hit.items(), again, strict=True)
-    }  # fmt: skip
+    }
 
 
 def _paired(order: Order) -> str:

@@ -31,22 +31,46 @@ PHASES = 8  # meshes of one walking cycle
 STRIDE = 1.45  # m walked in one cycle
 ASKEW = 0.12  # rad, standard deviation: cones and barriers stand by hand
 # people of a cast who walk and who stand, by style; many are in more than one place
-WALKING = ("adult", "adult", "elderly", "adult", "adult", "child", "adult", "stroller", "adult", "adult", "elderly",
-           "child", "adult", "adult")  # fmt: skip
+WALKING = (
+    "adult",
+    "adult",
+    "elderly",
+    "adult",
+    "adult",
+    "child",
+    "adult",
+    "stroller",
+    "adult",
+    "adult",
+    "elderly",
+    "child",
+    "adult",
+    "adult",
+)
 WAITING = ("standing",) * 6 + ("worker",)
 SLOW = 0.65  # of the speed of others: who walks with a stick
 GRIP = 0.457, 0.575  # where who pushes a stroller holds it: ahead of the middle and up, shares of length and height
 RACK = {"bicycle": 0.75, "motorcycle": 1.15}  # m from one two-wheeler to the next where they stand side by side
 # what stands at the kerb, how often, and how much of the kerb it takes, m
 PARKED = {
-    "car": (10.0, 6.3), "truck": (4.5, 10.5), "bus": (2.5, 13.0), "trailer": (3.5, 14.5), "construction": (2.0, 9.5),
-    "motorcycle": (1.4, 3.0), "bicycle": (1.6, 2.6),
-}  # fmt: skip
+    "car": (10.0, 6.3),
+    "truck": (4.5, 10.5),
+    "bus": (2.5, 13.0),
+    "trailer": (3.5, 14.5),
+    "construction": (2.0, 9.5),
+    "motorcycle": (1.4, 3.0),
+    "bicycle": (1.6, 2.6),
+}
 AGAINST = {"car": 0.1, "motorcycle": 0.4, "bicycle": 0.4}  # share of those at the kerb that face the traffic
 NOTHING = Mesh(
-    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3, 3), np.float32),
-    np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32), np.zeros(0, np.int32), (),
-)  # fmt: skip
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 3), np.int32),
+    np.zeros((0, 3, 3), np.float32),
+    np.zeros((0, 3, 2), np.float32),
+    np.zeros(0, np.int32),
+    np.zeros(0, np.int32),
+    (),
+)
 LONG = 7.0  # m; what takes more is placed first, along streets alone: between others it would hardly find room
 
 
@@ -159,9 +183,13 @@ class SceneObjects:
         return found
 
     def add(
-        self, who: tuple[str, str, Size, tuple[int, ...]], track: F64, *, active: Bool | None = None,
+        self,
+        who: tuple[str, str, Size, tuple[int, ...]],
+        track: F64,
+        *,
+        active: Bool | None = None,
         parked: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Another body: kind, style, size, meshes, and where it is. Its paint is drawn."""
         tag = len(self.bodies) + 1
         steps = np.hypot(*np.diff(track[:, :2], axis=0).T) if len(track) > 1 else np.zeros(0)
@@ -209,9 +237,15 @@ class Clear:
 
 
 def place_objects(
-    trace: EpisodeTrace, graph: LaneGraph, street: Street, *, key: tuple[object, ...], detail: int = 1,
-    streets: str = "town", many_signs: bool = False,
-) -> SceneObjects:  # fmt: skip
+    trace: EpisodeTrace,
+    graph: LaneGraph,
+    street: Street,
+    *,
+    key: tuple[object, ...],
+    detail: int = 1,
+    streets: str = "town",
+    many_signs: bool = False,
+) -> SceneObjects:
     """Bodies of a drive: the agents but the ego, and what stands or walks beside the first 300 m of its way.
 
     Args:
@@ -475,5 +509,12 @@ def _walk(graph: LaneGraph, lane: int, *, s0: float, speed: float, aside: float,
     places = 1.0 + np.where(there, along, 2 * length - along)
     rows = graph.along(lane, places)
     back = there == (speed < 0)
-    return np.stack([rows[:, 0] - aside * np.sin(rows[:, 2]), rows[:, 1] + aside * np.cos(rows[:, 2]),
-                     rows[:, 2] + np.pi * back, np.full(steps, KERB)], -1)  # fmt: skip
+    return np.stack(
+        [
+            rows[:, 0] - aside * np.sin(rows[:, 2]),
+            rows[:, 1] + aside * np.cos(rows[:, 2]),
+            rows[:, 2] + np.pi * back,
+            np.full(steps, KERB),
+        ],
+        -1,
+    )

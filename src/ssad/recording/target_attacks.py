@@ -128,9 +128,12 @@ class TargetAttacks:
             return [LitView(clip.lit(self.device), own.truth(clip)) for clip in own.clips()]
 
         return self.lights.edit(
-            spec, Target(*car.full_size), views=views, projected=projected,
+            spec,
+            Target(*car.full_size),
+            views=views,
+            projected=projected,
             detector=lambda: self.detector(spec.source),
-        )  # fmt: skip
+        )
 
     def under(self, pictures: LitPictures, spec: LightSpec) -> Iterator[tuple[str, Tensor, Truth]]:
         """Drive, picture and truth of pictures under a light."""
@@ -213,8 +216,10 @@ def see_all(
     """
     tasks = [
         (clips.out, part, target, surfaces, clips.device)
-        for clips in recordings if surfaces for part in unseen_parts(clips.out, layers_of(target, surfaces))
-    ]  # fmt: skip
+        for clips in recordings
+        if surfaces
+        for part in unseen_parts(clips.out, layers_of(target, surfaces))
+    ]
     if tasks:
         pool = open_pool(len(tasks), workers=workers, ray=ray, device=recordings[0].device)
         run_all(pool, see_surfaces, tasks, progress=progress)
@@ -252,8 +257,8 @@ def _from(rows: Sequence[Mapping[str, Any]], side: float | None) -> list[int]:
         return [0]
     near = sorted({abs(float(row["distance"]) - 10.0) for row in rows})[0]
     own = [
-        k for k, row in enumerate(rows)
-        if float(row["azimuth"]) == side and abs(float(row["distance"]) - 10.0) == near
-        and row["weather"] != "night"
-    ]  # fmt: skip
+        k
+        for k, row in enumerate(rows)
+        if float(row["azimuth"]) == side and abs(float(row["distance"]) - 10.0) == near and row["weather"] != "night"
+    ]
     return own[:1]

@@ -189,21 +189,28 @@ class TargetTable(Schema):
         mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
         found = [
             usual(
-                folder / "data" / town, ((town, count),), mode=mode, behind=self.behind,
+                folder / "data" / town,
+                ((town, count),),
+                mode=mode,
+                behind=self.behind,
                 distances=tuple(self.distances),
             )
             for town, count in images.items()
-        ]  # fmt: skip
+        ]
         if self.grid is not None:
             grid = self.grid
             found += [
                 usual(
-                    folder / "data" / f"{town}-grid", ((town, grid.count),), mode="orbit",
-                    distances=tuple(grid.distances), azimuths=tuple(grid.azimuths),
-                    elevations=tuple(grid.elevations), weathers=tuple(grid.weathers),
+                    folder / "data" / f"{town}-grid",
+                    ((town, grid.count),),
+                    mode="orbit",
+                    distances=tuple(grid.distances),
+                    azimuths=tuple(grid.azimuths),
+                    elevations=tuple(grid.elevations),
+                    weathers=tuple(grid.weathers),
                 )
                 for town in dict.fromkeys(pair.test for pair in self.pairs if self.seen_around(pair))
-            ]  # fmt: skip
+            ]
         further = max((entry.around for entry in self.attacks), default=0)
         for town in dict.fromkeys(pair.train for pair in self.pairs) if further else ():
             found.append(usual(folder / "data" / f"{town}-around", ((town, further),), mode="orbit"))
@@ -260,9 +267,15 @@ def _texture_rows(  # noqa: PLR0917
         spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
         spec["source"] = source if trained else ""
         fields = {
-            "test": pair.test, "train": pair.train, "view": view, "detector": detector, "carrier": carrier_title(row),
-            "attack": called, "source": spec["source"], "number": seed,
-        }  # fmt: skip
+            "test": pair.test,
+            "train": pair.train,
+            "view": view,
+            "detector": detector,
+            "carrier": carrier_title(row),
+            "attack": called,
+            "source": spec["source"],
+            "number": seed,
+        }
         words = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
         title = "/".join(map(str, words)) + (f"/{GRID}" if view == GRID else "")
         yield TargetRow(title, fields, spec)
@@ -287,10 +300,15 @@ def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
             source = detector if row["attack"] not in (None, RANDOM) else ""
             light = {"number": 0, **row, "source": source, "pair": pair.model_dump()}
             fields = {
-                "test": pair.test, "train": pair.train, "view": "drive", "detector": detector,
+                "test": pair.test,
+                "train": pair.train,
+                "view": "drive",
+                "detector": detector,
                 "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}),
-                "attack": _light_title(table, row), "source": source, "number": light["number"],
-            }  # fmt: skip
+                "attack": _light_title(table, row),
+                "source": source,
+                "number": light["number"],
+            }
             words = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
             yield TargetRow("/".join(map(str, words)), fields, {"attack": None, "light": light})
 
@@ -320,9 +338,10 @@ def _said(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
 def _differing(own: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
     """Stealth, and what others do not say alike: such as ", rate 0.01"."""
     told = (
-        (key, value) for key, value in own.items()
+        (key, value)
+        for key, value in own.items()
         if (key == "stealth" and value) or any(one.get(key) != value for one in others)
-    )  # fmt: skip
+    )
     return "".join(f", {key} {_words(value)}" for key, value in told)
 
 
@@ -375,14 +394,17 @@ def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
 def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
     """The row whose texture is shuffled (see `Entry.of`). ConfigError: there is none, or more than one."""
     rows = [
-        row_of(table, one) for one in table.attacks
+        row_of(table, one)
+        for one in table.attacks
         if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
-    ]  # fmt: skip
+    ]
     fit = [
-        row for row in rows
-        if entry.carrier in (None, row["carrier"]) and entry.texture in (None, row.get("file"))
+        row
+        for row in rows
+        if entry.carrier in (None, row["carrier"])
+        and entry.texture in (None, row.get("file"))
         and _within({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
-    ]  # fmt: skip
+    ]
     said = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in fit]
     plain = [row for row, own in zip(fit, said, strict=True) if all(_within(own, other) for other in said)]
     if not plain:

@@ -121,10 +121,12 @@ def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
     length, width, height = row["target_size"]
     centre = turn[:3, 3] + 0.5 * height * turn[:3, 2]  # a pose is that of the middle of the bottom
     solid = Solids(
-        torch.tensor(centre[None], dtype=torch.float32), torch.tensor([[length, height, width]], dtype=torch.float32),
-        torch.tensor(camera_yaw(turn[None, :3, 0]), dtype=torch.float32), torch.full((1, 2), torch.nan),
+        torch.tensor(centre[None], dtype=torch.float32),
+        torch.tensor([[length, height, width]], dtype=torch.float32),
+        torch.tensor(camera_yaw(turn[None, :3, 0]), dtype=torch.float32),
+        torch.full((1, 2), torch.nan),
         torch.tensor([NO_ATTRIBUTE]),
-    )  # fmt: skip
+    )
     return Truth(truth.label[:1], truth.box[:1], solid, truth.intrinsic)
 
 

@@ -125,12 +125,19 @@ def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") 
     score = float(non_printability(colour, printable_colours(), mask))
     away = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
     about = {
-        "name": name, "target": made.target, "carrier": made.carrier, "options": dict(made.options),
-        "dots_per_metre": dots, "sha256": hashlib.sha256(numbers).hexdigest(),
-        "metres": [round(one, 4) for one in surface.metres], "texels": [colour.shape[2], colour.shape[1]],
-        "rectangle": [round(v, 6) for v in _rectangle(surface)], "panels": _panels(mesh),
-        "non_printability": round(score, 4), "delta_e": round(away, 2),
-    }  # fmt: skip
+        "name": name,
+        "target": made.target,
+        "carrier": made.carrier,
+        "options": dict(made.options),
+        "dots_per_metre": dots,
+        "sha256": hashlib.sha256(numbers).hexdigest(),
+        "metres": [round(one, 4) for one in surface.metres],
+        "texels": [colour.shape[2], colour.shape[1]],
+        "rectangle": [round(v, 6) for v in _rectangle(surface)],
+        "panels": _panels(mesh),
+        "non_printability": round(score, 4),
+        "delta_e": round(away, 2),
+    }
     safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
     return [
         out / file for file in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.npz", "texture.json")

@@ -160,9 +160,12 @@ class Wearing:
         window = first
         if number > 1:
             window = Window.of(
-                [one.window.changed[0] for one in pictures], (number, *first.shape[1:]), first.sensor,
-                quality=first.quality, subsampling=first.subsampling,
-            )  # fmt: skip
+                [one.window.changed[0] for one in pictures],
+                (number, *first.shape[1:]),
+                first.sensor,
+                quality=first.quality,
+                subsampling=first.subsampling,
+            )
         (rows, columns), (_, _, wide) = window.read[0], first.shape
         size = rows[1] - rows[0], columns[1] - columns[0]
         radiance = pictures[0].part.new_zeros((number, *size, 3))
@@ -300,9 +303,11 @@ def seen_part(picture: Picture) -> dict[str, Any]:
     fragments = picture.fragments.copy()
     fragments["place"] = (rows - top) * (right - left) + columns - left
     return {
-        "corner": np.array([top, left]), "radiance": picture.radiance[0, top:bottom, left:right],
-        "exposure": picture.exposure[0], "fragments": fragments,
-    }  # fmt: skip
+        "corner": np.array([top, left]),
+        "radiance": picture.radiance[0, top:bottom, left:right],
+        "exposure": picture.exposure[0],
+        "fragments": fragments,
+    }
 
 
 def _kept(clip: ClipView, layers: Sequence[Layer | Decal]) -> dict[str, Any]:

@@ -161,9 +161,10 @@ def orbit_sign(
         turn = yaw + np.radians(azimuth)
         eye = middle + np.array([flat * np.cos(turn), flat * np.sin(turn), up])
         about = {
-            "distance": distance, "azimuth": azimuth % 360.0,
+            "distance": distance,
+            "azimuth": azimuth % 360.0,
             "elevation": round(float(np.degrees(np.arctan2(up, flat))), 1),
-        }  # fmt: skip
+        }
         yield Viewpoint(time, look_at(eye, middle + aside), target, weather, about)
 
 

@@ -171,11 +171,18 @@ def _compare(first: ComparedRun, second: ComparedRun, number: int) -> Comparison
     groups = Table(f"{name}_groups", "Each group of scenarios", heads, columns, apart, note) if whole else None
     left_out = {*first.subjects, *second.subjects} - {name for pair in pairs for name in pair}
     return Comparison(
-        first, second, table, groups,
-        changes=tuple(_changes(first.run, second.run)), verdicts=tuple(verdicts),
-        findings=tuple(_findings(table)), equal=equal, both=both, only=(only[0], only[1]),
+        first,
+        second,
+        table,
+        groups,
+        changes=tuple(_changes(first.run, second.run)),
+        verdicts=tuple(verdicts),
+        findings=tuple(_findings(table)),
+        equal=equal,
+        both=both,
+        only=(only[0], only[1]),
         left_out=tuple(sorted(left_out)),
-    )  # fmt: skip
+    )
 
 
 def _findings(table: Table) -> Iterator[str]:

@@ -78,11 +78,13 @@ def _cell(lines: Sequence[Line], column: Mapping[str, Any]) -> Cell:
     truths = [isinstance(value, bool) for value in values if value is not None]
     cases = [
         CaseValue(
-            math.nan if value is None else float(value), str(line.get("cluster") or line["key"]),
-            str(line.get("case") or line["key"]), failed=line["status"] != "ok",
+            math.nan if value is None else float(value),
+            str(line.get("cluster") or line["key"]),
+            str(line.get("case") or line["key"]),
+            failed=line["status"] != "ok",
         )
         for line, value in zip(lines, values, strict=True)
-    ]  # fmt: skip
+    ]
     cell = Cell.of(estimate(cases, "share" if truths and all(truths) else "mean"))
     counts = len(values) == 1 and type(values[0]) is int
     return replace(cell, digits=0 if counts or abs(cell.mean) >= 1000 else 1 if abs(cell.mean) >= 100 else 2)

@@ -14,9 +14,15 @@ from ssad.report.load import Run
 from ssad.report.tables import Cell
 
 TITLES = {
-    "fgsm": "FGSM", "pgd": "PGD", "cw": "C&W", "cw-min": "C&W, least change", "apgd": "APGD", "square": "Square",
-    "nes": "NES", "spsa": "SPSA",
-}  # fmt: skip
+    "fgsm": "FGSM",
+    "pgd": "PGD",
+    "cw": "C&W",
+    "cw-min": "C&W, least change",
+    "apgd": "APGD",
+    "square": "Square",
+    "nes": "NES",
+    "spsa": "SPSA",
+}
 DEFENCES = {"jpeg": "JPEG", "bits": "bit depth", "blur": "blur", "resize": "random resizing"}
 
 
@@ -149,10 +155,18 @@ def load_digital_run(run: Run) -> DigitalRun:
 def setting_of(record: Mapping[str, Any]) -> Setting:
     """What tells the attack of a record from others; records of older versions say less."""
     return Setting(
-        record["attack"] or "", record["loss"] or "", record["norm"] or "", float(record["radius"]),
-        int(record["steps"]), record["options"], _called(record.get("source", "")), record.get("defence", ""),
-        bool(record.get("aware")), record.get("target", ""), int(record.get("subset", 0)),
-    )  # fmt: skip
+        record["attack"] or "",
+        record["loss"] or "",
+        record["norm"] or "",
+        float(record["radius"]),
+        int(record["steps"]),
+        record["options"],
+        _called(record.get("source", "")),
+        record.get("defence", ""),
+        bool(record.get("aware")),
+        record.get("target", ""),
+        int(record.get("subset", 0)),
+    )
 
 
 def title_of(setting: Setting) -> str:

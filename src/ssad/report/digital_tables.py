@@ -176,8 +176,10 @@ def distance_table(run: DigitalRun) -> Table:
     names = [f"{metric}_{band}" for band in BANDS for metric in ("mAP", "recall")]
     rows = [
         Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), name) for name in names))
-        for d in run.detectors if not run.flat(d) for s in run.rows
-    ]  # fmt: skip
+        for d in run.detectors
+        if not run.flat(d)
+        for s in run.rows
+    ]
     columns = tuple(f"{metric}, {text}" for text in BANDS.values() for metric in ("mAP", "recall"))
     note = (
         "Percent, by distance from the ego, boxes and truth each by their own. mAP is the mean over the classes that "

@@ -95,16 +95,26 @@ def full_table(run: DrivingRun) -> Table:
 def normalised_table(run: DrivingRun) -> Table:
     """The terms of SafeBench's overall score, each 0 (best) to 1 (worst), and the two scores made of them."""
     columns = (
-        "CR", f"OR / {DIVISORS['OR']:g} m", f"DR / {DIVISORS['DR']:g} m", "1 - RC", f"TS / {DIVISORS['TS']:g} s",
-        "SafeBench score (lower is better)", "FREA score (higher is better)",
-    )  # fmt: skip
+        "CR",
+        f"OR / {DIVISORS['OR']:g} m",
+        f"DR / {DIVISORS['DR']:g} m",
+        "1 - RC",
+        f"TS / {DIVISORS['TS']:g} s",
+        "SafeBench score (lower is better)",
+        "FREA score (higher is better)",
+    )
     rows = []
     for (system, group), values in run.numbers.items():
         score = values["OS"]
         shown = (
-            values["CR"], _scaled("OR", values["OR"]), _scaled("DR", values["DR"]), values["RC"].scaled(-1.0, 1.0),
-            _scaled("TS", values["TS"]), score, score.scaled(-1.0, 1.0),
-        )  # fmt: skip
+            values["CR"],
+            _scaled("OR", values["OR"]),
+            _scaled("DR", values["DR"]),
+            values["RC"].scaled(-1.0, 1.0),
+            _scaled("TS", values["TS"]),
+            score,
+            score.scaled(-1.0, 1.0),
+        )
         rows.append(Row((system, run.headings[group]), tuple(Cell.of(e) for e in shown)))
     note = f"SafeBench's score weighs CR 0.4, OR 0.1, DR 0.1, 1 - RC 0.3, TS 0.1; FREA's is one minus it. {METHODS}"
     title = "Normalised metrics and overall scores"

@@ -26,9 +26,13 @@ def summary(folder: Path | str) -> rich.table.Table:
     run = load_run(folder)
     table = kind_module(run.kind).summary(run)
     result = rich.table.Table(
-        title=escape(run.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        title=escape(run.title),
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
         padding=(0, 1, 0, 0),
-    )  # fmt: skip
+    )
     for name in table.heads:
         result.add_column(escape(name.lower()), no_wrap=True)
     every = {head for row in table.rows for head in row.head}
@@ -48,7 +52,7 @@ def summary(folder: Path | str) -> rich.table.Table:
             *(escape(text) for text in (*(shown[head] for head in heads), *values)),
             style="bold" if average else None,
             end_section=after is not None and after.head[0].startswith("Avg.") and not average,
-        )  # fmt: skip
+        )
     failed = len(run.failures)
     notes = [table.note, f"{failed} of {len(run.lines)} cells failed and count" if failed else ""]
     result.caption, result.caption_justify = escape("\n".join(filter(None, notes))), "left"
@@ -58,9 +62,13 @@ def summary(folder: Path | str) -> rich.table.Table:
 def comparison_table(table: Table) -> rich.table.Table:
     """A table of differences: the interval in a column of its own, leading columns that say nothing left out."""
     result = rich.table.Table(
-        title=escape(table.title), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False,
+        title=escape(table.title),
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
         padding=(0, 1, 0, 0),
-    )  # fmt: skip
+    )
     telling = [k for k in range(len(table.heads)) if len({row.head[k] for row in table.rows}) > 1]
     for k in telling:
         result.add_column(escape(table.heads[k].lower()))

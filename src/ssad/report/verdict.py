@@ -86,9 +86,11 @@ def _physical(run: Run) -> list[str]:
         town = f" in {best['test']}" if len({line["test"] for line in lines}) > 1 else ""
         found.append(f"{best['attack']} hides {_hidden(best):.0%} of the targets from {detector}{town}.")
         alike = [
-            line for line in lines if all(line[key] == best[key] for key in ("test", "carrier"))
+            line
+            for line in lines
+            if all(line[key] == best[key] for key in ("test", "carrier"))
             and physical.learns_nothing(line["attack"], best["attack"])
-        ]  # fmt: skip
+        ]
         if alike:
             control = max(alike, key=_hidden)
             found.append(f"The strongest control ({control['attack']}) hides {_hidden(control):.0%}.")
@@ -223,9 +225,14 @@ def _sure(change: Cell) -> str:
 
 
 VERDICTS: dict[str, Callable[[Run], list[str]]] = {
-    "driving": _driving, "detection": _detection, "digital": _digital, "physical": _physical,
-    "adversarial": _adversarial, "gap": _gap, "how-often": _how_often,
-}  # fmt: skip
+    "driving": _driving,
+    "detection": _detection,
+    "digital": _digital,
+    "physical": _physical,
+    "adversarial": _adversarial,
+    "gap": _gap,
+    "how-often": _how_often,
+}
 """Kind of a part -> what says its verdict."""
 
 

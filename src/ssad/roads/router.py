@@ -213,8 +213,9 @@ def _search(graph: LaneGraph, starts: list[tuple[float, _Spot]], goal: _Spot) ->
                     legs.append(leg)
             return cost, start, legs[::-1]
 
-        def push(price: float, to: int, at: float, way: _Leg, *, base: float = cost, first: int = start,
-                 come: int = node) -> None:  # fmt: skip
+        def push(
+            price: float, to: int, at: float, way: _Leg, *, base: float = cost, first: int = start, come: int = node
+        ) -> None:
             heapq.heappush(queue, (base + price, next(count), to, at, first, come, way))
 
         if lane == goal.lane and goal.s >= s - 1e-6:

@@ -37,8 +37,19 @@ def write_town(town: Town) -> str:
     """The town as OpenDRIVE text, the same for the same town."""
     ends = _ends(town)
     root = Element("OpenDRIVE")
-    SubElement(root, "header", revMajor="1", revMinor="4", name=town.name, version="1", north="0", south="0",
-               east="0", west="0", vendor="SSAD")  # fmt: skip
+    SubElement(
+        root,
+        "header",
+        revMajor="1",
+        revMinor="4",
+        name=town.name,
+        version="1",
+        north="0",
+        south="0",
+        east="0",
+        west="0",
+        vendor="SSAD",
+    )
     roads: list[Element] = []
     lengths: dict[int, float] = {}
     for number, street in enumerate(town.streets, start=1):
@@ -189,12 +200,14 @@ def _interchange(roads: list[Element], root: Element, junction: Junction, ramps:
     on, off = ramps
     lanes = [(k, k) for k in range(1, narrow.street.lanes + 1)]
     last = wide.street.lanes
-    for k, (places, arms, pairs) in enumerate((
-        ((junction, junction), (narrow, wide), lanes),
-        ((junction, junction), (wide, narrow), lanes),
-        ((on, junction), (on.arms[0], wide), [(1, last)]),
-        ((junction, off), (wide, off.arms[0]), [(last, 1)]),
-    )):  # fmt: skip
+    for k, (places, arms, pairs) in enumerate(
+        (
+            ((junction, junction), (narrow, wide), lanes),
+            ((junction, junction), (wide, narrow), lanes),
+            ((on, junction), (on.arms[0], wide), [(1, last)]),
+            ((junction, off), (wide, off.arms[0]), [(last, 1)]),
+        )
+    ):
         _add_way(roads, element, _way(junction.id + 1 + k, places, arms, pairs=pairs), arms[0], pairs)
 
 
@@ -287,10 +300,27 @@ def _signals(root: Element, roads: list[Element], junction: Junction, lengths: d
         half = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + 0.5
         s = lengths[arm.road] - 0.1 if arm.at_end else 0.1
         # orientation "+": it faces traffic that drives along the road's own direction
-        light = SubElement(roads[arm.road - 1][-1], "signal", name="Signal_3Light_Post01", id=number, s=decimal(s),
-                           t=decimal(-half if arm.at_end else half), zOffset="0", hOffset="0", roll="0", pitch="0",
-                           orientation="+" if arm.at_end else "-", dynamic="yes", country="OpenDRIVE",
-                           type="1000001", subtype="-1", value="-1", text="", height="1.2", width="0.5")  # fmt: skip
+        light = SubElement(
+            roads[arm.road - 1][-1],
+            "signal",
+            name="Signal_3Light_Post01",
+            id=number,
+            s=decimal(s),
+            t=decimal(-half if arm.at_end else half),
+            zOffset="0",
+            hOffset="0",
+            roll="0",
+            pitch="0",
+            orientation="+" if arm.at_end else "-",
+            dynamic="yes",
+            country="OpenDRIVE",
+            type="1000001",
+            subtype="-1",
+            value="-1",
+            text="",
+            height="1.2",
+            width="0.5",
+        )
         low, high = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
         SubElement(light, "validity", fromLane=str(low), toLane=str(high))
     for phase, numbers in sorted(groups.items()):
@@ -319,12 +349,27 @@ def _signs(
     for k, arm in enumerate(ruled):
         aside = arm.offset(arm.street.lanes + 1) + arm.street.shoulder + SIGN_ASIDE
         back = STOP_LINE if arm.street.sidewalk and not junction.ring else 0.1
-        post = SubElement(roads[arm.road - 1][-1], "signal", name=name, id=str(junction.id + 700 + k),
-                          s=decimal(lengths[arm.road] - back if arm.at_end else back),
-                          t=decimal(-aside if arm.at_end else aside),
-                          zOffset="0", hOffset="0", roll="0", pitch="0", orientation="+" if arm.at_end else "-",
-                          dynamic="no", country="OpenDRIVE", type=kind, subtype="-1", value="-1", text="",
-                          height="0.76", width="0.76")  # fmt: skip
+        post = SubElement(
+            roads[arm.road - 1][-1],
+            "signal",
+            name=name,
+            id=str(junction.id + 700 + k),
+            s=decimal(lengths[arm.road] - back if arm.at_end else back),
+            t=decimal(-aside if arm.at_end else aside),
+            zOffset="0",
+            hOffset="0",
+            roll="0",
+            pitch="0",
+            orientation="+" if arm.at_end else "-",
+            dynamic="no",
+            country="OpenDRIVE",
+            type=kind,
+            subtype="-1",
+            value="-1",
+            text="",
+            height="0.76",
+            width="0.76",
+        )
         low, high = sorted((arm.inward(1), arm.inward(arm.street.lanes)))
         SubElement(post, "validity", fromLane=str(low), toLane=str(high))
 

@@ -277,8 +277,15 @@ def road_element(name: str, number: int, junction: int, pieces: list[Piece]) -> 
     plan = SubElement(road, "planView")
     s = 0.0
     for piece in pieces:
-        item = SubElement(plan, "geometry", s=decimal(s), x=decimal(piece.x), y=decimal(piece.y),
-                          hdg=decimal(wrap(piece.hdg)), length=decimal(piece.length))  # fmt: skip
+        item = SubElement(
+            plan,
+            "geometry",
+            s=decimal(s),
+            x=decimal(piece.x),
+            y=decimal(piece.y),
+            hdg=decimal(wrap(piece.hdg)),
+            length=decimal(piece.length),
+        )
         if piece.curvature:
             SubElement(item, "arc", curvature=decimal(piece.curvature))
         else:
@@ -311,8 +318,9 @@ def lane_element(
 def mark_lane(lane: Element, kind: str, color: str) -> None:
     """Add the paint on the outer edge of a lane; lane changes across it are allowed where it is broken and white."""
     change = "both" if kind == "broken" and color == "white" else "none"
-    SubElement(lane, "roadMark", sOffset="0", type=kind, weight="standard", color=color, width="0.12",
-               laneChange=change)  # fmt: skip
+    SubElement(
+        lane, "roadMark", sOffset="0", type=kind, weight="standard", color=color, width="0.12", laneChange=change
+    )
 
 
 def ahead(point: Point, heading: float, distance: float) -> Point:

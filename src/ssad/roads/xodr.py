@@ -49,11 +49,43 @@ _MARKS = {
 }
 _SPEED = {"mph": 0.44704, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "m/s": 1.0, "": 1.0}
 # attributes that must be numbers wherever they stand in a road
-_NUMBERS = frozenset({
-    "s", "t", "x", "y", "z", "a", "b", "c", "d", "hdg", "length", "curvature", "curvStart", "curvEnd", "sOffset",
-    "tOffset", "zOffset", "hOffset", "width", "height", "u", "v", "aU", "bU", "cU", "dU", "aV", "bV", "cV", "dV",
-    "pRange", "pitch", "roll",
-})  # fmt: skip
+_NUMBERS = frozenset(
+    {
+        "s",
+        "t",
+        "x",
+        "y",
+        "z",
+        "a",
+        "b",
+        "c",
+        "d",
+        "hdg",
+        "length",
+        "curvature",
+        "curvStart",
+        "curvEnd",
+        "sOffset",
+        "tOffset",
+        "zOffset",
+        "hOffset",
+        "width",
+        "height",
+        "u",
+        "v",
+        "aU",
+        "bU",
+        "cU",
+        "dU",
+        "aV",
+        "bV",
+        "cV",
+        "dV",
+        "pRange",
+        "pitch",
+        "roll",
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -229,8 +261,12 @@ class _Reader:
             for control in element.findall("control"):
                 sequence = element.get("sequence", "0")
                 phase.setdefault(control.get("signalId", ""), int(sequence) if sequence.isdigit() else 0)
-        signs = {s.get("id", ""): SIGNS[s.get("type", "")] for r in root.findall("road")
-                 for s in r.findall("signals/signal") if _sign(s)}  # fmt: skip
+        signs = {
+            s.get("id", ""): SIGNS[s.get("type", "")]
+            for r in root.findall("road")
+            for s in r.findall("signals/signal")
+            if _sign(s)
+        }
         return Network(roads, junctions, tuple(dict.fromkeys(lights)), phase, signs)
 
     def road(self, element: Element) -> Road:

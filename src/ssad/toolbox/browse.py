@@ -56,9 +56,13 @@ above, where a line points ahead and points are coloured by their height.</p>
 
 
 def write_page(
-    data: NuScenes, out: Path, *, scenes: Sequence[str] = (), moments: int = 3,
+    data: NuScenes,
+    out: Path,
+    *,
+    scenes: Sequence[str] = (),
+    moments: int = 3,
     progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Write OUT/index.html and its pictures.
 
     Args:
@@ -82,10 +86,19 @@ def write_page(
     for number, name in enumerate(names):
         shown.append(_scene(data.root, data.scene(name), out / "pictures", moments))
         progress(number + 1, len(names))
-    page = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(PAGE).render(
-        name=data.root.name, version=data.version, total=len(data.scenes()), scenes=shown, per=moments, side=SIDE,
-        reach=f"{REACH:.0f}",
-    )  # fmt: skip
+    page = (
+        jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+        .from_string(PAGE)
+        .render(
+            name=data.root.name,
+            version=data.version,
+            total=len(data.scenes()),
+            scenes=shown,
+            per=moments,
+            side=SIDE,
+            reach=f"{REACH:.0f}",
+        )
+    )
     write_atomic(out / "index.html", page)
     return out / "index.html"
 

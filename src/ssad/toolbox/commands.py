@@ -124,9 +124,15 @@ def shift_folder(
 
 
 def shift_picture_folder(
-    source: Path, out: Path, *, shifts: Sequence[str], severity: str, workers: int | None, ray: str | None,
+    source: Path,
+    out: Path,
+    *,
+    shifts: Sequence[str],
+    severity: str,
+    workers: int | None,
+    ray: str | None,
     settings: Mapping[str, Any],
-) -> int:  # fmt: skip
+) -> int:
     """Shift the pictures of a folder that is no nuScenes root, and print one line for each new folder.
 
     Args:
@@ -152,9 +158,15 @@ def shift_picture_folder(
     try:
         with Live("shift", 1, 0, console=Console(stderr=True), unit="pictures") as live:
             written = shift_pictures(
-                source, out, shifts=chosen, severities=strengths, settings=settings, workers=workers, ray=ray,
+                source,
+                out,
+                shifts=chosen,
+                severities=strengths,
+                settings=settings,
+                workers=workers,
+                ray=ray,
                 progress=live.show,
-            )  # fmt: skip
+            )
     except KeyboardInterrupt:
         print(f"stopped; finished files are kept in {out}; repeat the command to resume", file=sys.stderr)
         return 130
@@ -234,9 +246,16 @@ def write_contact_sheets(
     level = 3 if strength == "random" else int(strength)
     kind: Calibration = "paper" if calibration == "paper" else "physical"
     first, second = write_sheets(
-        source, out, version=version, channel=channel, scene=next(iter(scenes), None), boxes=rectangles,
-        severity=level, seed=seed, calibration=kind,
-    )  # fmt: skip
+        source,
+        out,
+        version=version,
+        channel=channel,
+        scene=next(iter(scenes), None),
+        boxes=rectangles,
+        severity=level,
+        seed=seed,
+        calibration=kind,
+    )
     print(f"all shifts: {first}\nall severities: {second}")
 
 

@@ -93,9 +93,16 @@ class Picture:
 
 
 def shift_pictures(
-    source: Path, out: Path, *, shifts: Sequence[str], severities: Sequence[Strength], settings: Mapping[str, Any],
-    workers: int | None = None, ray: str | None = None, progress: Callable[[int, int], None] = lambda done, of: None,
-) -> list[ShiftedFolder]:  # fmt: skip
+    source: Path,
+    out: Path,
+    *,
+    shifts: Sequence[str],
+    severities: Sequence[Strength],
+    settings: Mapping[str, Any],
+    workers: int | None = None,
+    ray: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[ShiftedFolder]:
     """Write OUT/SHIFT-SEVERITY with the files of a folder, its pictures shifted; goes on where it was stopped.
 
     The bytes depend neither on the number of workers nor on the cluster. OUT also holds the record of the work, as the
@@ -135,8 +142,9 @@ def shift_pictures(
     ) as store:
         wanted = [
             _picture(path, source, root, how=how, settings=settings)
-            for root, how in conditions.items() for path in pictures
-        ]  # fmt: skip
+            for root, how in conditions.items()
+            for path in pictures
+        ]
         for folder in {(one.root / one.key).parent for one in wanted}:
             remove_unfinished(folder)
         missing = [one for one in wanted if _name(one) not in store.results or not (one.root / one.key).is_file()]
@@ -160,9 +168,14 @@ def _picture(
         shift, 1 if strength == "random" else int(strength), seed=settings["seed"], calibration=settings["calibration"]
     )
     return Picture(
-        path, path.relative_to(source).as_posix(), root.absolute(), spec, strength == "random", settings["quality"],
+        path,
+        path.relative_to(source).as_posix(),
+        root.absolute(),
+        spec,
+        strength == "random",
+        settings["quality"],
         settings["subsampling"],
-    )  # fmt: skip
+    )
 
 
 def _name(one: Picture) -> str:
@@ -217,9 +230,14 @@ def camera_of(path: Path, image: U8) -> Camera:
 
 
 def _ended(
-    root: Path, source: Path, files: Sequence[Path], *, told: Mapping[str, Any], how: tuple[str, Strength],
+    root: Path,
+    source: Path,
+    files: Sequence[Path],
+    *,
+    told: Mapping[str, Any],
+    how: tuple[str, Strength],
     done: Mapping[str, Mapping[str, Any]],
-) -> ShiftedFolder:  # fmt: skip
+) -> ShiftedFolder:
     """Link what is no picture, say what was done, and count."""
     linked = 0
     for path in files:

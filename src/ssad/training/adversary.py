@@ -26,25 +26,60 @@ from ssad.world.selection import FreaSelection
 
 ADVERSARIES = {
     "adv-ppo": replace(
-        LEARNINGS["ppo"], steps=200_000, observation="adversary", action="adversary", reward="adversary", draws=6,
-        gamma=0.98, lr=3e-4, noise=0.6, entropy=0.002, validate=50_000,
+        LEARNINGS["ppo"],
+        steps=200_000,
+        observation="adversary",
+        action="adversary",
+        reward="adversary",
+        draws=6,
+        gamma=0.98,
+        lr=3e-4,
+        noise=0.6,
+        entropy=0.002,
+        validate=50_000,
     )
-}  # fmt: skip
+}
 ADVERSARIES |= {
     "frea": replace(ADVERSARIES["adv-ppo"], reward="feasible", steps=800_000, validate=250_000, seed=3),
     "adv-sac": replace(
-        LEARNINGS["sac"], steps=100_000, observation="adversary", action="adversary", reward="adversary", draws=6,
-        gamma=0.98, lr=3e-4, batch=256, validate=25_000,
+        LEARNINGS["sac"],
+        steps=100_000,
+        observation="adversary",
+        action="adversary",
+        reward="adversary",
+        draws=6,
+        gamma=0.98,
+        lr=3e-4,
+        batch=256,
+        validate=25_000,
     ),
     "adv-ddpg": replace(
-        LEARNINGS["td3"], algorithm="ddpg", steps=100_000, observation="adversary", action="adversary",
-        reward="adversary", draws=6, gamma=0.98, batch=256, validate=25_000,
+        LEARNINGS["td3"],
+        algorithm="ddpg",
+        steps=100_000,
+        observation="adversary",
+        action="adversary",
+        reward="adversary",
+        draws=6,
+        gamma=0.98,
+        batch=256,
+        validate=25_000,
     ),
     "adv-dqn": replace(
-        LEARNINGS["sac"], algorithm="dqn", steps=100_000, observation="adversary", action="adversary",
-        reward="adversary", draws=6, gamma=0.98, lr=5e-4, batch=256, noise=0.05, validate=25_000,
+        LEARNINGS["sac"],
+        algorithm="dqn",
+        steps=100_000,
+        observation="adversary",
+        action="adversary",
+        reward="adversary",
+        draws=6,
+        gamma=0.98,
+        lr=5e-4,
+        batch=256,
+        noise=0.05,
+        validate=25_000,
     ),
-}  # fmt: skip
+}
 """How adversaries are trained."""
 SCENARIOS = {"frea": ("training-lanes",)}
 """What they learn in unless told otherwise, where that is not the set `training`."""
@@ -168,9 +203,15 @@ def run_adversary_training(plan: AdversaryPlan, *, say: Say = print) -> Iterator
     where = f"{', '.join(plan.learned_in())}: {len(scenarios)} scenarios with traffic in {', '.join(graphs)}"
     path = plan.out / f"{plan.algorithm}.safetensors"
     yield finish(
-        path, learning, model, state=state, data=f"{where}; ego {plan.ego}", command=command_of(plan),
-        test=measure_all(plan), about={"ego": plan.ego},
-    )  # fmt: skip
+        path,
+        learning,
+        model,
+        state=state,
+        data=f"{where}; ego {plan.ego}",
+        command=command_of(plan),
+        test=measure_all(plan),
+        about={"ego": plan.ego},
+    )
 
 
 def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs: Any, ego: Driver) -> Any:
@@ -180,9 +221,17 @@ def _environment(learning: Learning, plan: AdversaryPlan, episodes: Any, graphs:
     from ssad.training.adversary_env import AdversaryEnv
 
     return AdversaryEnv(
-        episodes, graphs, learning.scenes, ego=ego, seed=learning.seed, reward=learning.reward, literal=plan.literal,
-        off_road=plan.off_road, scale=learning.reward_scale, action=learning.action,
-    )  # fmt: skip
+        episodes,
+        graphs,
+        learning.scenes,
+        ego=ego,
+        seed=learning.seed,
+        reward=learning.reward,
+        literal=plan.literal,
+        off_road=plan.off_road,
+        scale=learning.reward_scale,
+        action=learning.action,
+    )
 
 
 def measure_all(plan: AdversaryPlan) -> Callable[[Driver], dict[str, float]]:

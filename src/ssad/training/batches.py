@@ -279,11 +279,14 @@ def change_truths(
         solids = [Solids(**{name: values[k] for name, values in columns.items()}) for k in range(len(truths))]
     return [
         Truth(
-            labels[k], boxes[k], solids[k], None if lens is None else lens[k],
+            labels[k],
+            boxes[k],
+            solids[k],
+            None if lens is None else lens[k],
             crowd=None if solid is not None and truths[k].crowd is None else crowds[k],
         )
         for k in range(len(truths))
-    ]  # fmt: skip
+    ]
 
 
 def _changed_lens(

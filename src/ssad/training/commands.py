@@ -45,9 +45,18 @@ def train_detector(
     from ssad.training.detector import Plan, parse_changes, run_training
 
     plan = Plan(
-        recipe, (data, *(more or [])), out, split, val, parse_changes(change or []), weights=weights, device=device,
-        gpus=gpus, seconds=seconds, val_data=val_data,
-    )  # fmt: skip
+        recipe,
+        (data, *(more or [])),
+        out,
+        split,
+        val,
+        parse_changes(change or []),
+        weights=weights,
+        device=device,
+        gpus=gpus,
+        seconds=seconds,
+        val_data=val_data,
+    )
     for line in run_training(plan, say=lambda text: print(text, flush=True)):
         print(line)
 
@@ -76,9 +85,15 @@ def train_driver(
     from ssad.training.driver import DriverPlan, run_driver_training
 
     plan = DriverPlan(
-        algorithm, out, _names(scenarios), _names(test), parse_changes(change or []), seconds=seconds, device=device,
+        algorithm,
+        out,
+        _names(scenarios),
+        _names(test),
+        parse_changes(change or []),
+        seconds=seconds,
+        device=device,
         start=start,
-    )  # fmt: skip
+    )
     for line in run_driver_training(plan, say=lambda text: print(text, flush=True)):
         print(line)
 

@@ -94,11 +94,12 @@ def coco_truth(data: CocoSet, *, target: bool = False) -> list[Truth]:
     """
     return [
         Truth(
-            torch.from_numpy(image.label.astype(np.int64)), torch.from_numpy(image.box.astype(np.float32)),
+            torch.from_numpy(image.label.astype(np.int64)),
+            torch.from_numpy(image.box.astype(np.float32)),
             crowd=torch.from_numpy(~image.target if target else image.crowd.copy()),
         )
         for image in data.images
-    ]  # fmt: skip
+    ]
 
 
 def coco_items(folder: Path, split: str) -> tuple[tuple[str, ...], list[Item]]:
@@ -208,9 +209,17 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
     mine = items[share.rank :: share.world][: len(items) // share.world]
     say(f"{len(items)} pictures to learn from, {sum(len(i.truth.label) for i in items)} objects")
     final = train(
-        detector, fill(mine, device=device), recipe, out=plan.out, device=device,
-        validate=lambda d: validate(d, quick=True), say=say, share=share, seconds=plan.seconds, about=about,
-    )  # fmt: skip
+        detector,
+        fill(mine, device=device),
+        recipe,
+        out=plan.out,
+        device=device,
+        validate=lambda d: validate(d, quick=True),
+        say=say,
+        share=share,
+        seconds=plan.seconds,
+        about=about,
+    )
     if share.rank:
         return
     metrics = validate(final, quick=False)
@@ -221,10 +230,13 @@ def _run(plan: Plan, recipe: Recipe, device: str, share: Share, say: Say) -> Non
         say(f"stopped after {row['epoch']} of {row['of']} epochs; run it again to go on")
     folders = [*plan.data, *([plan.val_data] if plan.val_data else [])]
     card = Card(
-        data="; ".join(map(describe_data, folders)), command=command_of(plan), seed=recipe.seed,
-        metrics=metrics, classes=tuple(final.classes),
+        data="; ".join(map(describe_data, folders)),
+        command=command_of(plan),
+        seed=recipe.seed,
+        metrics=metrics,
+        classes=tuple(final.classes),
         config=recipe_data(recipe) | {"epochs_done": row["epoch"]} | before,
-    )  # fmt: skip
+    )
     save_weights(weights, final.state_dict(), card=card, half=True)
     draw_curves(plan.out)
 
@@ -314,10 +326,13 @@ def command_of(plan: Plan) -> str:
     for folder in plan.data[1:]:
         words += ["--more", folder.name]
     for option, value, usual in (
-        ("--val-data", plan.val_data and plan.val_data.name, None), ("--split", plan.split, "train"),
-        ("--val", plan.val, "val"), ("--weights", plan.weights and plan.weights.name, None), ("--gpus", plan.gpus, 1),
+        ("--val-data", plan.val_data and plan.val_data.name, None),
+        ("--split", plan.split, "train"),
+        ("--val", plan.val, "val"),
+        ("--weights", plan.weights and plan.weights.name, None),
+        ("--gpus", plan.gpus, 1),
         ("--seconds", plan.seconds, None),
-    ):  # fmt: skip
+    ):
         words += [option, str(value)] if value != usual else []
     return shlex.join([*words, *set_words(plan.changes)])
 

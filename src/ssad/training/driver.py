@@ -142,9 +142,14 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     from ssad.world.sb3 import SB3VecEnv
 
     env = VectorEnv(
-        episodes, graphs, learning.scenes, observation=learning.observation, action=learning.action,  # type: ignore[arg-type]
-        reward=lambda state: learning.reward_scale * reward(state), policies=make_system,
-    )  # fmt: skip
+        episodes,
+        graphs,
+        learning.scenes,
+        observation=learning.observation,
+        action=learning.action,  # type: ignore[arg-type]
+        reward=lambda state: learning.reward_scale * reward(state),
+        policies=make_system,
+    )
     model = make_model(learning, SB3VecEnv(env), device=plan.device)
     begun = "" if plan.start is None else begin_with(model, learning, plan.start)
     held = draw_episodes(scenarios, graphs, draws=2, seed=VALIDATION_SEED)[len(scenarios) :]
@@ -157,8 +162,14 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
     keys = (safeio.dump_json([e.key, e.seed]) for e in episodes)
     about = digest("driver training", *keys, *([begun] if begun else []))[:16]
     state = learn(
-        model, learning, plan.out, validate=validate, say=say, seconds=plan.seconds, about=about,
-    )  # fmt: skip
+        model,
+        learning,
+        plan.out,
+        validate=validate,
+        say=say,
+        seconds=plan.seconds,
+        about=about,
+    )
     if state["steps"] < learning.steps:
         say(f"stopped after {state['steps']} of {learning.steps} steps; run it again to go on")
     data = f"{', '.join(plan.scenarios)}: {len(scenarios)} scenarios in {', '.join(graphs)}"

@@ -147,18 +147,27 @@ def train(
         spent, quickest = spent + took, min(quickest, took)
         ends = recipe.last_epoch(epoch, spent, quickest)
         row: dict[str, Any] = {
-            "epoch": epoch, "of": ends, "lr": rate, "images_s": round(shown / took, 1),
+            "epoch": epoch,
+            "of": ends,
+            "lr": rate,
+            "images_s": round(shown / took, 1),
             **{f"loss_{name}": round(float(value) / per_epoch, 5) for name, value in sums.items()},
-        }  # fmt: skip
+        }
         if not all(math.isfinite(v) for v in row.values()):
             raise ConfigError(f"the loss is not finite in epoch {epoch}; use a smaller lr")
         if share.rank == 0:
             final = average if average is not None else detector
             state = {
-                "model": detector.state_dict(), "average": None if average is None else average.state_dict(),
-                "optimizer": optimizer.state_dict(), "epoch": epoch, "step": step, "spent": spent, "quickest": quickest,
-                "about": about, "recipe": safeio.dump_json(recipe_data(recipe)),
-            }  # fmt: skip
+                "model": detector.state_dict(),
+                "average": None if average is None else average.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "epoch": epoch,
+                "step": step,
+                "spent": spent,
+                "quickest": quickest,
+                "about": about,
+                "recipe": safeio.dump_json(recipe_data(recipe)),
+            }
             _save(out, state, row)
             if validate is not None and epoch % recipe.validate == 0 and epoch < ends:
                 row |= validate(final.eval())

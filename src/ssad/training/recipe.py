@@ -140,18 +140,41 @@ class Recipe:
 def _official(detector: str, lr: float, **changes: Any) -> Recipe:
     """As mmdetection3d 1.4 trains its nuScenes models, 1x: SGD, 12 epochs, a tenth after 8 and 11."""
     base = Recipe(
-        detector, 12, 16, lr, optimizer="sgd", weight_decay=1e-4, schedule="step", steps=(8, 11), warmup=500, clip=35.0,
-        average=0.0, amp=False, freeze=("backbone.conv1", "backbone.bn1", "backbone.layer1"), norm_eval=True,
-        jitter=0.0, noise=0.0,
-    )  # fmt: skip
+        detector,
+        12,
+        16,
+        lr,
+        optimizer="sgd",
+        weight_decay=1e-4,
+        schedule="step",
+        steps=(8, 11),
+        warmup=500,
+        clip=35.0,
+        average=0.0,
+        amp=False,
+        freeze=("backbone.conv1", "backbone.bn1", "backbone.layer1"),
+        norm_eval=True,
+        jitter=0.0,
+        noise=0.0,
+    )
     return replace(base, **changes)
 
 
 # The paper: SGD, momentum 0.99, weight decay 4e-4, from 0.01 to 0.001, from COCO weights
 _PAPER_YOLO = Recipe(
-    "yolov3", 100, 16, 0.01, optimizer="sgd", momentum=0.99, weight_decay=4e-4, schedule="linear", last=0.1, clip=10.0,
-    zoom=(0.6, 1.4), keep=0.3,
-)  # fmt: skip
+    "yolov3",
+    100,
+    16,
+    0.01,
+    optimizer="sgd",
+    momentum=0.99,
+    weight_decay=4e-4,
+    schedule="linear",
+    last=0.1,
+    clip=10.0,
+    zoom=(0.6, 1.4),
+    keep=0.3,
+)
 _LIGHT_3D = Recipe("fcos3d-light", 24, 32, 1e-3, zoom=(0.8, 1.3), weight_decay=0.02, validate=8, rare=0.1)
 _LIGHT_2D = Recipe("yolov5n", 60, 32, 2e-3, zoom=(0.4, 1.6), weight_decay=0.02, validate=20, keep=0.3)
 

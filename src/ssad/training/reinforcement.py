@@ -129,20 +129,32 @@ def make_model(learning: Learning, env: Any, *, device: str = "cpu") -> Any:
         return last + (first - last) * left
 
     common: dict[str, Any] = {
-        "learning_rate": rate, "gamma": learning.gamma, "batch_size": learning.batch, "seed": learning.seed,
+        "learning_rate": rate,
+        "gamma": learning.gamma,
+        "batch_size": learning.batch,
+        "seed": learning.seed,
         "device": device,
-    }  # fmt: skip
+    }
     nets: dict[str, Any] = {"net_arch": list(learning.hidden), "activation_fn": torch.nn.ReLU}
     if learning.algorithm == "ppo":
         nets["log_std_init"] = math.log(learning.noise)
         return sb3.PPO(
-            "MlpPolicy", env, n_steps=learning.rollout, n_epochs=learning.epochs, gae_lambda=learning.gae,
-            ent_coef=learning.entropy, policy_kwargs=nets, **common,
-        )  # fmt: skip
+            "MlpPolicy",
+            env,
+            n_steps=learning.rollout,
+            n_epochs=learning.epochs,
+            gae_lambda=learning.gae,
+            ent_coef=learning.entropy,
+            policy_kwargs=nets,
+            **common,
+        )
     more: dict[str, Any] = {
-        "buffer_size": learning.buffer, "learning_starts": learning.first, "train_freq": 1,
-        "gradient_steps": learning.updates, "policy_kwargs": nets,
-    }  # fmt: skip
+        "buffer_size": learning.buffer,
+        "learning_starts": learning.first,
+        "train_freq": 1,
+        "gradient_steps": learning.updates,
+        "policy_kwargs": nets,
+    }
     if learning.algorithm in ("td3", "ddpg"):
         size = env.action_space.shape
         more["action_noise"] = sb3.common.noise.NormalActionNoise(np.zeros(size), np.full(size, learning.noise))

@@ -65,8 +65,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """
 
     metadata = {  # noqa: RUF012
-        "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP, "render_modes": ["rgb_array"], "render_fps": 10,
-    }  # fmt: skip
+        "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP,
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(
         self,

@@ -36,12 +36,17 @@ class SceneViews:
         time, share = float(state.time[scene]), float(state.route_complete[scene])
         return self._towns[episode.town].draw(
             Moment(
-                pose, state.size[scene], state.kind[scene], state.active[scene],
-                state.roads.path[first : first + count, :2], np.zeros((0, 2)), lamps,  # type: ignore[arg-type]
+                pose,
+                state.size[scene],
+                state.kind[scene],
+                state.active[scene],
+                state.roads.path[first : first + count, :2],
+                np.zeros((0, 2)),
+                lamps,  # type: ignore[arg-type]
                 hit=6 if state.contact[scene] else None,
                 words=[f"{time:5.1f} s   {float(state.speed[scene, 0]):5.1f} m/s   route {share:3.0f} %"],
             )
-        )  # fmt: skip
+        )
 
 
 class Window:

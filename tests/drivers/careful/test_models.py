@@ -14,8 +14,17 @@ from ssad.drivers.careful.models import FSM, RSS, CarefulHuman, CarefulModel, Re
 
 def meet(**given: float) -> Encounter:
     """A slower car 20 m ahead in the lane, but for what is given."""
-    plain = {"speed": 20.0, "accel": 0.0, "gap": 20.0, "lead": 10.0, "lateral": -1.9, "approach": 0.0,
-             "through": np.inf, "length": 8.6, "moved": 0.0}  # fmt: skip
+    plain = {
+        "speed": 20.0,
+        "accel": 0.0,
+        "gap": 20.0,
+        "lead": 10.0,
+        "lateral": -1.9,
+        "approach": 0.0,
+        "through": np.inf,
+        "length": 8.6,
+        "moved": 0.0,
+    }
     return Encounter(**{name: np.array([value], np.float64) for name, value in (plain | given).items()})
 
 

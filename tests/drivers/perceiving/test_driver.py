@@ -42,12 +42,22 @@ def run(driver: Any, made: list[Episode], town: Any, **more: Any) -> list[Any]:
 def steady_view(time: float, scenes: int = 1, **readings: Any) -> Observation:
     none = np.zeros(scenes, np.float32)
     return Observation(
-        scene=np.arange(scenes, dtype=np.int32), agent=np.zeros(scenes, np.int32), time=none + np.float32(time),
-        speed=none, accel=none, pose=np.zeros((scenes, 3), np.float32), target_speed=none,
-        route=np.zeros((scenes, 40, 2), np.float32), lane_offset=none, heading_error=none,
-        others=np.zeros((scenes, 16, 7), np.float32), others_lane=np.zeros((scenes, 16), np.uint8),
-        signal=np.zeros((scenes, 2), np.float32), done=np.zeros(scenes, bool), readings=readings,
-    )  # fmt: skip
+        scene=np.arange(scenes, dtype=np.int32),
+        agent=np.zeros(scenes, np.int32),
+        time=none + np.float32(time),
+        speed=none,
+        accel=none,
+        pose=np.zeros((scenes, 3), np.float32),
+        target_speed=none,
+        route=np.zeros((scenes, 40, 2), np.float32),
+        lane_offset=none,
+        heading_error=none,
+        others=np.zeros((scenes, 16, 7), np.float32),
+        others_lane=np.zeros((scenes, 16), np.uint8),
+        signal=np.zeros((scenes, 2), np.float32),
+        done=np.zeros(scenes, bool),
+        readings=readings,
+    )
 
 
 class OneCar:
@@ -63,9 +73,12 @@ class OneCar:
         for image in images:
             n = int(image.mean() > 0.5)
             solid = Solids(
-                torch.tensor([[0.0, 0.8, 15.0]])[:n], torch.tensor([[4.5, 1.6, 1.9]])[:n], torch.zeros(1)[:n],
-                torch.zeros(1, 2)[:n], torch.zeros(1, dtype=torch.int64)[:n],
-            )  # fmt: skip
+                torch.tensor([[0.0, 0.8, 15.0]])[:n],
+                torch.tensor([[4.5, 1.6, 1.9]])[:n],
+                torch.zeros(1)[:n],
+                torch.zeros(1, 2)[:n],
+                torch.zeros(1, dtype=torch.int64)[:n],
+            )
             one = Detections(torch.ones(1)[:n], torch.ones(1, dtype=torch.int64)[:n], torch.zeros(1, 4)[:n], solid)
             found.append(self.change(one))
         return found

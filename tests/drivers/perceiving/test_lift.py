@@ -161,7 +161,10 @@ def random_detections(draws: np.random.Generator, count: int) -> Detections:
     box = np.column_stack([corner, corner + draws.uniform(5.0, 200.0, (count, 2))])
     tensor = torch.from_numpy
     solid = Solids(
-        tensor(place), tensor(size), tensor(draws.uniform(-3.0, 3.0, count)), tensor(draws.normal(size=(count, 2))),
+        tensor(place),
+        tensor(size),
+        tensor(draws.uniform(-3.0, 3.0, count)),
+        tensor(draws.normal(size=(count, 2))),
         torch.zeros(count, dtype=torch.int64),
-    )  # fmt: skip
+    )
     return Detections(tensor(draws.uniform(0.1, 1.0, count)), tensor(draws.integers(0, 10, count)), tensor(box), solid)

@@ -18,10 +18,15 @@ STEP = 0.2
 def objects(*places: tuple[float, float], scene: int = 0, score: float = 0.9, yaw: float = 0.0) -> Objects:
     n = len(places)
     return Objects(
-        np.full(n, scene), np.array(places, float).reshape(n, 2), np.tile(0.09 * np.eye(2), (n, 1, 1)),
-        np.full(n, yaw), np.tile([4.5, 1.9], (n, 1)), np.full((n, 2), np.nan), np.full(n, int(AgentKind.CAR)),
+        np.full(n, scene),
+        np.array(places, float).reshape(n, 2),
+        np.tile(0.09 * np.eye(2), (n, 1, 1)),
+        np.full(n, yaw),
+        np.tile([4.5, 1.9], (n, 1)),
+        np.full((n, 2), np.nan),
+        np.full(n, int(AgentKind.CAR)),
         np.full(n, score),
-    )  # fmt: skip
+    )
 
 
 def look(tracker: Tracker, k: int, found: Objects) -> None:

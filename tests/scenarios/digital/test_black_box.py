@@ -64,14 +64,17 @@ def moved_exactly(images: Tensor, clean: Tensor, budget: Budget) -> float:
 @pytest.mark.parametrize("budget", BUDGETS, ids=str)
 def test_an_image_does_not_know_its_batch(name: str, options: dict[str, Any], queries: int, budget: Budget) -> None:
     detector, (images, truth), keys = ToyDetector(), toy_scene(2), [("a",), ("b",)]
-    both = run_attack(
-        make_attack(name, **options), detector, images, truth, budget, objective=TrueLogits(), keys=keys
-    )  # fmt: skip
+    both = run_attack(make_attack(name, **options), detector, images, truth, budget, objective=TrueLogits(), keys=keys)
     for k in range(2):
         alone = run_attack(
-            make_attack(name, **options), detector, images[k : k + 1], truth[k : k + 1], budget,
-            objective=TrueLogits(), keys=keys[k : k + 1],
-        )  # fmt: skip
+            make_attack(name, **options),
+            detector,
+            images[k : k + 1],
+            truth[k : k + 1],
+            budget,
+            objective=TrueLogits(),
+            keys=keys[k : k + 1],
+        )
         assert torch.equal(alone.images[0], both.images[k])
         assert alone.cost == both.cost
 

@@ -89,9 +89,14 @@ def test_an_image_fares_the_same_alone(name: str) -> None:
     together = run_attack(make_attack(name, **options), detector, images, truth, budget, objective=loss, keys=keys)
     for k in range(3):
         alone = run_attack(
-            make_attack(name, **options), detector, images[k : k + 1], truth[k : k + 1], budget, objective=loss,
+            make_attack(name, **options),
+            detector,
+            images[k : k + 1],
+            truth[k : k + 1],
+            budget,
+            objective=loss,
             keys=keys[k : k + 1],
-        )  # fmt: skip
+        )
         assert torch.equal(alone.images[0], together.images[k])
 
 
@@ -220,10 +225,12 @@ def test_a_detector_without_gradients_is_named(check: bool) -> None:
 @pytest.mark.parametrize(
     ("images", "message"),
     [
-        (torch.zeros(0, 3, 8, 8), "images"), (torch.zeros(2, 3, 8, 8, dtype=torch.uint8), "of floats"),
-        (torch.full((2, 3, 48, 64), 0.5), "8 bits"), (torch.zeros(1, 3, 48, 64), "truth of 2"),
+        (torch.zeros(0, 3, 8, 8), "images"),
+        (torch.zeros(2, 3, 8, 8, dtype=torch.uint8), "of floats"),
+        (torch.full((2, 3, 48, 64), 0.5), "8 bits"),
+        (torch.zeros(1, 3, 48, 64), "truth of 2"),
     ],
-)  # fmt: skip
+)
 def test_bad_images_are_one_line(images: Tensor, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         run_attack(make_attack("pgd"), ToyDetector(), images, toy_scene()[1], Budget(px(5)))

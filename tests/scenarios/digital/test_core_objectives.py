@@ -75,9 +75,14 @@ def test_gradients_through_deformable_convolution() -> None:
 
 @pytest.mark.parametrize(
     ("detector", "name"),
-    [("yolov5n", "vanish"), ("yolov5n", "mislabel"), ("yolov5n", "localisation"), ("yolov3-tiny", "margin"),
-     ("yolov3-tiny", "fabricate")],
-)  # fmt: skip
+    [
+        ("yolov5n", "vanish"),
+        ("yolov5n", "mislabel"),
+        ("yolov5n", "localisation"),
+        ("yolov3-tiny", "margin"),
+        ("yolov3-tiny", "fabricate"),
+    ],
+)
 def test_gradients_of_yolo(detector: str, name: str) -> None:
     made, images, lens, truth = seen_by(detector)
     objective = Mislabel(confidence=100.0) if name == "mislabel" else make_objective(name)
@@ -153,9 +158,14 @@ def test_an_aim_needs_known_classes_and_a_loss_that_can_aim() -> None:
     images, truth = toy_scene(1)
     with pytest.raises(UnknownNameError, match="tram"):
         run_attack(
-            make_attack("fgsm"), ToyDetector(), images, truth, Budget(px(5)), objective="vanish",
+            make_attack("fgsm"),
+            ToyDetector(),
+            images,
+            truth,
+            Budget(px(5)),
+            objective="vanish",
             aim=Aim(classes=("tram",)),
-        )  # fmt: skip
+        )
     for name, message in (("full", "is of all objects"), ("fabricate", "takes no classes")):
         with pytest.raises(ConfigError, match=message):
             run_attack(
@@ -163,9 +173,12 @@ def test_an_aim_needs_known_classes_and_a_loss_that_can_aim() -> None:
             )
     with pytest.raises(ConfigError, match="one class"):
         run_attack(
-            make_attack("fgsm"), ToyDetector(("car",)), *toy_scene(1, classes=("car",)), Budget(px(5)),
+            make_attack("fgsm"),
+            ToyDetector(("car",)),
+            *toy_scene(1, classes=("car",)),
+            Budget(px(5)),
             objective="mislabel",
-        )  # fmt: skip
+        )
 
 
 def test_margin_stops_below_the_threshold() -> None:
@@ -269,7 +282,7 @@ class OverBudget(PGD):
         (PGD(), Shared(), "depends on the other images"),
         (OverBudget(), "full", "the budget is 6"),
     ],
-)  # fmt: skip
+)
 def test_weak_attacks_are_told(attack: Any, objective: Any, message: str) -> None:
     images, truth = toy_scene(2)
     faults = find_weaknesses(attack, ToyDetector(), images, truth, Budget(px(6)), objective=objective)
@@ -278,9 +291,18 @@ def test_weak_attacks_are_told(attack: Any, objective: Any, message: str) -> Non
 
 @pytest.mark.parametrize(
     ("name", "objective"),
-    [("pgd", "full"), ("pgd", "margin"), ("pgd", "vanish"), ("cw", "margin"), ("apgd", "full"), ("apgd", "margin"),
-     ("momentum", "full"), ("fgsm", "full"), ("noise", "full")],
-)  # fmt: skip
+    [
+        ("pgd", "full"),
+        ("pgd", "margin"),
+        ("pgd", "vanish"),
+        ("cw", "margin"),
+        ("apgd", "full"),
+        ("apgd", "margin"),
+        ("momentum", "full"),
+        ("fgsm", "full"),
+        ("noise", "full"),
+    ],
+)
 def test_sound_attacks_pass(name: str, objective: str) -> None:
     images, truth = toy_scene(2)
     budget = Budget(px(10))

@@ -107,8 +107,9 @@ def test_a_defended_detector_is_a_detector(defence: Defence, task: str) -> None:
     lens = LENS[None].expand(2, 3, 3) if task == "3d" else None
     shown = defence(images)
     assert torch.equal(detector.dense(images, lens).logit, bare.dense(shown, lens).logit)
-    for one, other in zip(detector.predict(images, lens, threshold=0.1), bare.predict(shown, lens, threshold=0.1),
-                          strict=True):  # fmt: skip
+    for one, other in zip(
+        detector.predict(images, lens, threshold=0.1), bare.predict(shown, lens, threshold=0.1), strict=True
+    ):
         assert torch.equal(one.box, other.box)
         assert torch.equal(one.score, other.score)
     through = run_attack(PGD(), bare, images, truth, BUDGET, objective="full", intrinsic=lens, through=defence)
@@ -184,7 +185,7 @@ def test_expectation_is_the_mean_over_the_draws() -> None:
     for case in cases:
         found = run_attack(
             Expected(Ask(), resize, draws=3), images=images, truth=truth, budget=BUDGET, objective=Vanish(), **case
-        )  # fmt: skip
+        )
         assert (found.cost.queries, found.cost.gradients) == (3, 3)
         assert found.about["attack"] == "ask-over-resize-0.5"
     parts = [Victim(detector, images, truth, Vanish(), through=resize.drawn(k)).gradient(images) for k in range(3)]

@@ -33,9 +33,12 @@ def solids(rows: list[tuple[float, float, float]]) -> Solids:
     """Boxes at centres x, y, z."""
     many = len(rows)
     return Solids(
-        torch.tensor(rows).view(-1, 3), torch.ones(many, 3), torch.zeros(many), torch.zeros(many, 2),
+        torch.tensor(rows).view(-1, 3),
+        torch.ones(many, 3),
+        torch.zeros(many),
+        torch.zeros(many, 2),
         torch.zeros(many, dtype=torch.long),
-    )  # fmt: skip
+    )
 
 
 def test_quality_of_boxes_by_hand() -> None:
@@ -106,9 +109,11 @@ def test_quality_of_solids_by_hand() -> None:
 def test_what_is_not_attacked_is_crowd() -> None:
     truth = Truth(torch.tensor([0, 1, 1]), BOX[:3], crowd=torch.tensor([False, False, True]))
     for aim, wanted in (
-        (Aim(), [False, False, True]), (Aim(classes=("b",)), [True, False, True]),
-        (Aim(objects=(0, 2)), [False, True, True]), (Aim(becomes={"a": "b"}), [False, True, True]),
-    ):  # fmt: skip
+        (Aim(), [False, False, True]),
+        (Aim(classes=("b",)), [True, False, True]),
+        (Aim(objects=(0, 2)), [False, True, True]),
+        (Aim(becomes={"a": "b"}), [False, True, True]),
+    ):
         assert of_aim(truth, aim, ("a", "b")).crowd.tolist() == wanted  # type: ignore[union-attr]
 
 
@@ -163,7 +168,7 @@ def test_different_members_win_in_different_images() -> None:
     images, truth = toy_scene(8, objects=5)
     found = run_ensemble(
         Ensemble([(Erase((0, 1)), "full"), (Erase((2, 3)), "full")]), detector, images, truth, Budget(px(10))
-    )  # fmt: skip
+    )
     assert set(found.about["won"]) == {0, 1}
 
 
@@ -185,9 +190,13 @@ def test_of_equal_members_the_noisier_wins_and_then_the_first() -> None:
 def test_a_defence_stands_before_the_judge_too() -> None:
     detector, (images, truth) = ToyDetector(), toy_scene(1)
     blank = run_ensemble(
-        Ensemble([(make_attack("noise"), "full")]), detector, images, truth, Budget(px(1)),
+        Ensemble([(make_attack("noise"), "full")]),
+        detector,
+        images,
+        truth,
+        Budget(px(1)),
         through=lambda x: 0 * x + 0.5,
-    )  # fmt: skip
+    )
     assert blank.about["clean_quality"] == [0.0]
 
 

@@ -62,9 +62,7 @@ def test_chosen_objects_keep_their_numbers_when_others_are_left_out() -> None:
         attack = Transfer(surrogate, PGD(start="none"), Vanish())
         if not any(known):
             continue
-        found = run_attack(
-            attack, victim, images, truth, BUDGET, objective=Vanish(), aim=Aim(objects=(number,))
-        ).images  # fmt: skip
+        found = run_attack(attack, victim, images, truth, BUDGET, objective=Vanish(), aim=Aim(objects=(number,))).images
         for k in range(2):
             for other in range(6):
                 same = torch.equal(cell(found[k], truth[k], other), cell(images[k], truth[k], other))
@@ -79,7 +77,7 @@ def test_an_image_does_not_know_its_batch() -> None:
     for k in range(2):
         alone = run_attack(
             attack, ToyDetector(), images[k : k + 1], truth[k : k + 1], BUDGET, objective="full", keys=keys[k : k + 1]
-        )  # fmt: skip
+        )
         assert torch.equal(alone.images[0], both[k])
 
 
@@ -100,9 +98,14 @@ def test_a_2d_surrogate_serves_a_3d_victim_and_the_other_way_round() -> None:
     for victim, surrogate in (("3d", "2d"), ("2d", "3d")):
         attack = Transfer(ToyDetector(task=surrogate, seed=2), PGD(), TrueLogits())  # type: ignore[arg-type]
         found = run_attack(
-            attack, ToyDetector(task=victim), images, truth, BUDGET, objective=TrueLogits(),  # type: ignore[arg-type]
+            attack,
+            ToyDetector(task=victim),
+            images,
+            truth,
+            BUDGET,
+            objective=TrueLogits(),  # type: ignore[arg-type]
             intrinsic=lens if victim == "3d" else None,
-        )  # fmt: skip
+        )
         assert bool((found.after > found.before + 5).all())
 
 
@@ -119,9 +122,14 @@ def test_bad_input_is_named() -> None:
     aim = Aim(becomes={"car": "pedestrian"})
     with pytest.raises(ConfigError, match="knows the class of none of the attacked objects"):
         run_attack(
-            Transfer(ToyDetector(("car", "tree")), PGD(), "mislabel"), ToyDetector(), images, truth, BUDGET,
-            objective="mislabel", aim=aim,
-        )  # fmt: skip
+            Transfer(ToyDetector(("car", "tree")), PGD(), "mislabel"),
+            ToyDetector(),
+            images,
+            truth,
+            BUDGET,
+            objective="mislabel",
+            aim=aim,
+        )
     with pytest.raises(UnknownNameError, match="loss"):
         Transfer(stranger, PGD(), "fulll")
     with pytest.raises(ConfigError, match="attack transfer: "):

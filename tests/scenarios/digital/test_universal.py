@@ -22,8 +22,11 @@ def test_it_raises_the_loss_of_pictures_that_it_was_not_fitted_to(budget: Budget
     detector = ToyDetector()
     images, truth = toy_scene(4)
     change = fit_universal(
-        [Victim(detector, images, truth, Fabricate())], budget, epochs=10, method=method  # type: ignore[arg-type]
-    )  # fmt: skip
+        [Victim(detector, images, truth, Fabricate())],
+        budget,
+        epochs=10,
+        method=method,  # type: ignore[arg-type]
+    )
     size = change.abs().max() if budget.norm == "linf" else change.norm()
     assert 0.9 * budget.radius < float(size) <= budget.radius * (1 + 1e-6)
     fresh, fresh_truth = toy_scene(4, seed=1)

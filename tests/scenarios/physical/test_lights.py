@@ -49,10 +49,18 @@ SETTINGS: dict[str, dict[str, float]] = {
     "shadow": {"left_a": -0.8, "up_a": 0.1, "left_b": 0.8, "up_b": 0.2, "left_c": 0.1, "up_c": 1.3},
     "laser": {"watts": 0.05, "wavelength": 550.0, "width": 0.3, "angle": 0.3, "aim_left": 0.0, "aim_up": 0.8},
     "flashlight": {
-        "lumens": 20.0, "distance": 6.0, "height": 1.5, "aside": 0.1, "aim_left": 0.2, "aim_up": 0.8, "beam": 0.12,
-        "red": 1.0, "green": 0.5, "blue": 0.2,
+        "lumens": 20.0,
+        "distance": 6.0,
+        "height": 1.5,
+        "aside": 0.1,
+        "aim_left": 0.2,
+        "aim_up": 0.8,
+        "beam": 0.12,
+        "red": 1.0,
+        "green": 0.5,
+        "blue": 0.2,
     },
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -123,9 +131,13 @@ def test_a_lamp_gives_no_more_light_than_its_power(scene: Scene, attack: LightAt
     points = torch.from_numpy(grid @ lamp.pose[:3, :3].T + lamp.pose[:3, 3])
     normal = torch.from_numpy(np.broadcast_to(-lamp.pose[:3, 2], grid.shape).copy())
     plane = replace(
-        lit(scene, attack.name), position=points, normal=normal, answer=torch.ones_like(points), fog=0.0,
+        lit(scene, attack.name),
+        position=points,
+        normal=normal,
+        answer=torch.ones_like(points),
+        fog=0.0,
         radiance=torch.zeros_like(points),
-    )  # fmt: skip
+    )
     light = attack.change(at_values(values), plane, TARGET)[0].numpy()
     lumens = (light @ [0.2126, 0.7152, 0.0722]).sum() * (x[1] - x[0]) * (y[1] - y[0]) / per_lux(Weather(-0.3))
     power = attack.power(values)
@@ -153,7 +165,7 @@ def test_the_eye_sees_green_and_not_infrared() -> None:
     found = matching(torch.tensor([450.0, 555.0, 650.0])).numpy()
     assert found == pytest.approx(
         np.array([[0.336, 0.038, 1.772], [0.512, 1.0, 0.0057], [0.2835, 0.107, 0.0]]), abs=0.03
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -267,9 +279,16 @@ def test_a_wrong_light_ends_in_one_line(name: str, options: Any, error: type[Exc
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("members", 0), ("members", 200), ("search", "luck"), ("patience", 3), ("searches", 0), ("settings", 2.5),
-     ("window", 100)],
-)  # fmt: skip
+    [
+        ("members", 0),
+        ("members", 200),
+        ("search", "luck"),
+        ("patience", 3),
+        ("searches", 0),
+        ("settings", 2.5),
+        ("window", 100),
+    ],
+)
 def test_a_wrong_search_ends_in_one_line(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"attack laser: .*{key}") as found:
         budget_of({key: value}, "laser")

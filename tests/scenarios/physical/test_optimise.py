@@ -207,13 +207,34 @@ def test_a_target_that_is_never_in_view_is_said() -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("epochs", 0), ("epochs", 2.5), ("batch", 0), ("batch", 2.5), ("batch", True), ("rate", 0.0), ("rate", "fast"),
-        ("rate", float("nan")), ("optimiser", "lbfgs"), ("worst", 1.5), ("stealth", -1.0), ("smooth", "x"),
-        ("smooth", -1.0), ("printed", -1.0), ("decay", -1.0), ("window", 200), ("window", 96), ("window", "256"),
-        ("objective", "hid"), ("objective", 3), ("expectation", 3), ("expectation", {"noise": "x"}),
-        ("expectation", {"nois": 0.2}), ("expectation", {"contrast": [1.2, 0.8]}), ("name", "x"), ("speed", 3),
+        ("epochs", 0),
+        ("epochs", 2.5),
+        ("batch", 0),
+        ("batch", 2.5),
+        ("batch", True),
+        ("rate", 0.0),
+        ("rate", "fast"),
+        ("rate", float("nan")),
+        ("optimiser", "lbfgs"),
+        ("worst", 1.5),
+        ("stealth", -1.0),
+        ("smooth", "x"),
+        ("smooth", -1.0),
+        ("printed", -1.0),
+        ("decay", -1.0),
+        ("window", 200),
+        ("window", 96),
+        ("window", "256"),
+        ("objective", "hid"),
+        ("objective", 3),
+        ("expectation", 3),
+        ("expectation", {"noise": "x"}),
+        ("expectation", {"nois": 0.2}),
+        ("expectation", {"contrast": [1.2, 0.8]}),
+        ("name", "x"),
+        ("speed", 3),
     ],
-)  # fmt: skip
+)
 def test_settings_that_cannot_be_are_refused_in_one_line(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=f"attack vanishing: .*{key}") as found:
         make_physical("vanishing", **{key: value})

@@ -26,7 +26,7 @@ from ssad.scenarios.static.physical.shipped import (
 
 CARD = TextureCard(
     "vanishing", "camouflage", {"texels": 32}, "yolov5n", "abc", "sedan:silver:0", "d", "c", 3, {"AP50": 0.1}
-)  # fmt: skip
+)
 
 
 def picture(side: int = 32) -> U8:
@@ -109,6 +109,8 @@ def test_a_texture_that_does_not_fit_is_refused(
     save_texture(tmp_path / "mine", picture(side), CARD)
     entry = {"name": "vanishing", "texture": str(tmp_path / "mine.json")} | change
     with pytest.raises(ConfigError, match=message):
-        Physical().plan(PhysicalSuite.model_validate(
-            {"kind": "physical", "name": "t", "detectors": ["yolov5n"], "attacks": [entry]}
-        ))  # fmt: skip
+        Physical().plan(
+            PhysicalSuite.model_validate(
+                {"kind": "physical", "name": "t", "detectors": ["yolov5n"], "attacks": [entry]}
+            )
+        )

@@ -39,21 +39,62 @@ _BLUNT = ((0.0, 0.93), (0.03, 0.985), (0.08, 1.0), (0.95, 1.0), (1.0, 0.98))
 CAB = Shell(
     top=((0.0, 0.93), (0.06, 0.985), (0.25, 1.0), (1.0, 1.0)),
     belt=((0.0, 0.44), (0.3, 0.46), (1.0, 0.50)),
-    plan=_BLUNT, cowl=0.0, screen=0.0, roof=1.0, deck=1.0, windows=((0.06, 0.62),), doors=(("front_door", 0.05, 0.72),),
-    axles=(0.55, 0.55), radius=0.178, sill=0.19, tumble=0.06, body=1.0, nose=0.05, tail=0.01, lamps=(S1, S2),
-    lamp_from=0.62, grille=(S3, S4), tail_lamps=(S4, S4), glass_gap=0.04, rear_window=False, wheel_width=0.3,
-)  # fmt: skip
+    plan=_BLUNT,
+    cowl=0.0,
+    screen=0.0,
+    roof=1.0,
+    deck=1.0,
+    windows=((0.06, 0.62),),
+    doors=(("front_door", 0.05, 0.72),),
+    axles=(0.55, 0.55),
+    radius=0.178,
+    sill=0.19,
+    tumble=0.06,
+    body=1.0,
+    nose=0.05,
+    tail=0.01,
+    lamps=(S1, S2),
+    lamp_from=0.62,
+    grille=(S3, S4),
+    tail_lamps=(S4, S4),
+    glass_gap=0.04,
+    rear_window=False,
+    wheel_width=0.3,
+)
 BUS = Shell(
     top=((0.0, 0.955), (0.012, 0.985), (0.04, 1.0), (0.97, 1.0), (1.0, 0.98)),
     belt=((0.0, 0.33), (0.04, 0.36), (0.09, 0.40), (1.0, 0.40)),
-    plan=((0.0, 0.93), (0.01, 0.98), (0.03, 1.0), (0.97, 1.0), (1.0, 0.97)), cowl=0.0, screen=0.0, roof=1.0, deck=1.0,
-    windows=((0.012, 0.085), (0.095, 0.205), (0.213, 0.325), (0.333, 0.445), (0.453, 0.565), (0.573, 0.685),
-             (0.693, 0.805), (0.813, 0.94)),
-    doors=(("front_door", 0.012, 0.090), ("rear_door", 0.452, 0.566)), axles=(0.225, 0.735), radius=0.146, sill=0.095,
-    tumble=0.035, body=0.90, nose=0.018, tail=0.008, lamps=(S1, S3), lamp_from=0.62, tail_lamps=(S1, S4),
+    plan=((0.0, 0.93), (0.01, 0.98), (0.03, 1.0), (0.97, 1.0), (1.0, 0.97)),
+    cowl=0.0,
+    screen=0.0,
+    roof=1.0,
+    deck=1.0,
+    windows=(
+        (0.012, 0.085),
+        (0.095, 0.205),
+        (0.213, 0.325),
+        (0.333, 0.445),
+        (0.453, 0.565),
+        (0.573, 0.685),
+        (0.693, 0.805),
+        (0.813, 0.94),
+    ),
+    doors=(("front_door", 0.012, 0.090), ("rear_door", 0.452, 0.566)),
+    axles=(0.225, 0.735),
+    radius=0.146,
+    sill=0.095,
+    tumble=0.035,
+    body=0.90,
+    nose=0.018,
+    tail=0.008,
+    lamps=(S1, S3),
+    lamp_from=0.62,
+    tail_lamps=(S1, S4),
     tail_from=0.82,
-    grille=(S4, S4), glass_gap=0.03, wheel_width=0.3,
-)  # fmt: skip
+    grille=(S4, S4),
+    glass_gap=0.03,
+    wheel_width=0.3,
+)
 
 
 def truck(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
@@ -207,10 +248,17 @@ def bus(style: str, size: Point, *, generator: np.random.Generator, detail: int)
     stripe = generator.random()
     if style == "bendy":
         return _bendy(size, detail)
-    shell = BUS if style == "city" else replace(
-        BUS, belt=((0.0, 0.36), (0.05, 0.40), (0.10, 0.50), (1.0, 0.50)), sill=0.105, tail_from=0.8,
-        top=((0.0, 0.93), (0.02, 0.985), (0.06, 1.0), (0.97, 1.0), (1.0, 0.97)),
-    )  # fmt: skip
+    shell = (
+        BUS
+        if style == "city"
+        else replace(
+            BUS,
+            belt=((0.0, 0.36), (0.05, 0.40), (0.10, 0.50), (1.0, 0.50)),
+            sill=0.105,
+            tail_from=0.8,
+            top=((0.0, 0.93), (0.02, 0.985), (0.06, 1.0), (0.97, 1.0), (1.0, 0.97)),
+        )
+    )
     roof = 0.955 if style == "city" else 1.0
     lower = (length, width, height * roof)
     parts = [skin(shell, lower, detail=detail)]
@@ -263,10 +311,18 @@ def _bendy(size: Point, detail: int) -> Mesh:
     ahead, behind, gap = 0.55 * length, 0.40 * length, 0.05 * length
     first = replace(BUS, axles=(0.25, 0.80), rear_window=False, tail_lamps=(S4, S4))
     second = replace(
-        BUS, windows=BUS.windows[1:], axles=(0.60, 0.60), lamps=(S4, S4), screen=0.03, cowl=0.0,
-        plan=((0.0, 1.0), (0.97, 1.0), (1.0, 0.97)), top=((0.0, 1.0), (0.97, 1.0), (1.0, 0.98)), nose=0.002,
-        belt=((0.0, 0.40), (1.0, 0.40)), doors=(("rear_door", 0.20, 0.37),),
-    )  # fmt: skip
+        BUS,
+        windows=BUS.windows[1:],
+        axles=(0.60, 0.60),
+        lamps=(S4, S4),
+        screen=0.03,
+        cowl=0.0,
+        plan=((0.0, 1.0), (0.97, 1.0), (1.0, 0.97)),
+        top=((0.0, 1.0), (0.97, 1.0), (1.0, 0.98)),
+        nose=0.002,
+        belt=((0.0, 0.40), (1.0, 0.40)),
+        doors=(("rear_door", 0.20, 0.37),),
+    )
     parts: list[Mesh] = []
     panels: list[Chart] = []
     sections = ((first, ahead, 0.5 * (length - ahead), True), (second, behind, -0.5 * (length - behind), False))

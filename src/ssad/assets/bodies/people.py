@@ -16,9 +16,18 @@ from ssad.core.geometry import cross
 
 SKINS = ((0.62, 0.40, 0.29), (0.50, 0.31, 0.21), (0.35, 0.20, 0.13), (0.20, 0.11, 0.07), (0.10, 0.055, 0.035))
 HAIRS = ((0.015, 0.012, 0.010), (0.05, 0.03, 0.02), (0.13, 0.075, 0.04), (0.38, 0.27, 0.14), (0.40, 0.40, 0.40))
-CLOTHS = ((0.02, 0.02, 0.025), (0.03, 0.045, 0.11), (0.14, 0.14, 0.15), (0.55, 0.55, 0.54), (0.30, 0.03, 0.04),
-          (0.05, 0.16, 0.08), (0.42, 0.33, 0.20), (0.07, 0.16, 0.36), (0.55, 0.38, 0.06),
-          (0.36, 0.15, 0.28))  # fmt: skip
+CLOTHS = (
+    (0.02, 0.02, 0.025),
+    (0.03, 0.045, 0.11),
+    (0.14, 0.14, 0.15),
+    (0.55, 0.55, 0.54),
+    (0.30, 0.03, 0.04),
+    (0.05, 0.16, 0.08),
+    (0.42, 0.33, 0.20),
+    (0.07, 0.16, 0.36),
+    (0.55, 0.38, 0.06),
+    (0.36, 0.15, 0.28),
+)
 HIVIS = (0.55, 0.75, 0.05)
 ORANGE = (0.80, 0.22, 0.02)
 BANDS = Material("bands", (0.62, 0.64, 0.66), specular=0.2, gloss=0.5)
@@ -89,13 +98,24 @@ def draw_look(
     if abs(sum(inner.colour) - sum(shirt.colour)) < 0.3:  # told apart from the jacket
         inner = replace(inner, colour=(0.60, 0.60, 0.58) if sum(shirt.colour) < 0.8 else (0.03, 0.03, 0.04))
     return Look(
-        cloth("skin", SKINS), cloth("hair", HAIRS), shirt, trousers,
+        cloth("skin", SKINS),
+        cloth("hair", HAIRS),
+        shirt,
+        trousers,
         cloth("shoes", (CLOTHS[0], CLOTHS[3], (0.09, 0.05, 0.03))),
-        bool(coat and not rider), bool(skirt and not coat and not rider), bool(pack), bool(long_hair),
-        bool(shorts and not coat and not skirt), bag_colour if bag and not pack and not rider else None,
-        cap_colour if cap and not helmet else None, replace(helmet_colour, gloss=0.8) if helmet else None,
-        inner if opened else None, BANDS if vest else None, bool(beard and not long_hair), visor,
-    )  # fmt: skip
+        bool(coat and not rider),
+        bool(skirt and not coat and not rider),
+        bool(pack),
+        bool(long_hair),
+        bool(shorts and not coat and not skirt),
+        bag_colour if bag and not pack and not rider else None,
+        cap_colour if cap and not helmet else None,
+        replace(helmet_colour, gloss=0.8) if helmet else None,
+        inner if opened else None,
+        BANDS if vest else None,
+        bool(beard and not long_hair),
+        visor,
+    )
 
 
 def walking(height: float, *, phase: float, swing: float, spread: float, child: bool = False) -> Pose:
@@ -256,9 +276,17 @@ def _trunk(pose: Pose, look: Look, h: float, *, n: int, child: bool) -> Mesh:
     forward = cross([0.0, 1.0, 0.0], up)
     length = float(np.linalg.norm(pose.neck - pose.pelvis))
     long = look.coat or look.skirt
-    rows = [(-0.16, 0.050, 0.070), (0.06, 0.066, 0.092), (0.16, 0.064, 0.089), (0.30, 0.060, 0.083),
-            (0.62, 0.070, 0.104), (0.86, 0.062, 0.112), (0.97, 0.038, 0.060), (1.03, 0.026, 0.028),
-            (1.12, 0.026, 0.028)]  # fmt: skip
+    rows = [
+        (-0.16, 0.050, 0.070),
+        (0.06, 0.066, 0.092),
+        (0.16, 0.064, 0.089),
+        (0.30, 0.060, 0.083),
+        (0.62, 0.070, 0.104),
+        (0.86, 0.062, 0.112),
+        (0.97, 0.038, 0.060),
+        (1.03, 0.026, 0.028),
+        (1.12, 0.026, 0.028),
+    ]
     if long:  # the hem goes round both thighs
         stride = max(abs(float(knee[0] - pose.pelvis[0])) for knee in pose.knees) / h
         rows = [(-0.60, 0.062 + 0.9 * stride, 0.118), (0.0, 0.076 + 0.3 * stride, 0.118), *rows[2:]]
@@ -402,9 +430,18 @@ def _dressed(look: Look, style: str, own: float) -> Look:
         shell = Material("helmet", ((0.75, 0.75, 0.72), (0.80, 0.52, 0.02), ORANGE)[int(3.0 * own)], gloss=0.6)
         dark = replace(look.trousers, colour=(0.03, 0.04, 0.08) if own < 0.7 else ORANGE)
         return replace(
-            look, shirt=vest, trousers=dark, helmet=shell, cap=shell, bands=BANDS, coat=False, skirt=False, pack=False,
-            shorts=False, bag=None,
-        )  # fmt: skip
+            look,
+            shirt=vest,
+            trousers=dark,
+            helmet=shell,
+            cap=shell,
+            bands=BANDS,
+            coat=False,
+            skirt=False,
+            pack=False,
+            shorts=False,
+            bag=None,
+        )
     if style == "stroller":
         return replace(look, bag=None)
     return look

@@ -85,9 +85,27 @@ def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = N
     graph = load_town(town) if isinstance(town, str) else town
     name = style_of(graph.name, style)
     what = hashlib.sha256(f"{FORMAT} {REVISION} {graph.name} {seed} {name}".encode())
-    for key in ("xy", "width", "offset", "kind", "junction", "left", "right", "left_marking", "right_marking",
-                "signal_xy", "signal_yaw", "signal_virtual", "stop_s", "stop_lane", "crosswalk_xy", "sign_xy",
-                "sign_kind", "rule_sign", "rule_lane"):  # fmt: skip
+    for key in (
+        "xy",
+        "width",
+        "offset",
+        "kind",
+        "junction",
+        "left",
+        "right",
+        "left_marking",
+        "right_marking",
+        "signal_xy",
+        "signal_yaw",
+        "signal_virtual",
+        "stop_s",
+        "stop_lane",
+        "crosswalk_xy",
+        "sign_xy",
+        "sign_kind",
+        "rule_sign",
+        "rule_lane",
+    ):
         what.update(getattr(graph, key).tobytes())
     path = home() / "cache" / "streets" / f"{what.hexdigest()[:24]}.npz"
     if path.exists():

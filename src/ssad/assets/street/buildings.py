@@ -44,10 +44,14 @@ def _masonry(look: Look) -> int:
 
 def _chimney(x: float, y: float, top: float, look: Look) -> Piece:
     brick = look.walls["brick"][0]
-    return join([
-        box((x - 0.35, y - 0.3, top - 1.6), (x + 0.35, y + 0.3, top + 0.7), brick, levels=VISIBLE),
-        box((x - 0.2, y - 0.15, top + 0.7), (x + 0.2, y + 0.15, top + 1.0), look.walls["roof_tiles"][0], levels=NEAR),
-    ])  # fmt: skip
+    return join(
+        [
+            box((x - 0.35, y - 0.3, top - 1.6), (x + 0.35, y + 0.3, top + 0.7), brick, levels=VISIBLE),
+            box(
+                (x - 0.2, y - 0.15, top + 0.7), (x + 0.2, y + 0.15, top + 1.0), look.walls["roof_tiles"][0], levels=NEAR
+            ),
+        ]
+    )
 
 
 def _dormers(count: int, width: float, y: float, z: float, look: Look, *, wall: int, roof: int) -> list[Piece]:
@@ -311,9 +315,17 @@ def _chapel(size: Size, look: Look) -> list[Piece]:
 
 
 KINDS: Mapping[str, Callable[[Size, Look], list[Piece]]] = {
-    "terrace": _terrace, "shop": _shop, "house": _house, "bungalow": _bungalow, "flats": _flats, "office": _office,
-    "tower": _tower, "hall": _hall, "shed": _shed, "chapel": _chapel,
-}  # fmt: skip
+    "terrace": _terrace,
+    "shop": _shop,
+    "house": _house,
+    "bungalow": _bungalow,
+    "flats": _flats,
+    "office": _office,
+    "tower": _tower,
+    "hall": _hall,
+    "shed": _shed,
+    "chapel": _chapel,
+}
 SIZES: Mapping[str, tuple[Size, Size]] = {  # least and most (front, depth), m
     "terrace": ((5.2, 9.0), (8.5, 12.0)),
     "shop": ((6.0, 9.0), (10.0, 13.0)),

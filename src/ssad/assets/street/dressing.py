@@ -180,8 +180,11 @@ def plant(
     for _ in range(int(1.2 * wanted)):
         p = rng.uniform(site.low + 4.0, site.high - 4.0)
         if site.free(p + 0.7 * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]), away=1.0):
-            soup.place(shrubs[int(rng.integers(len(shrubs)))], [(*p, EARTH - 0.03, rng.uniform(0.0, 6.28))],
-                       scale=np.array([rng.uniform(0.7, 1.4)]))  # fmt: skip
+            soup.place(
+                shrubs[int(rng.integers(len(shrubs)))],
+                [(*p, EARTH - 0.03, rng.uniform(0.0, 6.28))],
+                scale=np.array([rng.uniform(0.7, 1.4)]),
+            )
             site.take([p])
     angle = np.arange(9) * 2.0 * np.pi / 9
     for _ in range(int(0.8 * wanted) + 40):

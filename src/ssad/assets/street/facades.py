@@ -134,9 +134,17 @@ def door(wall: Wall, x: float, look: Look, *, size: tuple[float, float] = (1.0, 
 
 
 def gable(
-    x: tuple[float, float], y: tuple[float, float], z: float, rise: float, *, roof: int, wall: int,
-    across: bool = False, eaves: float = 0.4, hip: float = 0.0,
-) -> list[Piece]:  # fmt: skip
+    x: tuple[float, float],
+    y: tuple[float, float],
+    z: float,
+    rise: float,
+    *,
+    roof: int,
+    wall: int,
+    across: bool = False,
+    eaves: float = 0.4,
+    hip: float = 0.0,
+) -> list[Piece]:
     """A pitched roof over a block.
 
     Args:

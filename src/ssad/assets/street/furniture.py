@@ -132,30 +132,36 @@ def bench(look: Look) -> Piece:
     slats = np.array([[0.02 + 0.14 * k, -0.9, 0.42] for k in range(3)])
     backs = np.array([[-0.08, -0.9, 0.56], [-0.08, -0.9, 0.74]])
     legs = np.array([[0.0, -0.75, 0.0], [0.0, 0.70, 0.0]])
-    return join([
-        box(slats, slats + np.array([0.12, 1.8, 0.04]), wood, levels=NEAR, base=True),
-        box(backs, backs + np.array([0.04, 1.8, 0.13]), wood, levels=NEAR, base=True),
-        box(legs, legs + np.array([0.40, 0.05, 0.42]), look.iron, levels=NEAR),
-        box(legs + np.array([-0.08, 0, 0.42]), legs + np.array([-0.03, 0.05, 0.88]), look.iron, levels=NEAR),
-        box((-0.05, -0.9, 0.40), (0.42, 0.9, 0.46), wood, levels=MID),
-    ])  # fmt: skip
+    return join(
+        [
+            box(slats, slats + np.array([0.12, 1.8, 0.04]), wood, levels=NEAR, base=True),
+            box(backs, backs + np.array([0.04, 1.8, 0.13]), wood, levels=NEAR, base=True),
+            box(legs, legs + np.array([0.40, 0.05, 0.42]), look.iron, levels=NEAR),
+            box(legs + np.array([-0.08, 0, 0.42]), legs + np.array([-0.03, 0.05, 0.88]), look.iron, levels=NEAR),
+            box((-0.05, -0.9, 0.40), (0.42, 0.9, 0.46), wood, levels=MID),
+        ]
+    )
 
 
 def litter_bin(look: Look) -> Piece:
     """A litter bin."""
-    return join([
-        cylinder((0.22, 0.25), (0.05, 0.85), look.pole if look.style.old else look.metal, sides=8, levels=VISIBLE),
-        cylinder((0.27, 0.20), (0.85, 0.98), look.black, sides=8, levels=NEAR),
-    ])  # fmt: skip
+    return join(
+        [
+            cylinder((0.22, 0.25), (0.05, 0.85), look.pole if look.style.old else look.metal, sides=8, levels=VISIBLE),
+            cylinder((0.27, 0.20), (0.85, 0.98), look.black, sides=8, levels=NEAR),
+        ]
+    )
 
 
 def wheelie_bin(look: Look) -> Piece:
     """A household bin on wheels."""
     colour = look.walls["awning"][int(look.generator.integers(2, 6))]
-    return join([
-        box((-0.28, -0.25, 0.06), (0.28, 0.25, 0.95), look.palette.shade(colour, 0.5, "bin"), levels=NEAR),
-        box((-0.30, -0.28, 0.95), (0.33, 0.28, 1.02), look.black, levels=NEAR, base=True),
-    ])  # fmt: skip
+    return join(
+        [
+            box((-0.28, -0.25, 0.06), (0.28, 0.25, 0.95), look.palette.shade(colour, 0.5, "bin"), levels=NEAR),
+            box((-0.30, -0.28, 0.95), (0.33, 0.28, 1.02), look.black, levels=NEAR, base=True),
+        ]
+    )
 
 
 def bollard(look: Look) -> Piece:
@@ -168,13 +174,15 @@ def shelter(look: Look) -> Piece:
     """A bus shelter, open along x, 4 m wide."""
     post = np.array([[x, y, 0.0] for x in (-0.55, 0.55) for y in (-2.0, 1.94)])
     pane = box((-0.57, -1.95, 0.25), (-0.54, 1.95, 2.2), look.glass[3], levels=VISIBLE, base=True)
-    return join([
-        box(post, post + np.array([0.06, 0.06, 2.35]), look.metal, levels=VISIBLE),
-        box((-0.7, -2.15, 2.35), (0.8, 2.15, 2.47), look.metal, levels=VISIBLE, base=True),
-        pane,
-        box((-0.45, -1.4, 0.45), (-0.10, 1.4, 0.5), look.wood[0], levels=NEAR, base=True),
-        box((-0.5, 1.9, 0.4), (0.4, 1.96, 2.1), look.pick("awning"), levels=VISIBLE, base=True),
-    ])  # fmt: skip
+    return join(
+        [
+            box(post, post + np.array([0.06, 0.06, 2.35]), look.metal, levels=VISIBLE),
+            box((-0.7, -2.15, 2.35), (0.8, 2.15, 2.47), look.metal, levels=VISIBLE, base=True),
+            pane,
+            box((-0.45, -1.4, 0.45), (-0.10, 1.4, 0.5), look.wood[0], levels=NEAR, base=True),
+            box((-0.5, 1.9, 0.4), (0.4, 1.96, 2.1), look.pick("awning"), levels=VISIBLE, base=True),
+        ]
+    )
 
 
 def planter(look: Look) -> Piece:
@@ -196,11 +204,19 @@ def fence(kind: str, look: Look) -> Piece:
             ]
         )
     if kind == "planks":
-        return join([box((-0.5, -0.02, 0.05), (0.5, 0.02, 1.65), look.wood[2], levels=VISIBLE),
-                     box((-0.5, -0.05, 0.0), (-0.42, 0.05, 1.72), look.wood[0], levels=NEAR)])  # fmt: skip
+        return join(
+            [
+                box((-0.5, -0.02, 0.05), (0.5, 0.02, 1.65), look.wood[2], levels=VISIBLE),
+                box((-0.5, -0.05, 0.0), (-0.42, 0.05, 1.72), look.wood[0], levels=NEAR),
+            ]
+        )
     if kind == "wall":
-        return join([box((-0.5, -0.12, -0.1), (0.5, 0.12, 0.85), look.walls["brick"][2], levels=VISIBLE),
-                     box((-0.5, -0.16, 0.85), (0.5, 0.16, 0.93), look.stone[1], levels=VISIBLE)])  # fmt: skip
+        return join(
+            [
+                box((-0.5, -0.12, -0.1), (0.5, 0.12, 0.85), look.walls["brick"][2], levels=VISIBLE),
+                box((-0.5, -0.16, 0.85), (0.5, 0.16, 0.93), look.stone[1], levels=VISIBLE),
+            ]
+        )
     post = box((-0.5, -0.03, 0.0), (-0.44, 0.03, 1.1), look.metal, levels=NEAR)
     rails = np.array([[-0.5, -0.015, z] for z in (0.45, 0.98)])
     return join([post, box(rails, rails + np.array([1.0, 0.03, 0.05]), look.metal, levels=VISIBLE)])

@@ -55,32 +55,85 @@ class TownStyle:
 
 STYLES: Mapping[str, TownStyle] = {
     "town": TownStyle(
-        {"terrace": 4.0, "flats": 1.5, "house": 1.2, "shop": 1.5}, {"shed": 1.0, "house": 1.0, "flats": 0.6},
-        (0.4, 3.0), (0.0, 2.0), "grass", 1.5, 22.0, 0.25, 0.25, 26.0,
+        {"terrace": 4.0, "flats": 1.5, "house": 1.2, "shop": 1.5},
+        {"shed": 1.0, "house": 1.0, "flats": 0.6},
+        (0.4, 3.0),
+        (0.0, 2.0),
+        "grass",
+        1.5,
+        22.0,
+        0.25,
+        0.25,
+        26.0,
     ),
     "city": TownStyle(
-        {"office": 4.0, "flats": 2.0, "shop": 1.0, "tower": 1.0}, {"office": 1.0, "flats": 1.0, "hall": 0.6},
-        (2.5, 7.0), (3.0, 10.0), "grass", 1.0, 15.0, 0.15, 0.0, 30.0, furniture=1.5,
+        {"office": 4.0, "flats": 2.0, "shop": 1.0, "tower": 1.0},
+        {"office": 1.0, "flats": 1.0, "hall": 0.6},
+        (2.5, 7.0),
+        (3.0, 10.0),
+        "grass",
+        1.0,
+        15.0,
+        0.15,
+        0.0,
+        30.0,
+        furniture=1.5,
         tree_kinds=("round", "tall", "round"),
     ),
     "old": TownStyle(
-        {"terrace": 6.0, "shop": 3.0, "chapel": 0.12}, {"terrace": 1.0, "shed": 1.0},
-        (0.15, 0.4), (0.0, 0.0), "cobbles", 1.2, 0.0, 0.0, 0.0, 22.0, yellow=False, old=True, vacant=0.05,
-        furniture=1.3, tree_kinds=("round", "birch"),
+        {"terrace": 6.0, "shop": 3.0, "chapel": 0.12},
+        {"terrace": 1.0, "shed": 1.0},
+        (0.15, 0.4),
+        (0.0, 0.0),
+        "cobbles",
+        1.2,
+        0.0,
+        0.0,
+        0.0,
+        22.0,
+        yellow=False,
+        old=True,
+        vacant=0.05,
+        furniture=1.3,
+        tree_kinds=("round", "birch"),
     ),
     "suburb": TownStyle(
-        {"house": 6.0, "bungalow": 2.0, "terrace": 0.6}, {"shed": 1.0},
-        (5.0, 9.0), (4.0, 10.0), "lawn", 1.7, 0.0, 0.38, 0.3, 34.0, furniture=0.5,
+        {"house": 6.0, "bungalow": 2.0, "terrace": 0.6},
+        {"shed": 1.0},
+        (5.0, 9.0),
+        (4.0, 10.0),
+        "lawn",
+        1.7,
+        0.0,
+        0.38,
+        0.3,
+        34.0,
+        furniture=0.5,
     ),
     "outskirts": TownStyle(
-        {"hall": 3.0, "office": 1.2, "flats": 0.8, "house": 0.8}, {"hall": 1.0, "shed": 0.6},
-        (6.0, 14.0), (8.0, 30.0), "meadow", 0.6, 28.0, 0.1, 0.25, 40.0, vacant=0.15, furniture=0.6,
+        {"hall": 3.0, "office": 1.2, "flats": 0.8, "house": 0.8},
+        {"hall": 1.0, "shed": 0.6},
+        (6.0, 14.0),
+        (8.0, 30.0),
+        "meadow",
+        0.6,
+        28.0,
+        0.1,
+        0.25,
+        40.0,
+        vacant=0.15,
+        furniture=0.6,
     ),
-}  # fmt: skip
+}
 OF_TOWN = {
-    "Twinford": "town", "Crossgate": "city", "Oldmarket": "old", "Larkhill": "suburb", "ProvingGround": "outskirts",
-    "Ringmere": "town", "Longreach": "outskirts",
-}  # fmt: skip
+    "Twinford": "town",
+    "Crossgate": "city",
+    "Oldmarket": "old",
+    "Larkhill": "suburb",
+    "ProvingGround": "outskirts",
+    "Ringmere": "town",
+    "Longreach": "outskirts",
+}
 
 
 def style_of(town: str, style: str | None = None) -> str:
@@ -96,23 +149,54 @@ def style_of(town: str, style: str | None = None) -> str:
 
 
 # linear RGB of what is found in streets
-_PLASTER = [(0.68, 0.65, 0.58), (0.60, 0.52, 0.37), (0.52, 0.40, 0.31), (0.48, 0.50, 0.48), (0.70, 0.69, 0.66),
-            (0.57, 0.53, 0.41), (0.42, 0.34, 0.29), (0.50, 0.54, 0.56), (0.58, 0.47, 0.41),
-            (0.44, 0.45, 0.37)]  # fmt: skip
+_PLASTER = [
+    (0.68, 0.65, 0.58),
+    (0.60, 0.52, 0.37),
+    (0.52, 0.40, 0.31),
+    (0.48, 0.50, 0.48),
+    (0.70, 0.69, 0.66),
+    (0.57, 0.53, 0.41),
+    (0.42, 0.34, 0.29),
+    (0.50, 0.54, 0.56),
+    (0.58, 0.47, 0.41),
+    (0.44, 0.45, 0.37),
+]
 _BRICK = [(0.30, 0.11, 0.07), (0.36, 0.17, 0.10), (0.24, 0.10, 0.07), (0.42, 0.28, 0.17), (0.28, 0.20, 0.16)]
 _BOARD = [(0.72, 0.72, 0.70), (0.32, 0.40, 0.46), (0.58, 0.54, 0.44), (0.24, 0.30, 0.24), (0.46, 0.22, 0.18)]
 _CLADDING = [(0.45, 0.47, 0.50), (0.30, 0.33, 0.37), (0.62, 0.62, 0.60), (0.42, 0.38, 0.33), (0.18, 0.20, 0.23)]
 _SHEET = [(0.42, 0.46, 0.50), (0.16, 0.26, 0.40), (0.50, 0.48, 0.44), (0.22, 0.32, 0.26), (0.46, 0.16, 0.12)]
 _ROOF = [(0.20, 0.095, 0.062), (0.08, 0.08, 0.09), (0.14, 0.092, 0.075), (0.12, 0.125, 0.14), (0.22, 0.13, 0.09)]
-_DOOR = [(0.05, 0.12, 0.08), (0.20, 0.03, 0.03), (0.05, 0.08, 0.18), (0.16, 0.09, 0.05), (0.60, 0.60, 0.58),
-         (0.03, 0.03, 0.03)]  # fmt: skip
+_DOOR = [
+    (0.05, 0.12, 0.08),
+    (0.20, 0.03, 0.03),
+    (0.05, 0.08, 0.18),
+    (0.16, 0.09, 0.05),
+    (0.60, 0.60, 0.58),
+    (0.03, 0.03, 0.03),
+]
 _AWNING = [(0.45, 0.06, 0.05), (0.06, 0.22, 0.12), (0.08, 0.14, 0.36), (0.62, 0.48, 0.12), (0.60, 0.58, 0.54)]
-_EARTH = {"grass": (0.10, 0.165, 0.045), "lawn": (0.095, 0.19, 0.045), "meadow": (0.17, 0.185, 0.065),
-          "cobbles": (0.21, 0.195, 0.175)}  # fmt: skip
-_LEAF = {"round": (0.065, 0.125, 0.028), "tall": (0.085, 0.145, 0.035), "birch": (0.125, 0.18, 0.05),
-         "conifer": (0.022, 0.062, 0.028)}  # fmt: skip
-_WALLS = {"plaster": _PLASTER, "brick": _BRICK, "boards": _BOARD, "cladding": _CLADDING, "sheet": _SHEET,
-          "roof_tiles": _ROOF, "door": _DOOR, "awning": _AWNING}  # fmt: skip
+_EARTH = {
+    "grass": (0.10, 0.165, 0.045),
+    "lawn": (0.095, 0.19, 0.045),
+    "meadow": (0.17, 0.185, 0.065),
+    "cobbles": (0.21, 0.195, 0.175),
+}
+_LEAF = {
+    "round": (0.065, 0.125, 0.028),
+    "tall": (0.085, 0.145, 0.035),
+    "birch": (0.125, 0.18, 0.05),
+    "conifer": (0.022, 0.062, 0.028),
+}
+_WALLS = {
+    "plaster": _PLASTER,
+    "brick": _BRICK,
+    "boards": _BOARD,
+    "cladding": _CLADDING,
+    "sheet": _SHEET,
+    "roof_tiles": _ROOF,
+    "door": _DOOR,
+    "awning": _AWNING,
+}
 
 
 @dataclass
@@ -154,13 +238,18 @@ class Look:
         self.red = add("signal_red", (0.30, 0.02, 0.015), gloss=0.6)
         self.amber = add("signal_amber", (0.30, 0.14, 0.01), gloss=0.6)
         self.green = add("signal_green", (0.01, 0.22, 0.10), gloss=0.6)
-        self.glass = [add("window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
-                      for c in ((0.035, 0.045, 0.055), (0.05, 0.055, 0.055), (0.02, 0.028, 0.036),
-                                (0.07, 0.085, 0.10))]  # fmt: skip
-        self.blind = [add("window_blind", self._jitter(c, 0.1), specular=0.06, gloss=0.7)
-                      for c in ((0.36, 0.34, 0.30), (0.20, 0.20, 0.19))]  # fmt: skip
-        self.shop = [add("shop_window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
-                     for c in ((0.10, 0.09, 0.07), (0.05, 0.06, 0.07))]  # fmt: skip
+        self.glass = [
+            add("window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
+            for c in ((0.035, 0.045, 0.055), (0.05, 0.055, 0.055), (0.02, 0.028, 0.036), (0.07, 0.085, 0.10))
+        ]
+        self.blind = [
+            add("window_blind", self._jitter(c, 0.1), specular=0.06, gloss=0.7)
+            for c in ((0.36, 0.34, 0.30), (0.20, 0.20, 0.19))
+        ]
+        self.shop = [
+            add("shop_window", self._jitter(c, 0.3), specular=0.09, gloss=0.9)
+            for c in ((0.10, 0.09, 0.07), (0.05, 0.06, 0.07))
+        ]
         self.frame = [add("window_frame", c) for c in ((0.68, 0.68, 0.66), (0.10, 0.09, 0.08), (0.32, 0.33, 0.34))]
         self.stone = [add("stone", self._jitter(c, 0.08)) for c in ((0.46, 0.43, 0.37), (0.34, 0.33, 0.31))]
         for name, table in _WALLS.items():
@@ -174,9 +263,16 @@ class Look:
         self.wood = [
             add("wood", self._jitter(c, 0.15)) for c in ((0.20, 0.13, 0.075), (0.55, 0.54, 0.50), (0.12, 0.08, 0.05))
         ]
-        self.sign = {name: add(f"sign_{name}", c, gloss=0.4) for name, c in (
-            ("white", (0.78, 0.78, 0.76)), ("red", (0.42, 0.015, 0.02)), ("blue", (0.01, 0.08, 0.36)),
-            ("yellow", (0.75, 0.50, 0.02)), ("back", (0.32, 0.33, 0.34)))}  # fmt: skip
+        self.sign = {
+            name: add(f"sign_{name}", c, gloss=0.4)
+            for name, c in (
+                ("white", (0.78, 0.78, 0.76)),
+                ("red", (0.42, 0.015, 0.02)),
+                ("blue", (0.01, 0.08, 0.36)),
+                ("yellow", (0.75, 0.50, 0.02)),
+                ("back", (0.32, 0.33, 0.34)),
+            )
+        }
 
     def _jitter(self, colour: npt.ArrayLike, amount: float) -> npt.NDArray[np.float64]:
         """A colour a little lighter or darker, and a little off in hue."""

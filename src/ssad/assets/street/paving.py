@@ -80,8 +80,14 @@ def pave(soup: TriangleBuilder, graph: LaneGraph, ground: Ground, look: Look) ->
     bare = BELOW + (EARTH - BELOW) * np.clip((road - 0.5) / 4.0, 0.0, 1.0)
     middle = np.round(xy[faces].mean(axis=1) - low).astype(int)
     inner = ground.inner | (ground.paved < 2.5)
-    soup.add(level_ground(xy, faces, np.where(walk <= road + 0.05, EARTH, bare),
-                          np.where(inner[middle[:, 1], middle[:, 0]], look.earth, look.earth_far)))  # fmt: skip
+    soup.add(
+        level_ground(
+            xy,
+            faces,
+            np.where(walk <= road + 0.05, EARTH, bare),
+            np.where(inner[middle[:, 1], middle[:, 0]], look.earth, look.earth_far),
+        )
+    )
     _far(soup, ground, look)
 
 
@@ -89,9 +95,13 @@ def level_ground(xy: F64, faces: np.ndarray, z: F64, material: npt.ArrayLike) ->
     """Nearly level triangles with upright normals and world coordinates as uv."""
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(faces), 3, 3))
     return Piece(
-        np.column_stack([xy, z]), faces, up, xy[faces],
-        np.broadcast_to(np.asarray(material, np.int32), len(faces)), np.full(len(faces), ALL, np.int32),
-    )  # fmt: skip
+        np.column_stack([xy, z]),
+        faces,
+        up,
+        xy[faces],
+        np.broadcast_to(np.asarray(material, np.int32), len(faces)),
+        np.full(len(faces), ALL, np.int32),
+    )
 
 
 def _sidewalk(soup: TriangleBuilder, graph: LaneGraph, lane: int, look: Look) -> None:
@@ -130,10 +140,14 @@ def _far(soup: TriangleBuilder, ground: Ground, look: Look) -> None:
     middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
     n = 8
     t = np.arange(n) / n
-    inner = np.concatenate([
-        np.stack([x0 + t * (x1 - x0), y0 + 0 * t], 1), np.stack([x1 + 0 * t, y0 + t * (y1 - y0)], 1),
-        np.stack([x1 - t * (x1 - x0), y1 + 0 * t], 1), np.stack([x0 + 0 * t, y1 - t * (y1 - y0)], 1),
-    ])  # fmt: skip
+    inner = np.concatenate(
+        [
+            np.stack([x0 + t * (x1 - x0), y0 + 0 * t], 1),
+            np.stack([x1 + 0 * t, y0 + t * (y1 - y0)], 1),
+            np.stack([x1 - t * (x1 - x0), y1 + 0 * t], 1),
+            np.stack([x0 + 0 * t, y1 - t * (y1 - y0)], 1),
+        ]
+    )
     away = inner - middle
     rings = [inner]
     for radius in (1.2 * float(np.hypot(*away.T).max()), FAR_AWAY):

@@ -17,11 +17,47 @@ VISIBLE = NEAR | MID
 def _ball() -> tuple[F64, np.ndarray]:
     """Vertices [12, 3] and faces [20, 3] of an icosahedron."""
     g = (1.0 + 5.0**0.5) / 2.0
-    v = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g),
-                  (0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)], np.float64)  # fmt: skip
-    f = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2),
-                  (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11),
-                  (6, 2, 10), (8, 6, 7), (9, 8, 1)])  # fmt: skip
+    v = np.array(
+        [
+            (-1, g, 0),
+            (1, g, 0),
+            (-1, -g, 0),
+            (1, -g, 0),
+            (0, -1, g),
+            (0, 1, g),
+            (0, -1, -g),
+            (0, 1, -g),
+            (g, 0, -1),
+            (g, 0, 1),
+            (-g, 0, -1),
+            (-g, 0, 1),
+        ],
+        np.float64,
+    )
+    f = np.array(
+        [
+            (0, 11, 5),
+            (0, 5, 1),
+            (0, 1, 7),
+            (0, 7, 10),
+            (0, 10, 11),
+            (1, 5, 9),
+            (5, 11, 4),
+            (11, 10, 2),
+            (10, 7, 6),
+            (7, 1, 8),
+            (3, 9, 4),
+            (3, 4, 2),
+            (3, 2, 6),
+            (3, 6, 8),
+            (3, 8, 9),
+            (4, 9, 5),
+            (2, 4, 11),
+            (6, 2, 10),
+            (8, 6, 7),
+            (9, 8, 1),
+        ]
+    )
     return v / np.linalg.norm(v[0]), f
 
 
@@ -127,8 +163,15 @@ def _conifer(look: Look) -> Piece:
         v = np.vstack([rim, [[0.0, 0.0, min(high, tall)]]])
         i = np.arange(sides)
         up = np.column_stack([np.cos(angle), np.sin(angle), np.full(sides, 0.6)])
-        parts.append(smooth(v, np.stack([i, (i + 1) % sides, np.full(sides, sides)], 1), np.vstack([up, [[0, 0, 1]]]),
-                            greens[k % 2], levels=VISIBLE))  # fmt: skip
+        parts.append(
+            smooth(
+                v,
+                np.stack([i, (i + 1) % sides, np.full(sides, sides)], 1),
+                np.vstack([up, [[0, 0, 1]]]),
+                greens[k % 2],
+                levels=VISIBLE,
+            )
+        )
         under = np.vstack([rim, [[0.0, 0.0, low + 0.3 * radius]]])
         inwards = np.stack([(i + 1) % sides, i, np.full(sides, sides)], 1)
         down = np.broadcast_to([0.0, 0.0, -1.0], under.shape)
@@ -142,10 +185,12 @@ def bush(look: Look) -> Piece:
     greens = _greens(str(rng.choice(["round", "tall", "birch"])), look)
     radius = np.array([0.7, 0.7, 0.6]) * rng.uniform(0.8, 1.2, 3)
     centre = np.array([0.0, 0.0, 0.85 * radius[2]])
-    return join([
-        blob(centre, 0.92 * radius, look.palette.shade(greens[-1], 0.7), look, levels=VISIBLE),
-        leaves(centre, radius, look, count=36, size=0.22, materials=greens),
-    ])  # fmt: skip
+    return join(
+        [
+            blob(centre, 0.92 * radius, look.palette.shade(greens[-1], 0.7), look, levels=VISIBLE),
+            leaves(centre, radius, look, count=36, size=0.22, materials=greens),
+        ]
+    )
 
 
 def hedge(look: Look, material: int) -> Piece:

@@ -73,8 +73,10 @@ def survey(graph: LaneGraph) -> Ground:
     if not driving.any():
         raise MapError(f"town '{graph.name}': no drivable lane; choose another town")
     if float(np.ptp(graph.z)) > 1.0:
-        raise MapError(f"town '{graph.name}': it is not flat (heights differ by {np.ptp(graph.z):.1f} m); streets are "
-                       "built for flat towns only, choose another")  # fmt: skip
+        raise MapError(
+            f"town '{graph.name}': it is not flat (heights differ by {np.ptp(graph.z):.1f} m); streets are "
+            "built for flat towns only, choose another"
+        )
     low = np.floor(graph.xy.min(axis=0) - MARGIN)
     size = np.ceil((graph.xy.max(axis=0) + MARGIN - low) / 32.0).astype(int) * 32
     nx, ny = size.tolist()
@@ -181,10 +183,14 @@ def _squares(used: npt.NDArray[np.bool_], k: int, at: I32) -> npt.NDArray[np.int
     """Triangles of squares of k cells with corners at [n, 2] (row, column): two, or a fan by finer neighbours."""
     wide = used.shape[1]
     step = np.arange(k)
-    ring = np.concatenate([
-        np.stack([0 * step, step], 1), np.stack([step, k + 0 * step], 1),
-        np.stack([k + 0 * step, k - step], 1), np.stack([k - step, 0 * step], 1),
-    ])  # fmt: skip
+    ring = np.concatenate(
+        [
+            np.stack([0 * step, step], 1),
+            np.stack([step, k + 0 * step], 1),
+            np.stack([k + 0 * step, k - step], 1),
+            np.stack([k - step, 0 * step], 1),
+        ]
+    )
     node = at[:, None, :].astype(np.int64) + ring[None]
     flat = node[..., 0] * wide + node[..., 1]
     seen = used[node[..., 0], node[..., 1]]

@@ -158,9 +158,13 @@ def box(low: ArrayLike, high: ArrayLike, material: ArrayLike, *, levels: int = A
     """Boxes along the axes from low [n, 3] to high [n, 3]; the underside is left out unless `base`."""
     a, b = (np.asarray(v, np.float64).reshape(-1, 3) for v in (low, high))
     corner = np.stack(
-        [np.stack([(a, b)[i][:, 0], (a, b)[j][:, 1], (a, b)[k][:, 2]], axis=1)
-         for k in (0, 1) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))], axis=1,
-    )  # fmt: skip
+        [
+            np.stack([(a, b)[i][:, 0], (a, b)[j][:, 1], (a, b)[k][:, 2]], axis=1)
+            for k in (0, 1)
+            for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
+        ],
+        axis=1,
+    )
     sides = _SIDES if base else _SIDES[:5]
     index = np.repeat(np.broadcast_to(np.asarray(material, np.int32), len(a)), len(sides))
     return flat(corner[:, sides].reshape(-1, 4, 3), index, levels=levels)

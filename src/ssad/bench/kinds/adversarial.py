@@ -107,15 +107,27 @@ class Adversarial(ScenarioKind):
         # all generators and systems meet the same bases with the same seeds
         cells = tuple(
             self.scenario_cell(
-                suite, one, systems[system], generators[generator], *others, system=system,
+                suite,
+                one,
+                systems[system],
+                generators[generator],
+                *others,
+                system=system,
                 title=f"{generator}/{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
-                chance=("adversarial", repetition), fields={"generator": generator}, generator=generator,
-                repetition=repetition, budget=suite.budget, batch=suite.batch, keep=suite.keep, grade=suite.grade,
+                chance=("adversarial", repetition),
+                fields={"generator": generator},
+                generator=generator,
+                repetition=repetition,
+                budget=suite.budget,
+                batch=suite.batch,
+                keep=suite.keep,
+                grade=suite.grade,
                 transfer=list(suite.transfer),
             )
-            for generator, system, one, repetition
-            in product(suite.generators, suite.systems, scenarios, range(suite.repetitions))
-        )  # fmt: skip
+            for generator, system, one, repetition in product(
+                suite.generators, suite.systems, scenarios, range(suite.repetitions)
+            )
+        )
         return Plan(self, suite, device, cells, {"towns": towns, "systems": systems, "generators": generators})
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
@@ -157,9 +169,13 @@ class Adversarial(ScenarioKind):
         generator = factory(chosen, seeds=[cell.seed for cell in alive], budget=spec["budget"])
         clock: dict[int, float] = {}  # rollouts of each base -> s for all bases
         outcomes = search(
-            generator, chosen, trials, budget=spec["budget"], batch=spec["batch"],
+            generator,
+            chosen,
+            trials,
+            budget=spec["budget"],
+            batch=spec["batch"],
             after=lambda asked: clock.update({asked: time.process_time() - began}),
-        )  # fmt: skip
+        )
         usual = reference(job.folder, job.device)
         saved = [
             self._save(cell, base, row, job.folder) for cell, base, row in zip(alive, chosen, outcomes, strict=True)
@@ -181,9 +197,7 @@ class Adversarial(ScenarioKind):
         mark = f"-{cell.spec['repetition']}" if cell.spec["repetition"] else ""
         stem = f"{base.scenario.name}/{cell.spec['generator']}{mark}"
         artefacts = {"scenarios": f"found/{cell.key}.yaml", "trace": f"traces/{cell.key}.npz"}
-        found, made = saved_collisions(
-            folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem
-        )  # fmt: skip
+        found, made = saved_collisions(folder / artefacts["scenarios"], base, row, keep=cell.spec["keep"], stem=stem)
         if not found:
             return {}, []
         assert found[0].trace is not None

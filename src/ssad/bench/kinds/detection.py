@@ -116,9 +116,11 @@ class DetectorKind(Kind):
             total = suite.recorded.scenes * len(suite.recorded.towns)
             with Live("recording", total, 0, console=resources.console, unit="scenes") as live:
                 root = record_nuscenes(
-                    recording_of(suite, folder / "data"), workers=resources.workers, ray=resources.ray,
+                    recording_of(suite, folder / "data"),
+                    workers=resources.workers,
+                    ray=resources.ray,
                     progress=live.show,
-                )  # fmt: skip
+                )
         with NuScenes(root, suite.version) as data:
             version = data.version
             scenes = {name: data.scene(name) for name in scenes_of(data, suite.split)}
@@ -129,11 +131,16 @@ class DetectorKind(Kind):
                 "to score; choose another split"
             )
         settings = {
-            "root": str(root.resolve()), "version": version, "detectors": dict(plan.details),
-            "seed": suite.seed, "replicates": suite.replicates, "scenes": tokens,
-            "threads": max(1, default_workers() // (resources.workers or default_workers())), **self.settings(suite),
+            "root": str(root.resolve()),
+            "version": version,
+            "detectors": dict(plan.details),
+            "seed": suite.seed,
+            "replicates": suite.replicates,
+            "scenes": tokens,
+            "threads": max(1, default_workers() // (resources.workers or default_workers())),
+            **self.settings(suite),
             **self.about(scenes),
-        }  # fmt: skip
+        }
         job = Job(folder, plan.device, settings)
         forget_failures([boxes_path(folder, c.system, one) for c in retry for one in self.scenes(c, job)])
         return settings
@@ -192,9 +199,11 @@ class DetectorKind(Kind):
         examination = replace(examination, detectors=((system, dict(examination.detectors)[system]),))
         shown, _ = self.sheet(examination, plan.suite, cell)
         return Replay(
-            cell, difference(record, result), picture=shown,
+            cell,
+            difference(record, result),
+            picture=shown,
             compared=f"{len(result['metrics'])} metrics, {same} of {len(files)} files of boxes the same to the bit",
-        )  # fmt: skip
+        )
 
 
 class Detection(DetectorKind):
@@ -284,6 +293,13 @@ def _examination(job: Job) -> Examination:
         for name, (detector, kind, options) in own.get("defended", {}).items()
     }
     return Examination(
-        job.folder, Path(own["root"]), own["version"], tuple(own["detectors"].items()), own["seed"], job.device,
-        own["threads"], own.get("calibration", "physical"), defended,
-    )  # fmt: skip
+        job.folder,
+        Path(own["root"]),
+        own["version"],
+        tuple(own["detectors"].items()),
+        own["seed"],
+        job.device,
+        own["threads"],
+        own.get("calibration", "physical"),
+        defended,
+    )

@@ -57,9 +57,19 @@ class Digital(DetectorKind):
     suite = DigitalSuite
     columns = (*DetectorKind.columns, Column("drop", "share of the clean mAP that is lost", "", "higher"))
     factors = (
-        "detector", "attack", "loss", "norm", "radius", "steps", "options", "source", "defence", "aware",
-        "target", "subset",
-    )  # fmt: skip
+        "detector",
+        "attack",
+        "loss",
+        "norm",
+        "radius",
+        "steps",
+        "options",
+        "source",
+        "defence",
+        "aware",
+        "target",
+        "subset",
+    )
 
     def plan(self, suite: DigitalSuite, *, device: str = "cpu", check: bool = True) -> Plan:
         """Attacks, defences and detectors are built once, the data set is looked at."""
@@ -93,8 +103,10 @@ class Digital(DetectorKind):
         job, images = Job(folder, plan.device, settings), settings["images"]
         passes: dict[str, Any] = {
             f"{one.source}/{one.name}": one.spec.passes_in(images[one.scene])
-            for cell in plan.cells for one in self.scenes(cell, job) if isinstance(one, AttackedScene)
-        }  # fmt: skip
+            for cell in plan.cells
+            for one in self.scenes(cell, job)
+            if isinstance(one, AttackedScene)
+        }
         count = len(plan.details)
         text = f"{sum(passes.values()):,} forward and backward passes for {count} detector{'s' if count != 1 else ''}"
         resources.console.print(f"{text} in all", highlight=False)
@@ -144,8 +156,9 @@ class Digital(DetectorKind):
         defended = {
             system_name(detector, guard): [detector, guard.name, dict(guard.options)]
             for detector in (split_weights(text)[0] for text in suite.detectors)
-            for guard in dict.fromkeys(guard_of(suite, one) for one in suite.attacks if one.defence) if guard
-        }  # fmt: skip
+            for guard in dict.fromkeys(guard_of(suite, one) for one in suite.attacks if one.defence)
+            if guard
+        }
         return {"batch": suite.batch, "defended": defended}
 
     def about(self, scenes: Mapping[str, SceneData]) -> dict[str, Any]:

@@ -180,12 +180,20 @@ class Driving(ScenarioKind):
         # the seed does not depend on the system: systems meet the same episodes
         cells = tuple(
             self.scenario_cell(
-                suite, one, systems[system], system=system, chance=("episode", repetition),
+                suite,
+                one,
+                systems[system],
+                system=system,
+                chance=("episode", repetition),
                 title=f"{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
-                repetition=repetition, spread=suite.spread if repetition else 0.0, **away,
+                repetition=repetition,
+                spread=suite.spread if repetition else 0.0,
+                **away,
             )
-            for system in suite.systems for one in scenarios for repetition in range(suite.repetitions)
-        )  # fmt: skip
+            for system in suite.systems
+            for one in scenarios
+            for repetition in range(suite.repetitions)
+        )
         if check:
             for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
                 _check(cell)

@@ -134,17 +134,23 @@ class Gap(ScenarioKind):
                     wearers[name, one.scenario.name] = wearer(name, episode, town(one.scenario.town))
         cells = [
             self._cell(suite, one, condition, repetition, versions[_name(condition[0])], worn_by)
-            for condition in conditions for one in scenarios
+            for condition in conditions
+            for one in scenarios
             for worn_by in [wearers.get((condition[1], one.scenario.name))]
             if worn_by is not None or not is_worn(condition[1])
             for repetition in range(suite.repetitions)
-        ]  # fmt: skip
+        ]
         return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
 
     def _cell(  # noqa: PLR0917  # plain values
-        self, suite: GapSuite, one: Described, condition: tuple[str | PerceivingSystem, str, int], repetition: int,
-        version: str, worn_by: int | None = None,
-    ) -> Cell:  # fmt: skip
+        self,
+        suite: GapSuite,
+        one: Described,
+        condition: tuple[str | PerceivingSystem, str, int],
+        repetition: int,
+        version: str,
+        worn_by: int | None = None,
+    ) -> Cell:
         """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
         system, perturbation, severity = condition
         own = None if isinstance(system, str) else system.model_dump(mode="json")
@@ -152,13 +158,23 @@ class Gap(ScenarioKind):
         family = family_of(perturbation)
         texture = texture_version(perturbation) if family in (TEXTURE, LIGHT) else ""
         return self.scenario_cell(
-            suite, one, version, suite.seed, texture, system=_name(system), chance=("episode", repetition),
+            suite,
+            one,
+            version,
+            suite.seed,
+            texture,
+            system=_name(system),
+            chance=("episode", repetition),
             title=f"{_name(system)}/{under}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
             fields={"perturbation": perturbation, "severity": severity, "family": family},
-            repetition=repetition, spread=suite.spread if repetition else 0.0, settings=own,
-            perturbation=perturbation, severity=severity, repair=suite.repair and own is not None,
+            repetition=repetition,
+            spread=suite.spread if repetition else 0.0,
+            settings=own,
+            perturbation=perturbation,
+            severity=severity,
+            repair=suite.repair and own is not None,
             **({"wearer": worn_by} if is_worn(perturbation) else {}),
-        )  # fmt: skip
+        )
 
     def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
         """See `ScenarioKind`."""

@@ -85,11 +85,18 @@ class HowOften(ScenarioKind):
         settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
         cells = tuple(
             self.scenario_cell(
-                suite, one, systems[system], title=f"{method}/{system}/{one.scenario.name}", system=system,
-                chance=("how often", method), fields={"method": method}, method=method, **settings,
+                suite,
+                one,
+                systems[system],
+                title=f"{method}/{system}/{one.scenario.name}",
+                system=system,
+                chance=("how often", method),
+                fields={"method": method},
+                method=method,
+                **settings,
             )
             for system, one, method in product(suite.systems, scenarios, suite.methods)
-        )  # fmt: skip
+        )
         if check:
             for cell in cells:
                 chance_of(cell, device).process(1)

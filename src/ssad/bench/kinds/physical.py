@@ -111,9 +111,12 @@ class Physical(Kind):
             with Live("rendering what wears textures", 1, 0, console=resources.console, unit="parts") as live:
                 see_all(recordings, suite.target, surfaces, **work, progress=live.show)
         return {
-            "target": suite.target, "floor": suite.floor, "replicates": suite.replicates, "seed": suite.seed,
+            "target": suite.target,
+            "floor": suite.floor,
+            "replicates": suite.replicates,
+            "seed": suite.seed,
             "grid": suite.grid.count if suite.grid else 0,
-        }  # fmt: skip
+        }
 
     def start(self, job: Job) -> None:
         """Memory for tensors is kept."""

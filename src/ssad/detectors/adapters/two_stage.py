@@ -115,10 +115,15 @@ class TwoStage(Adapter):
 
         filled = torch.arange(len(chosen[0]) + empty, device=image.device) < len(chosen[0])
         found = {
-            "class_logits": fill(logit), "box_regression": fill(boxes), "proposals": fill(chosen[0]),
-            "filled": filled[None], "objectness": objectness[None, :, 0], "rpn_regression": regression[None],
-            "anchors": anchors, "inside": torch.tensor(batch.image_sizes[0]),
-        }  # fmt: skip
+            "class_logits": fill(logit),
+            "box_regression": fill(boxes),
+            "proposals": fill(chosen[0]),
+            "filled": filled[None],
+            "objectness": objectness[None, :, 0],
+            "rpn_regression": regression[None],
+            "anchors": anchors,
+            "inside": torch.tensor(batch.image_sizes[0]),
+        }
         return found | {f"feature{k}": value for k, value in enumerate(levels)}
 
     def _boxes(self, regression: Tensor, proposals: Tensor) -> Tensor:
@@ -140,10 +145,14 @@ class TwoStage(Adapter):
             place, label = ((score > least) & filled[:, None] & large).nonzero(as_tuple=True)
             found.append(
                 suppress(
-                    score[place, label], label, box[place, label], iou=roi.nms_thresh,
-                    limit=roi.detections_per_img, size=dense.size,
+                    score[place, label],
+                    label,
+                    box[place, label],
+                    iou=roi.nms_thresh,
+                    limit=roi.detections_per_img,
+                    size=dense.size,
                 )
-            )  # fmt: skip
+            )
         return found
 
     @torch.no_grad()

@@ -213,9 +213,11 @@ class Ultralytics(Adapter):
         box, kind, crowd = targets.box[k, :real], targets.label[k, :real], targets.crowd[k, :real]
         inside = torch.cat((place[:, None] - box[:, :2], box[:, 2:] - place[:, None]), -1).amin(-1) > 1e-9
         pairs = (len(place), real, 4)
-        overlap = ciou(
-            predicted[:, None].expand(pairs).reshape(-1, 4), box.expand(pairs).reshape(-1, 4)
-        ).clamp(min=0).view(len(place), real)  # fmt: skip
+        overlap = (
+            ciou(predicted[:, None].expand(pairs).reshape(-1, 4), box.expand(pairs).reshape(-1, 4))
+            .clamp(min=0)
+            .view(len(place), real)
+        )
         overlap = overlap * inside
         aligned = dense.logit[k].sigmoid()[:, kind] ** ALPHA * overlap**BETA
         best = aligned.topk(min(TOP, len(place)), 0).indices

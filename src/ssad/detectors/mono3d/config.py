@@ -14,13 +14,29 @@ from ssad.core.errors import ConfigError
 # mean and deviation of depth (m), and mean length, height, width (m), in the order of MMDET3D_CLASSES. The bicycle
 # has the size of the construction vehicle: the published weights were trained with these numbers.
 BASE_DEPTHS = (
-    (31.99, 21.12), (37.15, 24.63), (39.69, 23.97), (40.91, 26.34), (34.16, 20.11), (22.35, 13.70), (24.28, 16.05),
-    (27.26, 15.50), (20.61, 13.68), (22.74, 15.01),
-)  # fmt: skip
+    (31.99, 21.12),
+    (37.15, 24.63),
+    (39.69, 23.97),
+    (40.91, 26.34),
+    (34.16, 20.11),
+    (22.35, 13.70),
+    (24.28, 16.05),
+    (27.26, 15.50),
+    (20.61, 13.68),
+    (22.74, 15.01),
+)
 BASE_DIMS = (
-    (4.62, 1.73, 1.96), (6.93, 2.83, 2.51), (12.56, 3.89, 2.94), (11.22, 3.50, 2.95), (6.68, 3.21, 2.85),
-    (6.68, 3.21, 2.85), (2.11, 1.46, 0.78), (0.73, 1.77, 0.67), (0.41, 1.08, 0.41), (0.50, 0.99, 2.52),
-)  # fmt: skip
+    (4.62, 1.73, 1.96),
+    (6.93, 2.83, 2.51),
+    (12.56, 3.89, 2.94),
+    (11.22, 3.50, 2.95),
+    (6.68, 3.21, 2.85),
+    (6.68, 3.21, 2.85),
+    (2.11, 1.46, 0.78),
+    (0.73, 1.77, 0.67),
+    (0.41, 1.08, 0.41),
+    (0.50, 0.99, 2.52),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +152,35 @@ _LIGHT_WEIGHTS = (1, 1, 0.2, 1, 1, 1, 1, 0.2, 0.2)
 FCOS3D = Mono3DConfig("fcos3d")
 PGD_DET = replace(FCOS3D, name="pgd-det", pgd=True, threshold=0.01, code_weights=_PGD_WEIGHTS)
 FCOS3D_LIGHT = Mono3DConfig(
-    "fcos3d-light", trunk=18, width=40, channels=128, strides=(8, 16, 32, 64), ranges=(32.0, 64.0, 128.0, 1e8),
-    deformable=False, input_width=800, trained_width=800, virtual_focal=632.0, std=(57.375, 57.12, 58.395),
-    start=(20.0, 4.0, 1.7, 1.8), rays=True, code_weights=_LIGHT_WEIGHTS, nms=0.3, image_nms=0.7,
-    threshold=0.02, vote=0.7, fade=0.01, heading="vectors",
-)  # fmt: skip
+    "fcos3d-light",
+    trunk=18,
+    width=40,
+    channels=128,
+    strides=(8, 16, 32, 64),
+    ranges=(32.0, 64.0, 128.0, 1e8),
+    deformable=False,
+    input_width=800,
+    trained_width=800,
+    virtual_focal=632.0,
+    std=(57.375, 57.12, 58.395),
+    start=(20.0, 4.0, 1.7, 1.8),
+    rays=True,
+    code_weights=_LIGHT_WEIGHTS,
+    nms=0.3,
+    image_nms=0.7,
+    threshold=0.02,
+    vote=0.7,
+    fade=0.01,
+    heading="vectors",
+)
 PGD_DET_LIGHT = replace(
-    FCOS3D_LIGHT, name="pgd-det-light", pgd=True, threshold=0.01, start=None, sure=0.5, vote=0.8, fade=0.02,
+    FCOS3D_LIGHT,
+    name="pgd-det-light",
+    pgd=True,
+    threshold=0.01,
+    start=None,
+    sure=0.5,
+    vote=0.8,
+    fade=0.02,
     code_weights=(*_LIGHT_WEIGHTS, *_PGD_WEIGHTS[9:]),
-)  # fmt: skip
+)

@@ -47,18 +47,26 @@ def flatten(maps: dict[str, list[Tensor]]) -> Flat:
         return torch.cat([m.flatten(2).transpose(1, 2) for m in maps[name]], 1)
 
     return Flat(
-        rows("cls_scores"), rows("bbox_preds"), rows("dir_cls_preds"), rows("attr_preds"), rows("centernesses")[..., 0],
+        rows("cls_scores"),
+        rows("bbox_preds"),
+        rows("dir_cls_preds"),
+        rows("attr_preds"),
+        rows("centernesses")[..., 0],
         rows("depth_cls_preds") if "depth_cls_preds" in maps else None,
-    )  # fmt: skip
+    )
 
 
 def pick(flat: Flat, image: Tensor, rows: Tensor) -> Flat:
     """Some places [N] of images [N]."""
     bins = None if flat.bins is None else flat.bins[image, rows]
     return Flat(
-        flat.logit[image, rows], flat.reg[image, rows], flat.direction[image, rows], flat.attribute[image, rows],
-        flat.centreness[image, rows], bins,
-    )  # fmt: skip
+        flat.logit[image, rows],
+        flat.reg[image, rows],
+        flat.direction[image, rows],
+        flat.attribute[image, rows],
+        flat.centreness[image, rows],
+        bins,
+    )
 
 
 def places_of(maps: list[Tensor], strides: tuple[int, ...]) -> Places:

@@ -94,10 +94,16 @@ class Mono3D(nn.Module):
                 solids = self._solids(flat, places.xy, lens[:, None])
                 box = self._boxes(flat, places.xy, solids, lens=lens[:, None], size=size)
         return Dense(
-            logit=flat.logit, quality=flat.centreness, box=box,
-            place=(places.xy - places.xy.new_tensor([0.0, above])) / scale, stride=places.stride / scale[0],
-            level=places.level, size=size, maps={**maps, "intrinsic": [lens]}, features=tuple(features),
-        )  # fmt: skip
+            logit=flat.logit,
+            quality=flat.centreness,
+            box=box,
+            place=(places.xy - places.xy.new_tensor([0.0, above])) / scale,
+            stride=places.stride / scale[0],
+            level=places.level,
+            size=size,
+            maps={**maps, "intrinsic": [lens]},
+            features=tuple(features),
+        )
 
     def _maps(
         self, images: Tensor, intrinsic: Tensor | None
@@ -160,8 +166,15 @@ class Mono3D(nn.Module):
             if self.config.heading == "vectors":
                 yaw = yaw - picked.reg[of, 6] + yaw_of_vectors(direction).to(yaw)
             columns = (
-                score[stay], label[stay], shown[stay], centre, extent, yaw, velocity, picked.attribute[of].argmax(-1),
-            )  # fmt: skip
+                score[stay],
+                label[stay],
+                shown[stay],
+                centre,
+                extent,
+                yaw,
+                velocity,
+                picked.attribute[of].argmax(-1),
+            )
             counts = torch.bincount(image[stay], minlength=len(lens)).tolist()
             parts = zip(*(torch.split(column.to(device), counts) for column in columns), strict=True)
             return [Detections(part[0], part[1], part[2], Solids(*part[3:])) for part in parts]
@@ -306,9 +319,15 @@ class Mono3D(nn.Module):
         places = places_of(dense.maps["cls_scores"], self.config.strides)
         with _exact(lens):
             return losses(
-                self.config, flatten(_head_maps(dense)), places, assignment, lens, factor=self._factor(lens),
-                fuse=self.bbox_head.fuse, reduction=reduction,
-            )  # fmt: skip
+                self.config,
+                flatten(_head_maps(dense)),
+                places,
+                assignment,
+                lens,
+                factor=self._factor(lens),
+                fuse=self.bbox_head.fuse,
+                reduction=reduction,
+            )
 
     def _solids(
         self, flat: Flat, xy: Tensor, lens: Tensor, image: Tensor | None = None

@@ -21,9 +21,16 @@ Fuse = Callable[[Tensor, Tensor, Tensor | None], Tensor]
 
 
 def losses(
-    config: Mono3DConfig, flat: Flat, places: Places, assignment: Assignment, lens: Tensor, *, factor: Tensor | None,
-    fuse: Fuse, reduction: Reduction,
-) -> dict[str, Tensor]:  # fmt: skip
+    config: Mono3DConfig,
+    flat: Flat,
+    places: Places,
+    assignment: Assignment,
+    lens: Tensor,
+    *,
+    factor: Tensor | None,
+    fuse: Fuse,
+    reduction: Reduction,
+) -> dict[str, Tensor]:
     """Training losses; depth is compared as the head predicts it, before the factor.
 
     Args:
@@ -88,17 +95,30 @@ def losses(
         found["bbox2d"] = smooth(reg[:, 9:] / stride[:, None], target[:, 9:], 9)
         bin_of = direction.argmax(-1) if config.heading == "bins" else None
         each = _consistency(
-            config, places.xy[place], reg, depth=depth, direction=bin_of, target=target, stride=stride,
+            config,
+            places.xy[place],
+            reg,
+            depth=depth,
+            direction=bin_of,
+            target=target,
+            stride=stride,
             lens=lens[image],
-        )  # fmt: skip
+        )
         found["consistency"] = total.mean(each * weights[9:].mean())
     return found
 
 
 def _consistency(
-    config: Mono3DConfig, xy: Tensor, reg: Tensor, *, depth: Tensor, direction: Tensor | None, target: Tensor,
-    stride: Tensor, lens: Tensor,
-) -> Tensor:  # fmt: skip
+    config: Mono3DConfig,
+    xy: Tensor,
+    reg: Tensor,
+    *,
+    depth: Tensor,
+    direction: Tensor | None,
+    target: Tensor,
+    stride: Tensor,
+    lens: Tensor,
+) -> Tensor:
     """1 - GIoU [M] of the 2D box with the hull of the projected corners of the 3D box.
 
     The 3D box is the predicted one, its centre unprojected with the predicted depth and then moved to the true depth

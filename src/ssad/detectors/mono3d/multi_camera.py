@@ -70,8 +70,15 @@ def merge_cameras(
         score, label = one.score.detach().cpu().double().numpy(), one.label.cpu().numpy()
         near = (score > LEAST) & (_distance(centre, to_ego) <= REACH[label])
         pose = to_world @ to_ego
-        rows = (centre @ pose[:3, :3].T + pose[:3, 3], size, pose[:3, :3] @ camera_axes(yaw),
-                _flat(velocity) @ pose[:3, :3].T, score, label, solid.attribute.cpu().numpy())  # fmt: skip
+        rows = (
+            centre @ pose[:3, :3].T + pose[:3, 3],
+            size,
+            pose[:3, :3] @ camera_axes(yaw),
+            _flat(velocity) @ pose[:3, :3].T,
+            score,
+            label,
+            solid.attribute.cpu().numpy(),
+        )
         columns.append(tuple(r[near] for r in rows))
     world, size, axes, velocity, score, label, attribute = (np.concatenate(c) for c in zip(*columns, strict=True))
     ahead = int(np.argmax([pose[0, 2] for pose in cam_to_ego]))  # its optical axis points along the ego's x
@@ -89,9 +96,14 @@ def merge_cameras(
     names = tuple(_attribute(int(k), int(a)) for k, a in zip(label[rows], attribute[rows], strict=True))
     rotation = matrix_to_quaternion(pose[:3, :3] @ camera_axes(yaw[rows]))
     return DetectedBoxes(
-        world[rows], size[rows][:, size_columns("lhw", "lwh")], rotation, moved[:, :2],
-        score[rows], label[rows].astype(np.int32), names,
-    )  # fmt: skip
+        world[rows],
+        size[rows][:, size_columns("lhw", "lwh")],
+        rotation,
+        moved[:, :2],
+        score[rows],
+        label[rows].astype(np.int32),
+        names,
+    )
 
 
 def _empty() -> DetectedBoxes:

@@ -79,11 +79,15 @@ def _pad(truth: Sequence[Truth], device: torch.device, dtype: torch.dtype) -> _P
 
     real = [torch.ones_like(one.label, dtype=torch.bool) if one.crowd is None else ~one.crowd for one in truth]
     return _Padded(
-        side_by_side(real), side_by_side([one.label for one in truth]), side_by_side([one.box for one in truth]),
-        side_by_side([s.centre for s in solids]), side_by_side([s.size_lhw for s in solids]),
-        side_by_side([s.yaw for s in solids]), side_by_side([s.velocity for s in solids]),
+        side_by_side(real),
+        side_by_side([one.label for one in truth]),
+        side_by_side([one.box for one in truth]),
+        side_by_side([s.centre for s in solids]),
+        side_by_side([s.size_lhw for s in solids]),
+        side_by_side([s.yaw for s in solids]),
+        side_by_side([s.velocity for s in solids]),
         side_by_side([s.attribute for s in solids]),
-    )  # fmt: skip
+    )
 
 
 def _all(
@@ -112,9 +116,16 @@ def _all(
     near = of(box)
     local = objects.yaw - torch.atan2(objects.centre[..., 0], objects.centre[..., 2])
     reg = torch.cat(
-        [picked / stride, of(objects.centre)[..., 2:], of(objects.size_lhw), of(local)[..., None], of(objects.velocity),
-         torch.cat([places.xy - near[..., :2], near[..., 2:] - places.xy], -1) / stride], -1,
-    )  # fmt: skip
+        [
+            picked / stride,
+            of(objects.centre)[..., 2:],
+            of(objects.size_lhw),
+            of(local)[..., None],
+            of(objects.velocity),
+            torch.cat([places.xy - near[..., :2], near[..., 2:] - places.xy], -1) / stride,
+        ],
+        -1,
+    )
     relative = picked.norm(dim=-1) / (1.414 * config.radius * places.stride)
     extra = {
         "reg": torch.where(found[..., None], reg, torch.zeros_like(reg)),

@@ -129,9 +129,14 @@ class Yolo(Adapter):
         scale = self._scale(dense.size, dense.box)
         raw = flatten(dense.maps["raw"], self.anchors.shape[1])
         answers = Answers(
-            raw[..., :4], dense.box * scale, dense.quality, dense.logit, assignment.label,
-            assignment.extra["box"].to(scale) * scale, self._padded(dense.size),
-        )  # fmt: skip
+            raw[..., :4],
+            dense.box * scale,
+            dense.quality,
+            dense.logit,
+            assignment.label,
+            assignment.extra["box"].to(scale) * scale,
+            self._padded(dense.size),
+        )
         kind: Reduction = reduction
         if self.spec.rule == "v3":
             return losses_v3(answers, grid, box_loss=self.spec.box_loss, reduction=kind)

@@ -94,10 +94,15 @@ def encounters(
     belief: Belief = view.readings["truth"]
     seen = in_sight(view.pose[:, :2], belief, reach) & (belief.kind != AgentKind.NONE)
     e = meet(
-        path, half=half, place=np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64),
-        yaw=np.asarray(belief.pose[..., 2] - view.pose[:, None, 2], np.float64), speed=np.asarray(belief.speed),
-        size=np.asarray(belief.size), own_speed=np.asarray(view.speed), own_accel=np.asarray(view.accel),
-    )  # fmt: skip
+        path,
+        half=half,
+        place=np.asarray(to_local(view.pose[:, None], belief.pose[..., :2]), np.float64),
+        yaw=np.asarray(belief.pose[..., 2] - view.pose[:, None, 2], np.float64),
+        speed=np.asarray(belief.speed),
+        size=np.asarray(belief.size),
+        own_speed=np.asarray(view.speed),
+        own_accel=np.asarray(view.accel),
+    )
     comes = seen & (e.approach > 0.05)
     now = np.where(comes, moved + np.maximum(e.approach, 0.0) * dt, 0.0)
     return replace(e, moved=now), seen, now

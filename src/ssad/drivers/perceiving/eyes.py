@@ -31,9 +31,14 @@ from ssad.drivers.perceiving.objects import I64, SIZES
 FRONT = ("CAM_FRONT",)
 # what a perfect detector calls each kind
 NAMES: Mapping[int, str] = {
-    AgentKind.CAR: "car", AgentKind.TRUCK: "truck", AgentKind.BUS: "bus", AgentKind.MOTORCYCLE: "motorcycle",
-    AgentKind.BICYCLE: "bicycle", AgentKind.WALKER: "pedestrian", AgentKind.PROP: "barrier",
-}  # fmt: skip
+    AgentKind.CAR: "car",
+    AgentKind.TRUCK: "truck",
+    AgentKind.BUS: "bus",
+    AgentKind.MOTORCYCLE: "motorcycle",
+    AgentKind.BICYCLE: "bicycle",
+    AgentKind.WALKER: "pedestrian",
+    AgentKind.PROP: "barrier",
+}
 MEMORY = 100  # bytes that a detector needs on a GPU for each value of a picture, about
 _SLOTS = 64  # a scene has fewer agents: draws for all, so that none depends on how many there are
 
@@ -379,8 +384,11 @@ def _joined(one: Detections, other: Detections) -> Detections:
     assert a is not None
     assert b is not None
     solid = Solids(
-        torch.cat([a.centre, b.centre]), torch.cat([a.size_lhw, b.size_lhw]), torch.cat([a.yaw, b.yaw]),
-        torch.cat([a.velocity, b.velocity]), torch.cat([a.attribute, b.attribute]),
-    )  # fmt: skip
+        torch.cat([a.centre, b.centre]),
+        torch.cat([a.size_lhw, b.size_lhw]),
+        torch.cat([a.yaw, b.yaw]),
+        torch.cat([a.velocity, b.velocity]),
+        torch.cat([a.attribute, b.attribute]),
+    )
     score, label = torch.cat([one.score, other.score]), torch.cat([one.label, other.label])
     return Detections(score, label, torch.cat([one.box, other.box]), solid)

@@ -29,8 +29,10 @@ from ssad.drivers.perceiving.objects import I64, Objects
 
 MEMORY = 0.8  # what earlier sizes, kinds and headings weigh, at each hit
 SCORES = {
-    "fcos3d-light": (0.25, 0.1), "fcos3d-light-robust": (0.25, 0.1), "pgd-det-light": (0.13, 0.05),
-}  # fmt: skip
+    "fcos3d-light": (0.25, 0.1),
+    "fcos3d-light-robust": (0.25, 0.1),
+    "pgd-det-light": (0.13, 0.05),
+}
 """High and low for detectors that score low."""
 SURE = 2.0  # standard deviations of its speed above which the direction in which a track moves is its heading
 
@@ -268,9 +270,19 @@ class Tracker:
         axis, heading, votes = _looks(found)
         once, none = np.ones(n, np.int64), np.zeros(n, np.int64)
         return Tracks(
-            found.scene, order, when[found.scene], mean, covariance, axis, heading, found.size, votes, found.score,
-            once, none,
-        )  # fmt: skip
+            found.scene,
+            order,
+            when[found.scene],
+            mean,
+            covariance,
+            axis,
+            heading,
+            found.size,
+            votes,
+            found.score,
+            once,
+            none,
+        )
 
     def confirmed(self, scenes: I32 | I64, times: F64) -> Tracks:
         """The confirmed tracks of some scenes, each at its scene's time.
@@ -281,9 +293,7 @@ class Tracker:
         """
         when = np.full(len(self._born), np.nan)
         when[scenes] = times
-        chosen = self.tracks.take(
-            (self.tracks.hits >= self.settings.confirm) & np.isfinite(when[self.tracks.scene])
-        )  # fmt: skip
+        chosen = self.tracks.take((self.tracks.hits >= self.settings.confirm) & np.isfinite(when[self.tracks.scene]))
         return chosen.at(when[chosen.scene], self.settings.density)
 
 

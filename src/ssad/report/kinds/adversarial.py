@@ -25,11 +25,16 @@ from ssad.report.tables import METHODS, Cell, Row, Table
 RANDOM, ADVERSARIES = "random", "adv-ppo"
 SUMMARY = ("survived", "CR", "rollouts", "distinct", "moving", "attributable")
 GRADES = {
-    "moving": "ego moves", "avoided_by_cc": "CC avoids", "avoided_by_reg157": "Reg157 avoids",
-    "avoided_by_rss": "RSS avoids", "avoided_by_fsm": "FSM avoids", "attributable": "any of these avoids",
-    "attributable_moving": "the same, ego moves", "avoided_by_limit": "a manoeuvre avoids",
+    "moving": "ego moves",
+    "avoided_by_cc": "CC avoids",
+    "avoided_by_reg157": "Reg157 avoids",
+    "avoided_by_rss": "RSS avoids",
+    "avoided_by_fsm": "FSM avoids",
+    "attributable": "any of these avoids",
+    "attributable_moving": "the same, ego moves",
+    "avoided_by_limit": "a manoeuvre avoids",
     "impact_speed": "impact speed, m/s",
-}  # fmt: skip
+}
 NOTE = "CR: survived bases in which a collision is found; avoidable: of the saved collisions, by a careful driver"
 VIEWS = 24
 Line = Mapping[str, Any]

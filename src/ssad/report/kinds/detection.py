@@ -24,9 +24,17 @@ SOURCE = "published by the paper: nuScenes val, severities drawn from 1 to 5"
 FAMILIES = {"environment": "Environment", "sensor": "Sensor", "object": "Object", "clean": "Clean"}
 TITLES = {"uniform": "uniform noise", "gaussian": "gaussian noise", "impulse": "impulse noise", "": "clean"}
 CLASSES = (
-    "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle", "traffic_cone",
+    "car",
+    "truck",
+    "bus",
+    "trailer",
+    "construction_vehicle",
+    "pedestrian",
+    "motorcycle",
+    "bicycle",
+    "traffic_cone",
     "barrier",
-)  # fmt: skip
+)
 ERRORS = {"mATE": "m", "mASE": "1 - IoU", "mAOE": "rad", "mAVE": "m/s", "mAAE": "1 - accuracy"}
 
 
@@ -177,10 +185,15 @@ def main_table(run: DetectionRun) -> Table:
     else:
         strength = "each scene at one severity from 1 to 5, all five as often, give or take one"
     return Table(
-        "shifts", "Detection under distribution shifts", ("Family", "Shift"), tuple(columns), tuple(rows),
+        "shifts",
+        "Detection under distribution shifts",
+        ("Family", "Shift"),
+        tuple(columns),
+        tuple(rows),
         f"Percent; {strength}; {interval_note(run)} Shaded rows: {SOURCE}; ours "
-        "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.", SOURCE,
-    )  # fmt: skip
+        "are other pictures and other detectors, so the fall under a shift can be compared, the level cannot.",
+        SOURCE,
+    )
 
 
 def left_table(run: DetectionRun) -> Table:
@@ -194,14 +207,20 @@ def left_table(run: DetectionRun) -> Table:
         if shift in PUBLISHED and any(names):
             cells = [
                 Cell(100 * PUBLISHED[shift][name][k] / PUBLISHED[""][name][k] if name else math.nan)
-                for name in names for k in (0, 1)
-            ]  # fmt: skip
+                for name in names
+                for k in (0, 1)
+            ]
             rows.append(Row(head, tuple(cells), published=True))
     return Table(
-        "left", "What is left of the clean score", ("Family", "Shift"), tuple(columns), tuple(rows),
+        "left",
+        "What is left of the clean score",
+        ("Family", "Shift"),
+        tuple(columns),
+        tuple(rows),
         "Percent of each detector's own clean score, which is what other pictures and detectors can be compared by."
-        + (f" Shaded rows: from the numbers {SOURCE}." if any(row.published for row in rows) else ""), SOURCE,
-    )  # fmt: skip
+        + (f" Shaded rows: from the numbers {SOURCE}." if any(row.published for row in rows) else ""),
+        SOURCE,
+    )
 
 
 def severity_table(run: DetectionRun) -> Table:
@@ -275,11 +294,14 @@ def robustness_table(run: DetectionRun) -> Table | None:
                 cells.append(score_cell(run, value, known, n, bounded=False))
         rows.append(Row((detector,), tuple(cells)))
     return Table(
-        "robustness", "Robustness in one number", ("Detector",), ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)"),
+        "robustness",
+        "Robustness in one number",
+        ("Detector",),
+        ("mCE (NDS)", "mRR (NDS)", "mCE (mAP)", "mRR (mAP)"),
         tuple(rows),
         f"Percent, over all shifts and severities {', '.join(severities)}. mCE: errors relative to those of "
         f"{run.detectors[0]} (lower is better); mRR: share of the clean score that is left (higher is better).",
-    )  # fmt: skip
+    )
 
 
 def _drawn(values: Mapping[str, Sequence[Sequence[float]]], k: int) -> dict[str, list[float]]:
@@ -309,13 +331,14 @@ def curves(run: DetectionRun, metric: str = "NDS") -> str:
         lines = [
             [
                 Point(
-                    int(n) / 5, cell_of(run, run.record(d, shift if n != "0" else "", n), metric),
+                    int(n) / 5,
+                    cell_of(run, run.record(d, shift if n != "0" else "", n), metric),
                     f"{d}, {title_of(shift)} {n}",
                 )
                 for n in steps
             ]
             for d in run.detectors
-        ]  # fmt: skip
+        ]
         found.append(Panel(title_of(shift), ticks, lines))
     return panels(found, label=f"{metric} over severity")
 
@@ -331,10 +354,14 @@ def tiles(run: DetectionRun, robust: Table | None) -> list[dict[str, Any]]:
         rates = resilience_rate(parts, base) if parts and base > 0 else {}
         worst = min(rates, key=lambda s: rates[s], default="")
         found.append(
-            {"name": detector, "mAP": cell_of(run, clean, "mAP"), "NDS": cell_of(run, clean, "NDS"),
-             "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
-             "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else ""}
-        )  # fmt: skip
+            {
+                "name": detector,
+                "mAP": cell_of(run, clean, "mAP"),
+                "NDS": cell_of(run, clean, "NDS"),
+                "mRR": robust.rows[number].cells[1] if robust else Cell(math.nan),
+                "worst": f"{title_of(worst)}: {100 * rates[worst]:.0f} % of NDS is left" if worst else "",
+            }
+        )
     return found
 
 
@@ -352,15 +379,27 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     main, left, severities = main_table(run), left_table(run), severity_table(run)
     cars, classes = car_table(run), class_table(run)
     page = render(
-        "detection.html", found, main=main, left=left, severities=severities, cars=cars, classes=classes,
-        robust=robust, tiles=tiles(run, robust), plot=curves(run), plot_map=curves(run, "mAP"),
-        pictures=pictures(found.folder), samples=max(int(r.get("n", 0)) for r in run.records.values()),
-        scenes=run.scenes, skipped=_skipped(run),
+        "detection.html",
+        found,
+        main=main,
+        left=left,
+        severities=severities,
+        cars=cars,
+        classes=classes,
+        robust=robust,
+        tiles=tiles(run, robust),
+        plot=curves(run),
+        plot_map=curves(run, "mAP"),
+        pictures=pictures(found.folder),
+        samples=max(int(r.get("n", 0)) for r in run.records.values()),
+        scenes=run.scenes,
+        skipped=_skipped(run),
         failures=[
             (r["detector"], r["shift"] or "clean", r["severity"], r["reason"])
-            for r in run.records.values() if r["status"] != "ok"
+            for r in run.records.values()
+            if r["status"] != "ok"
         ],
-    )  # fmt: skip
+    )
     return page, [t for t in (main, left, robust, severities, cars, classes) if t is not None]
 
 

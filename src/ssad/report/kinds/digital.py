@@ -91,8 +91,11 @@ def lost_table(run: DigitalRun) -> Table:
         rows.append(Row(head, tuple(cells)))
         told = published_row(run, setting)
         if told and clean:
-            shares = [100 * (1 - a / b) for after, before in zip(told[1], clean[1], strict=True)
-                      for a, b in zip(after, before, strict=True)]  # fmt: skip
+            shares = [
+                100 * (1 - a / b)
+                for after, before in zip(told[1], clean[1], strict=True)
+                for a, b in zip(after, before, strict=True)
+            ]
             rows.append(Row(told[0], tuple(Cell(share) for share in shares), published=True))
     columns = tuple(f"{d} {metric}" for d in run.detectors for metric in run.metrics(d))
     note = "Percent of each detector's own clean score; more is a stronger attack."
@@ -103,9 +106,16 @@ def effort_table(run: DigitalRun) -> Table:
     """What each attack took, and what it did to the loss that it ascends."""
     names = ("gradients", "queries", "loss_before", "loss_after", "used", "change_px", "idle", "gradient_error")
     columns = (
-        "gradients an image", "queries an image", "loss before", "loss after", "budget used (%)", "largest change (px)",
-        "idle images", "error of the gradient (%)", "images at once",
-    )  # fmt: skip
+        "gradients an image",
+        "queries an image",
+        "loss before",
+        "loss after",
+        "budget used (%)",
+        "largest change (px)",
+        "idle images",
+        "error of the gradient (%)",
+        "images at once",
+    )
     rows = []
     for (detector, setting), record in run.records.items():
         if not setting.attack or setting.source or record["status"] != "ok" or (setting.defence and not setting.aware):
@@ -158,8 +168,9 @@ def class_table(run: DigitalRun) -> Table:
     """AP of each class under the attacks of the table."""
     rows = [
         Row((d, title_of(s), size_of(s)), tuple(metric_cell(run.record(d, s), f"AP_{c}") for c in CLASSES))
-        for d in run.detectors for s in run.rows
-    ]  # fmt: skip
+        for d in run.detectors
+        for s in run.rows
+    ]
     note = "AP in percent; a class that is not in the data counts as 0 in mAP, as in the official evaluation."
     columns = tuple(c.replace("_", " ") for c in CLASSES)
     return Table("classes", "By class", ("Detector", "Attack", "Budget"), columns, tuple(rows), note)
@@ -177,12 +188,27 @@ def attempts_of(run: DigitalRun) -> list[Attempt]:
         group = [defence_of(setting), setting.target, scenes_of(setting) if setting.subset else ""]
         found.append(
             Attempt(
-                detector, attack, float(record["metrics"]["mAP"]), float(clean["metrics"]["mAP"]), loss, norm, radius,
-                steps, record["access"], options, tuple(replicates_of(record, "mAP")), record["loss_before"],
-                record["loss_after"], record["gradient_error"], record["coupling"], record["used"], record["change_px"],
-                setting.source or ("the bare detector" if unaware else ""), ", ".join(filter(None, group)),
+                detector,
+                attack,
+                float(record["metrics"]["mAP"]),
+                float(clean["metrics"]["mAP"]),
+                loss,
+                norm,
+                radius,
+                steps,
+                record["access"],
+                options,
+                tuple(replicates_of(record, "mAP")),
+                record["loss_before"],
+                record["loss_after"],
+                record["gradient_error"],
+                record["coupling"],
+                record["used"],
+                record["change_px"],
+                setting.source or ("the bare detector" if unaware else ""),
+                ", ".join(filter(None, group)),
             )
-        )  # fmt: skip
+        )
     return found
 
 
@@ -190,11 +216,16 @@ def published_attempts() -> list[Attempt]:
     """The paper's own table as the audit reads it; which losses were ascended it does not say."""
     return [
         Attempt(
-            f"{detector} (paper)", attack, scores[0] / 100, PUBLISHED[""][detector][0] / 100, radius=EPSILON,
+            f"{detector} (paper)",
+            attack,
+            scores[0] / 100,
+            PUBLISHED[""][detector][0] / 100,
+            radius=EPSILON,
             steps=DIGITAL_STEPS[attack],
         )
-        for attack in DIGITAL_STEPS for detector, scores in PUBLISHED[attack].items()
-    ]  # fmt: skip
+        for attack in DIGITAL_STEPS
+        for detector, scores in PUBLISHED[attack].items()
+    ]
 
 
 def audit_table(verdict: Verdict) -> Table:
@@ -282,11 +313,15 @@ def tiles(run: DigitalRun) -> list[dict[str, Any]]:
         worst = min(ran)[1] if ran else None
         clean = run.clean(detector)
         found.append(
-            {"name": detector, "mAP": metric_cell(clean, "mAP"), "NDS": metric_cell(clean, "NDS"),
-             "worst": f"{title_of(worst)}; {size_of(worst)}" if worst else "no attack ran",
-             "left": metric_cell(run.record(detector, worst), "mAP") if worst else Cell(math.nan),
-             "lost": lost_cell(run, detector, worst, "mAP") if worst else Cell(math.nan)}
-        )  # fmt: skip
+            {
+                "name": detector,
+                "mAP": metric_cell(clean, "mAP"),
+                "NDS": metric_cell(clean, "NDS"),
+                "worst": f"{title_of(worst)}; {size_of(worst)}" if worst else "no attack ran",
+                "left": metric_cell(run.record(detector, worst), "mAP") if worst else Cell(math.nan),
+                "lost": lost_cell(run, detector, worst, "mAP") if worst else Cell(math.nan),
+            }
+        )
     return found
 
 
@@ -309,15 +344,28 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     others = [table for make in makers if (table := make(run)).rows]
     distances = distance_table(run)
     page = render(
-        "digital.html", found, others=others, distances=distances,
-        main=main, lost=lost, effort=effort, every=every, classes=classes, audit=checked,
-        audited=verdict, paper=audit(published_attempts()) if run.suite.get("reference") else None, tiles=tiles(run),
-        plot=curves(run, "radius"), plot_steps=curves(run, "steps"), pictures=pictures(found.folder),
-        samples=max(int(r.get("n", 0)) for r in run.records.values()), scenes=run.scenes,
+        "digital.html",
+        found,
+        others=others,
+        distances=distances,
+        main=main,
+        lost=lost,
+        effort=effort,
+        every=every,
+        classes=classes,
+        audit=checked,
+        audited=verdict,
+        paper=audit(published_attempts()) if run.suite.get("reference") else None,
+        tiles=tiles(run),
+        plot=curves(run, "radius"),
+        plot_steps=curves(run, "steps"),
+        pictures=pictures(found.folder),
+        samples=max(int(r.get("n", 0)) for r in run.records.values()),
+        scenes=run.scenes,
         failures=[
             (detector, title_of(setting), size_of(setting), circumstances(setting), record["reason"])
             for (detector, setting), record in run.records.items()
             if record["status"] != "ok"
         ],
-    )  # fmt: skip
+    )
     return page, [main, lost, *others, checked, effort, every, classes, distances]

@@ -23,24 +23,39 @@ STEPS = re.compile(r"^(attack-.*)-[0-9]+$")  # attack-pgd-2 is of the family att
 Line = Mapping[str, Any]
 Condition = tuple[str, str, int]
 MAIN = {
-    "AP": "AP", "target_recall": "recall of the object that matters", "believed": "believed",
-    "phantoms": "phantoms a look", "collision": "CR", "route_completion": "RC", "min_ttc": "least TTC, s",
-    "hard_braking": "hard braking",
-}  # fmt: skip
-DROPS = {
-    "AP": "AP", "target_recall": "recall of the object that matters", "phantoms": "phantoms a look", "collision": "CR",
+    "AP": "AP",
+    "target_recall": "recall of the object that matters",
+    "believed": "believed",
+    "phantoms": "phantoms a look",
+    "collision": "CR",
     "route_completion": "RC",
-}  # fmt: skip
+    "min_ttc": "least TTC, s",
+    "hard_braking": "hard braking",
+}
+DROPS = {
+    "AP": "AP",
+    "target_recall": "recall of the object that matters",
+    "phantoms": "phantoms a look",
+    "collision": "CR",
+    "route_completion": "RC",
+}
 SIGNS = {
-    "sign_recall_5_20": "read from 5 to 20 m", "sign_recall_20_40": "read from 20 to 40 m",
-    "sign_read_at": "first read at, m", "stop_signs": "signs run",
-}  # fmt: skip
+    "sign_recall_5_20": "read from 5 to 20 m",
+    "sign_recall_20_40": "read from 20 to 40 m",
+    "sign_read_at": "first read at, m",
+    "stop_signs": "signs run",
+}
 BOUNDED = ("AP", "target_recall", "believed", "route_completion", "sign_recall_5_20", "sign_recall_20_40")
 ROOM = (110.0, 13.0)  # pixels of a name in the figure
 CAUSES = ("hidden", "missed", "misplaced", "late", "known")
 SIZE, MARGIN = 360, 46
-COLOURS = {"fault": "var(--s1)", "shift": "var(--s0)", "attack": "var(--s2)", "texture": "var(--s3)",
-           "light": "var(--s4)"}  # fmt: skip
+COLOURS = {
+    "fault": "var(--s1)",
+    "shift": "var(--s0)",
+    "attack": "var(--s2)",
+    "texture": "var(--s3)",
+    "light": "var(--s4)",
+}
 
 
 def conditions(run: Run) -> dict[Condition, list[Line]]:
@@ -60,16 +75,25 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
     """The page and its tables."""
     main, drop, rank, cause, signs = (
         make(run) for make in (main_table, drop_table, rank_table, cause_table, sign_table)
-    )  # fmt: skip
+    )
     tables = [main, drop, rank, cause, *([signs] if signs.rows else [])]
     failures = [
         ([line["system"], line["perturbation"], str(line["severity"]), line["cluster"]], line["reason"])
         for line in run.failures
     ]
     page = render(
-        "gap.html", run, main=main, drop=drop, rank=rank, cause=cause, signs=signs, plot=scatter(run),
-        failures=failures, sheets=sheets(run), systems=list(dict.fromkeys(c[0] for c in conditions(run))),
-    )  # fmt: skip
+        "gap.html",
+        run,
+        main=main,
+        drop=drop,
+        rank=rank,
+        cause=cause,
+        signs=signs,
+        plot=scatter(run),
+        failures=failures,
+        sheets=sheets(run),
+        systems=list(dict.fromkeys(c[0] for c in conditions(run))),
+    )
     return page, tables
 
 

@@ -20,18 +20,25 @@ from ssad.report.tables import Cell, Row, Table
 SOURCE = "published by the paper: CARLA, YoloV5 and YoloV3 fine-tuned there, a camera 20 m behind"
 TITLES = {"adv-patch": "Adv. Patch", "das": "DAS", "tpa": "TPA", "vanishing": "vanishing (strong)"}
 PAPER = {
-    ("clean", ""): "Benign", ("random", "patch"): "Random patch", ("adv-patch", "patch"): "Adv. Patch",
-    ("random", "camouflage"): "Random camouflage", ("das", "camouflage"): "DAS", ("tpa", "camouflage"): "TPA",
-}  # fmt: skip
+    ("clean", ""): "Benign",
+    ("random", "patch"): "Random patch",
+    ("adv-patch", "patch"): "Adv. Patch",
+    ("random", "camouflage"): "Random camouflage",
+    ("das", "camouflage"): "DAS",
+    ("tpa", "camouflage"): "TPA",
+}
 DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name begins -> its column in the paper
 BESIDE = {"Oldmarket": "Town04", "Larkhill": "Town03"}  # town of a test -> the paper's that stands in its place
 LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
 CONTROLS = ("random", "noise", "grey", "shuffled")
 SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class"}
 OTHERS = {
-    "ASR_50": "ASR at 0.5", "AP50_all": "AP50, whole class", "AP50_all_25": "AP50 > 0.25, whole class",
-    "ASR_all_25": "ASR, whole class", "confidence": "mean score",
-}  # fmt: skip
+    "ASR_50": "ASR at 0.5",
+    "AP50_all": "AP50, whole class",
+    "AP50_all_25": "AP50 > 0.25, whole class",
+    "ASR_all_25": "ASR, whole class",
+    "confidence": "mean score",
+}
 
 Line = Mapping[str, Any]
 Shown = tuple[str, str, str]
@@ -183,8 +190,9 @@ def margin_table(run: PhysicalRun) -> Table:
             controls = [other for other in run.attacks if other[1] == carrier and learns_nothing(other[0], name)]
             gaps = [
                 (paired_gap(draw, line), other)
-                for other, line in product(controls, own) for draw in run.lines(test, "drive", detector, other)
-            ]  # fmt: skip
+                for other, line in product(controls, own)
+                for draw in run.lines(test, "drive", detector, other)
+            ]
             if gaps:
                 gap, best = min(gaps, key=lambda one: lower(one[0]))
                 cells = score(own, "AP50"), score(run.lines(test, "drive", detector, best), "AP50"), gap
@@ -338,9 +346,7 @@ def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[t
     for _, test in run.pairs:
         for detector in run.detectors:
             seen = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
-            drawn = [
-                draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in seen if lines
-            ]  # fmt: skip
+            drawn = [draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in seen if lines]
             if drawn:
                 found.append((f"{detector}, {test}", heat_maps(drawn, label=f"{label}, {detector} in {test}")))
     return found
@@ -383,9 +389,10 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
     for detector in run.detectors:
         scores = {attack: score(run.lines(test, "drive", detector, attack), "AP50") for attack in run.attacks}
         trained = {
-            attack: cell for attack, cell in scores.items()
+            attack: cell
+            for attack, cell in scores.items()
             if attack[0] != "clean" and attack[0].split()[0] not in CONTROLS and not math.isnan(cell.mean)
-        }  # fmt: skip
+        }
         worst = min(trained, key=lambda attack: trained[attack].mean, default=None)
         carrier = worst[1] if worst else ""
         # of lights the clean pictures of their hour
@@ -394,9 +401,14 @@ def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
             next((cell for (name, _), cell in scores.items() if name == "clean"), Cell(math.nan)),
         )
         found.append(
-            {"name": detector, "town": test, "clean": clean,
-             "worst": title_of(worst) if worst else "none has run", "left": trained[worst] if worst else Cell(math.nan)}
-        )  # fmt: skip
+            {
+                "name": detector,
+                "town": test,
+                "clean": clean,
+                "worst": title_of(worst) if worst else "none has run",
+                "left": trained[worst] if worst else Cell(math.nan),
+            }
+        )
     return found
 
 
@@ -412,12 +424,27 @@ def section(found: Run) -> tuple[str, Sequence[Table]]:
     margins, others, effort = margin_table(run), others_table(run), effort_table(run)
     further = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
     page = render(
-        "physical.html", found, main=main, margins=margins, further=further, others=others, effort=effort,
-        tiles=tiles(run), maps=maps(run), weathers=weather_maps(run), pictures=pictures(found.folder),
+        "physical.html",
+        found,
+        main=main,
+        margins=margins,
+        further=further,
+        others=others,
+        effort=effort,
+        tiles=tiles(run),
+        maps=maps(run),
+        weathers=weather_maps(run),
+        pictures=pictures(found.folder),
         failures=[
-            (line["test"], line["view"], line["detector"], title_of((line["attack"], line["carrier"])), line["source"],
-             line.get("reason", ""))
+            (
+                line["test"],
+                line["view"],
+                line["detector"],
+                title_of((line["attack"], line["carrier"])),
+                line["source"],
+                line.get("reason", ""),
+            )
             for line in found.failures
         ],
-    )  # fmt: skip
+    )
     return page, [*main, margins, *further, others, effort]

@@ -50,9 +50,16 @@ def frozen(episode: Episode, trace: EpisodeTrace, *, name: str | None = None) ->
         told = told_rows(stopping(rows, until) if trace.active[-1, agent] else rows)
         actors.append(Actor(trace.names[agent], trace.models[agent], Pose(*told[0][1:]), trajectory=told))
     return replace(
-        base, name=name or base.name, type=CUSTOM, trigger=None, placements=(), parameters=values,
-        actors=tuple(actors), traffic=None, source=f"{base.name}, seed {episode.seed}",
-    )  # fmt: skip
+        base,
+        name=name or base.name,
+        type=CUSTOM,
+        trigger=None,
+        placements=(),
+        parameters=values,
+        actors=tuple(actors),
+        traffic=None,
+        source=f"{base.name}, seed {episode.seed}",
+    )
 
 
 def with_motion(scenario: Scenario, name: str, rows: F64) -> Scenario:

@@ -44,13 +44,20 @@ def measure(proposal: Proposal, trace: EpisodeTrace, graph: LaneGraph, adversari
     motor = [a for a in who if trace.kind[a] <= AgentKind.MOTORCYCLE]
     acceleration, jerk, kept = _effort(trace, [a for a in who if trace.kind[a] <= AgentKind.BICYCLE])
     return Outcome(
-        proposal, trace=trace, adversaries=who, collision=len(hits) > 0,
-        time=time, impact_speed=impact_speed, ego_speed=ego_speed,
+        proposal,
+        trace=trace,
+        adversaries=who,
+        collision=len(hits) > 0,
+        time=time,
+        impact_speed=impact_speed,
+        ego_speed=ego_speed,
         gap=0.0 if len(hits) else _least_gap(trace, box, who),
         off_road=any(_leaves_road(trace, graph, a) for a in motor),
         hit_others=any(_hits_others(trace, box, a) for a in who),
-        acceleration=acceleration, jerk=jerk, within_limits=kept,
-    )  # fmt: skip
+        acceleration=acceleration,
+        jerk=jerk,
+        within_limits=kept,
+    )
 
 
 def _closing_speed(trace: EpisodeTrace, row: int, agent: int) -> float:

@@ -106,9 +106,17 @@ def _fields_at(location: Location) -> list[str]:
     """Names of the fields of the dataclass at a location of a scenario."""
     kind: type = Scenario
     inner: dict[str, type] = {
-        "route": Pose, "placements": Pose, "trigger": Pose, "pose": Pose, "actors": Actor, "phases": Phase,
-        "when": Condition, "signals": SignalPlan, "traffic": TrafficPlan, "limits": Limits,
-    }  # fmt: skip
+        "route": Pose,
+        "placements": Pose,
+        "trigger": Pose,
+        "pose": Pose,
+        "actors": Actor,
+        "phases": Phase,
+        "when": Condition,
+        "signals": SignalPlan,
+        "traffic": TrafficPlan,
+        "limits": Limits,
+    }
     for part in location:
         kind = inner.get(str(part), kind) if isinstance(part, str) else kind
     return [f.name for f in dataclasses.fields(kind)]

@@ -57,8 +57,14 @@ def monte_carlo(
         low, high = weighted_limits(failures, failures, 1.0, count)
         yield (
             RareEstimate(
-                failures / count, float(low), float(high), "Monte Carlo", count, failures, float(failures),
+                failures / count,
+                float(low),
+                float(high),
+                "Monte Carlo",
+                count,
+                failures,
+                float(failures),
                 process.work() - before,
             ),
             found,
-        )  # fmt: skip
+        )

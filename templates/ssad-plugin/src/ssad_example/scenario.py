@@ -20,10 +20,14 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
         start = Phase(value["speed"], Condition("ego_distance", value["trigger"], number))
         walkers.append(
             EpisodeAgent(
-                f"walker {number}", "walker", Controller.SCRIPT, Pose(float(x), float(y), yaw + np.pi / 2),
-                target_speed=value["speed"], phases=(start,),
+                f"walker {number}",
+                "walker",
+                Controller.SCRIPT,
+                Pose(float(x), float(y), yaw + np.pi / 2),
+                target_speed=value["speed"],
+                phases=(start,),
             )
-        )  # fmt: skip
+        )
     return walkers
 
 

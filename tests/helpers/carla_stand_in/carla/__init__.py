@@ -118,13 +118,20 @@ class WorldSettings:
 ATTRIBUTES = {
     "sensor.camera.rgb": {"image_size_x", "image_size_y", "fov"},
     "sensor.lidar.ray_cast": {
-        "channels", "range", "points_per_second", "rotation_frequency", "upper_fov", "lower_fov", "horizontal_fov",
-        "noise_stddev", "dropoff_general_rate",
+        "channels",
+        "range",
+        "points_per_second",
+        "rotation_frequency",
+        "upper_fov",
+        "lower_fov",
+        "horizontal_fov",
+        "noise_stddev",
+        "dropoff_general_rate",
     },
     "sensor.other.radar": {"horizontal_fov", "vertical_fov", "points_per_second", "range"},
     "sensor.other.collision": set(),
     "sensor.other.lane_invasion": set(),
-}  # fmt: skip
+}
 
 
 class ActorBlueprint:
@@ -266,11 +273,13 @@ def _axes(rotation: Rotation) -> np.ndarray:
     """Forward, right and up of a rotation of Unreal's, in its left-handed frame, as columns."""
     p, y, r = (math.radians(v) for v in (rotation.pitch, rotation.yaw, rotation.roll))
     cp, sp, cy, sy, cr, sr = math.cos(p), math.sin(p), math.cos(y), math.sin(y), math.cos(r), math.sin(r)
-    return np.array([
-        [cp * cy, sr * sp * cy - cr * sy, -(cr * sp * cy + sr * sy)],
-        [cp * sy, sr * sp * sy + cr * cy, cy * sr - cr * sp * sy],
-        [sp, -sr * cp, cr * cp],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [cp * cy, sr * sp * cy - cr * sy, -(cr * sp * cy + sr * sy)],
+            [cp * sy, sr * sp * sy + cr * cy, cy * sr - cr * sp * sy],
+            [sp, -sr * cp, cr * cp],
+        ]
+    )
 
 
 class Sensor(Actor):

@@ -38,15 +38,26 @@ def box(speed: float, trigger_distance: float) -> tuple[Parameter, ...]:
     """
     return (
         Parameter(
-            "trigger_distance", trigger_distance - 5.0, trigger_distance + 5.0, trigger_distance, "m",
-            "the car starts when the ego is this near to it", 2.0, (trigger_distance - 6.0, trigger_distance + 6.0),
+            "trigger_distance",
+            trigger_distance - 5.0,
+            trigger_distance + 5.0,
+            trigger_distance,
+            "m",
+            "the car starts when the ego is this near to it",
+            2.0,
+            (trigger_distance - 6.0, trigger_distance + 6.0),
         ),
         Parameter(
-            "speed", speed - 5.0, speed + 5.0, speed, "m/s",
-            "speed that the car accelerates to", SPEED_SPREAD * speed,
+            "speed",
+            speed - 5.0,
+            speed + 5.0,
+            speed,
+            "m/s",
+            "speed that the car accelerates to",
+            SPEED_SPREAD * speed,
         ),
         Parameter("longitudinal", -5.0, 5.0, 0.0, "m", "shift of the car along its heading", 1.5),
-    )  # fmt: skip
+    )
 
 
 def meeting_car(

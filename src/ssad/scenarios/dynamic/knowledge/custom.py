@@ -50,9 +50,14 @@ def _with_policy(actor: Actor, graph: LaneGraph) -> EpisodeAgent:
         except RouteError as error:
             raise RouteError(f"actor {actor.name}: {error}") from None
     return EpisodeAgent(
-        actor.name, actor.model, Controller.EXTERNAL, actor.pose, target_speed=actor.target_speed, route=route,
+        actor.name,
+        actor.model,
+        Controller.EXTERNAL,
+        actor.pose,
+        target_speed=actor.target_speed,
+        route=route,
         policy=actor.policy,
-    )  # fmt: skip
+    )
 
 
 def _recorded(actor: Actor) -> EpisodeAgent:

@@ -59,10 +59,15 @@ def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Gen
             if s < float(graph.length[lane]) - 10.0:
                 place = Place(lane, s)
                 agent = EpisodeAgent(
-                    name=body, model=body, controller=Controller.AUTOPILOT, pose=pose_at(graph, place),
-                    speed=speed, target_speed=speed, route=random_route(graph, lane, s, 400.0, rng),
+                    name=body,
+                    model=body,
+                    controller=Controller.AUTOPILOT,
+                    pose=pose_at(graph, place),
+                    speed=speed,
+                    target_speed=speed,
+                    route=random_route(graph, lane, s, 400.0, rng),
                     wake_distance=plan.wake_distance,
-                )  # fmt: skip
+                )
                 found.append((abs(s - here), agent))
             s += 0.5 * model(body).length
     nearest = [agent for _, agent in sorted(found, key=lambda pair: pair[0])[: plan.maximum]]

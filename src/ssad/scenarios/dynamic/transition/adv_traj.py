@@ -18,8 +18,11 @@ from ssad.core.types import F64
 from ssad.scenarios.dynamic.transition.motion import KNOTS, MotionSearch, Way
 
 REACH: Final[Mapping[str, float]] = {
-    "StraightObstacle": 1.0, "TurningObstacle": 1.0, "LaneChanging": 2.0, "VehiclePassing": 2.0,
-}  # fmt: skip
+    "StraightObstacle": 1.0,
+    "TurningObstacle": 1.0,
+    "LaneChanging": 2.0,
+    "VehiclePassing": 2.0,
+}
 ELSEWHERE: Final = 3.0  # m
 SMOOTH: Final = 1.0  # s over which offsets are means: a wheel does not turn at once
 

@@ -105,13 +105,16 @@ class MotionSearch(ABC):
         self._search: list[dict[int, Any]] = [
             {
                 agent: CMA(
-                    mean=np.full(KNOTS, 0.5), sigma=SIGMA, bounds=np.tile([0.0, 1.0], (KNOTS, 1)),
-                    seed=seed32(self.name, seed, agent), population_size=POPULATION,
+                    mean=np.full(KNOTS, 0.5),
+                    sigma=SIGMA,
+                    bounds=np.tile([0.0, 1.0], (KNOTS, 1)),
+                    seed=seed32(self.name, seed, agent),
+                    population_size=POPULATION,
                 )
                 for agent in who
             }
             for who, seed in zip(self._agents, seeds, strict=True)
-        ]  # fmt: skip
+        ]
         self._worst: list[dict[int, float]] = [{} for _ in self.bases]
         self._told: list[dict[int, list[tuple[F64, float]]]] = [{a: [] for a in who} for who in self._agents]
         self._asked: list[tuple[int, F64]] = []

@@ -111,9 +111,16 @@ def run_attack(
     ascended = make_objective(objective) if isinstance(objective, str) else objective
     with steady(detector):
         victim = Victim(
-            detector, images, truth, ascended, intrinsic=intrinsic, aim=aim, keys=keys, through=through,
+            detector,
+            images,
+            truth,
+            ascended,
+            intrinsic=intrinsic,
+            aim=aim,
+            keys=keys,
+            through=through,
             precision=precision,
-        )  # fmt: skip
+        )
         error = check_gradient(victim) if check and attack.access == "white-box" else None
         before = victim.loss(victim.clean)
         victim.cost = Cost()
@@ -125,9 +132,14 @@ def run_attack(
         kept = quantise(found, victim.codes, budget).to(victim.clean) / LEVELS
         after = victim.loss(kept)
     about = {
-        "attack": attack.name, "access": attack.access, "loss": ascended.name, "norm": budget.norm,
-        "radius_px": round(budget.radius * LEVELS, 6), "gradients": cost.gradients, "queries": cost.queries,
-    }  # fmt: skip
+        "attack": attack.name,
+        "access": attack.access,
+        "loss": ascended.name,
+        "norm": budget.norm,
+        "radius_px": round(budget.radius * LEVELS, 6),
+        "gradients": cost.gradients,
+        "queries": cost.queries,
+    }
     return Attacked(kept, before, after, victim.idle, cost, error, about)
 
 

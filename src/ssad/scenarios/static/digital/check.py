@@ -77,9 +77,15 @@ def find_weaknesses(
             )
     if own.cost.gradients > 1:
         reference = run_attack(
-            PGD(own.cost.gradients), detector, images, truth, budget, objective=Margin(), intrinsic=intrinsic,
+            PGD(own.cost.gradients),
+            detector,
+            images,
+            truth,
+            budget,
+            objective=Margin(),
+            intrinsic=intrinsic,
             check=False,
-        )  # fmt: skip
+        )
         left, least = (quality_left(detector, one.images, truth, intrinsic) for one in (own, reference))
         if left > least + BESIDE:
             faults.append(
@@ -103,9 +109,14 @@ def _budget_faults(attack: Attack, victim: Victim, budget: Budget) -> list[str]:
 
 
 def _batch_faults(  # noqa: PLR0917
-    attack: Attack, detector: Detector, images: Tensor, truth: Sequence[Truth], budget: Budget, objective: Objective,
+    attack: Attack,
+    detector: Detector,
+    images: Tensor,
+    truth: Sequence[Truth],
+    budget: Budget,
+    objective: Objective,
     intrinsic: Tensor | None,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Whether an image fares the same alone as beside others."""
     faults, losses = [], {}
     for count in (1, len(images)):

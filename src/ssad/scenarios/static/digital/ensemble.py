@@ -103,23 +103,38 @@ def run_ensemble(
 
     runs = [
         run_attack(
-            attack, detector, images, truth, budget, objective=objective, intrinsic=intrinsic, aim=aim, keys=keys,
-            through=through, check=check,
+            attack,
+            detector,
+            images,
+            truth,
+            budget,
+            objective=objective,
+            intrinsic=intrinsic,
+            aim=aim,
+            keys=keys,
+            through=through,
+            check=check,
         )
         for attack, objective in ensemble.members
-    ]  # fmt: skip
+    ]
     left = [judged(run.images) for run in runs]
     clean = judged(images)
     won = [min(range(len(runs)), key=lambda m: left[m][k].order) for k in range(len(images))]
     cost = Cost(sum(run.cost.gradients for run in runs), sum(run.cost.queries + 1 for run in runs))
     errors = [run.gradient_error for run in runs if run.gradient_error is not None]
     about: dict[str, Any] = {
-        "attack": ensemble.name, "access": ensemble.access, "loss": "quality", "norm": budget.norm,
-        "radius_px": round(budget.radius * LEVELS, 6), "gradients": cost.gradients, "queries": cost.queries,
-        "members": [f"{run.about['attack']}/{run.about['loss']}" for run in runs], "won": won,
+        "attack": ensemble.name,
+        "access": ensemble.access,
+        "loss": "quality",
+        "norm": budget.norm,
+        "radius_px": round(budget.radius * LEVELS, 6),
+        "gradients": cost.gradients,
+        "queries": cost.queries,
+        "members": [f"{run.about['attack']}/{run.about['loss']}" for run in runs],
+        "won": won,
         "quality": [[member[k].value for member in left] for k in range(len(images))],
         "clean_quality": [one.value for one in clean],
-    }  # fmt: skip
+    }
     return Attacked(
         torch.stack([runs[m].images[k] for k, m in enumerate(won)]),
         images.new_tensor([1 - one.value for one in clean]),

@@ -94,9 +94,11 @@ def _in_double(victim: Victim, detector: Any) -> Victim:
     found.cost = copy.copy(victim.cost)
     frozen = victim.situation.assignment
     assignment = Assignment(
-        frozen.label, frozen.owner, tuple(_double(one) for one in frozen.truth),
+        frozen.label,
+        frozen.owner,
+        tuple(_double(one) for one in frozen.truth),
         {name: _wide(value) for name, value in frozen.extra.items()},
-    )  # fmt: skip
+    )
     found.situation = type(victim.situation)(detector, assignment, victim.situation.aim)
     return found
 

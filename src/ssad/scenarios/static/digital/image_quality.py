@@ -74,8 +74,10 @@ def image_quality(
         matched = match_2d(
             Boxes2D(np.zeros(len(real), np.int32), real.astype(np.int32), _array(truth.box), ignore=crowd),
             Boxes2D(np.zeros(len(label), np.int32), label.astype(np.int32), _array(found.box[rank]), score),
-            labels=many, threshold=IOU, max_detections=MOST,
-        )  # fmt: skip
+            labels=many,
+            threshold=IOU,
+            max_detections=MOST,
+        )
         # it orders equal scores by class; sums over all of a kind do not mind
         score = np.sort(_best(score, label))[::-1]
     else:
@@ -120,9 +122,7 @@ def _match_3d(
     near = (distance < METRES) & (label[:, None] == real[None])
     pred, box = np.nonzero(near & ~crowd[None])
     order = np.lexsort((box, distance[pred, box], pred))
-    ((took, _),) = assign(
-        pred[order], box[order], distance[pred, box][order], boxes=len(real), thresholds=(np.inf,)
-    )  # fmt: skip
+    ((took, _),) = assign(pred[order], box[order], distance[pred, box][order], boxes=len(real), thresholds=(np.inf,))
     hit = np.zeros(len(found), np.bool_)
     hit[took] = True
     ignored = (near & crowd[None]).any(1)

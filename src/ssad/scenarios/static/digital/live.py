@@ -136,9 +136,17 @@ class LiveAttack:
         unknown = self.spent.gradient_error is None and any(len(one.label) for one in truth)
         try:
             done = run_attack(
-                self.attack, detector, images, truth, self.budget, objective=self.objective, intrinsic=lens,
-                aim=self.aim, keys=keys, check=unknown,
-            )  # fmt: skip
+                self.attack,
+                detector,
+                images,
+                truth,
+                self.budget,
+                objective=self.objective,
+                intrinsic=lens,
+                aim=self.aim,
+                keys=keys,
+                check=unknown,
+            )
         except NothingToAttackError:
             return frames
         if done.gradient_error is not None:
@@ -169,9 +177,13 @@ def _as_truth(found: Detections, intrinsic: Tensor | None) -> Truth:
     solid = found.solid
     if solid is not None:
         solid = replace(
-            solid, centre=solid.centre.cpu(), size_lhw=solid.size_lhw.cpu(), yaw=solid.yaw.cpu(),
-            velocity=solid.velocity.cpu(), attribute=solid.attribute.cpu(),
-        )  # fmt: skip
+            solid,
+            centre=solid.centre.cpu(),
+            size_lhw=solid.size_lhw.cpu(),
+            yaw=solid.yaw.cpu(),
+            velocity=solid.velocity.cpu(),
+            attribute=solid.attribute.cpu(),
+        )
     return Truth(found.label.cpu(), found.box.cpu(), solid, None if solid is None else intrinsic)
 
 

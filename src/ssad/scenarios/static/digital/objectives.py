@@ -26,12 +26,22 @@ TERMS: Mapping[str, frozenset[str]] = {
         {"cls", "obj", "centerness", "classification", "bbox_ctrness", "loss_classifier", "loss_objectness"}
     ),
     "localisation": frozenset(
-        {"box", "offset", "depth", "size", "bbox2d", "consistency", "bbox_regression", "loss_box_reg",
-         "loss_rpn_box_reg", "dfl"}
+        {
+            "box",
+            "offset",
+            "depth",
+            "size",
+            "bbox2d",
+            "consistency",
+            "bbox_regression",
+            "loss_box_reg",
+            "loss_rpn_box_reg",
+            "dfl",
+        }
     ),
     "depth": frozenset({"depth"}),
     "orientation": frozenset({"rotsin", "dir", "axis", "side"}),
-}  # fmt: skip
+}
 """Names of the training losses of our detectors, and of those that adapters wrap, by what they are about."""
 
 

@@ -92,9 +92,14 @@ class Transfer:
         if intrinsic is None and self.surrogate.task == "3d":
             raise ConfigError(f"{self.name}: {self.surrogate.name} finds 3D boxes, and the intrinsics are missing")
         asked = Victim(
-            self.surrogate, victim.clean[list(own)], truth, self._loss(), intrinsic=intrinsic, aim=aim,
+            self.surrogate,
+            victim.clean[list(own)],
+            truth,
+            self._loss(),
+            intrinsic=intrinsic,
+            aim=aim,
             keys=[victim.keys[k] for k in own],
-        )  # fmt: skip
+        )
         if self.check and self.inner.access == "white-box":
             check_gradient(asked)
         images = self.inner.perturb(asked, budget).detach()
@@ -133,7 +138,7 @@ def _translated(aim: Aim, kept: Sequence[int], surrogate: Detector) -> Aim:
         aim = replace(aim, objects=tuple(place for place, one in enumerate(kept) if one in aim.objects))
     becomes = {
         name: other for name, other in aim.becomes.items() if name in surrogate.classes and other in surrogate.classes
-    }  # fmt: skip
+    }
     if aim.becomes and not becomes:
         aim = replace(aim, classes=())
     return replace(aim, becomes=becomes)

@@ -83,8 +83,11 @@ FOGRA39: Final = (
     (3.66, 3.8, 3.13),
 )
 # from XYZ under D50 to linear sRGB, which is defined under D65: Bradford's adaptation, then IEC 61966-2-1 (Lindbloom)
-D50_TO_SRGB: Final = ((3.1338561, -1.6168667, -0.4906146), (-0.9787684, 1.9161415, 0.0334540),
-                      (0.0719453, -0.2289914, 1.4052427))  # fmt: skip
+D50_TO_SRGB: Final = (
+    (3.1338561, -1.6168667, -0.4906146),
+    (-0.9787684, 1.9161415, 0.0334540),
+    (0.0719453, -0.2289914, 1.4052427),
+)
 
 
 @lru_cache(maxsize=1)

@@ -92,10 +92,17 @@ class TextureFolder:
         path = self.kept(spec)
         if not path.is_file():
             trained = train_texture(
-                make_physical(spec.trained, **spec.settings), detector(), surface, views(),
-                start=control("grey", surface.size), printable=printable_colours(), paint=paint,
-                device=self.device, key=(self.seed, spec.name), checkpoint=path.with_suffix(".checkpoint.npz"),
-            )  # fmt: skip
+                make_physical(spec.trained, **spec.settings),
+                detector(),
+                surface,
+                views(),
+                start=control("grey", surface.size),
+                printable=printable_colours(),
+                paint=paint,
+                device=self.device,
+                key=(self.seed, spec.name),
+                checkpoint=path.with_suffix(".checkpoint.npz"),
+            )
             losses, gradients = np.array(trained.losses), np.array(trained.gradients)
             safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})
         return torch.from_numpy(safeio.load_npz(path)["colour"].copy())

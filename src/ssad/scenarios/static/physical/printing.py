@@ -61,9 +61,9 @@ class Expectation:
             height, width = colour.shape[1:]
             aspect = width / height
             cos, sin = torch.cos(angle), torch.sin(angle)
-            rows = torch.stack([
-                torch.stack([cos, -sin / aspect, move[:, 0]], -1), torch.stack([sin * aspect, cos, move[:, 1]], -1)
-            ], 1)  # fmt: skip
+            rows = torch.stack(
+                [torch.stack([cos, -sin / aspect, move[:, 0]], -1), torch.stack([sin * aspect, cos, move[:, 1]], -1)], 1
+            )
             grid = functional.affine_grid(rows, list(found.shape), align_corners=False)
             found = functional.grid_sample(found, grid, mode="bilinear", padding_mode="border", align_corners=False)
         factor, offset = (values[:, k, None, None, None] for k in (-2, -1))

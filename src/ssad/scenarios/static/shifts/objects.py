@@ -265,10 +265,26 @@ def _add_item(
     wide, tall = ((high - low + kernels.STEP - 1) // kernels.STEP + 2).tolist()
     plan.items.append(
         (
-            index, into, -into @ new_centre, old, old_centre, middle, *plan.outline(target), *plan.outline(outline),
-            low[0], low[1], high[0], high[1], plan.node_count, wide, tall, rank, int(skip), streak,
+            index,
+            into,
+            -into @ new_centre,
+            old,
+            old_centre,
+            middle,
+            *plan.outline(target),
+            *plan.outline(outline),
+            low[0],
+            low[1],
+            high[0],
+            high[1],
+            plan.node_count,
+            wide,
+            tall,
+            rank,
+            int(skip),
+            streak,
         )
-    )  # fmt: skip
+    )
     if not skip and streak.any():
         plan.lines.append((rank, len(plan.items) - 1, int((high - low).sum()) + 4))
     if not skip and not streak.any():

@@ -80,9 +80,15 @@ def _snow(batch: Batch, frames: Sequence[Frame], specs: Sequence[ShiftSpec]) -> 
     dim = (batch.count, batch.height)
     out, highest = batch.like(), wp.empty(dim, dtype=int, device=batch.device)
     inputs = [
-        batch.words(), layer.flatten(), on(batch, keep), table.PAPER_GREY, batch.height, batch.width,
-        batch.stride // 4, highest,
-    ]  # fmt: skip
+        batch.words(),
+        layer.flatten(),
+        on(batch, keep),
+        table.PAPER_GREY,
+        batch.height,
+        batch.width,
+        batch.stride // 4,
+        highest,
+    ]
     batch.launch(falling.blend_snow, dim, inputs, out.words())
     _darken(out, highest)
     return out, [Applied(True, {"angle_deg": round(float(a), 1)}) for a in angle]

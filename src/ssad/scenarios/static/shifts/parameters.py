@@ -24,8 +24,13 @@ OVEREXPOSURE: Final[Five] = (0.7, 1.3, 2.0, 2.7, 3.3)
 # objects. m: length of such a piece of the way, where the first begins ahead of the first pose, how far the way goes on
 # straight behind the last, how far objects stand beside it (a lane), where they are too far to be seen
 ANOMALIES: Final = (
-    ("debris", 1), ("animal", 2), ("overturned", 3), ("fallen_tree", 4), ("debris", 5), ("animal", 5),
-)  # fmt: skip
+    ("debris", 1),
+    ("animal", 2),
+    ("overturned", 3),
+    ("fallen_tree", 4),
+    ("debris", 5),
+    ("animal", 5),
+)
 ANOMALY_EVERY: Final = 40.0
 ANOMALY_FIRST: Final = 8.0
 ANOMALY_AHEAD: Final = 40.0

@@ -16,8 +16,11 @@ from ssad.scenarios.static.physical.noninvasive.search import Budget, Found, Lit
 from ssad.scenarios.static.physical.noninvasive.shadow import Shadow
 
 LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
-    "shadow": Shadow, "laser": Laser, "projector": Projector, "flashlight": Flashlight,
-}  # fmt: skip
+    "shadow": Shadow,
+    "laser": Laser,
+    "projector": Projector,
+    "flashlight": Flashlight,
+}
 
 
 def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projector | Flashlight:

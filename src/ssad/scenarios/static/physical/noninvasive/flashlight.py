@@ -48,24 +48,30 @@ class Flashlight:
     def ranges(self, target: Target) -> Ranges:
         """See `LightAttack`."""
         return {
-            "lumens": (0.0, self.lumens), "distance": self.distance, "height": self.height,
-            "aside": (-self.aside, self.aside), "aim_left": (-0.5 * target.width, 0.5 * target.width),
-            "aim_up": (0.2 * target.height, target.height), "beam": self.beam, "red": (0.0, 1.0), "green": (0.0, 1.0),
+            "lumens": (0.0, self.lumens),
+            "distance": self.distance,
+            "height": self.height,
+            "aside": (-self.aside, self.aside),
+            "aim_left": (-0.5 * target.width, 0.5 * target.width),
+            "aim_up": (0.2 * target.height, target.height),
+            "beam": self.beam,
+            "red": (0.0, 1.0),
+            "green": (0.0, 1.0),
             "blue": (0.0, 1.0),
-        }  # fmt: skip
+        }
 
     def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
         """Pose, power, spread and colour of N settings."""
         away, aside = values["distance"], values["aside"]
-        place = torch.stack(
-            [target.rear - away * torch.cos(aside), away * torch.sin(aside), values["height"]], -1
-        )  # fmt: skip
+        place = torch.stack([target.rear - away * torch.cos(aside), away * torch.sin(aside), values["height"]], -1)
         point = torch.stack([torch.full_like(away, target.rear), values["aim_left"], values["aim_up"]], -1)
         colour = torch.stack([values["red"], values["green"], values["blue"]], -1)
         return {
-            "pose": aimed(place, point), "power": values["lumens"],
-            "spread": values["beam"][:, None].expand(-1, 2), "colour": colour,
-        }  # fmt: skip
+            "pose": aimed(place, point),
+            "power": values["lumens"],
+            "spread": values["beam"][:, None].expand(-1, 2),
+            "colour": colour,
+        }
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
         """See `LightAttack`."""

@@ -124,9 +124,11 @@ class LightFolder:
                     attack, detector(), target, views(), budget=budget, search=how, key=(self.seed, spec.name)
                 )
                 about = {
-                    "values": found.values, "queries": found.queries, "loss_before": found.before,
+                    "values": found.values,
+                    "queries": found.queries,
+                    "loss_before": found.before,
                     "loss_after": found.loss,
-                }  # fmt: skip
+                }
             else:
                 values = random_settings(attack, target, key=(self.seed, spec.number))
                 about = {"values": values, "queries": 0}
@@ -158,14 +160,22 @@ class LightFolder:
                 training = attack.training(**spec.settings)
                 views = projected(attack.edit(control("grey", surface.size), target))
                 trained = train_texture(
-                    training, detector(), surface, views, start=control("grey", surface.size), shown=attack.light_of,
-                    key=(self.seed, spec.name), device=self.device, checkpoint=path.with_suffix(".checkpoint.npz"),
-                )  # fmt: skip
+                    training,
+                    detector(),
+                    surface,
+                    views,
+                    start=control("grey", surface.size),
+                    shown=attack.light_of,
+                    key=(self.seed, spec.name),
+                    device=self.device,
+                    checkpoint=path.with_suffix(".checkpoint.npz"),
+                )
                 colour = trained.colour
                 about = {
-                    "queries": len(views) * len(trained.losses), "loss_before": trained.losses[0],
+                    "queries": len(views) * len(trained.losses),
+                    "loss_before": trained.losses[0],
                     "loss_after": trained.losses[-1],
-                }  # fmt: skip
+                }
             else:
                 colour = control("random", surface.size, seed=spec.number)
             safeio.save_npz(numbers, {"colour": colour.numpy()})

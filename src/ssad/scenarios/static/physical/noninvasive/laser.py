@@ -56,10 +56,13 @@ class Laser:
     def ranges(self, target: Target) -> Ranges:
         """See `LightAttack`."""
         return {
-            "watts": (0.0, self.watts), "wavelength": self.wavelength, "width": self.width,
+            "watts": (0.0, self.watts),
+            "wavelength": self.wavelength,
+            "width": self.width,
             "angle": (-0.5 * float(np.pi), 0.5 * float(np.pi)),
-            "aim_left": (-0.5 * target.width, 0.5 * target.width), "aim_up": (0.2 * target.height, target.height),
-        }  # fmt: skip
+            "aim_left": (-0.5 * target.width, 0.5 * target.width),
+            "aim_up": (0.2 * target.height, target.height),
+        }
 
     def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
         """Pose, power, spread and colour of N settings."""
@@ -68,10 +71,11 @@ class Laser:
         point = torch.stack([torch.full_like(left, target.rear), left, values["aim_up"]], -1)
         down = 0.5 * values["width"] / self.distance
         return {
-            "pose": aimed(place, point, values["angle"]), "power": values["watts"] * LUMEN_PER_WATT,
+            "pose": aimed(place, point, values["angle"]),
+            "power": values["watts"] * LUMEN_PER_WATT,
             "spread": torch.stack([torch.full_like(down, self.fan), down], -1),
             "colour": spectral_colour(values["wavelength"]),
-        }  # fmt: skip
+        }
 
     def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
         """See `LightAttack`."""

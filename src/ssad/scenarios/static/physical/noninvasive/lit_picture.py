@@ -107,10 +107,16 @@ def lit_picture(
         return torch.from_numpy(np.array(array, np.float32)).to(device)
 
     return LitPicture(
-        on_device(picture.image).permute(0, 3, 1, 2) / 255, (rows.start, columns.start),
-        on_device(picture.radiance[place]), on_device((picture.radiance - shaded)[place]),
+        on_device(picture.image).permute(0, 3, 1, 2) / 255,
+        (rows.start, columns.start),
+        on_device(picture.radiance[place]),
+        on_device((picture.radiance - shaded)[place]),
         on_device(surface.albedo[place] * gain),
         on_device((surface.position[place].astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]),
-        on_device(surface.normal[place] @ pose[:3, :3]), pose[:3, :3].T @ sun if sun[2] > 0.0 else None,
-        float(picture.exposure[0]), per_lux(view.weather), view.weather.fog, view.sensor,
-    )  # fmt: skip
+        on_device(surface.normal[place] @ pose[:3, :3]),
+        pose[:3, :3].T @ sun if sun[2] > 0.0 else None,
+        float(picture.exposure[0]),
+        per_lux(view.weather),
+        view.weather.fog,
+        view.sensor,
+    )

@@ -58,9 +58,10 @@ class Projector:
     def lamp(self, target: Target) -> Lamp:
         """The projector in the target's frame, power in lumen; it shows texture 0."""
         place = [
-            target.rear - self.distance * float(np.cos(self.aside)), self.distance * float(np.sin(self.aside)),
+            target.rear - self.distance * float(np.cos(self.aside)),
+            self.distance * float(np.sin(self.aside)),
             self.height,
-        ]  # fmt: skip
+        ]
         middle = [target.rear, 0.0, 0.5 * target.height]
         pose = numbers(aimed(*(torch.tensor([v], dtype=torch.float64) for v in (place, middle))))
         away = float(np.linalg.norm(np.subtract(middle, place)))
@@ -100,8 +101,14 @@ class Projector:
             ConfigError: A setting that it does not have, or a value that it refuses.
         """
         given: dict[str, Any] = {
-            "epochs": 40, "rate": 0.1, "smooth": 0.02, "printed": 0.0, "window": 320, "expectation": AIMED, **settings,
-        }  # fmt: skip
+            "epochs": 40,
+            "rate": 0.1,
+            "smooth": 0.02,
+            "printed": 0.0,
+            "window": 320,
+            "expectation": AIMED,
+            **settings,
+        }
         if isinstance(given["expectation"], Mapping):
             given["expectation"] = {**asdict(AIMED), **given["expectation"]}
         what = f"attack {self.name}"
