@@ -32,9 +32,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ssad.core.detections import Assignment, Dense, Detections, Truth
+from ssad.core.machine import keep_memory
 from ssad.detectors import make_detector
-from ssad.evaluation.detection import score_2d
-from ssad.jobs.machine import keep_memory
+from ssad.detectors.on_scenes import score_2d
 from ssad.scenarios.static.digital import Budget, make_attack, px, run_attack
 from ssad.scenarios.static.digital.victim import Victim, steady
 from ssad.training.batches import PictureSet, move

@@ -38,10 +38,10 @@ from ssad.drivers.careful.grade import AFTER, _Onlooker, danger_begins
 from ssad.drivers.careful.replay import Ending, Takeover, play
 from ssad.metrics import CaseValue, estimate
 from ssad.metrics.driving import first_contact
-from ssad.roads import load_town
 from ssad.scenarios.dynamic.generate import Trials, scenario_of
 from ssad.scenarios.dynamic.policy.adv_ppo import Adversary
 from ssad.training.adversary import AdversaryPlan, run_adversary_training
+from ssad.world.roads import load_town
 from ssad.world.selection import FreaSelection, Note
 
 ROOT = Path(__file__).resolve().parents[1]

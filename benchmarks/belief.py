@@ -26,8 +26,8 @@ from ssad.core.types import Episode, EpisodeTrace, Limits
 from ssad.drivers.belief import DegradedBelief, LineOfSight
 from ssad.drivers.builtin import Autopilot, Blind
 from ssad.metrics.intervals import Clusters, bounded_limits
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -31,19 +31,19 @@ import numpy as np
 import torch
 import warp as wp
 
-from ssad.assets.bodies import draw_paint, make_body
-from ssad.assets.street import build_street
-from ssad.camera.lamps import own_lamps
-from ssad.camera.render import PLAIN, Quality, View, Weather, render
-from ssad.camera.scene import Layer, Scene, Thing
-from ssad.camera.texture import retexture, taps_of
 from ssad.core.driving import Observation
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
 from ssad.core.types import Controller, Limits
-from ssad.recording.loop_sensors import Onboard
-from ssad.roads import load_town
+from ssad.rendering.bodies import draw_paint, make_body
+from ssad.rendering.camera.lamps import own_lamps
+from ssad.rendering.camera.render import PLAIN, Quality, View, Weather, render
+from ssad.rendering.camera.scene import Layer, Scene, Thing
+from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.onboard import Onboard
+from ssad.rendering.street import build_street
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 

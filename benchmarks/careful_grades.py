@@ -10,13 +10,13 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
+from ssad.core.machine import quiet_warp
 from ssad.drivers import make_system
 from ssad.drivers.careful.grade import Grade, grade_collision
 from ssad.drivers.careful.models import MODELS
-from ssad.jobs.machine import quiet_warp
 from ssad.metrics.driving import impact_speed
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
+from ssad.core.machine import quiet_warp
 from ssad.core.types import AgentKind
 from ssad.drivers import make_system
-from ssad.jobs.machine import quiet_warp
-from ssad.report.found_view import found_view
+from ssad.experiments.adversarial.collision_view import found_view
 from ssad.training.driver import draw_episodes, find_scenarios
 from ssad.world.rollout import rollout
 from ssad.world.world import World

@@ -24,10 +24,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from ssad import World, build_episode, load_scenarios, load_town, make_system
+from ssad.core.machine import quiet_warp, versions
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import CameraEyes, front
-from ssad.jobs.machine import quiet_warp, versions
-from ssad.recording.loop_sensors import Onboard
+from ssad.rendering.onboard import Onboard
 from ssad.world.rollout import Loop
 
 THREE = ("CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT")

@@ -23,23 +23,23 @@ from typing import Any
 import numpy as np
 import torch
 
-from ssad.camera.labels import label_picture
-from ssad.camera.render import Weather, render
-from ssad.camera.sensor import BRIGHTEST, noise_levels
 from ssad.core import safeio
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import ALIKE, CLASSES
 from ssad.core.rotations import quaternion_to_yaw, wrap_angle
 from ssad.core.seeding import generator
+from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
-from ssad.evaluation.camera_truth import scenes_of
-from ssad.evaluation.detection import box_table, detect, detect_2d, numbers
+from ssad.detectors.on_scenes import box_table, detect, detect_2d, numbers
 from ssad.metrics.detection import BoxTable, filter_boxes, match, scene_intervals
 from ssad.metrics.detection2d import Boxes2D, average_precision, match_2d
-from ssad.recording.clip_recorder import clip_views
-from ssad.recording.viewpoints import weather_name
+from ssad.recorders.target_images import clip_views
+from ssad.recorders.viewpoints import weather_name
+from ssad.rendering.camera.labels import label_picture
+from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.camera.sensor import BRIGHTEST, noise_levels
 from ssad.training.detector import describe_data
 
 ROOT = Path(__file__).parents[1]
@@ -57,7 +57,7 @@ SCORES = (0.5, 0.25, 0.15, 0.1, 0.05, 0.01, 0.001)  # the last: all that a detec
 
 
 def weather_of(description: str) -> str:
-    """Day, night, wet ... of a scene, from the words that `ssad.recording.nuscenes_recorder.weather_words` writes."""
+    """Day, night, wet ... of a scene, from the words that `ssad.recorders.nuscenes.weather_words` writes."""
     found = re.search(r"sun (\d+) degrees (above|below) the horizon, clouds (\d+) %", description)
     if found is None:
         raise SystemExit(f"a scene tells no weather: {description}")

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.joined_runs import joined, summary_of
-from ssad.bench.suite import load_suite
 from ssad.core.checkpoints import state_hash
-from ssad.evaluation.scene_boxes import detector_of
-from ssad.report.digital_run import Setting, setting_of
-from ssad.report.kinds.digital import section
+from ssad.experiments.perception.digital.page import section
+from ssad.experiments.perception.digital.run import Setting, setting_of
+from ssad.experiments.perception.scene_boxes import detector_of
+from ssad.experiments.suites import load_suite
 from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]

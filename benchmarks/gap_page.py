@@ -25,9 +25,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ssad.metrics import CaseValue, estimate, paired_difference
-from ssad.recording.perceiving_loop import PerceivingSystem
-from ssad.report.kinds.gap import (
+from ssad.experiments.gap.page import (
     COLOURS,
     Condition,
     cause_table,
@@ -38,6 +36,8 @@ from ssad.report.kinds.gap import (
     sign_table,
     values,
 )
+from ssad.experiments.gap.perceiving_loop import PerceivingSystem
+from ssad.metrics import CaseValue, estimate, paired_difference
 from ssad.report.load import Run, load_run
 from ssad.report.tables import Cell, Row, Table, to_markdown
 

@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
+from ssad.core.machine import quiet_warp
 from ssad.core.seeding import generator
 from ssad.drivers import make_system
-from ssad.jobs.machine import quiet_warp
 from ssad.metrics.rare_events import weighted_limits
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
 from ssad.world.rare.brute import monte_carlo
 from ssad.world.rare.importance import importance, learn
 from ssad.world.rare.process import WorldProcess
 from ssad.world.rare.splitting import splitting
+from ssad.world.roads import load_town
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 

@@ -34,7 +34,8 @@ ssad run how-often --set noise.lapse=0.02 --set episodes=20000
 ssad replay runs/how-often importance/autopilot/lane-traffic/05
 ```
 A suite of this kind names systems, scenarios, `noise`, `methods` and how many `episodes`, `particles` and `repeats`
-they get ([src/ssad/evaluation/failure_rate.py](../src/ssad/evaluation/failure_rate.py)). The table shows collisions in
+they get
+([failure_rate.py](../src/ssad/experiments/how_often/failure_rate.py)). The table shows collisions in
 a million episodes with 95 % limits, the effective number of collisions, agent-steps simulated and those of them that
 went into learning, and collisions in 1,000 h and 1,000 km. A collision of each method is kept and driven again by
 `ssad replay`.

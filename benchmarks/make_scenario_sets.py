@@ -22,7 +22,6 @@ from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.safeio import write_atomic
 from ssad.core.types import F64, LaneType, Pose, Scenario, TrafficPlan
-from ssad.roads import load_town
 from ssad.scenarios.dynamic.catalog import PRECRASH
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import turn_of, wrap
@@ -30,6 +29,7 @@ from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.scenarios.dynamic.knowledge.natural_junction import candidates
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
+from ssad.world.roads import load_town
 
 PRECRASH_TOWN = "ProvingGround"
 NATURAL_TOWNS: Mapping[str, int] = {"Twinford": 30, "Crossgate": 45}
@@ -238,7 +238,7 @@ def precrash(graph: LaneGraph, routes: int = 4, *, prefix: str = "", least: int 
 @remembered(16)
 def junction_routes(graph: LaneGraph, routes: int) -> tuple[Stretch, ...]:
     """Routes through junctions, turns in rotation, on which traffic has room."""
-    from ssad.roads import route_along
+    from ssad.world.roads import route_along
 
     def works(stretch: Stretch) -> bool:
         try:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from ssad.core.lane_graph import save_graph
 from ssad.core.safeio import write_atomic
-from ssad.roads.bake import bake
-from ssad.roads.designs import DESIGNS, generate_town
+from ssad.world.roads.bake import bake
+from ssad.world.roads.designs import DESIGNS, generate_town
 
 
 def main(folder: str) -> None:

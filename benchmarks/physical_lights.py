@@ -21,19 +21,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import torch
 
-from ssad.camera.photometry import per_lux
-from ssad.camera.render import render
-from ssad.camera.scene_edit import NO_EDIT, SceneEdit
+from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
-from ssad.evaluation.target_scores import sightings, target_scores
-from ssad.jobs.machine import quiet_warp
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.lit_clips import LitClip, LitPictures
-from ssad.recording.target import TargetCar
-from ssad.recording.target_views import drive_of
-from ssad.scenarios.static.physical.noninvasive import Flashlight, Laser
-from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND
+from ssad.experiments.perception.physical.lit_images import LitClip, LitPictures
+from ssad.experiments.perception.physical.target_views import drive_of
+from ssad.metrics.target_attacks import sightings, target_scores
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.camera.photometry import per_lux
+from ssad.rendering.camera.render import render
+from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit
+from ssad.rendering.target import TargetCar
+from ssad.scenarios.static.physical.lights import Flashlight, Laser
+from ssad.scenarios.static.physical.lights.lit_image import BLIND
 
 RESULTS = Path(__file__).parent / "results" / "physical_lights.json"
 TOWN, HOURS = "Oldmarket", ("noon", "low_sun", "sun_behind", "night")

@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.joined_runs import joined, summary_of
 from ssad.core.checkpoints import state_hash
 from ssad.detectors import make_detector
-from ssad.report.kinds.physical import section
+from ssad.experiments.perception.physical.page import section
 from ssad.report.tables import to_markdown
 
 ROOT = Path(__file__).parents[1]

@@ -24,19 +24,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from torch import Tensor
 
-from ssad.camera.texture import to_linear
 from ssad.core.detections import Truth
+from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
-from ssad.evaluation.target_scores import sightings, target_scores
-from ssad.jobs.machine import quiet_warp
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.target import TargetCar
-from ssad.recording.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.metrics.target_attacks import sightings, target_scores
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.camera.texture import to_linear
+from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Hide
 from ssad.scenarios.static.physical import Patch, View, albedo_of, control, make_physical, train_texture
-from ssad.scenarios.static.physical.inks import printable_colours
-from ssad.scenarios.static.physical.printing import NOMINAL
+from ssad.scenarios.static.physical.textures.inks import printable_colours
+from ssad.scenarios.static.physical.textures.printing import NOMINAL
 
 RESULTS = Path(__file__).parent / "results" / "physical_patch.json"
 WINDOW, EPOCHS, BATCH = 192, 30, 16

@@ -14,15 +14,15 @@ import numpy as np
 import torch
 
 from ssad.core.images import save_picture
+from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
-from ssad.evaluation.target_sheet import target_sheet
-from ssad.jobs.machine import quiet_warp
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.target import TargetCar
-from ssad.recording.target_views import TargetClips
+from ssad.experiments.perception.physical.target_sheet import target_sheet
+from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.physical import albedo_of, control, make_carrier
-from ssad.scenarios.static.physical.shipped import load_texture
+from ssad.scenarios.static.physical.textures.card import load_texture
 
 OUT = Path(__file__).parents[1] / "docs" / "physical.jpg"
 TOWN, DETECTOR = "Oldmarket", "yolov5n"

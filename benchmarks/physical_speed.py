@@ -23,16 +23,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
 
+from ssad.core.machine import quiet_warp
 from ssad.detectors import make_detector
-from ssad.jobs.machine import quiet_warp
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.target import TargetCar
-from ssad.recording.target_views import TargetClips
+from ssad.experiments.perception.physical.target_views import TargetClips
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.target import TargetCar
 from ssad.scenarios.static.digital.objectives import Situation, make_objective
 from ssad.scenarios.static.digital.victim import steady
 from ssad.scenarios.static.physical import Camouflage, Expectation, View, albedo_of, control
-from ssad.scenarios.static.physical.optimise import TARGET
+from ssad.scenarios.static.physical.textures.optimise import TARGET
 from ssad.scenarios.static.physical.zoom import around_target
 
 TOWN, WINDOW, BATCH = "Twinford", 192, 8

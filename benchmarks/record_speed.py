@@ -16,7 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ssad.recording.nuscenes_recorder import TOWNS, Recording, record_nuscenes
+from ssad.recorders.nuscenes import TOWNS, Recording, record_nuscenes
 
 
 def main() -> None:

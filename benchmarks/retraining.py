@@ -120,7 +120,7 @@ def found_files(out: Path, part: str, size: Size) -> list[str]:
 
 def hunt(out: Path, size: Size, generator: str, seed: int, part: str) -> None:
     """Search the bases that fall to one ego, and save the distinct collisions."""
-    from ssad.evaluation.search_scores import MOVING, distinct
+    from ssad.experiments.adversarial.search_scores import MOVING, distinct
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.generate import scenario_of
 
@@ -147,7 +147,7 @@ def search_all(
 ) -> tuple[list[Any], list[Any]]:
     """Bases that a system survives and a generator can change, and the outcomes of each."""
     from ssad.drivers import make_system
-    from ssad.evaluation.found_collisions import refusal
+    from ssad.experiments.adversarial.found_collisions import refusal
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
 
     trials = Trials(lambda: make_system(system), make_system)
@@ -217,7 +217,7 @@ def work(out: Path, size: Size, function: Callable[..., None], arguments: tuple[
     """One task; its processor time, s."""
     import torch
 
-    from ssad.jobs.machine import quiet_warp
+    from ssad.core.machine import quiet_warp
 
     quiet_warp()
     torch.set_num_threads(1)

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 
 from ssad.core.types import Episode, EpisodeTrace, Scenario
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scenario_type
+from ssad.world.roads import load_town
 
 
 def parameter_samples(scenario: Scenario, count: int) -> list[Scenario]:
@@ -88,8 +88,8 @@ def measure_apart(source: Path, count: int) -> dict[str, dict[str, float]]:
 
 def drive(episodes: Sequence[Episode], system: str) -> list[EpisodeTrace]:
     """What happens in the episodes with a driving system by name."""
+    from ssad.core.machine import quiet_warp
     from ssad.drivers import make_system
-    from ssad.jobs.machine import quiet_warp
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 

@@ -37,7 +37,7 @@ from ssad.core.seeding import digest, generator  # noqa: E402
 SHARE = np.array([0.43, 0.08, 0.015, 0.023, 0.013, 0.20, 0.011, 0.01, 0.09, 0.13])
 OURS = """
 import json, sys
-from ssad.evaluation.score import score_results
+from ssad.datasets.nuscenes.score import score_results
 root, out = sys.argv[1:]
 found = score_results(root + "/results.json", dataroot=root, version="v1.0-mini", split="mini_val")
 json.dump(found, open(out, "w"))

@@ -17,9 +17,9 @@ import numpy as np
 
 from ssad.drivers import make_system
 from ssad.metrics import CaseValue, Estimate, estimate, paired_difference
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
+from ssad.world.roads import load_town
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results" / "searches.json"

@@ -22,13 +22,13 @@ import torch
 import warp as wp
 from camera_speed import scene
 
-from ssad.camera.render import View, _develop, render
-from ssad.camera.sensor import PINHOLE, Sensor
-from ssad.camera.texture import retexture, taps_of
-from ssad.camera.torch_jpeg import jpeg
-from ssad.camera.torch_sensor import Window, develop, draw_noise
 from ssad.core.detections import Truth
 from ssad.detectors import make_detector
+from ssad.rendering.camera.render import View, _develop, render
+from ssad.rendering.camera.sensor import PINHOLE, Sensor
+from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.camera.torch_jpeg import jpeg
+from ssad.rendering.camera.torch_sensor import Window, develop, draw_noise
 
 NOISE = 0.012
 RENDERED = {

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from ssad.core.checkpoints import state_hash
-from ssad.evaluation.scene_boxes import detector_of
-from ssad.report.kinds.detection import title_of
+from ssad.experiments.perception.scene_boxes import detector_of
+from ssad.experiments.perception.shifts.page import title_of
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import VERSIONS
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from ssad.core.images import read_image
 from ssad.core.safeio import make_folder
-from ssad.recording.target import class_of_target, parse_target
-from ssad.report.kinds.physical import PhysicalRun, lower, margin_table, title_of
+from ssad.experiments.perception.physical.page import PhysicalRun, lower, margin_table, title_of
+from ssad.rendering.target import class_of_target, parse_target
 from ssad.report.load import load_run
-from ssad.scenarios.static.physical.shipped import SHIPPED, TextureCard, save_texture
+from ssad.scenarios.static.physical.textures.card import SHIPPED, TextureCard, save_texture
 
 METRICS = ("AP50", "AP50_25", "ASR_25", "ASR_50")
 

@@ -15,8 +15,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ssad.roads import LaneQuery, load_town, town_names
-from ssad.roads.query import DRIVABLE
+from ssad.world.roads import LaneQuery, load_town, town_names
+from ssad.world.roads.query import DRIVABLE
 
 
 def median(work: Callable[[], object], repeats: int = 7) -> float:

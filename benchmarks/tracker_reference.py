@@ -48,8 +48,8 @@ def boxes_of_drive(scenario: Any, detector: Any) -> Frames:
     from ssad import World, build_episode, load_town, make_system, rollout
     from ssad.core.rotations import upright_pose
     from ssad.drivers.perceiving.eyes import front, projected
-    from ssad.evaluation.drive_perception import in_view
-    from ssad.recording.loop_sensors import Onboard
+    from ssad.experiments.gap.component_metrics import in_view
+    from ssad.rendering.onboard import Onboard
     from ssad.world.models import MODELS
 
     town = load_town(scenario.town)

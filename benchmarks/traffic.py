@@ -21,6 +21,7 @@ import numpy as np
 
 from benchmarks.insert import insert
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.machine import quiet_warp
 from ssad.core.seeding import generator
 from ssad.core.types import (
     Controller,
@@ -34,13 +35,12 @@ from ssad.core.types import (
     Scenario,
     SignalState,
 )
-from ssad.jobs.machine import quiet_warp
-from ssad.roads import load_town, random_route
-from ssad.roads.library import BUILT_IN, town_names
-from ssad.roads.query import LaneQuery
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits
 from ssad.world.episode_arrays import signal_programs
 from ssad.world.kernels.data import Presence
+from ssad.world.roads import load_town, random_route
+from ssad.world.roads.library import BUILT_IN, town_names
+from ssad.world.roads.query import LaneQuery
 from ssad.world.world import VERSION, World
 
 BODIES = {

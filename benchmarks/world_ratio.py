@@ -30,8 +30,8 @@ def serve(batch: int, steps: int, device: str) -> None:
     import warp
 
     from ssad.core.types import Controller
-    from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
+    from ssad.world.roads import load_town
     from ssad.world.world import World
 
     scenarios = load_scenarios(SCENARIOS)

@@ -21,9 +21,9 @@ import numpy as np
 import warp as wp
 
 from ssad.core.types import Controller
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.kernels.look import OBSERVATION, look
+from ssad.world.roads import load_town
 from ssad.world.sensors import launcher
 from ssad.world.world import World
 

@@ -66,7 +66,7 @@ def test_a_reference_has_a_name_arguments_and_a_label() -> None:
 
 def test_arguments_make_another_system_and_the_content_of_their_files_counts(mine: Path) -> None:
     from ssad.drivers import make_system
-    from ssad.recording.closed_loop import system_version
+    from ssad.simulators.closed_loop import system_version
 
     assert make_system(f"{mine.name}:Mine?gain=3@third").name == "third"
     with pytest.raises(ConfigError, match="unexpected keyword argument 'gian'"):
@@ -142,7 +142,7 @@ class Ahead:
 def test_the_results_of_a_data_set_hold_what_was_found_at_its_place(tiny_set: Path, tmp_path: Path) -> None:
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.datasets.nuscenes.results import read_results
-    from ssad.evaluation.found import detect_dataset
+    from ssad.detectors.detect import detect_dataset
 
     with NuScenes(tiny_set) as data:
         path, _, boxes = detect_dataset(Ahead(), data, tmp_path)  # type: ignore[arg-type]
@@ -159,7 +159,7 @@ def test_detect_on_a_data_set_writes_what_score_reads(tiny_set: Path, tmp_path: 
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.datasets.nuscenes.results import read_results
     from ssad.detectors import make_detector
-    from ssad.evaluation.found import detect_dataset
+    from ssad.detectors.detect import detect_dataset
 
     with NuScenes(tiny_set) as data:
         path, samples, boxes = detect_dataset(make_detector("fcos3d-light"), data, tmp_path)

@@ -13,7 +13,7 @@ from helpers.command import ssad
 
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.contact_sheet import pick_frame
+from ssad.recorders.shifted.contact_sheet import pick_frame
 
 
 def perfect(root: Path, file: Path, **meta: str) -> Path:

@@ -152,9 +152,9 @@ def test_the_picture_of_the_architecture_shows_the_import_contract() -> None:
 
 
 def test_the_kind_of_the_architecture_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ssad.bench.kind import Resources
-    from ssad.bench.run import run
-    from ssad.bench.suite import kind_of, load_suite
+    from ssad.engine.kind import Resources
+    from ssad.engine.run import run
+    from ssad.experiments.suites import kind_of, load_suite
 
     (block,) = blocks(TEXTS["ARCHITECTURE.md"], "python")
     (tmp_path / "coin.py").write_text(block)

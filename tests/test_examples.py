@@ -53,9 +53,9 @@ def test_adversaries_by_selection() -> None:
 
 def test_a_generator_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ssad.drivers import make_system
-    from ssad.roads import load_town
     from ssad.scenarios.dynamic import load_scenarios
     from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
+    from ssad.world.roads import load_town
 
     (block,) = examples(FOLDER / "generators.md")
     (tmp_path / "later.py").write_text(block)

@@ -13,10 +13,10 @@ import pytest
 import typer
 
 from ssad.cli import app
+from ssad.cli.listing import LISTS
 from ssad.core.errors import LISTED, MissingExtraError, install_extra, unknown_name
 from ssad.core.safeio import parse_yaml
 from ssad.core.version import __version__
-from ssad.listing import LISTS
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = sorted((ROOT / "src" / "ssad").rglob("*.py"))

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from ssad.core.checkpoints import state_hash
-from ssad.evaluation.scene_boxes import detector_of
-from ssad.recording.nuscenes_recorder import WEATHERS, draw_weather, weather_words
-from ssad.recording.viewpoints import weather_name
+from ssad.experiments.perception.scene_boxes import detector_of
+from ssad.recorders.nuscenes import WEATHERS, draw_weather, weather_words
+from ssad.recorders.viewpoints import weather_name
 from ssad.scenarios.static.shifts import VERSIONS
 
 ROOT = Path(__file__).parents[1]

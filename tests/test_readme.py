@@ -19,8 +19,8 @@ def block(language: str) -> str:
 
 def test_a_driving_system_of_your_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from ssad.drivers import make_system
-    from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
+    from ssad.world.roads import load_town
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 
@@ -36,8 +36,8 @@ def test_a_driving_system_of_your_own(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_scenario_of_your_own(tmp_path: Path) -> None:
-    from ssad.roads import load_town
     from ssad.scenarios.dynamic import build_episode, load_scenarios
+    from ssad.world.roads import load_town
 
     (tmp_path / "mine.yaml").write_text(block("yaml"))
     scenarios = load_scenarios(tmp_path / "mine.yaml")

@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING, Any
 from ssad.core.version import __version__
 
 if TYPE_CHECKING:
-    from ssad.camera.render import View as View
-    from ssad.camera.render import render as render
     from ssad.core.errors import SSADError as SSADError
+    from ssad.datasets.nuscenes.score import score_results as score_results
     from ssad.detectors import make_detector as make_detector
     from ssad.drivers import make_system as make_system
-    from ssad.evaluation.score import score_results as score_results
+    from ssad.experiments.runs import write_report as write_report
     from ssad.metrics import episode_metrics as episode_metrics
-    from ssad.report import write_report as write_report
+    from ssad.rendering.camera.render import View as View
+    from ssad.rendering.camera.render import render as render
     from ssad.report.compare import compare_runs as compare_runs
     from ssad.results import Results as Results
     from ssad.results import load_results as load_results
     from ssad.results import run as run
-    from ssad.roads import load_town as load_town
     from ssad.scenarios.dynamic import build_episode as build_episode
     from ssad.scenarios.dynamic import load_scenarios as load_scenarios
     from ssad.scenarios.dynamic import save_scenarios as save_scenarios
     from ssad.scenarios.static.shifts import ShiftSpec as ShiftSpec
     from ssad.scenarios.static.shifts import shift_images as shift_images
+    from ssad.world.roads import load_town as load_town
     from ssad.world.rollout import rollout as rollout
     from ssad.world.world import World as World
 
@@ -37,7 +37,7 @@ _WHERE = {
     "load_results": "results",
     "Results": "results",
     "compare_runs": "report.compare",
-    "write_report": "report",
+    "write_report": "experiments.runs",
     "make_detector": "detectors",
     "shift_images": "scenarios.static.shifts",
     "ShiftSpec": "scenarios.static.shifts",

@@ -26,8 +26,8 @@ from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import digest
 from ssad.drivers import make_system
-from ssad.roads import LaneGraph, load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import LaneGraph, load_town
 
 if TYPE_CHECKING:
     from ssad.core.types import Episode, Scenario

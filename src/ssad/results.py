@@ -14,14 +14,13 @@ from rich.console import Console
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.traces import load_trace
 from ssad.core.types import EpisodeTrace
-from ssad.report import write_report
+from ssad.experiments.runs import summary, write_report
 from ssad.report.load import Run, load_run
-from ssad.report.terminal import summary
 
 if TYPE_CHECKING:
     import pandas
 
-    from ssad.bench.kind import Plan, Resources
+    from ssad.engine.kind import Plan, Resources
 
 PICTURES = (".jpg", ".jpeg", ".png")
 
@@ -65,7 +64,7 @@ class Results(Run):
         Raises:
             ConfigError: There is none, or more than one.
         """
-        from ssad.bench.kind import Cell, find_cell
+        from ssad.engine.kind import Cell, find_cell
 
         names = self.names
         cells = [Cell(row["key"], names.get(row["key"], row["key"]), "", 0, {}, row) for row in self.rows]
@@ -160,8 +159,8 @@ def make_plan(suite: str | Path, settings: Sequence[str] | Mapping[str, Any] = (
     Raises:
         SSADError: The suite, a setting or the device is wrong.
     """
-    from ssad.bench.suite import kind_of, load_suite
-    from ssad.jobs.machine import pick_device
+    from ssad.core.machine import pick_device
+    from ssad.experiments.suites import kind_of, load_suite
 
     if isinstance(settings, Mapping):
         settings = [f"{key}={json.dumps(value, default=str)}" for key, value in settings.items()]
@@ -192,7 +191,7 @@ def run_plan(
     Raises:
         SSADError: The folder cannot be written, holds another run, or no worker can start.
     """
-    from ssad.bench.run import run as run_cells
+    from ssad.engine.run import run as run_cells
 
     if len(run_cells(plan, folder, resources, retry=retry, only=only)) == len(plan.cells):
         resources.console.print(f"{plan.suite.name}: pictures and report", highlight=False)
@@ -234,7 +233,7 @@ def run(
     Raises:
         SSADError: The suite is wrong, the folder cannot be written, or it holds another run.
     """
-    from ssad.bench.kind import Resources
+    from ssad.engine.kind import Resources
 
     plan = make_plan(suite, set, device=device)
     console = Console(stderr=True, quiet=quiet)

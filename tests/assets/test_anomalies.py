@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.assets.actor_bodies import BODY_CATEGORIES
-from ssad.assets.bodies import BODIES, make_body
-from ssad.assets.mesh import Mesh
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, make_body
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.rendering.meshes.mesh import Mesh
 
 ANOMALIES = ("debris", "animal", "overturned", "fallen_tree")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.assets.bodies import BODIES, make_body
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, make_body
 
 
 @pytest.mark.parametrize("kind", BODIES)

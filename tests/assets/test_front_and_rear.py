@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ssad.assets.bodies import BODIES, make_body
-from ssad.assets.mesh import Mesh
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, make_body
+from ssad.rendering.meshes.mesh import Mesh
 
 RIDDEN_AND_HEAVY = [(kind, style) for kind in ("bicycle", "motorcycle", "truck") for style in BODIES[kind].styles]
 

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, Mesh, box
-from ssad.assets.mesh_files import load_mesh
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.meshes.mesh import Material, Mesh, box
+from ssad.rendering.meshes.mesh_files import load_mesh
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets.bodies import BODIES, PAINT_SHARES, PAINTS, draw_paint, draw_size, make_body
-from ssad.assets.bodies.parts import MARGIN, Chart, pack
-from ssad.assets.mesh import Material, Mesh, box, lathe, loft, merge, prism, ring, sphere, triangulate, tube
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, PAINT_SHARES, PAINTS, draw_paint, draw_size, make_body
+from ssad.rendering.bodies.parts import MARGIN, Chart, pack
+from ssad.rendering.meshes.mesh import Material, Mesh, box, lathe, loft, merge, prism, ring, sphere, triangulate, tube
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
 RED = Material("red", (0.5, 0.1, 0.1), paint=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.assets.bodies import BODIES, draw_size, make_body
-from ssad.assets.mesh import Mesh
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, draw_size, make_body
+from ssad.rendering.meshes.mesh import Mesh
 
 KINDS = ("stop_sign", "yield_sign")
 STYLES = [(kind, style) for kind in KINDS for style in BODIES[kind].styles]

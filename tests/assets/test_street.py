@@ -12,15 +12,15 @@ import numpy.typing as npt
 import pytest
 from helpers.quick import others_slow
 
-from ssad.assets.mesh import Material
-from ssad.assets.street import STYLES, Street, build_street, cached_street, load_street, save_street
-from ssad.assets.street.free_ground import polygon_distance
-from ssad.assets.street.model import NEAR
-from ssad.assets.street.region import Ground, region_mesh, survey
 from ssad.core.errors import FormatError, MapError, UnknownNameError
 from ssad.core.lane_graph import LaneGraph, load_graph
 from ssad.core.types import LaneType
-from ssad.roads.query import LaneQuery
+from ssad.rendering.meshes.mesh import Material
+from ssad.rendering.street import STYLES, Street, build_street, cached_street, load_street, save_street
+from ssad.rendering.street.free_ground import polygon_distance
+from ssad.rendering.street.model import NEAR
+from ssad.rendering.street.region import Ground, region_mesh, survey
+from ssad.world.roads.query import LaneQuery
 
 TOWNS = ("Twinford", "Crossgate", "Oldmarket", "Larkhill", "Ringmere")
 QUICK = ("Twinford", "Oldmarket")  # a regular town and one of crooked streets and cobbles
@@ -31,7 +31,7 @@ STREETS = (LaneType.DRIVING, LaneType.PARKING)
 
 @cache
 def town(name: str) -> LaneGraph:
-    return load_graph(str(files("ssad.roads.towns") / f"{name}.npz"))
+    return load_graph(str(files("ssad.world.roads.towns") / f"{name}.npz"))
 
 
 @cache
@@ -259,7 +259,7 @@ def test_cache(ssad_home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         asked.append((seed, style))
         return built
 
-    monkeypatch.setattr("ssad.assets.street.build.build_street", build)
+    monkeypatch.setattr("ssad.rendering.street.build.build_street", build)
     one = cached_street(graph)
     (path,) = (ssad_home / "cache" / "streets").glob("*.npz")
     two = cached_street(graph)
@@ -290,7 +290,7 @@ def test_bad_input(tmp_path: Path) -> None:
         with pytest.raises(FormatError):
             load_street(path)
     with pytest.raises(FormatError, match="not a street"):
-        load_street(str(files("ssad.roads.towns") / "Twinford.npz"))
+        load_street(str(files("ssad.world.roads.towns") / "Twinford.npz"))
     scene = street("Twinford")
     bad = scene.vertices.copy()
     bad[5] = np.nan

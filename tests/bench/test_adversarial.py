@@ -11,20 +11,20 @@ import pytest
 from helpers.command import ssad
 from helpers.metric_traces import make_trace
 
-from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.adversarial import Adversarial
-from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Outcome, Proposal
 from ssad.core.jsonl import read_lines
 from ssad.core.traces import load_trace
 from ssad.drivers import make_system
-from ssad.evaluation.search_scores import distinct, summary
+from ssad.engine.kind import Job, Resources
+from ssad.experiments.adversarial.kind import Adversarial
+from ssad.experiments.adversarial.search_scores import distinct, summary
+from ssad.experiments.suites import load_suite
 from ssad.metrics.realism import FEATURES
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.generate import Trials
+from ssad.world.roads import load_town
 
 (SCENARIO,) = load_scenarios("UnprotectedLeftTurn/00")
 STEP = 0.1 * np.arange(31)
@@ -105,7 +105,7 @@ def test_a_generator_without_anything_to_search_is_told_before_anything_runs(tmp
 def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_searched(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ssad.bench.kinds.adversarial.reference", lambda folder, device: {})
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: {})
     kind = Adversarial()
     settings = ["generators=king", "budget=1", "scenarios=[StraightObstacle/00]"]
     with pytest.raises(ConfigError, match=r"generator king: scenario StraightObstacle/00: there is no vehicle in it"):
@@ -119,7 +119,7 @@ def test_a_base_that_a_generator_cannot_change_is_recorded_and_the_others_are_se
 
 def test_a_search_is_recorded_and_what_it_finds_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usual = {name: np.zeros(20) for name in FEATURES}
-    monkeypatch.setattr("ssad.bench.kinds.adversarial.reference", lambda folder, device: usual)
+    monkeypatch.setattr("ssad.experiments.adversarial.kind.reference", lambda folder, device: usual)
     kind = Adversarial()
     settings = [
         "generators=halton",

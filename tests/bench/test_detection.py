@@ -23,21 +23,21 @@ from helpers.sharing import Shared
 from rich.console import Console
 from typer.testing import CliRunner
 
-from ssad.bench.kind import Plan, Resources
-from ssad.bench.kinds import detection
-from ssad.bench.kinds.detection import Detection, DetectionSuite
-from ssad.bench.replay import difference
-from ssad.bench.run import run, run_json
-from ssad.bench.suite import load_suite
 from ssad.cli import app
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.seeding import generator
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
-from ssad.jobs.local import WORKER_MEMORY
+from ssad.engine.kind import Plan, Resources
+from ssad.engine.local import WORKER_MEMORY
+from ssad.engine.replay import difference
+from ssad.engine.run import run, run_json
+from ssad.experiments.perception.scene_boxes import ShiftedScene, boxes_path, find_boxes, forget_failures, read_boxes
+from ssad.experiments.perception.shifts import kind as detection
+from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
+from ssad.experiments.perception.shifts.page import left_table, load_detection_run, main_table, robustness_table
+from ssad.experiments.runs import write_report
+from ssad.experiments.suites import load_suite
 from ssad.metrics.detection import match
-from ssad.report import write_report
-from ssad.report.kinds.detection import left_table, load_detection_run, main_table, robustness_table
 from ssad.report.load import load_run
 from ssad.report.paper import SHIFTS as PUBLISHED
 from ssad.scenarios.static.shifts import SHIFTS as KNOWN
@@ -241,7 +241,7 @@ def test_the_paper_stands_beside_detectors_of_its_kind(folder: Path, tmp_path: P
 
 def test_stored_boxes_give_the_official_scores(folder: Path, root: Path) -> None:
     from ssad.datasets.nuscenes.truth import read_truth
-    from ssad.evaluation.detection import box_table
+    from ssad.detectors.on_scenes import box_table
     from ssad.metrics.detection_boxes import filter_boxes
 
     truth = read_truth(root, "v1.0-mini")
@@ -389,7 +389,7 @@ def test_two_weights_of_one_kind_have_labels(root: Path, tmp_path: Path, monkeyp
         module.task = "3d"  # type: ignore[assignment]
         return module
 
-    monkeypatch.setattr("ssad.recording.scored_data.detector_of", detector)
+    monkeypatch.setattr("ssad.experiments.perception.scored_data.detector_of", detector)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/home/nobody")
     given = ["fcos3d-light", "fcos3d-light@fresh=random", "fcos3d-light@a=own.pth", "fcos3d-light@b=~/own.pth"]

@@ -13,12 +13,12 @@ import pytest
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.kind import Job, Plan, Resources
-from ssad.bench.kinds import detection
-from ssad.bench.kinds.detection import Detection, DetectionSuite
 from ssad.core.errors import ConfigError, FormatError
-from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path
-from ssad.recording.scored_data import Recorded, recording_of
+from ssad.engine.kind import Job, Plan, Resources
+from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path
+from ssad.experiments.perception.scored_data import Recorded, recording_of
+from ssad.experiments.perception.shifts import kind as detection
+from ssad.experiments.perception.shifts.kind import Detection, DetectionSuite
 from ssad.scenarios.static.shifts import SHIFTS, VERSIONS, ShiftSpec, dealt_severities
 
 GOOD: dict[str, Any] = {

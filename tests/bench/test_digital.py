@@ -16,26 +16,40 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.kind import Job, Plan, Resources
-from ssad.bench.kinds import digital
-from ssad.bench.kinds.digital import Digital, DigitalSuite
-from ssad.bench.run import run
-from ssad.bench.suite import command_of, load_suite
 from ssad.core.errors import SSADError
 from ssad.core.images import read_image
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation import attacked_scenes
-from ssad.evaluation.attack_sheet import magnified
-from ssad.evaluation.attack_tally import sum_notes
-from ssad.evaluation.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
-from ssad.evaluation.scene_boxes import Examination, Watched, boxes_path, detector_of, find_boxes, read_boxes
-from ssad.recording import scored_data
-from ssad.report import write_report
-from ssad.report.kinds.digital import attempts_of, effort_table, load_digital_run, lost_table, main_table, short_of
-from ssad.report.kinds.digital import summary as kind_summary
+from ssad.engine.command import command_of
+from ssad.engine.kind import Job, Plan, Resources
+from ssad.engine.run import run
+from ssad.experiments.perception import scored_data
+from ssad.experiments.perception.digital import attacked_scenes
+from ssad.experiments.perception.digital import kind as digital
+from ssad.experiments.perception.digital.attack_sheet import magnified
+from ssad.experiments.perception.digital.attack_tally import sum_notes
+from ssad.experiments.perception.digital.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
+from ssad.experiments.perception.digital.page import (
+    attempts_of,
+    effort_table,
+    load_digital_run,
+    lost_table,
+    main_table,
+    short_of,
+)
+from ssad.experiments.perception.digital.page import summary as kind_summary
+from ssad.experiments.perception.scene_boxes import (
+    Examination,
+    Watched,
+    boxes_path,
+    detector_of,
+    find_boxes,
+    read_boxes,
+)
+from ssad.experiments.runs import summary, write_report
+from ssad.experiments.suites import load_suite
 from ssad.report.load import load_run
 from ssad.report.paper import DIGITAL as PUBLISHED
-from ssad.report.terminal import summary
 from ssad.scenarios.static.digital.universal import UniversalFit
 from ssad.training.data import nuscenes_items
 

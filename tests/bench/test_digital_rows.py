@@ -15,25 +15,31 @@ import pytest
 from helpers.sharing import Shared
 from rich.console import Console
 
-from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.digital import Digital, DigitalSuite
-from ssad.bench.run import run
 from ssad.core.errors import SSADError
 from ssad.core.nuscenes_names import CATEGORY_TO_CLASS, MMDET3D_CLASSES
+from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth
-from ssad.evaluation import attack_scores, attacked_scenes
-from ssad.evaluation.attack_scores import by_distance, target_success, worst_by_sample, worst_of
-from ssad.evaluation.attacked_scenes import AttackedScene
-from ssad.evaluation.camera_truth import camera_truth
-from ssad.evaluation.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
-from ssad.evaluation.detection import SampleBoxes, match_boxes
-from ssad.evaluation.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
-from ssad.report import write_report
-from ssad.report.digital_run import Resampling, setting_of
-from ssad.report.digital_tables import defence_table, halving, halving_table, target_table, transfer_table
-from ssad.report.kinds.detection import interval_note
-from ssad.report.kinds.digital import attempts_of, load_digital_run, main_table
+from ssad.detectors.on_scenes import SampleBoxes, match_boxes
+from ssad.engine.kind import Job, Resources
+from ssad.engine.run import run
+from ssad.experiments.perception.digital import attack_scores, attacked_scenes
+from ssad.experiments.perception.digital.attack_scores import by_distance, target_success, worst_by_sample, worst_of
+from ssad.experiments.perception.digital.attacked_scenes import AttackedScene
+from ssad.experiments.perception.digital.chosen_object import NEAREST, chosen_first, chosen_object, chosen_places
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
+from ssad.experiments.perception.digital.page import attempts_of, load_digital_run, main_table
+from ssad.experiments.perception.digital.run import Resampling, setting_of
+from ssad.experiments.perception.digital.tables import (
+    defence_table,
+    halving,
+    halving_table,
+    target_table,
+    transfer_table,
+)
+from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, boxes_path, read_scenes, truth_of
+from ssad.experiments.perception.shifts.page import interval_note
+from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
 
 ONE, OTHER = "helpers.linear3d:build", "helpers.linear3d:build_other"
@@ -252,7 +258,9 @@ def test_the_chosen_object_is_the_nearest_that_a_camera_sees_or_one_instance(
         frame = next(f for f in cameras if len(camera_truth(f, found.take(np.array([row]))).label))
         assert chosen_first(scene, frame, NEAREST, classes).token[0] == found.token[row]
     first = chosen_object(scene, sample, NEAREST)
-    monkeypatch.setattr("ssad.evaluation.chosen_object._seen", lambda frame, found, row: row != first)
+    monkeypatch.setattr(
+        "ssad.experiments.perception.digital.chosen_object._seen", lambda frame, found, row: row != first
+    )
     assert chosen_object(scene, sample, NEAREST) == np.argsort(gap, kind="stable")[1], "the nearest is hidden"
     assert chosen_object(scene, sample, "nobody") is None
     assert chosen_object(scene, sample, NEAREST, ("trailer",)) is None, "the tiny set has none"

@@ -14,13 +14,13 @@ import pytest
 from helpers.sharing import Shared
 from rich.console import Console
 
-from ssad.bench.kind import Resources
-from ssad.bench.kinds.digital import Digital, DigitalSuite
-from ssad.bench.run import run
 from ssad.core.errors import SSADError
-from ssad.report import write_report
-from ssad.report.digital_tables import black_box_table, distance_table, hardened_table, transfer_table
-from ssad.report.kinds.digital import load_digital_run, main_table
+from ssad.engine.kind import Resources
+from ssad.engine.run import run
+from ssad.experiments.perception.digital.kind import Digital, DigitalSuite
+from ssad.experiments.perception.digital.page import load_digital_run, main_table
+from ssad.experiments.perception.digital.tables import black_box_table, distance_table, hardened_table, transfer_table
+from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
 
 THREE, OTHER, TWO = (f"helpers.linear3d:{name}" for name in ("build", "build_other", "build_flat"))

@@ -18,17 +18,16 @@ import torch
 from helpers.command import ssad
 from rich.console import Console
 
-from ssad.bench.kind import Plan, Resources
-from ssad.bench.kinds.driving import Driving, DrivingSuite
-from ssad.bench.replay import replay
-from ssad.bench.run import run
 from ssad.core.errors import ConfigError, RouteError, SSADError, StoreError
 from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace, save_trace
-from ssad.recording.attacked_film import attacked_frames
-from ssad.recording.texture_export import Print, export_texture
-from ssad.report.terminal import summary
+from ssad.engine.kind import Plan, Resources
+from ssad.engine.run import run
+from ssad.experiments.driving.attacked_film import attacked_frames
+from ssad.experiments.driving.kind import Driving, DrivingSuite
+from ssad.experiments.runs import replay, summary
+from ssad.scenarios.static.physical.textures.export import Print, export_texture
 
 SCENARIOS = ["StraightObstacle/00", "LaneChanging/01", "natural/Crossgate_00/00"]
 
@@ -144,8 +143,8 @@ def test_replay_films_a_drive_with_a_texture(done: Path, tmp_path: Path, monkeyp
         agents.append(attack.agent)
         return islice(attacked_frames(trace, graph, attack, **(options | {"width": 96})), 2)
 
-    monkeypatch.setattr("ssad.recording.attacked_film.attacked_frames", short)
-    monkeypatch.setattr("ssad.recording.episode_scene.PHASES", 1)  # bodies are made faster
+    monkeypatch.setattr("ssad.experiments.driving.attacked_film.attacked_frames", short)
+    monkeypatch.setattr("ssad.rendering.episode_scene.PHASES", 1)  # bodies are made faster
     export_texture(tmp_path / "shirt", Print(torch.zeros((3, 128, 128)), "camouflage", {}, "pedestrian"), dots=20)
     words = "replay", done, "blind/StraightObstacle/00", "--detector", "none", "--out", tmp_path / "out", "--wear"
     shown = ssad(*words, tmp_path / "shirt")
@@ -221,8 +220,8 @@ def test_an_unroutable_scenario_ends_before_anything_is_written(
 
 def start(folder: Path, name: str) -> subprocess.Popen[bytes]:
     code = (
-        "import sys\nfrom ssad.bench.kind import Resources\nfrom ssad.bench.kinds.driving import Driving\n"
-        "from ssad.bench.run import run\nfrom ssad.bench.suite import load_suite\n"
+        "import sys\nfrom ssad.engine.kind import Resources\nfrom ssad.experiments.driving.kind import Driving\n"
+        "from ssad.engine.run import run\nfrom ssad.experiments.suites import load_suite\n"
         "run(Driving().plan(load_suite(sys.argv[1])), sys.argv[2], Resources(2))\n"
     )
     command = [sys.executable, "-c", code, name, str(folder)]

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ssad.bench.kind import Cell, Job, Plan, Resources
-from ssad.bench.kinds import driving
-from ssad.bench.kinds.driving import (
-    Driving,
-    DrivingSuite,
-    suite_scenarios,
-)
 from ssad.core.errors import ConfigError, RouteError, UnknownNameError
 from ssad.core.lane_graph import town_file
 from ssad.core.types import Actor, Pose, Scenario
+from ssad.engine.kind import Cell, Job, Plan, Resources
+from ssad.experiments.driving import kind as driving
+from ssad.experiments.driving.kind import Driving, DrivingSuite
+from ssad.experiments.scenario_kind import suite_scenarios
 
 GOOD: dict[str, Any] = {"name": "s", "systems": ["autopilot", "blind"], "scenarios": ["x"]}
 

@@ -23,13 +23,13 @@ from helpers.killing import STOPS, kill_9, started_by, wait_until_ended
 from helpers.own_kind import DiceSuite
 from rich.console import Console
 
-from ssad.bench.kind import Resources
-from ssad.bench.run import read_plan, run, slice_of
-from ssad.bench.suite import kind_of, load_suite
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.jsonl import read_lines
-from ssad.jobs.local import WORKER_MEMORY, Worker
-from ssad.report import write_report
+from ssad.engine.kind import Resources
+from ssad.engine.local import WORKER_MEMORY, Worker
+from ssad.engine.run import run, slice_of
+from ssad.experiments.runs import read_plan, write_report
+from ssad.experiments.suites import kind_of, load_suite
 
 TESTS = Path(__file__).resolve().parent.parent
 
@@ -209,7 +209,7 @@ def test_a_slice_that_is_retried_leaves_what_failed_elsewhere(tmp_path: Path) ->
 
 def test_a_worker_that_cannot_start_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_kind.Dice, "start", _cannot_start)
-    monkeypatch.setattr("ssad.bench.run._start", _cannot_start)
+    monkeypatch.setattr("ssad.engine.run._start", _cannot_start)
     with pytest.raises(SSADError, match="no die here") as caught:
         go(dice(["a"]), tmp_path)
     assert "\n" not in str(caught.value)
@@ -252,8 +252,8 @@ def start(folder: Path, count: int, stop_at: int | None = None) -> subprocess.Po
     code += (
         # a shell that runs this in the background has told its children to ignore Ctrl-C
         "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from helpers.own_kind import Dice, DiceSuite\nfrom ssad.bench.kind import Resources\n"
-        "from ssad.bench.run import run\nnumbers = [f'slow-{i}' for i in range(int(sys.argv[2]))]\n"
+        "from helpers.own_kind import Dice, DiceSuite\nfrom ssad.engine.kind import Resources\n"
+        "from ssad.engine.run import run\nnumbers = [f'slow-{i}' for i in range(int(sys.argv[2]))]\n"
         "suite = DiceSuite(name='dice', systems=['fair'], numbers=numbers, timeout_s=60.0, chunk=3)\n"
         "run(Dice().plan(suite), sys.argv[1], Resources(2))"
     )

@@ -13,21 +13,21 @@ from helpers.sharing import Shared
 from pydantic import ValidationError
 from rich.console import Console
 
-from ssad.bench.kind import Plan, Resources
-from ssad.bench.kinds.gap import Gap, GapSuite
-from ssad.bench.kinds.gap import _conditions as planned_conditions
-from ssad.bench.run import run
-from ssad.bench.suite import load_suite, suite_files
 from ssad.core.errors import SSADError
 from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
 from ssad.core.traces import load_trace
 from ssad.core.types import AgentKind
-from ssad.recording.loop_perturbations import perturbation_names, texture_version, worn
-from ssad.report import check_artefacts, write_report
-from ssad.report.kinds.gap import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
+from ssad.engine.kind import Plan, Resources
+from ssad.engine.run import run
+from ssad.experiments.gap.kind import Gap, GapSuite
+from ssad.experiments.gap.kind import _conditions as planned_conditions
+from ssad.experiments.gap.loop_perturbations import perturbation_names, texture_version, worn
+from ssad.experiments.gap.page import cause_table, conditions, drop_table, main_table, rank_table, scatter, sheets
+from ssad.experiments.runs import summary, write_report
+from ssad.experiments.suites import load_suite, suite_files
+from ssad.report import check_artefacts
 from ssad.report.load import load_run
-from ssad.report.terminal import summary
 from ssad.world.models import MODELS
 
 SHORT = """

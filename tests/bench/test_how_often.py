@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from helpers.command import ssad
 
-from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.how_often import HowOften, HowOftenSuite
-from ssad.bench.suite import load_suite
 from ssad.core.errors import ConfigError
 from ssad.core.jsonl import read_lines
 from ssad.drivers import make_system
-from ssad.evaluation.failure_rate import ChanceEpisode
-from ssad.roads import load_town
+from ssad.engine.kind import Job, Resources
+from ssad.experiments.how_often.failure_rate import ChanceEpisode
+from ssad.experiments.how_often.kind import HowOften, HowOftenSuite
+from ssad.experiments.suites import load_suite
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 
 SMALL = ["episodes=1200", "particles=60", "repeats=8", "batch=200", "noise.lapse=0.3"]
 

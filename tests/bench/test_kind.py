@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from ssad.bench import replay as replays
-from ssad.bench.kind import Cell, CellError, Column, Job, Kind, Plan, Replay, Resources, SuiteBase, find_cell
-from ssad.bench.replay import replay
 from ssad.core.errors import ConfigError, StoreError
+from ssad.engine import replay as replays
+from ssad.engine.kind import Cell, CellError, Column, Job, Kind, Plan, Replay, Resources, SuiteBase, find_cell
+from ssad.experiments.runs import replay
 
 
 class Least(Kind):

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from helpers.command import ssad
 
-from ssad.bench.kind import Job, Resources
-from ssad.bench.kinds.physical import Physical, PhysicalSuite, attacks_of
-from ssad.bench.run import run
-from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.images import read_image
-from ssad.recording.target_table import rows_of
-from ssad.report import write_report
+from ssad.engine.kind import Job, Resources
+from ssad.engine.run import run
+from ssad.experiments.perception.physical.kind import Physical, PhysicalSuite, attacks_of
+from ssad.experiments.perception.physical.target_table import rows_of
+from ssad.experiments.runs import write_report
+from ssad.experiments.suites import load_suite
 from ssad.scenarios.static.physical import Expectation, TextureSpec, make_physical
 
 ROOT = Path(__file__).parents[2]
@@ -350,7 +350,7 @@ def test_textures_of_a_run_are_exported(tmp_path: Path, monkeypatch: pytest.Monk
     """A control can be made any time; what is not trained, or shows no texture, is one line."""
     attacks = [{"name": "random", "carrier": "patch", "options": {"width": 1.2, "height": 0.3}}, "vanishing"]
     plan = Physical().plan(suite(attacks=attacks))
-    monkeypatch.setattr("ssad.bench.kinds.physical.read_plan", lambda folder: plan)
+    monkeypatch.setattr("ssad.experiments.perception.physical.kind.read_plan", lambda folder: plan)
     clean, random, vanishing = plan.cells
     done = ssad("export", "texture", str(tmp_path), random.key, str(tmp_path / "out"), "--dots", "400")
     assert str(tmp_path / "out" / "target.obj") in done.stdout.replace("\n", "")
@@ -439,11 +439,11 @@ def test_the_grid_is_recorded_and_a_panel_that_nobody_sees_is_refused_there_alon
 
 def test_a_clean_car_that_is_not_found_is_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No attack is reported where the detector does worse than the floor without it."""
-    from ssad.bench.kind import CellError
-    from ssad.evaluation.target_scores import Sighting
+    from ssad.engine.kind import CellError
+    from ssad.metrics.target_attacks import Sighting
 
     nothing = Sighting("a", np.zeros((0, 4)), np.zeros(0), np.array([[0.0, 0.0, 9.0, 9.0]]), np.zeros(1, bool))
-    monkeypatch.setattr("ssad.bench.kinds.physical._clean_sightings", lambda *given: (nothing,))
+    monkeypatch.setattr("ssad.experiments.perception.physical.kind._clean_sightings", lambda *given: (nothing,))
     plan = Physical().plan(suite(floor=0.9))
     job = Job(tmp_path, "cpu", {"target": "sedan:silver:0", "seed": 0, "floor": 0.9, "replicates": 0})
     (clean,) = Physical().execute([plan.cells[0]], job).values()

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ssad.assets.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
-from ssad.assets.bodies import BODIES
-from ssad.camera.rig import RIG, rig_camera
 from ssad.core.images import read_image
 from ssad.core.nuscenes_names import CLASSES as NUSCENES
-from ssad.recording.camera_sheets import SHOWN, class_sheet
-from ssad.recording.episode_scene import EpisodeScene, body_of, moments_of
-from ssad.recording.onboard import above, moments, onboard_sheet, pick_trace
-from ssad.recording.run_pictures import write_pictures
-from ssad.roads import load_town
+from ssad.experiments.driving.run_images import write_pictures
+from ssad.rendering.bodies import BODIES
+from ssad.rendering.bodies.actor_bodies import ACTOR_BODIES, BODY_CATEGORIES, class_of
+from ssad.rendering.camera.rig import RIG, rig_camera
+from ssad.rendering.camera_sheets import SHOWN, class_sheet
+from ssad.rendering.episode_scene import EpisodeScene, body_of, moments_of
+from ssad.rendering.trace_sheet import above, moments, onboard_sheet, pick_trace
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

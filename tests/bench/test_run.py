@@ -11,15 +11,16 @@ from typing import Any, ClassVar, Literal
 import pytest
 from rich.console import Console
 
-from ssad.bench import run as engine
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
-from ssad.bench.run import hash_artefacts, read_plan, run, run_json
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, StoreError
 from ssad.core.jsonl import read_lines
 from ssad.core.safeio import read_json
-from ssad.jobs.pool import Pool
-from ssad.jobs.task import Outcome, Task
+from ssad.engine import run as engine
+from ssad.engine.kind import Cell, Column, Job, Kind, Names, Plan, Resources, SuiteBase
+from ssad.engine.pool import Pool
+from ssad.engine.run import hash_artefacts, run, run_json
+from ssad.engine.task import Outcome, Task
+from ssad.experiments.runs import read_plan
 
 TIMEOUT = 8.0
 

@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
-from ssad.bench.kind import Plan, find_cell
-from ssad.bench.kinds import driving
-from ssad.bench.kinds.driving import Driving, DrivingSuite
-from ssad.bench.suite import command_of, load_suite, suite_files
 from ssad.core.errors import ConfigError, SSADError, UnknownNameError
 from ssad.core.types import Pose, Scenario
+from ssad.engine.command import command_of
+from ssad.engine.kind import Plan, find_cell
+from ssad.experiments.driving import kind as driving
+from ssad.experiments.driving.kind import Driving, DrivingSuite
+from ssad.experiments.suites import load_suite, suite_files
 
 GOOD = "name: mine\nsystems: [blind]\nscenarios: [precrash]\n"
 

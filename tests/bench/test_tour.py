@@ -10,13 +10,14 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from ssad.bench.kind import Resources
-from ssad.bench.kinds.tour import Tour, TourSuite
-from ssad.bench.run import run
-from ssad.bench.suite import load_suite
 from ssad.core import safeio
 from ssad.core.errors import ConfigError
-from ssad.report import check_artefacts, write_report
+from ssad.engine.kind import Resources
+from ssad.engine.run import run
+from ssad.experiments.runs import write_report
+from ssad.experiments.suites import load_suite
+from ssad.experiments.tour.kind import Tour, TourSuite
+from ssad.report import check_artefacts
 from ssad.report.load import load_run
 from ssad.report.verdict import verdict
 
@@ -75,7 +76,7 @@ def test_every_part_is_a_run_of_its_own_and_the_front_page_leads_there(tmp_path:
 def test_a_part_that_fails_fails_alone_and_can_be_run_again_and_what_is_done_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ssad.bench.kinds.gap import Gap
+    from ssad.experiments.gap.kind import Gap
 
     suite, out, prepare = tour_of(tmp_path), tmp_path / "out", Gap.prepare
 

@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, box
-from ssad.camera.labels import Labels, extents, label_picture, visible_share
-from ssad.camera.render import PLAIN, Picture, View, render
-from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.nuscenes_names import visibility_token
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.labels import Labels, extents, label_picture, visible_share
+from ssad.rendering.camera.render import PLAIN, Picture, View, render
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.meshes.mesh import Material, box
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 500.0
 CAMERA = Camera(WIDTH, HEIGHT, np.array([[FOCAL, 0, 320.0], [0, FOCAL, 180.0], [0, 0, 1]]))

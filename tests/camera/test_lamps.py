@@ -11,16 +11,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets import mesh as meshes
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, build
-from ssad.camera.lamps import Lamp, lamp_strength, lit_circle, near_of, own_lamps
-from ssad.camera.render import PLAIN, Quality, View, Weather, light_of, render
-from ssad.camera.scene import Scene, Thing, collect
-from ssad.camera.texture import retexture, taps_of
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.lamps import Lamp, lamp_strength, lit_circle, near_of, own_lamps
+from ssad.rendering.camera.render import PLAIN, Quality, View, Weather, light_of, render
+from ssad.rendering.camera.scene import Scene, Thing, collect
+from ssad.rendering.camera.texture import retexture, taps_of
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 CAMERA = Camera(96, 96, np.array([[96.0, 0, 48.0], [0, 96.0, 48.0], [0, 0, 1]]))

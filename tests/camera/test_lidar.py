@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, Mesh, box, build, sphere
-from ssad.assets.street.model import Street
-from ssad.camera.lidar import HDL32E, Lidar, points_in_boxes, sweep
-from ssad.camera.scene import Scene, Thing
 from ssad.core.boxes import TrackedBoxes, WorldBoxes
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.lidar import HDL32E, Lidar, points_in_boxes, sweep
+from ssad.rendering.meshes.mesh import Material, Mesh, box, build, sphere
+from ssad.rendering.street.model import Street
 
 GREY = Material("grey", (0.5, 0.5, 0.5))
 PAINT = Material("paint", (0.4, 0.4, 0.4), paint=True)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.camera.photometry import illuminance, per_lux
-from ssad.camera.render import Weather
+from ssad.rendering.camera.photometry import illuminance, per_lux
+from ssad.rendering.camera.render import Weather
 
 
 @pytest.mark.parametrize(("degrees", "lux"), [(90, 128_800), (0, 759), (-6, 3.4), (-12, 0.0081)])

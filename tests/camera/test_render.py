@@ -11,13 +11,13 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets import mesh as meshes
-from ssad.assets.mesh import Material, build
-from ssad.camera.kernels import raster
-from ssad.camera.render import PLAIN, View, Weather, light_of, render, response
-from ssad.camera.scene import Scene, Thing
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
+from ssad.rendering.camera.kernels import raster
+from ssad.rendering.camera.render import PLAIN, View, Weather, light_of, render, response
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, build
-from ssad.camera.render import Picture, View, Weather, render
-from ssad.camera.scene import Layer, Scene, Thing
-from ssad.camera.texture import retexture, taps_of, to_linear
-from ssad.camera.torch_sensor import develop
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.render import Picture, View, Weather, render
+from ssad.rendering.camera.scene import Layer, Scene, Thing
+from ssad.rendering.camera.texture import retexture, taps_of, to_linear
+from ssad.rendering.camera.torch_sensor import develop
+from ssad.rendering.meshes.mesh import Material, build
 
 
 @pytest.fixture(scope="module")

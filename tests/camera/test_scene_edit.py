@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.assets import mesh as meshes
-from ssad.assets.mesh import Material, build
-from ssad.camera.lamps import Lamp
-from ssad.camera.photometry import per_lux
-from ssad.camera.render import Quality, View, Weather, render
-from ssad.camera.scene import Decal, Layer, Scene, Thing
-from ssad.camera.scene_edit import Card, SceneEdit, render_with
-from ssad.camera.sensor import Sensor
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.rotations import upright_pose
+from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.photometry import per_lux
+from ssad.rendering.camera.render import Quality, View, Weather, render
+from ssad.rendering.camera.scene import Decal, Layer, Scene, Thing
+from ssad.rendering.camera.scene_edit import Card, SceneEdit, render_with
+from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 CAMERA = Camera(96, 96, np.array([[96.0, 0, 48.0], [0, 96.0, 48.0], [0, 0, 1]]))

@@ -15,15 +15,18 @@ import warp as wp
 from PIL import Image
 from torch import Tensor
 
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, build
-from ssad.camera import torch_jpeg
-from ssad.camera.render import View, Weather, develop_radiance, render, response
-from ssad.camera.scene import Layer, Scene, Thing
-from ssad.camera.sensor import DAY_EXPOSURE, PINHOLE, Sensor, noise_levels
-from ssad.camera.texture import Taps, retexture, taps_of
-from ssad.camera.torch_jpeg import jpeg, quantisation, to_8_bits
-from ssad.camera.torch_sensor import (
+from ssad.core.errors import ConfigError
+from ssad.core.frames import FORWARD, Camera
+from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera import torch_jpeg
+from ssad.rendering.camera.render import View, Weather, develop_radiance, render, response
+from ssad.rendering.camera.scene import Layer, Scene, Thing
+from ssad.rendering.camera.sensor import DAY_EXPOSURE, PINHOLE, Sensor, noise_levels
+from ssad.rendering.camera.texture import Taps, retexture, taps_of
+from ssad.rendering.camera.torch_jpeg import jpeg, quantisation, to_8_bits
+from ssad.rendering.camera.torch_sensor import (
     Window,
     curve,
     demosaic,
@@ -33,10 +36,7 @@ from ssad.camera.torch_sensor import (
     fill,
     photosites,
 )
-from ssad.core.errors import ConfigError
-from ssad.core.frames import FORWARD, Camera
-from ssad.core.images import decode_image, encode_jpeg
-from ssad.core.seeding import generator
+from ssad.rendering.meshes.mesh import Material, build
 
 SENSORS = {
     "default": Sensor(),

@@ -11,15 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssad.assets import mesh as meshes
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Material, build
-from ssad.camera.render import PLAIN, Picture, View, Weather, render
-from ssad.camera.scene import Decal, Layer, Scene, Thing
-from ssad.camera.texture import PRINTABLE, levels_of, paint_mask, printable, pyramid, retexture, taps_of
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.seeding import generator
+from ssad.rendering.bodies import make_body
+from ssad.rendering.camera.render import PLAIN, Picture, View, Weather, render
+from ssad.rendering.camera.scene import Decal, Layer, Scene, Thing
+from ssad.rendering.camera.texture import PRINTABLE, levels_of, paint_mask, printable, pyramid, retexture, taps_of
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.4, 0.4), specular=0.0, gloss=0.0)
 PAINT = Material("paint", (0.5, 0.5, 0.5), specular=0.0, gloss=0.0, paint=True)

@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssad.assets import mesh as meshes
-from ssad.assets.mesh import Material, build
-from ssad.camera.lamps import Lamp
-from ssad.camera.render import PLAIN, Picture, View, Weather, render
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.torch_lamp import lamp_light, shine
 from ssad.core.errors import ConfigError
 from ssad.core.frames import FORWARD, Camera
+from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.render import PLAIN, Picture, View, Weather, render
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.torch_lamp import lamp_light, shine
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
 
 GREY = Material("grey", (0.4, 0.3, 0.2), specular=0.0, gloss=0.0)
 CAMERA = Camera(96, 64, np.array([[90.0, 0, 48.0], [0, 90.0, 32.0], [0, 0, 1]]))

@@ -13,7 +13,7 @@ import pytest
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import LaneGraph, Marking, equal, load_graph, save_graph
 from ssad.core.types import LaneType
-from ssad.roads import load_town
+from ssad.world.roads import load_town
 from tests.world.worlds import straight_graph
 
 

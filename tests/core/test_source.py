@@ -113,7 +113,7 @@ def test_a_package_is_followed_from_its_own_place(write: Write) -> None:
 
 def test_the_source_of_a_cell_is_found() -> None:
     """What a drive depends on is in its key, and a report or a detector is not."""
-    found = set(source_files("ssad.bench.kinds.driving"))
+    found = set(source_files("ssad.experiments.driving.kind"))
     for name in (
         "core.safeio",
         "core.registry",
@@ -130,7 +130,7 @@ def test_the_source_of_a_cell_is_found() -> None:
     ):
         assert f"ssad.{name}" in found, name
     assert not any(name.startswith(("ssad.report", "ssad.training")) for name in found)
-    seen = set(source_files("ssad.bench.kinds.detection"))
+    seen = set(source_files("ssad.experiments.perception.shifts.kind"))
     for name in (
         "detectors.mono3d.nms",
         "detectors.yolo.decode",

@@ -13,9 +13,9 @@ from ssad.core.errors import ConfigError, FormatError
 from ssad.core.nuscenes_names import ATTRIBUTES, CATEGORY_TO_CLASS, CLASSES
 from ssad.datasets.nuscenes import results as module
 from ssad.datasets.nuscenes.results import read_results, with_ego
+from ssad.datasets.nuscenes.score import score_results
 from ssad.datasets.nuscenes.splits import official_splits, scenes_of_split
 from ssad.datasets.nuscenes.truth import read_truth
-from ssad.evaluation.score import score_results
 from ssad.metrics.detection import BoxTable
 
 

@@ -16,10 +16,10 @@ from ssad.core.errors import FormatError
 from ssad.core.images import read_image
 from ssad.datasets.coco import CocoSet, read_coco
 from ssad.detectors import SHIPPED, make_detector
-from ssad.evaluation.detection import score_2d, score_3d
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+from ssad.detectors.on_scenes import score_2d, score_3d
+from ssad.recorders.nuscenes import Recording, record_nuscenes
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
 from ssad.training.batches import PictureSet, fill
 from ssad.training.detector import coco_items, coco_truth
 

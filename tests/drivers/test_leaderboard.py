@@ -15,9 +15,9 @@ from ssad.core.errors import ConfigError
 from ssad.core.types import Actor, Limits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard import Leaderboard, RoadOption, _plan, geolocation
-from ssad.recording.closed_loop import onboard_sensors
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.simulators.closed_loop import onboard_sensors
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

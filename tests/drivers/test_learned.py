@@ -13,12 +13,12 @@ from ssad.core.checkpoints import Card, load_card, save_weights
 from ssad.core.errors import FormatError
 from ssad.core.traces import trace_hash
 from ssad.drivers import LEARNED, SYSTEMS, make_system
-from ssad.drivers.rl.learned import SHIPPED
+from ssad.drivers.learned.policies import SHIPPED
 from ssad.metrics import episode_metrics
-from ssad.recording.closed_loop import system_version
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.simulators.closed_loop import system_version
 from ssad.world.check import check_driver
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

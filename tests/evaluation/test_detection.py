@@ -11,11 +11,11 @@ import torch
 
 from ssad.core.detections import Detections, Solids, Truth
 from ssad.core.errors import ConfigError
+from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import read_truth
 from ssad.detectors import make_detector
-from ssad.evaluation.camera_truth import camera_truth
-from ssad.evaluation.detection import detect_scene, joined, match_boxes, score_2d, to_host
+from ssad.detectors.on_scenes import detect_scene, joined, match_boxes, score_2d, to_host
 from ssad.metrics.detection_boxes import TP_METRICS
 from ssad.training.batches import PictureSet
 from ssad.training.data import nuscenes_items

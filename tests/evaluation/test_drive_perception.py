@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace, straight
 
-from ssad.camera.rig import rig_camera
 from ssad.core.types import AgentKind, Contact, EpisodeTrace
 from ssad.drivers.perceiving.objects import Objects, no_objects
 from ssad.drivers.perceiving.tracker import Tracker, Tracking, Tracks
-from ssad.evaluation.drive_perception import (
+from ssad.experiments.gap.component_metrics import (
     Perceived,
     cause_of_collision,
     component_metrics,
@@ -24,6 +23,7 @@ from ssad.evaluation.drive_perception import (
     sign_metrics,
     track_metrics,
 )
+from ssad.rendering.camera.rig import rig_camera
 
 CAMERAS = {"front": rig_camera("CAM_FRONT", 640)}
 STEPS = 41

@@ -10,9 +10,9 @@ import torch
 
 from ssad.core.detections import Detections
 from ssad.core.nuscenes_names import MMDET3D_CLASSES
+from ssad.datasets.nuscenes.camera_truth import camera_truth
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.camera_truth import camera_truth
-from ssad.evaluation.picture_scores import (
+from ssad.detectors.image_scores import (
     PictureMatches,
     gather_pictures,
     match_pictures,

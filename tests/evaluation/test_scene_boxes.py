@@ -11,9 +11,9 @@ from helpers.oracle3d import Oracle
 
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.truth import GroundTruth, read_truth
-from ssad.evaluation import scene_boxes
-from ssad.evaluation.detection import SampleBoxes, detect_scene
-from ssad.evaluation.scene_boxes import Examination, ShiftedScene, distinct_scenes, score_scenes
+from ssad.detectors.on_scenes import SampleBoxes, detect_scene
+from ssad.experiments.perception import scene_boxes
+from ssad.experiments.perception.scene_boxes import Examination, ShiftedScene, distinct_scenes, score_scenes
 from ssad.metrics.detection_boxes import BoxTable
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssad.evaluation.target_grid import grid_scores
-from ssad.evaluation.target_scores import Sighting
+from ssad.metrics.target_attacks import Sighting
+from ssad.metrics.target_grid import grid_scores
 
 TARGET = np.array([[10.0, 10.0, 50.0, 40.0]])
 

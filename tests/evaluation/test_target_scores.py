@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ssad.core.detections import Detections, Truth
-from ssad.evaluation.target_scores import Sighting, _precisions, precision, sighting, target_scores
+from ssad.metrics.target_attacks import Sighting, _precisions, precision, sighting, target_scores
 
 TARGET, OTHER = [10.0, 10.0, 50.0, 40.0], [100.0, 10.0, 140.0, 40.0]
 

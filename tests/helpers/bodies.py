@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from ssad.assets.actor_bodies import plain_body
-from ssad.assets.mesh import Mesh, Point
-from ssad.recording import scene_objects
+from ssad.rendering import scene_objects
+from ssad.rendering.bodies.actor_bodies import plain_body
+from ssad.rendering.meshes.mesh import Mesh, Point
 
 
 @contextmanager

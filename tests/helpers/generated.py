@@ -6,9 +6,9 @@ from dataclasses import replace
 
 from ssad.core.types import Scenario
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, scenario_of, search
+from ssad.world.roads import load_town
 
 BASES = ("RightTurn/00", "CrossingNegotiation/00", "RedlightRunning/01", "UnprotectedLeftTurn/02", "LaneChanging/00")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 # is killed, however late that comes.
 STOPS = """
 import os, signal
-from ssad.jobs.store import Store
+from ssad.engine.store import Store
 _append = Store.append
 def _append_and_stop(self, result, episode):
     _append(self, result, episode)

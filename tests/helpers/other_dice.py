@@ -9,7 +9,7 @@ from typing import Any
 from helpers.deeds import DEEDS
 from helpers.own_kind import Dice
 
-from ssad.bench.kind import Cell, Job
+from ssad.engine.kind import Cell, Job
 
 
 class LyingDice(Dice):

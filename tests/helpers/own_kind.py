@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from helpers.deeds import DEEDS
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, SuiteBase
+from ssad.engine.kind import Cell, Column, Job, Kind, Names, SuiteBase
 
 
 class DiceSuite(SuiteBase):

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import SSADError
-from ssad.toolbox import Options
-from ssad.toolbox.manifest import read_lines
+from ssad.recorders.shifted import Options
+from ssad.recorders.shifted.manifest import read_lines
 
 VERSION = "v1.0-mini"
 SCENES = ("scene-0103", "scene-0916")

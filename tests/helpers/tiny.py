@@ -8,8 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ssad.camera.lidar import HDL32E, points_in_boxes
-from ssad.camera.rig import RIG, rig_camera
 from ssad.core.boxes import WorldBoxes
 from ssad.core.frames import Camera
 from ssad.core.images import encode_jpeg
@@ -19,6 +17,8 @@ from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8
 from ssad.datasets.nuscenes.files import points_bytes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
+from ssad.rendering.camera.rig import RIG, rig_camera
+from ssad.rendering.lidar import HDL32E, points_in_boxes
 
 START_US = 1_600_000_000_000_000
 STEP_US = 500_000  # from one key frame to the next

@@ -22,20 +22,20 @@ from helpers.command import ssad_process
 from helpers.quick import others_slow
 from matplotlib.path import Path as Path2D
 
-from ssad.camera.lidar import Lidar
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import Actor, Controller, Episode, EpisodeTrace, Limits, Pose, Scenario, SignalState
 from ssad.drivers import make_system
 from ssad.drivers.leaderboard_sensors import camera_of, lidar_of, radar_of
-from ssad.interchange import carla as adapter
-from ssad.interchange.carla import Carla
-from ssad.interchange.carla_sensors import Own, eyes_of
-from ssad.interchange.carla_server import WEATHERS, Server
 from ssad.metrics import episode_metrics
-from ssad.recording.closed_loop import asked_sensors
-from ssad.roads import load_town, town_signals
+from ssad.rendering.lidar import Lidar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.simulators.carla import simulator as adapter
+from ssad.simulators.carla.sensors import Own, eyes_of
+from ssad.simulators.carla.server import WEATHERS, Server
+from ssad.simulators.carla.simulator import Carla
+from ssad.simulators.closed_loop import asked_sensors
+from ssad.world.roads import load_town, town_signals
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

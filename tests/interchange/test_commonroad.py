@@ -18,9 +18,9 @@ from ssad.interchange.commonroad_reader import read_commonroad
 from ssad.interchange.commonroad_writer import STILL
 from ssad.interchange.export import export_commonroad
 from ssad.metrics import episode_metrics
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.frozen import frozen
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -20,8 +20,8 @@ from ssad.drivers import make_system
 from ssad.interchange.commonroad_reader import read_commonroad
 from ssad.interchange.export import export_commonroad
 from ssad.metrics import criticality
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -19,10 +19,10 @@ from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.writer import NuScenesWriter
 from ssad.drivers import make_system
 from ssad.interchange.drive_log import AXLE_TO_MIDDLE, model_of, scenario_of_drive
-from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
-from ssad.roads import load_town
+from ssad.recorders.nuscenes import Recording, record_nuscenes
 from ssad.scenarios.dynamic import build_episode, read_scenarios
 from ssad.scenarios.dynamic.frozen import thinned
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -16,18 +16,18 @@ pytest.importorskip("highway_env", reason="needs the extra highway")
 
 from highway_env.vehicle.behavior import IDMVehicle
 
-from ssad.bench.kind import Resources
-from ssad.bench.kinds.driving import Driving, DrivingSuite
-from ssad.bench.run import run
 from ssad.core.traces import trace_hash
 from ssad.core.types import Controller, Episode, Limits
 from ssad.drivers.builtin import Autopilot, Blind
-from ssad.interchange import highway_env
-from ssad.interchange.highway_env import PLACES, HighwayEnv, highway_episode, highway_scenarios, highway_town
+from ssad.engine.kind import Resources
+from ssad.engine.run import run
+from ssad.experiments.driving.kind import Driving, DrivingSuite
+from ssad.experiments.runs import write_report
 from ssad.metrics import episode_metrics
-from ssad.report import write_report
 from ssad.scenarios.dynamic import scenario_from
 from ssad.scenarios.dynamic.schema import scenario_data
+from ssad.simulators import highway_env
+from ssad.simulators.highway_env import PLACES, HighwayEnv, highway_episode, highway_scenarios, highway_town
 from ssad.world.check import check_driver, check_simulator
 from ssad.world.rollout import Loop, rollout
 

@@ -14,9 +14,9 @@ from ssad.core.types import Scenario
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1, read_leaderboard
 from ssad.metrics import episode_metrics
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, import_routes, load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.frozen import frozen
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

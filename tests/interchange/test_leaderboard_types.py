@@ -14,8 +14,8 @@ from ssad.core.types import F64, Controller, EpisodeTrace, Scenario, SignalPlan
 from ssad.drivers import make_system
 from ssad.interchange.leaderboard import read_leaderboard
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

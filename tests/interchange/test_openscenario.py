@@ -21,9 +21,9 @@ from ssad.drivers import make_system
 from ssad.interchange.export import export_openscenario
 from ssad.interchange.openscenario_reader import read_openscenario
 from ssad.metrics import episode_metrics
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios
 from ssad.scenarios.dynamic.frozen import frozen
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -16,9 +16,9 @@ from helpers.command import ssad
 from ssad.core.types import Controller, Episode, EpisodeAgent, Limits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.interchange.scenic_programs import Program, load_program, map_of, sample
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, read_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, search
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import ConfigError, StoreError
-from ssad.jobs import cluster
-from ssad.jobs.cluster import RayCluster
-from ssad.jobs.task import Outcome, Task
+from ssad.engine import cluster
+from ssad.engine.cluster import RayCluster
+from ssad.engine.task import Outcome, Task
 
 
 class RayError(Exception):

@@ -17,9 +17,9 @@ from helpers.clock import Clock, stopped
 from helpers.descriptors import open_files
 
 from ssad.core.errors import ConfigError, SSADError
-from ssad.jobs import local
-from ssad.jobs.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
-from ssad.jobs.task import Outcome, Task
+from ssad.engine import local
+from ssad.engine.local import THREADS, WORKER_MEMORY, LocalProcesses, ThisProcess, Worker, memory_left
+from ssad.engine.task import Outcome, Task
 
 GIB = 1 << 30
 

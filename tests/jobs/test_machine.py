@@ -13,9 +13,9 @@ from types import SimpleNamespace
 import pytest
 from helpers.descriptors import open_files
 
+from ssad.core import machine
 from ssad.core.errors import ConfigError
-from ssad.jobs import machine
-from ssad.jobs.machine import (
+from ssad.core.machine import (
     cuda_driver,
     default_workers,
     gpu_workers,
@@ -172,7 +172,7 @@ def test_gpus_are_shared_by_as_many_as_their_memory_takes(
 HELD = """
 import ctypes
 import numpy as np
-from ssad.jobs.machine import keep_memory
+from ssad.core.machine import keep_memory
 
 class Mallinfo(ctypes.Structure):  # struct mallinfo2 of <malloc.h>
     _fields_ = [(name, ctypes.c_size_t) for name in (

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import ConfigError, SSADError, StoreError
-from ssad.jobs import pool as pools
-from ssad.jobs.local import LocalProcesses, memory_left
-from ssad.jobs.pool import Pool, open_pool, run_all
-from ssad.jobs.task import Outcome, Task
+from ssad.engine import pool as pools
+from ssad.engine.local import LocalProcesses, memory_left
+from ssad.engine.pool import Pool, open_pool, run_all
+from ssad.engine.task import Outcome, Task
 
 
 def seen(number: int) -> tuple[int, str]:
@@ -70,7 +70,7 @@ def test_each_process_sees_one_gpu_in_turn() -> None:
 def test_processes_share_the_cores_in_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("ssad.jobs.pool.default_workers", lambda: 6)
+    monkeypatch.setattr("ssad.engine.pool.default_workers", lambda: 6)
     assert set(run_all(open_pool(2, workers=2), threads, range(2))) == {"3"}
 
 

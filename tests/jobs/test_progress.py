@@ -8,8 +8,8 @@ import pytest
 from helpers.clock import Clock, stopped
 from rich.console import Console
 
-from ssad.jobs import progress
-from ssad.jobs.progress import Live
+from ssad.engine import progress
+from ssad.engine.progress import Live
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ from helpers.descriptors import open_files
 
 from ssad.core.errors import StoreError
 from ssad.core.jsonl import read_lines
-from ssad.jobs import store as stores
-from ssad.jobs.store import Store, locked, read_run
+from ssad.engine import store as stores
+from ssad.engine.store import Store, locked, read_run
 
 RUN: dict[str, Any] = {"identity": "a", "suite": {"name": "s", "seed": 0}}
 

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from ssad.core.errors import ConfigError
-from ssad.jobs import worker
-from ssad.jobs.local import Worker
-from ssad.jobs.task import Outcome, Task
+from ssad.engine import worker
+from ssad.engine.local import Worker
+from ssad.engine.task import Outcome, Task
 
 
 def begin(path: Path) -> None:
@@ -166,7 +166,7 @@ def test_the_kernel_ends_it_with_its_parent(process: Worker) -> None:
 def test_it_takes_its_descriptors_from_the_command_line() -> None:
     theirs, orders = os.pipe()
     answers, theirs_too = os.pipe()
-    command = [sys.executable, "-m", "ssad.jobs.worker", str(theirs), str(theirs_too)]
+    command = [sys.executable, "-m", "ssad.engine.worker", str(theirs), str(theirs_too)]
     with subprocess.Popen(command, pass_fds=(theirs, theirs_too)) as one:
         os.close(theirs)
         os.close(theirs_too)

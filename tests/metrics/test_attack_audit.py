@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from ssad.experiments.perception.digital.page import published_attempts
 from ssad.metrics.attack_audit import RULES, Attempt, Verdict, audit, weaker
-from ssad.report.kinds.digital import published_attempts
 
 CLEAN = 0.3
 BASE = Attempt(

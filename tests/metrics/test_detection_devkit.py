@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from helpers.devkit_sets import SETS, SPLIT, VERSION, write_set
 
-from ssad.evaluation.score import score_results
+from ssad.datasets.nuscenes.score import score_results
 
 TESTS = Path(__file__).resolve().parents[1]
 DEVKIT = os.environ.get("SSAD_DEVKIT_PYTHON")

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.assets.mesh import Mesh
-from ssad.camera.scene_edit import SceneEdit
 from ssad.core.errors import FormatError, SSADError
 from ssad.core.types import AgentKind, Controller, EpisodeTrace, Limits
-from ssad.recording.attacked_film import attacked_frames, first_ahead
-from ssad.recording.light_export import Shining, export_light, load_worn
-from ssad.recording.lit_clips import at_hour
-from ssad.recording.live_attack import LiveAttack
-from ssad.recording.loop_sensors import DAY
-from ssad.recording.target import TargetCar
-from ssad.roads import load_town
+from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
+from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.rendering.hours import at_hour
+from ssad.rendering.meshes.mesh import Mesh
+from ssad.rendering.onboard import DAY
+from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
-from ssad.scenarios.static.physical.noninvasive import Projector, Target, make_light
+from ssad.scenarios.static.physical.lights import Projector, Target, make_light
+from ssad.scenarios.static.physical.lights.export import Shining, export_light, load_worn
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

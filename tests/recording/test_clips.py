@@ -23,23 +23,23 @@ import torch
 from helpers.bodies import plain_bodies, two_phases
 from helpers.sharing import Shared
 
-from ssad.camera.labels import label_picture
-from ssad.camera.render import Weather, render
-from ssad.camera.scene import Layer
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, FormatError, StoreError
 from ssad.core.images import encode_jpeg
 from ssad.core.seeding import generator
 from ssad.core.types import F64, EpisodeTrace
-from ssad.recording.clip_recorder import CLASSES, HIDDEN, SECONDS, SEEN, TARGET, _named, clip_views, record_clips
-from ssad.recording.clips import FOCAL, SMALL, Clips, pair_images
-from ssad.recording.drives import make_drive
-from ssad.recording.nuscenes_recorder import drive
-from ssad.recording.scene_objects import SceneObjects
-from ssad.recording.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
-from ssad.recording.target_views import solid_target, target_truth
-from ssad.recording.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
-from ssad.roads import load_town
+from ssad.experiments.perception.physical.target_views import solid_target, target_truth
+from ssad.recorders.drives import make_drive
+from ssad.recorders.nuscenes import drive
+from ssad.recorders.target_images import CLASSES, HIDDEN, SECONDS, SEEN, TARGET, _named, clip_views, record_clips
+from ssad.recorders.target_recording import FOCAL, SMALL, Clips, pair_images
+from ssad.recorders.viewpoints import AIM, CAR_EYE, EYE, follow, look_at, polar, turn_of, weather_name
+from ssad.rendering.camera.labels import label_picture
+from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.camera.scene import Layer
+from ssad.rendering.scene_objects import SceneObjects
+from ssad.rendering.target import Target, TargetCar, TargetSign, TargetWalker, parse_target
+from ssad.world.roads import load_town
 
 PAIRS = (("Twinford", 4), ("Oldmarket", 3))
 BOTH = pytest.mark.parametrize("mode", ["drives", pytest.param("orbits", marks=pytest.mark.slow)])

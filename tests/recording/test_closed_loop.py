@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.recording import closed_loop
-from ssad.recording.closed_loop import system_version, town_version, type_version
+from ssad.simulators import closed_loop
+from ssad.simulators.closed_loop import system_version, town_version, type_version
 
 
 class Thing:

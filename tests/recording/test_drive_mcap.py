@@ -16,9 +16,9 @@ from ssad.core.rotations import yaw_to_quaternion
 from ssad.core.types import EpisodeTrace, LaneType
 from ssad.drivers.perceiving.driver import Perceiving
 from ssad.drivers.perceiving.eyes import PerfectEyes, front
-from ssad.evaluation.drive_perception import Watcher
-from ssad.evaluation.drive_sheet import Seen
-from ssad.recording.drive_mcap import need_mcap, write_mcap
+from ssad.experiments.gap.component_metrics import Watcher
+from ssad.experiments.gap.drive_sheet import Seen
+from ssad.experiments.gap.mcap import need_mcap, write_mcap
 from ssad.world.rollout import rollout
 
 

@@ -10,14 +10,14 @@ import pytest
 import torch
 from helpers.bodies import plain_bodies
 
-from ssad.camera.render import Weather
 from ssad.core.errors import UnknownNameError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.lit_clips import HOURS, LitClip, at_hour, lit_clips
-from ssad.scenarios.static.physical.noninvasive import Flashlight, Projector, Shadow
-from ssad.scenarios.static.physical.noninvasive.light import at_values
+from ssad.experiments.perception.physical.lit_images import HOURS, LitClip, at_hour, lit_clips
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.camera.render import Weather
+from ssad.scenarios.static.physical.lights import Flashlight, Projector, Shadow
+from ssad.scenarios.static.physical.lights.light import at_values
 
 
 @pytest.fixture(scope="module")

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.camera.scene_edit import SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import Controller, Limits
-from ssad.recording import episode_scene
-from ssad.recording.light_export import Shining
-from ssad.recording.lit_clips import at_hour
-from ssad.recording.live_attack import LiveAttack
-from ssad.recording.loop_sensors import DAY, Onboard
-from ssad.recording.target import parse_target
-from ssad.recording.texture_export import Print
-from ssad.roads import load_town
+from ssad.rendering import episode_scene
+from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.rendering.hours import at_hour
+from ssad.rendering.onboard import DAY, Onboard
+from ssad.rendering.target import parse_target
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import make_carrier
+from ssad.scenarios.static.physical.lights.export import Shining
+from ssad.scenarios.static.physical.textures.export import Print
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -10,8 +10,8 @@ import torch
 
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.frames import Camera
-from ssad.recording.loop_perturbations import STEPS, family_of, perturbed
-from ssad.recording.loop_sensors import Onboard
+from ssad.experiments.gap.loop_perturbations import STEPS, family_of, perturbed
+from ssad.rendering.onboard import Onboard
 from tests.scenarios.digital.toy_detector import ToyDetector, toy_scene
 
 SIZE = toy_scene(1)[0].shape[-2:]

@@ -10,11 +10,11 @@ import pytest
 from ssad import World, build_episode, load_scenarios, load_town
 from ssad.core.errors import FormatError
 from ssad.core.frames import Camera
-from ssad.recording.light_export import export_light
-from ssad.recording.lit_clips import at_hour
-from ssad.recording.loop_lights import LIT, hour_of, light_version, shining
-from ssad.recording.loop_perturbations import family_of, has_severities, is_worn, texture_version, worn
-from ssad.recording.loop_sensors import DAY, Onboard
+from ssad.experiments.gap.loop_perturbations import family_of, has_severities, is_worn, texture_version, worn
+from ssad.rendering.hours import at_hour
+from ssad.rendering.onboard import DAY, Onboard
+from ssad.scenarios.static.physical.lights.export import export_light
+from ssad.scenarios.static.physical.lights.loop import LIT, hour_of, light_version, shining
 
 
 @pytest.fixture(scope="module")

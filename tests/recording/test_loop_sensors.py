@@ -10,27 +10,27 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.assets.mesh import Mesh
-from ssad.camera.lamps import Lamp
-from ssad.camera.lidar import Lidar
-from ssad.camera.render import Weather, render
-from ssad.camera.rig import rig_camera
-from ssad.camera.scene_edit import Card, SceneEdit
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeTrace, Limits, SignalState
-from ssad.recording import loop_sensors
-from ssad.recording.episode_scene import LENSES, Moment, moments_of
-from ssad.recording.live_attack import LiveAttack
-from ssad.recording.loop_perturbations import worn
-from ssad.recording.loop_sensors import Onboard
-from ssad.recording.scene_objects import PHASES
-from ssad.recording.target import TargetCar
-from ssad.roads import load_town
+from ssad.experiments.gap.loop_perturbations import worn
+from ssad.rendering import onboard as loop_sensors
+from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.camera.rig import rig_camera
+from ssad.rendering.camera.scene_edit import Card, SceneEdit
+from ssad.rendering.episode_scene import LENSES, Moment, moments_of
+from ssad.rendering.lidar import Lidar
+from ssad.rendering.meshes.mesh import Mesh
+from ssad.rendering.onboard import Onboard
+from ssad.rendering.scene_objects import PHASES
+from ssad.rendering.target import TargetCar
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.static.physical import Camouflage
 from ssad.world.check import check_driver
+from ssad.world.roads import load_town
 from ssad.world.rollout import Loop, rollout
 from ssad.world.world import World
 
@@ -299,7 +299,7 @@ def test_a_trace_has_no_further_agents_or_steps(driven) -> None:
 
 
 def test_the_engine_has_the_sensors_of_nuscenes_for_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ssad.recording import closed_loop as driving
+    from ssad.simulators import closed_loop as driving
 
     watcher = Watcher("CAM_BACK")
     short = replace(episodes()[0], limits=Limits(max_steps=2))

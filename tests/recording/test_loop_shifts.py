@@ -9,9 +9,9 @@ import pytest
 
 from ssad import World, build_episode, load_scenarios, load_town, make_system
 from ssad.core.frames import Camera
-from ssad.recording.loop_sensors import Onboard
-from ssad.recording.loop_shifts import ShiftedCamera, boxes_of
+from ssad.rendering.onboard import Onboard
 from ssad.scenarios.static.shifts import ShiftSpec
+from ssad.scenarios.static.shifts.loop import ShiftedCamera, boxes_of
 from ssad.world.rollout import Loop
 
 

@@ -10,10 +10,10 @@ import torch
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
-from ssad.recording import loop_universal
-from ssad.recording.loop_perturbations import perturbed
-from ssad.recording.loop_sensors import Onboard
-from ssad.recording.loop_universal import pictures_of_other_drives
+from ssad.experiments.gap import universal_attack as loop_universal
+from ssad.experiments.gap.loop_perturbations import perturbed
+from ssad.experiments.gap.universal_attack import pictures_of_other_drives
+from ssad.rendering.onboard import Onboard
 from tests.scenarios.digital.toy_detector import ToyDetector, toy_scene
 
 SIZE = toy_scene(1)[0].shape[-2:]

@@ -21,11 +21,6 @@ import numpy as np
 import pytest
 from helpers.bodies import plain_bodies
 
-from ssad.assets.actor_bodies import BODY_CATEGORIES
-from ssad.assets.bodies import make_body
-from ssad.assets.mesh import Mesh
-from ssad.assets.street import cached_street
-from ssad.assets.street.model import Street
 from ssad.core.errors import ConfigError, MapError, StoreError
 from ssad.core.geometry import obb_distance
 from ssad.core.images import read_image
@@ -35,14 +30,19 @@ from ssad.core.rotations import quaternion_to_matrix
 from ssad.core.types import LaneType
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.scene_shifter import SceneShifter
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.drives import CARS, MIX, drive_street, make_drive, thinned
-from ssad.recording.nuscenes_recorder import AHEAD, Recording, drive, record_nuscenes
-from ssad.recording.scene_objects import RACK, SceneObjects, place_objects
-from ssad.roads import load_town, save_graph
+from ssad.recorders.drives import CARS, MIX, drive_street, make_drive, thinned
+from ssad.recorders.nuscenes import AHEAD, Recording, drive, record_nuscenes
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.bodies import make_body
+from ssad.rendering.bodies.actor_bodies import BODY_CATEGORIES
+from ssad.rendering.meshes.mesh import Mesh
+from ssad.rendering.scene_objects import RACK, SceneObjects, place_objects
+from ssad.rendering.street import cached_street
+from ssad.rendering.street.model import Street
 from ssad.scenarios.static.shifts import ShiftSpec
+from ssad.scenarios.static.shifts.scene_shifter import SceneShifter
+from ssad.world.roads import load_town, save_graph
 
 # as the fixture `recorded` was made, but for its sweeps
 SMALL = {"towns": ("Twinford", "Oldmarket"), "held_out": ("Oldmarket",), "scenes": 1, "seconds": 1.0, "width": 160}
@@ -211,7 +211,7 @@ def test_only_what_is_drawn_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
         built.append(kind)
         return make_body(kind, **options)
 
-    monkeypatch.setattr("ssad.recording.scene_objects.make_body", counting)
+    monkeypatch.setattr("ssad.rendering.scene_objects.make_body", counting)
     objects = SceneObjects(0.1, ("lazy",))
     car = objects.make("car", "sedan", (4.5, 1.8, 1.5))
     objects.make("pedestrian", "adult", (0.6, 0.6, 1.8), phases=3)
@@ -241,9 +241,9 @@ def test_four_drives_share_a_street_that_is_built_for_them(tmp_path: Path, monke
                     record((*task[:2], [number]))
             asked.append(("together", *numbers))
 
-    monkeypatch.setattr("ssad.recording.nuscenes_recorder.drive_street", street)
-    monkeypatch.setattr("ssad.recording.nuscenes_recorder.run_parts", tried)
-    monkeypatch.setattr("ssad.recording.nuscenes_recorder._merge", lambda *what: None)
+    monkeypatch.setattr("ssad.recorders.nuscenes.drive_street", street)
+    monkeypatch.setattr("ssad.recorders.nuscenes.run_parts", tried)
+    monkeypatch.setattr("ssad.recorders.nuscenes._merge", lambda *what: None)
     small = {"scenes": 5, "seconds": 0.5, "width": 64, "streets": "any", "seed": 7}
     record_nuscenes(Recording(tmp_path, ("Twinford",), (), **small), workers=0)  # type: ignore[arg-type]
     first, second = (7, "Twinford", 0), (7, "Twinford", 1)
@@ -284,7 +284,7 @@ def test_long_vehicles_stand_at_the_kerb() -> None:
 def test_a_town_without_a_road_to_drive_on_is_refused_in_one_line(
     tmp_path: Path, ssad_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ssad.recording.drives.cached_street", lambda town: None)  # takes long to build, is not needed
+    monkeypatch.setattr("ssad.recorders.drives.cached_street", lambda town: None)  # takes long to build, is not needed
     town = ssad_home / "towns" / "Paths.npz"
     graph = load_town("ProvingGround")
     # every lane to drive on lies within a junction: no place to start from

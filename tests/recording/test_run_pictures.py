@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from ssad.recording import run_pictures
-from ssad.recording.run_pictures import write_pictures
+from ssad.experiments.driving import run_images as run_pictures
+from ssad.experiments.driving.run_images import write_pictures
 
 
 def test_pictures_are_made_once_and_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -7,18 +7,18 @@ import functools
 import numpy as np
 import pytest
 
-from ssad.assets.bodies import make_body
-from ssad.assets.street import cached_street
 from ssad.core.lane_graph import LaneGraph, SignKind
 from ssad.core.rotations import upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F64, LaneType
 from ssad.datasets.coco import coco_data
-from ssad.recording.clip_recorder import CLASSES, faces, label_of
-from ssad.recording.clips import BEHIND
-from ssad.recording.scene_objects import Clear, SceneObjects, _signs
-from ssad.recording.street_signs import StreetSign, plate_and_post, street_signs
-from ssad.roads import load_town
+from ssad.recorders.target_images import CLASSES, faces, label_of
+from ssad.recorders.target_recording import BEHIND
+from ssad.rendering.bodies import make_body
+from ssad.rendering.scene_objects import Clear, SceneObjects, _signs
+from ssad.rendering.street import cached_street
+from ssad.rendering.street_signs import StreetSign, plate_and_post, street_signs
+from ssad.world.roads import load_town
 
 
 @functools.cache

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ssad.bench.suite import load_suite
-from ssad.recording import target_sheets
+from ssad.experiments.perception.physical import target_sheets
+from ssad.experiments.suites import load_suite
 
 
 def test_pictures_are_shown_on_the_device_of_the_attacks(tmp_path: Path, monkeypatch: Any) -> None:

@@ -10,13 +10,13 @@ import pytest
 import torch
 from PIL import Image
 
-from ssad.assets.mesh_files import load_mesh
 from ssad.core import safeio
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.images import read_image
-from ssad.recording.target import TargetCar, TargetSign
-from ssad.recording.texture_export import Print, export_texture, load_print
+from ssad.rendering.meshes.mesh_files import load_mesh
+from ssad.rendering.target import TargetCar, TargetSign
 from ssad.scenarios.static.physical import Camouflage, Patch, control
+from ssad.scenarios.static.physical.textures.export import Print, export_texture, load_print
 
 
 def test_a_patch_has_its_true_size_and_lies_where_the_target_wears_it(tmp_path: Path) -> None:

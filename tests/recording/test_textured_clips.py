@@ -14,21 +14,21 @@ import torch
 from helpers.bodies import plain_bodies
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import ssad.recording.textured_clips as module
-from ssad.camera.render import Picture, render
-from ssad.camera.scene import Layer
-from ssad.camera.texture import paint_mask, retexture, taps_of
-from ssad.camera.torch_jpeg import jpeg
-from ssad.camera.torch_sensor import develop
+import ssad.experiments.perception.physical.textured_images as module
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.images import read_image
-from ssad.recording.clip_recorder import TARGET, clip_views, record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.nuscenes_recorder import SENSOR
-from ssad.recording.target import TargetCar
-from ssad.recording.textured_clips import KEPT, Wearing, textured_clips
-from ssad.recording.viewpoints import look_at
-from ssad.scenarios.static.physical.carrier import Road
+from ssad.experiments.perception.physical.textured_images import KEPT, Wearing, textured_clips
+from ssad.recorders.nuscenes import SENSOR
+from ssad.recorders.target_images import TARGET, clip_views, record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.recorders.viewpoints import look_at
+from ssad.rendering.camera.render import Picture, render
+from ssad.rendering.camera.scene import Layer
+from ssad.rendering.camera.texture import paint_mask, retexture, taps_of
+from ssad.rendering.camera.torch_jpeg import jpeg
+from ssad.rendering.camera.torch_sensor import develop
+from ssad.rendering.target import TargetCar
+from ssad.scenarios.static.physical.textures.carrier import Road
 
 LAYERS = (Layer(0), Layer(1, (0.2, 0.2, 0.6, 0.6), 0.5))
 CAR = TargetCar("suv", "red", seed=2)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from helpers.metric_traces import make_trace
 
-from ssad.bench.kinds.adversarial import Adversarial
-from ssad.report.found_view import ADVERSARY, EGO, ROAD, found_view
-from ssad.report.kinds.adversarial import (
+from ssad.experiments.adversarial.collision_view import ADVERSARY, EGO, ROAD, found_view
+from ssad.experiments.adversarial.kind import Adversarial
+from ssad.experiments.adversarial.page import (
     against_table,
     budget_table,
     careful_table,
@@ -23,7 +23,7 @@ from ssad.report.kinds.adversarial import (
     transfer_table,
 )
 from ssad.report.load import Run
-from ssad.roads import load_town
+from ssad.world.roads import load_town
 
 
 def line(generator: str, base: int, first: int | None, *, survived: bool = True, **changes: Any) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.report.digital_run import DigitalRun, Setting, gained_cell, lost_cell
+from ssad.experiments.perception.digital.run import DigitalRun, Setting, gained_cell, lost_cell
 from ssad.report.load import Run
 
 CLEAN, PGD = Setting(), Setting("pgd", "margin", "linf", 5.0, 10)

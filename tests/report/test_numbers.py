@@ -19,7 +19,8 @@ from PIL import Image
 
 from ssad.core.errors import StoreError
 from ssad.core.traces import save_trace, trace_hash
-from ssad.report import check_artefacts, write_report
+from ssad.experiments.runs import write_report
+from ssad.report import check_artefacts
 from ssad.report.pages import kind_module
 
 

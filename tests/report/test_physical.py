@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssad.report import write_report
-from ssad.report.heatmap import HeatMap, heat_maps
-from ssad.report.kinds.physical import (
+from ssad.experiments.perception.physical.heatmap import HeatMap, heat_maps
+from ssad.experiments.perception.physical.page import (
     PhysicalRun,
     comparison_table,
     grid_table,
@@ -22,6 +21,7 @@ from ssad.report.kinds.physical import (
     tiles,
     transfer_table,
 )
+from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
 from ssad.report.paper import PHYSICAL
 

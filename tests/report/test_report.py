@@ -24,16 +24,17 @@ from ssad.core.lane_strips import thin
 from ssad.core.safeio import plain
 from ssad.core.traces import load_trace, save_trace
 from ssad.drivers import make_system
+from ssad.experiments.driving.driving_tables import precrash_table
+from ssad.experiments.driving.embed import SCALE, episode_data, origin, pack
+from ssad.experiments.driving.episodes import load_episodes
+from ssad.experiments.runs import write_report
 from ssad.metrics import episode_metrics
-from ssad.report import write_report, write_video
-from ssad.report.driving_tables import precrash_table
-from ssad.report.embed import SCALE, episode_data, origin, pack
-from ssad.report.episodes import load_episodes
+from ssad.report import write_video
 from ssad.report.load import load_run
 from ssad.report.paper import NATURAL, PRECRASH, SCENARIOS
 from ssad.report.tables import tex, to_csv, to_latex, to_markdown
-from ssad.roads import load_town, save_graph
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town, save_graph
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 
@@ -264,7 +265,7 @@ def test_report_needs_no_world(run_folder: Path) -> None:
     import sys
 
     code = (
-        "import sys\nfrom pathlib import Path\nfrom ssad.report import write_report\n"
+        "import sys\nfrom pathlib import Path\nfrom ssad.experiments.runs import write_report\n"
         "write_report(Path(sys.argv[1]))\n"
         "assert not {'torch', 'warp', 'carla', 'gymnasium'} & set(sys.modules), 'heavy imports'"
     )

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from helpers.run_folder import write_run
 
-from ssad.report import write_report
+from ssad.experiments.runs import write_report
 from ssad.report.load import load_run
 from ssad.report.verdict import verdict
 

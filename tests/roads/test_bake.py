@@ -13,10 +13,10 @@ from roads.towns import IMPORTED, built_in, imported
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import LaneGraph, SignKind, equal
 from ssad.core.types import LaneType
-from ssad.roads import bake, import_map, load_graph, load_town, town_names
-from ssad.roads import bake as bake_function
-from ssad.roads.designs import generate_town
-from ssad.roads.query import nearest_all, segments
+from ssad.world.roads import bake, import_map, load_graph, load_town, town_names
+from ssad.world.roads import bake as bake_function
+from ssad.world.roads.designs import generate_town
+from ssad.world.roads.query import nearest_all, segments
 
 carla = pytest.importorskip("carla", reason="the extra carla is not installed (no wheel for this Python)")
 

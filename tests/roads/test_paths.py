@@ -8,9 +8,9 @@ import pytest
 from ssad.core.errors import MapError
 from ssad.core.lane_graph import equal, load_graph, save_graph
 from ssad.core.types import Pose
-from ssad.roads import route_along
-from ssad.roads.paths import graph_of_paths
-from ssad.roads.query import nearest_all
+from ssad.world.roads import route_along
+from ssad.world.roads.paths import graph_of_paths
+from ssad.world.roads.query import nearest_all
 
 
 def line(x0: float, x1: float, y: float, step: float = 0.4) -> np.ndarray:

@@ -10,8 +10,8 @@ from helpers.quick import others_slow
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.types import LaneType
-from ssad.roads import LaneGraph, LaneQuery
-from ssad.roads.query import DRIVABLE, MARGIN, segments
+from ssad.world.roads import LaneGraph, LaneQuery
+from ssad.world.roads.query import DRIVABLE, MARGIN, segments
 
 
 def brute(graph: LaneGraph, points: np.ndarray, types: tuple[LaneType, ...]) -> tuple[np.ndarray, ...]:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ssad.core.errors import ConfigError, UnknownNameError
-from ssad.recording.nuscenes_recorder import Recording
-from ssad.roads import is_town, load_town, town_names, town_xodr
-from ssad.roads.random_towns import random_town, write_random_town
+from ssad.recorders.nuscenes import Recording
+from ssad.world.roads import is_town, load_town, town_names, town_xodr
+from ssad.world.roads.random_towns import random_town, write_random_town
 
 
 @pytest.mark.parametrize("number", range(6))

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from roads.towns import built_in
 
-from ssad.assets.street.region import survey
 from ssad.core.lane_graph import SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario
-from ssad.recording.drives import make_drive
-from ssad.roads import LaneGraph, random_route, route_along
+from ssad.recorders.drives import make_drive
+from ssad.rendering.street.region import survey
+from ssad.world.roads import LaneGraph, random_route, route_along
 from ssad.world.world import World
 
 RINGS = (((220.0, 170.0), 22.0), ((450.0, 170.0), 20.0))

@@ -18,8 +18,8 @@ from ssad.core.errors import RouteError
 from ssad.core.rotations import wrap_angle
 from ssad.core.seeding import generator
 from ssad.core.types import LaneType, Pose, Route
-from ssad.roads import LaneGraph, LaneQuery, random_route, route_along
-from ssad.roads.router import _Leg, _line
+from ssad.world.roads import LaneGraph, LaneQuery, random_route, route_along
+from ssad.world.roads.router import _Leg, _line
 
 QUICK = ("Twinford", "Ringmere")  # a grid with its shortest ways exact, and roundabouts
 TURN = 0.28  # rad a metre: the tightest turn has 8 m radius, the shortest lane change is 10 m

@@ -10,9 +10,9 @@ import pytest
 from roads.towns import BUILT_IN, IMPORTED, built_in, imported
 
 from ssad.core.types import SignalState
-from ssad.roads import LaneGraph, bake
-from ssad.roads.designs import generate_town
 from ssad.world.episode_arrays import signal_programs
+from ssad.world.roads import LaneGraph, bake
+from ssad.world.roads.designs import generate_town
 
 GO = (int(SignalState.GREEN), int(SignalState.YELLOW))
 

@@ -16,10 +16,10 @@ from ssad.core.errors import MapError, UnknownNameError
 from ssad.core.lane_graph import SignKind
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType
-from ssad.roads import LaneGraph, bake, load_town, town_names
-from ssad.roads.designs import DESIGNS as TOWNS
-from ssad.roads.designs import generate_town
-from ssad.roads.router import _across
+from ssad.world.roads import LaneGraph, bake, load_town, town_names
+from ssad.world.roads.designs import DESIGNS as TOWNS
+from ssad.world.roads.designs import generate_town
+from ssad.world.roads.router import _across
 
 INTERCHANGES = {2000, 12000}  # of Longreach
 
@@ -190,7 +190,7 @@ def test_towns_by_name(ssad_home: Path) -> None:
     assert set(town_names()) == set(BUILT_IN) == set(TOWNS)
     assert generate_town("Twinford") == generate_town("Twinford")
     for name in BUILT_IN:
-        assert (files("ssad.roads.towns") / f"{name}.npz").read_bytes().__len__() < 300_000
+        assert (files("ssad.world.roads.towns") / f"{name}.npz").read_bytes().__len__() < 300_000
     with pytest.raises(UnknownNameError, match="closest: Twinford"):
         load_town("Twinfrod")
     with pytest.raises(UnknownNameError):

@@ -20,11 +20,11 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.safeio import npz_bytes
 from ssad.core.seeding import generator
 from ssad.core.types import ENDS, Controller, LaneType
-from ssad.roads import LaneGraph, bake, random_route
-from ssad.roads.designs import DESIGNS as TOWNS
-from ssad.roads.designs import generate_town
-from ssad.roads.library import BUILT_IN
 from ssad.scenarios.dynamic import build_episode
+from ssad.world.roads import LaneGraph, bake, random_route
+from ssad.world.roads.designs import DESIGNS as TOWNS
+from ssad.world.roads.designs import generate_town
+from ssad.world.roads.library import BUILT_IN
 from ssad.world.world import World
 
 NEW = ("Oldmarket", "Larkhill")
@@ -37,12 +37,12 @@ KEPT = {  # recorded results depend on them
 
 
 def baked(name: str) -> bytes:
-    return (files("ssad.roads.towns") / f"{name}.npz").read_bytes()
+    return (files("ssad.world.roads.towns") / f"{name}.npz").read_bytes()
 
 
 @cache
 def town(name: str) -> LaneGraph:
-    return load_graph(str(files("ssad.roads.towns") / f"{name}.npz"))
+    return load_graph(str(files("ssad.world.roads.towns") / f"{name}.npz"))
 
 
 def driving(graph: LaneGraph) -> list[int]:

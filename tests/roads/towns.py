@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from ssad.roads import LaneGraph, load_graph, load_town
+from ssad.world.roads import LaneGraph, load_graph, load_town
 
 BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
 IMPORTED = ("Town_Safebench_Light", "Town02", "Town05")

@@ -10,10 +10,10 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.core.traces import trace_hash
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, scenario_of, search
 from ssad.scenarios.dynamic.policy.adv_ppo import SHIPPED, Adversary, AdvPPO
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.selection import FreaSelection
 from ssad.world.world import World

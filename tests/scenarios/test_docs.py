@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import SCENARIOS, build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.knowledge._kind import EGO_START, TARGET_SPEED_SPREAD
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town
 
 PAGE = (Path(__file__).parents[2] / "docs" / "scenarios.md").read_text()
 

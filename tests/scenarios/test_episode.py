@@ -10,10 +10,10 @@ import pytest
 
 from ssad.core.errors import ConfigError, RouteError
 from ssad.core.types import Actor, Controller, Limits, Pose, Route, Scenario, SignalPlan, SignalState, TrafficPlan
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.episode import _start
 from ssad.world.models import model
+from ssad.world.roads import load_town
 
 START = Pose(217.0, -5.25)
 PLAIN = Scenario("Mine", "Custom", "ProvingGround", (START, Pose(317.0, -5.25)))

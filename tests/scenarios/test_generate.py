@@ -16,11 +16,11 @@ from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.generators import Base, Generator, Outcome, Proposal
 from ssad.core.types import Bool, Controller, Pose
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, read_scenarios, save_scenarios
 from ssad.scenarios.dynamic.frozen import frozen
 from ssad.scenarios.dynamic.generate import Trials, generator_factory, generator_list, scenario_of, search
 from ssad.scenarios.dynamic.outcome import measure
+from ssad.world.roads import load_town
 
 
 def trials(system: str = "blind") -> Trials:

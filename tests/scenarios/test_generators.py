@@ -11,12 +11,12 @@ from helpers.quick import others_slow
 
 from ssad.core.generators import Base, Generator, Outcome
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.generate import GENERATORS, Trials, generator_factory
 from ssad.scenarios.dynamic.logged.near_miss import moved, near_misses
 from ssad.scenarios.dynamic.policy.l2c import _Distribution
 from ssad.scenarios.dynamic.transition.motion import KNOTS, Way
+from ssad.world.roads import load_town
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import pytest
 
 from ssad.core.errors import FormatError
 from ssad.core.types import Pose
-from ssad.roads import load_graph
 from ssad.scenarios.dynamic import PRECRASH, build_episode, import_routes, load_scenarios, save_scenarios, scenario_type
 from ssad.scenarios.dynamic.importer import _PARAMETERS
+from ssad.world.roads import load_graph
 
 ROUTE = (
     '<routes><route id="0" town="T"><waypoint x="0" y="10" yaw="0" z="0"/>'
@@ -494,8 +494,8 @@ def test_every_parameter_of_a_list_is_one_of_its_scenario(number: int) -> None:
 
 def test_a_trigger_on_a_curve_is_found_on_the_route_through_its_town(tmp_path: Path) -> None:
     """The straight line between the ends of a turn passes more than 2 m beside its lane."""
-    from ssad.roads import load_town
-    from ssad.roads.router import route_along
+    from ssad.world.roads import load_town
+    from ssad.world.roads.router import route_along
 
     turn = load_scenarios("RightTurn")[0]
     ends = (turn.route[0], turn.route[-1])

@@ -11,12 +11,12 @@ import torch
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Outcome
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials, search
 from ssad.scenarios.dynamic.transition import kinematics
 from ssad.scenarios.dynamic.transition.kinematics import King
 from ssad.scenarios.dynamic.transition.road import raster_of
+from ssad.world.roads import load_town
 from ssad.world.twin import MotionState, RoadField, bodies_of, box_gap, unroll
 
 BASE, *_, OTHER = [s for s in load_scenarios("natural") if s.name.endswith(("Twinford_03/00", "Crossgate_30/06"))]

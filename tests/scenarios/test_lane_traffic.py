@@ -10,10 +10,10 @@ import pytest
 
 from ssad.core.errors import RouteError
 from ssad.core.types import Controller, Pose, TrafficPlan
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.scenarios.dynamic.knowledge.lane_traffic import lanes_beside
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town
 
 
 def test_columns_stand_on_the_lanes_of_the_egos_direction_and_keep_apart() -> None:

@@ -20,7 +20,6 @@ from ssad.core.geometry import obb_distance
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.seeding import generator
 from ssad.core.types import Actor, Condition, Episode, Phase, Pose, Route, Scenario
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import (
     PRECRASH,
     Parameter,
@@ -38,6 +37,7 @@ from ssad.scenarios.dynamic.knowledge import _meeting
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route, trigger_index
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import model
+from ssad.world.roads import load_town
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = load_scenarios("precrash")
@@ -352,7 +352,7 @@ def test_a_second_draw_searches_nothing(monkeypatch: pytest.MonkeyPatch) -> None
         raise AssertionError("searched again")
 
     monkeypatch.setattr(_meeting, "_meet", never)
-    monkeypatch.setattr("ssad.roads.route_along", never)
+    monkeypatch.setattr("ssad.world.roads.route_along", never)
     for scenario, first in zip(scenarios, before, strict=True):
         second = build(scenario, 1)
         assert second.agents[0].route is first.agents[0].route

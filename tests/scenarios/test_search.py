@@ -11,12 +11,12 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.core.generators import Base, Generator, Outcome, Proposal
 from ssad.core.types import F64, Scenario
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.generate import GENERATORS, generator_factory
 from ssad.scenarios.dynamic.sampling import sampling_ranges
 from ssad.scenarios.dynamic.search.bayesian import expected_improvement, predict
 from ssad.scenarios.dynamic.search.box import Box
+from ssad.world.roads import load_town
 
 SEARCHES = [name for name, where in GENERATORS.items() if ".search." in where]
 (SCENARIO,) = load_scenarios("UnprotectedLeftTurn/00")

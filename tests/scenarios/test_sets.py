@@ -37,11 +37,11 @@ from ssad.core.types import (
     Scenario,
     SignalState,
 )
-from ssad.roads import LaneQuery, load_town
 from ssad.scenarios.dynamic import PRECRASH, build_episode, load_scenarios, scenario_type
 from ssad.scenarios.dynamic.sets import DATA
 from ssad.scenarios.dynamic.yamlio import scenario_text
 from ssad.world.models import model
+from ssad.world.roads import LaneQuery, load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

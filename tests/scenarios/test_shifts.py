@@ -17,13 +17,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import page_trend_test
 
-from ssad.camera.sensor import KNEE
 from ssad.core.boxes import TrackedBoxes
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.frames import Camera, Frame, SceneContext, SweepFrame, camera_to_world
 from ssad.core.types import U8
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.scene_shifter import SceneShifter
+from ssad.rendering.camera.sensor import KNEE
 from ssad.scenarios.static.shifts import (
     KNOWN,
     SHIFTS,
@@ -37,6 +36,7 @@ from ssad.scenarios.static.shifts import (
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.exposure import exposure_table
 from ssad.scenarios.static.shifts.light import tables, to_codes, to_linear
+from ssad.scenarios.static.shifts.scene_shifter import SceneShifter
 from ssad.scenarios.static.shifts.sun import choose_sun, sun_direction
 from ssad.scenarios.static.shifts.weather import extinction, scene_weather
 
@@ -377,7 +377,7 @@ def test_cameras_of_a_moment_agree_whether_the_sun_is_hidden(street: NuScenes, m
     scene = street.scene(street.scenes()[0].name)
     frames = [f for f in scene.frames if f.key_frame and f.modality == "camera"][:6]
     for share in (0.0, 0.4, 1.0):
-        monkeypatch.setattr("ssad.evaluation.scene_shifter.free_sun", lambda *_, share=share: share)
+        monkeypatch.setattr("ssad.scenarios.static.shifts.scene_shifter.free_sun", lambda *_, share=share: share)
         shifter = SceneShifter(street.root, scene, ShiftSpec("sunlight", 5))
         found = [shifter.image(frame)[1] for frame in frames]
         front = [one for one in found if "the sun is not in front of this camera" not in one.skipped]

@@ -10,12 +10,12 @@ import pytest
 
 from ssad.core.generators import Base
 from ssad.drivers import make_system
-from ssad.roads import load_town
-from ssad.roads.query import LaneQuery
 from ssad.scenarios.dynamic import load_scenarios
 from ssad.scenarios.dynamic.generate import Trials
 from ssad.scenarios.dynamic.transition import trajectory
 from ssad.scenarios.dynamic.transition.trajectory import Cat, traffic
+from ssad.world.roads import load_town
+from ssad.world.roads.query import LaneQuery
 
 
 @pytest.fixture(scope="module")

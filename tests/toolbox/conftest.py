@@ -9,7 +9,7 @@ import pytest
 from helpers.shifted_roots import options
 from helpers.tiny import make_tiny
 
-from ssad.toolbox import materialise
+from ssad.recorders.shifted import materialise
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from helpers.command import ssad
 from helpers.killing import STOPS, kill_9, wait_until_stopped
 
 from ssad.core.images import read_image, save_picture
-from ssad.toolbox.picture_folder import camera_of
+from ssad.recorders.shifted.image_folder import camera_of
 
 
 @pytest.fixture

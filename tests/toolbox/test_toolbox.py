@@ -1,4 +1,4 @@
-"""`ssad.toolbox`: what it writes, that it says what it did, that it goes on where it was."""
+"""`ssad.recorders.shifted`: what it writes, that it says what it did, that it goes on where it was."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from ssad.core.errors import ConfigError, StoreError
 from ssad.core.images import decode_image, encode_jpeg, read_image
 from ssad.datasets.nuscenes.files import read_points
 from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.recorders.shifted import SceneShifter, check_manifest, materialise, verify
+from ssad.recorders.shifted import scene_writer as work
 from ssad.scenarios.static.shifts import SHIFTS, ShiftSpec, random_severity, shift_images, transformed_boxes
-from ssad.toolbox import SceneShifter, check_manifest, materialise, verify
-from ssad.toolbox import scene_writer as work
 
 HELPER = Path(__file__).resolve().parent.parent / "helpers" / "devkit_load.py"
 

@@ -1,4 +1,4 @@
-"""`ssad.toolbox`: broken data, output that cannot be written, what does not pass for a shifted dataset."""
+"""`ssad.recorders.shifted`: broken data, output that cannot be written, what does not pass for a shifted dataset."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from helpers.shifted_roots import SCENES, VERSION, edit, fails, first, lines, op
 
 from ssad.core.errors import FormatError, StoreError
 from ssad.core.images import encode_jpeg
-from ssad.toolbox import check_manifest, materialise, read_manifest, verify
-from ssad.toolbox import scene_writer as work
-from ssad.toolbox import write as run
+from ssad.recorders.shifted import check_manifest, materialise, read_manifest, verify
+from ssad.recorders.shifted import scene_writer as work
+from ssad.recorders.shifted import write as run
 
 # ---------------------------------------------------------------- nothing changed, broken data
 

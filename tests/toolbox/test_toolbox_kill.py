@@ -14,15 +14,15 @@ from helpers.killing import kill_9, started_by, wait_until_ended
 from helpers.tiny import make_tiny
 
 from ssad.core.errors import StoreError
-from ssad.toolbox import Options, check_manifest, materialise, verify
-from ssad.toolbox.manifest import read_lines
+from ssad.recorders.shifted import Options, check_manifest, materialise, verify
+from ssad.recorders.shifted.manifest import read_lines
 
 VERSION = "v1.0-mini"
 SHIFTS = ("snow", "scale")
 DRIVER = """
 import sys
 from pathlib import Path
-from ssad.toolbox import Options, materialise
+from ssad.recorders.shifted import Options, materialise
 if __name__ == "__main__":
     options = Options(Path(sys.argv[1]), Path(sys.argv[2]), "v1.0-mini", ("snow", "scale"), ("random",))
     materialise(options, workers=int(sys.argv[3]), progress=lambda done, of: print(done, of, flush=True))

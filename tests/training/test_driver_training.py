@@ -15,7 +15,7 @@ from helpers.command import ssad
 
 from ssad.core.checkpoints import load_card
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
-from ssad.drivers.rl.learned import PPO
+from ssad.drivers.learned.policies import PPO
 from ssad.training.adversary import AdversaryPlan, run_adversary_training
 from ssad.training.driver import DriverPlan, draw_episodes, find_scenarios, run_driver_training
 from ssad.training.reinforcement import LEARNINGS, find_learning, learn, make_model, read_log

@@ -17,9 +17,9 @@ from ssad.cli import main
 from ssad.core.checkpoints import read_card
 from ssad.core.errors import ConfigError, FormatError
 from ssad.detectors import SHIPPED, make_detector
-from ssad.recording.clip_recorder import record_clips
-from ssad.recording.clips import Clips
-from ssad.recording.target import parse_target
+from ssad.recorders.target_images import record_clips
+from ssad.recorders.target_recording import Clips
+from ssad.rendering.target import parse_target
 from ssad.training import detector as training
 from ssad.training.detector import Plan, command_of, describe_data, run_training
 from ssad.training.recipe import find_recipe

@@ -15,9 +15,9 @@ from ssad.core.types import ENDS, AgentKind, Controller, EpisodeAgent, Pose, Sig
 from ssad.drivers import make_system
 from ssad.drivers.belief import DegradedBelief, LineOfSight, in_sight
 from ssad.drivers.builtin import Autopilot, Blind
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.belief import Lanes, rested
+from ssad.world.roads import load_town
 from ssad.world.rollout import Loop, rollout
 from ssad.world.sensors import SENSORS
 from ssad.world.world import World

@@ -13,8 +13,8 @@ import pytest
 from world.worlds import DEVICES
 
 from ssad.core.types import Controller
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.world import World
 
 STEPS = 1000

@@ -8,9 +8,9 @@ import pytest
 from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
 from ssad.core.types import Controller
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
+from ssad.world.roads import load_town
 from ssad.world.world import World
 from tests.world.test_lane_changes import two_lanes
 from tests.world.worlds import ego, episode, line_route

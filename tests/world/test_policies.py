@@ -14,11 +14,11 @@ from ssad.core.traces import first_difference
 from ssad.core.types import Actor, Controller, Episode, Limits, Pose, Scenario
 from ssad.drivers import make_system
 from ssad.drivers.careful.grade import grade_collision
-from ssad.roads.library import load_town
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.schema import check
 from ssad.scenarios.dynamic.yamlio import read_scenarios, save_scenarios
 from ssad.world.env import VectorEnv
+from ssad.world.roads.library import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -23,7 +23,7 @@ from ssad.core.types import (
     SignalState,
 )
 from ssad.metrics import episode_metrics
-from ssad.roads import LaneGraph, load_town, random_route
+from ssad.world.roads import LaneGraph, load_town, random_route
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

@@ -12,9 +12,9 @@ from helpers.quick import others_slow
 from benchmarks.traffic import town_routes, traffic
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import Controller, Episode, EpisodeAgent, LaneType, Pose, Route
-from ssad.roads import load_town
-from ssad.roads.library import BUILT_IN
 from ssad.scenarios.dynamic.knowledge.natural_junction import fits
+from ssad.world.roads import load_town
+from ssad.world.roads.library import BUILT_IN
 from ssad.world.world import World
 
 

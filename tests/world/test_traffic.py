@@ -11,8 +11,8 @@ from world.worlds import GRAPHS, ego, episode, line_route, straight_graph
 
 from benchmarks.traffic import LENGTH, ROUTES, between_lanes, measure, town_routes, traffic, upper_limit
 from ssad.core.types import ENDS, Controller, EpisodeAgent, Pose
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads import load_town
 from ssad.world.world import World
 
 

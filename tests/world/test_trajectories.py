@@ -8,10 +8,10 @@ import pytest
 
 from ssad.core.errors import ConfigError
 from ssad.core.types import Actor, Controller, EpisodeAgent, Limits, Pose, Scenario
-from ssad.roads.library import load_town
 from ssad.scenarios.dynamic.episode import build_episode
 from ssad.scenarios.dynamic.schema import check
 from ssad.scenarios.dynamic.yamlio import read_scenarios, save_scenarios
+from ssad.world.roads.library import load_town
 from ssad.world.world import World
 
 from .worlds import GRAPHS, ego, episode

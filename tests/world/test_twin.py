@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from ssad.core.errors import ConfigError
 from ssad.core.geometry import obb_distance
 from ssad.core.types import LaneType, Limits
-from ssad.roads.library import load_town
-from ssad.roads.query import LaneQuery
 from ssad.world.models import MODELS
+from ssad.world.roads.library import load_town
+from ssad.world.roads.query import LaneQuery
 from ssad.world.twin import MotionState, RoadField, advance, bodies_of, box_gap, unroll
 from ssad.world.world import World
 

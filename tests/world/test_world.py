@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.types import ENDS, Condition, Controller, Episode, EpisodeAgent, Limits, Phase, Pose
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.check import check_simulator
 from ssad.world.kernels.traffic import LONGEST
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town
 from ssad.world.world import World
 from tests.world.worlds import DEVICES, GRAPHS, NO_PASSING, ego, episode, line_route
 

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import typer
 
 from ssad.cli import data, exchange, looking, running
+from ssad.cli.importing import ExportGroup, register
+from ssad.cli.listing import ALIASES, LISTS
+from ssad.cli.train import train_app
 from ssad.core.errors import SSADError, missing_extra, unknown_name
 from ssad.core.version import __version__
-from ssad.interchange.commands import ExportGroup, register
-from ssad.listing import ALIASES, LISTS
-from ssad.training.commands import train_app
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -99,7 +99,7 @@ def list_names(
 @app.command()
 def doctor() -> None:
     """Check this machine: what works, what is missing. Exit code 1: something that every run needs is broken."""
-    from ssad.doctor import examine
+    from ssad.cli.doctor import examine
 
     broken = False
     for finding in examine():

@@ -60,7 +60,7 @@ def shift(
 
     To resume, repeat the command. Exit code 1: some files failed, or --verify found files that differ.
     """
-    from ssad.toolbox.commands import shift_folder, shift_picture_folder, verify_folder, write_contact_sheets
+    from ssad.cli.shift import shift_folder, shift_picture_folder, verify_folder, write_contact_sheets
 
     if verify:
         raise typer.Exit(verify_folder(out))
@@ -134,8 +134,8 @@ def score(
     """
     from rich.console import Console
 
-    from ssad.evaluation.score import score_results, tables, write_summary
-    from ssad.toolbox.commands import checked
+    from ssad.cli.shift import checked
+    from ssad.datasets.nuscenes.score import score_results, tables, write_summary
 
     found = score_results(
         results, dataroot=dataroot, version=version, split=split, replicates=intervals, check=checked(dataroot)
@@ -183,9 +183,9 @@ def record(
     """Record drives with the nuScenes sensors as a dataset in the nuScenes schema. To resume, repeat the command."""
     from rich.console import Console
 
-    from ssad.jobs.machine import pick_device
-    from ssad.jobs.progress import Live
-    from ssad.recording.nuscenes_recorder import Recording, record_nuscenes
+    from ssad.core.machine import pick_device
+    from ssad.engine.progress import Live
+    from ssad.recorders.nuscenes import Recording, record_nuscenes
 
     def names(text: str) -> tuple[str, ...]:
         return tuple(name.strip() for name in text.split(",") if name.strip())
@@ -198,9 +198,9 @@ def record(
     unit = "parts" if clips is not None else "scenes"
     with Live("record", 1, 0, console=Console(stderr=True), unit=unit) as live:
         if clips is not None:
-            from ssad.recording.clip_recorder import record_clips
-            from ssad.recording.clips import Clips, pair_images
-            from ssad.recording.target import parse_target
+            from ssad.recorders.target_images import record_clips
+            from ssad.recorders.target_recording import Clips, pair_images
+            from ssad.rendering.target import parse_target
 
             pairs = pair_images(names(towns), names(images))
             todo = Clips(

@@ -24,8 +24,8 @@ def export_texture(
     dots: Annotated[int, typer.Option(min=1, help="Dots per metre of print.png.")] = 1000,
 ) -> None:
     """Write the texture of a physical attack at true size, and the target as OBJ that wears it."""
-    from ssad.bench.kinds.physical import shown_by
-    from ssad.recording.target_export import export_shown_texture
+    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.target_export import export_shown_texture
 
     attacks, found = shown_by(folder, cell)
     for path in export_shown_texture(attacks, found.spec, out, name=found.name, dots=dots):
@@ -40,8 +40,8 @@ def export_light(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder for light.json, and a projector's picture.")],
 ) -> None:
     """Write the settings of a light attack, and what a projector shows."""
-    from ssad.bench.kinds.physical import shown_by
-    from ssad.recording.target_export import export_shown_light
+    from ssad.experiments.perception.physical.kind import shown_by
+    from ssad.experiments.perception.physical.target_export import export_shown_light
 
     attacks, found = shown_by(folder, cell)
     for path in export_shown_light(attacks, found.spec, out, name=found.name):
@@ -56,8 +56,8 @@ def import_map(
 ) -> None:
     """Import an OpenDRIVE map as a town. Needs the extra `carla` (Python 3.11 or 3.12)."""
     from ssad.core.safeio import home
-    from ssad.roads import import_map as bake
-    from ssad.roads import load_town, town_names
+    from ssad.world.roads import import_map as bake
+    from ssad.world.roads import load_town, town_names
 
     label = name or file.stem
     if town_names().get(label) == "built-in":
@@ -74,10 +74,10 @@ def import_routes(
 ) -> None:
     """Import a folder of routes as a set of scenarios, for the key `scenarios` of a suite; name what is left out."""
     from ssad.core.safeio import home
-    from ssad.roads import is_town
     from ssad.scenarios.dynamic import import_routes as read
     from ssad.scenarios.dynamic import save_scenarios
     from ssad.scenarios.dynamic.sets import BUILT_IN_SETS
+    from ssad.world.roads import is_town
 
     label = name or folder.resolve().name
     if not label.replace("-", "").replace("_", "").isalnum():
@@ -115,9 +115,9 @@ def import_drive(
     from ssad.core.safeio import home
     from ssad.datasets.nuscenes.reader import NuScenes
     from ssad.interchange.drive_log import scenario_of_drive
-    from ssad.roads import import_map as store
-    from ssad.roads import town_names
     from ssad.scenarios.dynamic import save_scenarios
+    from ssad.world.roads import import_map as store
+    from ssad.world.roads import town_names
 
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a scenario file ends in .yaml")

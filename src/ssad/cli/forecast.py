@@ -11,14 +11,14 @@ from typing import Any
 
 from rich.console import Console
 
-from ssad.bench.kind import Plan, Resources
-from ssad.bench.run import run
 from ssad.core import safeio
 from ssad.core.errors import SSADError
 from ssad.core.jsonl import read_lines
+from ssad.core.machine import default_workers
 from ssad.core.registry import label_of
-from ssad.jobs.machine import default_workers
-from ssad.jobs.store import RESULTS
+from ssad.engine.kind import Plan, Resources
+from ssad.engine.run import run
+from ssad.engine.store import RESULTS
 
 
 @dataclass

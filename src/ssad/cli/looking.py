@@ -38,10 +38,10 @@ def detect(
     """
     from rich.console import Console
 
+    from ssad.core.machine import pick_device
     from ssad.detectors import make_detector
-    from ssad.evaluation.found import detect_dataset, detect_pictures, is_dataset
-    from ssad.jobs.machine import pick_device
-    from ssad.jobs.progress import Live
+    from ssad.detectors.detect import detect_dataset, detect_pictures, is_dataset
+    from ssad.engine.progress import Live
 
     folders = [source for source in sources if is_dataset(source)]
     if folders and len(sources) > 1:
@@ -63,7 +63,7 @@ def detect(
         print(f"boxes: {out / 'detections.json'}")
         return
     from ssad.datasets.nuscenes.reader import NuScenes
-    from ssad.toolbox.manifest import manifest_digest, read_manifest
+    from ssad.recorders.shifted.manifest import manifest_digest, read_manifest
 
     root = folders[0]
     manifest = "clean" if read_manifest(root) is None else manifest_digest(root)
@@ -88,9 +88,9 @@ def show(
     """Write a page to look at a data set: pictures with their boxes, and the LiDAR from above."""
     from rich.console import Console
 
+    from ssad.datasets.browse import check_scenes, write_page
     from ssad.datasets.nuscenes.reader import NuScenes
-    from ssad.jobs.progress import Live
-    from ssad.toolbox.browse import check_scenes, write_page
+    from ssad.engine.progress import Live
 
     names = [name.strip() for name in scenes.split(",") if name.strip()]
     with NuScenes(root, version) as data:

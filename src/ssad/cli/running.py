@@ -59,23 +59,23 @@ def run(
     """
     from rich.console import Console
 
-    from ssad.bench.kind import Resources
-    from ssad.report.terminal import summary
+    from ssad.engine.kind import Resources
+    from ssad.experiments.runs import summary
     from ssad.results import make_plan, run_plan
 
     if sample and not dry_run:
         raise ConfigError("--sample can only be used with --dry-run")
     if print_config:
-        from ssad.bench.suite import load_suite
         from ssad.core.safeio import dump_yaml
+        from ssad.experiments.suites import load_suite
 
         print(dump_yaml(load_suite(suite, settings or []).model_dump(mode="json")), end="")
         return
     plan = make_plan(suite, settings or [], device=device)
     folder = out or Path("runs") / plan.suite.name
     if dry_run:
-        from ssad.bench.run import slice_of
         from ssad.cli.forecast import forecast
+        from ssad.engine.run import slice_of
 
         part = replace(plan, cells=tuple(slice_of(plan, _wanted(only or []))))
         for line in forecast(part, folder, Resources(workers, ray, plan.device), sample=sample):
@@ -113,8 +113,9 @@ def _wanted(texts: list[str]) -> dict[str, list[str]]:
 
 def report(folder: Dir) -> None:
     """Write DIR/report.html and DIR/tables from the results in DIR. Exit code 1: files are missing or were changed."""
-    from ssad.jobs.store import read_run
-    from ssad.report import check_artefacts, write_report
+    from ssad.engine.store import read_run
+    from ssad.experiments.runs import write_report
+    from ssad.report import check_artefacts
 
     read_run(folder)
     print(f"report: {write_report(folder)}")
@@ -176,16 +177,16 @@ def replay(
     driver saw them, beside the same drive without the perturbation.
     Exit code 1: the new run differs from the record.
     """
-    from ssad.bench.replay import replay as run_again
     from ssad.core.images import save_picture
     from ssad.core.safeio import make_folder
     from ssad.core.traces import save_trace
+    from ssad.experiments.runs import replay as run_again
     from ssad.report import write_video
     from ssad.report.video import frames, save_frames
 
     film_of = _film(wear, wearer, detector)  # whatever is wrong with it ends before the drive
     if mcap:
-        from ssad.recording.drive_mcap import need_mcap, write_mcap
+        from ssad.experiments.gap.mcap import need_mcap, write_mcap
 
         need_mcap()
     found = run_again(folder, cell)
@@ -224,11 +225,11 @@ def _film(wear: Path | None, wearer: int | None, detector: str) -> Callable[[Any
             raise ConfigError("--wearer says who is attacked: give --wear ATTACK as well")
         return None
     from ssad.detectors import make_detector
-    from ssad.recording.attacked_film import attacked_frames, first_ahead
-    from ssad.recording.light_export import load_worn
-    from ssad.recording.lit_clips import at_hour
-    from ssad.recording.loop_sensors import DAY
+    from ssad.experiments.driving.attacked_film import attacked_frames, first_ahead
+    from ssad.rendering.hours import at_hour
+    from ssad.rendering.onboard import DAY
     from ssad.report.video import save_frames
+    from ssad.scenarios.static.physical.lights.export import load_worn
 
     worn, judge = load_worn(wear), None if detector == "none" else make_detector(detector)
     kind = worn.live(1).kind

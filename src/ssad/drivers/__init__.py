@@ -16,7 +16,7 @@ from ssad.core.seeding import digest
 from ssad.core.types import Controller
 
 if TYPE_CHECKING:
-    from ssad.camera.lidar import Lidar
+    from ssad.rendering.lidar import Lidar
 
 SYSTEMS: dict[str, str] = {
     "autopilot": "ssad.drivers.builtin:Autopilot",
@@ -30,9 +30,9 @@ SYSTEMS: dict[str, str] = {
     "perceiving-fcos3d": "ssad.drivers.perceiving.systems:Fcos3d",
     "perceiving-pgd-det": "ssad.drivers.perceiving.systems:PgdDet",
     "perceiving-yolov5n": "ssad.drivers.perceiving.systems:Yolov5n",
-    "ppo": "ssad.drivers.rl.learned:PPO",
-    "sac": "ssad.drivers.rl.learned:SAC",
-    "td3": "ssad.drivers.rl.learned:TD3",
+    "ppo": "ssad.drivers.learned.policies:PPO",
+    "sac": "ssad.drivers.learned.policies:SAC",
+    "td3": "ssad.drivers.learned.policies:TD3",
 }
 LEARNED = ("ppo", "sac", "td3")
 """Systems with weights: NAME has the shipped ones if there are any, NAME:FILE.safetensors others."""

@@ -23,7 +23,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssad.camera.lidar import Lidar
 from ssad.core.driving import Observation
 from ssad.core.errors import ConfigError, FormatError
 from ssad.core.frames import Camera
@@ -44,7 +43,8 @@ from ssad.drivers.leaderboard_sensors import (
     lidar_of,
     radar_of,
 )
-from ssad.roads import load_town, town_xodr
+from ssad.rendering.lidar import Lidar
+from ssad.world.roads import load_town, town_xodr
 
 GRAVITY: Final = 9.81  # m/s^2
 STEP: Final = 0.1  # s

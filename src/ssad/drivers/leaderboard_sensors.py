@@ -13,10 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from ssad.camera.lidar import Lidar
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Camera
 from ssad.core.types import F32, F64
+from ssad.rendering.lidar import Lidar
 
 RADIUS: Final = 6378137.0  # m, of the earth in CARLA's projection
 CAMERA: Final = "sensor.camera.rgb"

@@ -26,11 +26,11 @@ from ssad.interchange.commonroad_writer import benchmark_map
 from ssad.interchange.commonroad_xml import STEP, VERSION, Texts, own_values
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import plan_of, scenario_name
-from ssad.roads import is_town, load_town, route_along, town_names
-from ssad.roads.query import nearest_all
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import Place, lane_path
 from ssad.scenarios.dynamic.schema import MAX_SPEED
+from ssad.world.roads import is_town, load_town, route_along, town_names
+from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

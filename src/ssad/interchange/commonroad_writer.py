@@ -18,8 +18,8 @@ from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, Controller, Episode, EpisodeAgent, Pose
 from ssad.interchange.commonroad_lanes import write_lanes
 from ssad.interchange.commonroad_xml import TYPES, VERSION, decimal, node, own_source, points
-from ssad.roads import route_along
 from ssad.world.models import model
+from ssad.world.roads import route_along
 
 DATE: Final = "2026-01-01"  # required by the format; fixed, so that a scenario always gives the same text
 GOAL: Final = 10.0  # m around the end of the route that are the goal

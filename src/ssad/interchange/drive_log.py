@@ -21,12 +21,12 @@ from ssad.core.types import F64, Actor, Limits, Pose, Scenario, SignalPlan
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.datasets.nuscenes.scene import MAX_TIME_DIFF, SceneData
 from ssad.interchange.ego_start import start_parameters
-from ssad.roads import is_town, load_town, route_along
-from ssad.roads.paths import graph_of_paths
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.frozen import Rows, told_rows
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
+from ssad.world.roads import is_town, load_town, route_along
+from ssad.world.roads.paths import graph_of_paths
 
 OURS: Final = "ssad"  # the vehicle of a log that `ssad record` wrote
 AXLE_TO_MIDDLE: Final = 1.385  # m from the rear axle of nuScenes' Renault Zoe, where its poses are, to its middle

@@ -12,9 +12,9 @@ from ssad.core.safeio import make_folder, write_atomic
 from ssad.core.types import Episode, Scenario
 from ssad.interchange.commonroad_writer import STILL, commonroad_text
 from ssad.interchange.openscenario_writer import openscenario_text
-from ssad.roads import load_town, town_signals, town_xodr
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.frozen import frozen
+from ssad.world.roads import load_town, town_signals, town_xodr
 
 Written = tuple[list[Path], list[str]]
 """The files, and what they do not carry over, a line for each scenario that it is true of."""

@@ -28,10 +28,10 @@ from ssad.interchange.export import Written, episode
 from ssad.interchange.leaderboard_site import LIMITS, Site
 from ssad.interchange.leaderboard_types import TYPES, UNPLAYED, nobody
 from ssad.interchange.openscenario_places import Values
-from ssad.roads import load_town, route_along, town_names
 from ssad.scenarios.dynamic import CUSTOM, build_episode
 from ssad.scenarios.dynamic.knowledge._placing import trigger_index
 from ssad.scenarios.dynamic.schema import scenario_data, scenario_from
+from ssad.world.roads import load_town, route_along, town_names
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element as Node

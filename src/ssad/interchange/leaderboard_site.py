@@ -13,8 +13,6 @@ from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, Actor, Condition, LaneType, Limits, Phase, Pose, Route, Scenario, SignalPlan
-from ssad.roads import route_along
-from ssad.roads.query import nearest_all
 from ssad.scenarios.dynamic.knowledge._meeting import time_to_cover
 from ssad.scenarios.dynamic.knowledge._placing import (
     Place,
@@ -30,6 +28,8 @@ from ssad.scenarios.dynamic.knowledge._placing import (
     width_at,
 )
 from ssad.world.models import MODELS
+from ssad.world.roads import route_along
+from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ssad.core.types import Phase, Pose
-from ssad.interchange.bodies import MODEL_OF, nearest_model
 from ssad.interchange.openscenario_places import Values
+from ssad.simulators.carla.blueprints import MODEL_OF, nearest_model
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
 

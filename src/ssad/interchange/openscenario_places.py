@@ -14,8 +14,8 @@ from ssad.core.errors import FormatError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import LaneType, Pose
-from ssad.roads.query import nearest_all
 from ssad.scenarios.dynamic.knowledge._placing import Place, ahead, behind, pose_at, shifted
+from ssad.world.roads.query import nearest_all
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

@@ -27,11 +27,11 @@ from ssad.interchange.openscenario_entities import Entity, read_entities
 from ssad.interchange.openscenario_places import Places, Values
 from ssad.interchange.openscenario_triggers import Triggers
 from ssad.interchange.scenario_parts import plan_of, scenario_name
-from ssad.roads import is_town, load_town, route_along, town_signals
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.knowledge._placing import lane_path, shifted
 from ssad.scenarios.dynamic.schema import MAX_SPEED
 from ssad.world.models import MODELS
+from ssad.world.roads import is_town, load_town, route_along, town_signals
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

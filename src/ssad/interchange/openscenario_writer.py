@@ -26,7 +26,7 @@ from ssad.core.types import (
     Pose,
     SignalState,
 )
-from ssad.interchange.bodies import BLUEPRINTS, CATEGORY
+from ssad.simulators.carla.blueprints import BLUEPRINTS, CATEGORY
 from ssad.world.models import model
 
 DATE: Final = "2026-01-01T00:00:00"  # required by the format; fixed, so that a scenario always gives the same text

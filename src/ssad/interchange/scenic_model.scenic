@@ -18,7 +18,7 @@ simulator ScenicWorld(globalParameters.map, timestep=globalParameters.timestep)
 
 
 class WorldObject(DrivingObject):
-    """What is in the world: `category` is that of `ssad.interchange.bodies`."""
+    """What is in the world: `category` is that of `ssad.simulators.carla.blueprints`."""
     category: "prop"
     blueprint: None
 

@@ -27,11 +27,11 @@ from ssad.core.seeding import digest
 from ssad.core.types import F64, Actor, LaneType, Limits, Pose, Scenario
 from ssad.interchange.ego_start import start_parameters
 from ssad.interchange.scenario_parts import scenario_name
-from ssad.roads import load_town, route_along, town_names, town_xodr
-from ssad.roads.query import nearest_all
 from ssad.scenarios.dynamic import build_episode
 from ssad.scenarios.dynamic.frozen import agent_pose, stopping, told_rows
 from ssad.scenarios.dynamic.knowledge._placing import Place, lane_path
+from ssad.world.roads import load_town, route_along, town_names, town_xodr
+from ssad.world.roads.query import nearest_all
 
 MODEL: Final = "ssad.interchange.scenic_model"
 STEP: Final = 0.1  # s

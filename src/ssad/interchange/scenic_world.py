@@ -19,10 +19,10 @@ from scenic.domains.driving.simulators import DrivingSimulation, DrivingSimulato
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, Limits, Model, Pose, Route, Scenario
-from ssad.interchange.bodies import nearest_model
-from ssad.roads import load_town
+from ssad.simulators.carla.blueprints import nearest_model
 from ssad.world.episode_arrays import MAX_AGENTS
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town
 from ssad.world.world import World
 
 STEP: Final = 0.1  # s

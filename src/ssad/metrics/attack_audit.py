@@ -39,7 +39,7 @@ class Attempt:
         options: further settings, as text; `restarts` is read from it.
         draws: bootstrap replicates of the score, paired between attempts.
         before, after: mean of the ascended loss.
-        gradient_error, coupling, used, change: see `ssad.evaluation.attacked_scenes`.
+        gradient_error, coupling, used, change: see `ssad.experiments.perception.digital.attacked_scenes`.
         source: what the pictures were made against, if it was not what they are shown to.
         group: what else must be equal for scores to be compared, such as a defence or a target; part of what the
             sentences call the detector.

@@ -1,8 +1,7 @@
-"""From the records of a run to tables, a self-contained HTML page with replays, and videos.
+"""From the records of a run to tables, figures and pages. Knows no kind of experiment.
 
 Reads records, traces and baked towns only: a report is rebuilt without the world.
 """
 
 from ssad.report.artefacts import check_artefacts as check_artefacts
-from ssad.report.pages import write_report as write_report
 from ssad.report.video import write_video as write_video

@@ -16,14 +16,22 @@ from ssad.report.tables import METHODS, Cell, Row, Table
 Line = Mapping[str, Any]
 
 
-def section(run: Run) -> tuple[str, Sequence[Table]]:
-    """The page of a run and its one table."""
+def section(run: Run, *, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+    """The page of a run, with the sentences that it begins with, and its one table."""
     factors = _factors(run)
     table = result_table(run)
     failed = [
         ([_factor(line, name) for name in factors], line["status"], line.get("reason", "")) for line in run.failures
     ]
-    page = render("default.html", run, results=table, factors=factors, failures=failed, pictures=pictures(run.folder))
+    page = render(
+        "default.html",
+        run,
+        verdict=verdict,
+        results=table,
+        factors=factors,
+        failures=failed,
+        pictures=pictures(run.folder),
+    )
     return page, [table]
 
 

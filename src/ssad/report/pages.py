@@ -1,46 +1,22 @@
-"""The page of a run: which section it has, and what the pages of all kinds share."""
+"""Pages of runs: rendering of a template, with what the pages of all kinds share."""
 
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
-from ssad.core import safeio
 from ssad.metrics import METRICS
 from ssad.report.artefacts import artefact_problems
-from ssad.report.load import Run, load_run
-from ssad.report.tables import Cell, Table, to_csv, write_tables
+from ssad.report.load import Run
+from ssad.report.tables import Cell, Table, to_csv
+from ssad.report.verdict import complete_verdict
 
 TABLE_HASH = "hash-of-the-main-table"  # stands on a page until its tables are known
-
-
-def write_report(folder: Path | str) -> Path:
-    """Write DIR/report.html and DIR/tables/*.csv|md|tex from the records in DIR.
-
-    The page is that of the run's kind: `ssad.report.kinds.KIND` if there is such a module, else tables of all columns.
-    Missing or altered artefacts are named on it.
-
-    Args:
-        folder: a run folder.
-
-    Returns:
-        Where the page is.
-
-    Raises:
-        StoreError: the folder holds no run, has no results, or cannot be written.
-    """
-    run = load_run(folder)
-    page, tables = kind_module(run.kind).section(run)
-    write_tables(run.folder, tables)
-    page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
-    path = run.folder / "report.html"
-    safeio.write_atomic(path, page)
-    return path
 
 
 def table_hash(table: Table) -> str:
@@ -48,31 +24,33 @@ def table_hash(table: Table) -> str:
     return hashlib.sha256(to_csv(table).encode()).hexdigest()[:12]
 
 
-def kind_module(kind: str) -> Any:
-    """The module with `section` and `summary` of a kind, the default one if it has none of its own."""
-    name = f"ssad.report.kinds.{kind}"
-    if not kind.isidentifier() or importlib.util.find_spec(name) is None:
-        name = "ssad.report.default"
-    return importlib.import_module(name)
+def render(template: str | Path, run: Run, *, verdict: Sequence[str] = (), **values: Any) -> str:
+    """Render a page from its template, with what all pages show; every value is escaped.
 
-
-def render(name: str, run: Run, **values: Any) -> str:
-    """A page from its template and what all pages show; what it is given is escaped."""
+    Args:
+        template: Name of a template of the report, or path of a template of a kind's own. It extends "base.html".
+        run: The run.
+        verdict: Sentences that the page begins with (see `ssad.report.verdict.complete_verdict`).
+        values: What the template shows besides.
+    """
+    path = Path(template)
+    loaders: list[jinja2.BaseLoader] = [jinja2.PackageLoader("ssad.report")]
+    if path.is_absolute():
+        loaders.insert(0, jinja2.FileSystemLoader(path.parent))
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("ssad.report"),
+        loader=jinja2.ChoiceLoader(loaders),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["heat"] = heat
-    verdict = importlib.import_module("ssad.report.verdict").verdict(run)  # it knows pages of kinds, which know this
-    return environment.get_template(name).render(
+    return environment.get_template(path.name).render(
         **{
             "run": run,
             "suite": run.suite,
             "versions": run.header.get("versions", {}),
-            "verdict": verdict,
+            "verdict": complete_verdict(run, verdict),
             "problems": artefact_problems(run),
             "table_hash": TABLE_HASH,
             **values,

@@ -4,27 +4,19 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from pathlib import Path
 
 import rich.table
 from rich import box
 from rich.markup import escape
 
-from ssad.report.load import load_run
-from ssad.report.pages import kind_module
+from ssad.report.load import Run
 from ssad.report.tables import Table
 
 MODULE = re.compile(r"^[\w.]+:(?=\w+$)")  # of "module:Class"
 
 
-def summary(folder: Path | str) -> rich.table.Table:
-    """Our rows of the first table of a run's kind: n and interval of the first metric, the values of the others.
-
-    Raises:
-        StoreError: the folder holds no run with results.
-    """
-    run = load_run(folder)
-    table = kind_module(run.kind).summary(run)
+def terminal_table(run: Run, table: Table) -> rich.table.Table:
+    """Rows of a table that were measured here: n and interval of the first metric, the values of the others."""
     result = rich.table.Table(
         title=escape(run.title),
         title_justify="left",

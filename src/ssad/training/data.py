@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from ssad.core.images import read_image
+from ssad.datasets.nuscenes.camera_truth import camera_truth, scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
-from ssad.evaluation.camera_truth import camera_truth, scenes_of
 from ssad.training.batches import Item
 
 

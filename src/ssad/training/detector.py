@@ -25,10 +25,10 @@ from ssad.core.errors import ConfigError
 from ssad.core.images import read_image
 from ssad.core.seeding import digest
 from ssad.datasets.coco import CocoSet, read_coco
+from ssad.datasets.nuscenes.camera_truth import scenes_of
 from ssad.datasets.nuscenes.reader import NuScenes
 from ssad.detectors import make_detector
-from ssad.evaluation.camera_truth import scenes_of
-from ssad.evaluation.detection import score_2d, score_3d
+from ssad.detectors.on_scenes import score_2d, score_3d
 from ssad.training.batches import Item, PictureSet, fill
 from ssad.training.data import nuscenes_items
 from ssad.training.loop import LAST, LOG, Share, read_last, read_rows, train, write_row

@@ -19,7 +19,6 @@ from ssad.core.seeding import digest
 from ssad.core.types import Episode, Scenario
 from ssad.drivers import make_system
 from ssad.metrics import episode_metrics
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.training.recipe import set_words
 from ssad.training.reinforcement import (
@@ -34,6 +33,7 @@ from ssad.training.reinforcement import (
 )
 from ssad.world.env import VectorEnv, reward_of
 from ssad.world.policy import Policy, PolicyDriver
+from ssad.world.roads import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 

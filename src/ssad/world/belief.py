@@ -14,11 +14,11 @@ from ssad.core.errors import ConfigError
 from ssad.core.geometry import to_local
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F32, F64, I32, AgentKind, Bool, LaneType, SignalState
-from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.episode_arrays import TURN
 from ssad.world.kernels.belief import CLEARING
 from ssad.world.kernels.data import FAR, HORIZON, STRIDE, TurnRank
 from ssad.world.kernels.shared import BRIDGE
+from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 
 FITS = 0.5  # cosine of the angle between an object and a lane that goes its way
 RESTS = 0.5  # m/s: who is slower is at rest

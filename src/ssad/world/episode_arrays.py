@@ -13,9 +13,9 @@ from ssad.core.driving import RoadTables
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.lane_graph import LaneGraph, Marking, SignKind
 from ssad.core.types import F32, I32, AgentKind, Controller, Episode, EpisodeAgent, LaneType, Model, Route
-from ssad.roads.query import CELL, DRIVABLE, grid_of
 from ssad.world.kernels.data import FAR, ContactPolicy, EpisodeArrays, Roads, TurnRank, When, array_types
 from ssad.world.kernels.shared import BRIDGE
+from ssad.world.roads.query import CELL, DRIVABLE, grid_of
 
 MAX_AGENTS = 63  # contacts are kept as one bit an agent
 LATERAL_COMFORT = 2.5  # m/s^2 in bends, sets the speed profile of a route

@@ -18,8 +18,8 @@ from torch import Tensor
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import AgentKind, LaneType
-from ssad.roads.query import DRIVABLE, LaneQuery
 from ssad.world.models import GRIP, REVERSE_SPEED, STEER_TIME, WALKER_RATE, model
+from ssad.world.roads.query import DRIVABLE, LaneQuery
 
 SUBSTEPS = 2  # of a step, as in the world
 _ROWS = 1 << 22  # pairs of point and segment looked at in one go
@@ -174,7 +174,7 @@ class RoadField:
 
     The value is the distance from the nearest strip of a lane: from its centre line, less half its width. It is
     positive off the road and falls to minus half a width on a centre line; between two lanes side by side it is 0.
-    On the road as `ssad.roads.query.LaneQuery` finds it means at most 0.
+    On the road as `ssad.world.roads.query.LaneQuery` finds it means at most 0.
 
     Args:
         graph: Of the town.

@@ -15,8 +15,8 @@ import warp as wp
 from ssad.core.driving import Belief, Scenes, WorldState
 from ssad.core.errors import ConfigError
 from ssad.core.lane_graph import LaneGraph
+from ssad.core.machine import quiet_warp
 from ssad.core.types import F32, I32, U8, AgentKind, Bool, Controller, Episode, Model, SignalState
-from ssad.jobs.machine import quiet_warp
 from ssad.world.belief import Lanes, check, complete, lanes_of, rested
 from ssad.world.episode_arrays import build
 from ssad.world.kernels.belief import see

@@ -11,8 +11,8 @@ from ssad.core.traces import first_difference
 from ssad.core.types import Controller, EpisodeAgent, Limits, Pose, SignalState
 from ssad.drivers import make_system
 from ssad.drivers.careful.sight import Path
-from ssad.roads.library import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
+from ssad.world.roads.library import load_town
 from ssad.world.rollout import rollout
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode

@@ -22,7 +22,7 @@ from ssad.drivers.perceiving.driver import Perceiving, Sighting
 from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, on_host
 from ssad.drivers.perceiving.systems import Fcos3d, OneCamera, PgdDet, Yolov5n
 from ssad.drivers.perceiving.tracker import Tracking, tracking_of
-from ssad.recording.closed_loop import system_version
+from ssad.simulators.closed_loop import system_version
 from ssad.world.rollout import Loop
 
 CAMERA = Camera.typical(64, 36)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.camera.rig import RIG, rig_camera
 from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Belief
 from ssad.core.errors import ConfigError
@@ -19,6 +18,7 @@ from ssad.core.types import F64, AgentKind
 from ssad.drivers.perceiving.eyes import boxes_of, projected
 from ssad.drivers.perceiving.lift import Lifting, lift, merged
 from ssad.drivers.perceiving.objects import KINDS, SIZES, Objects, no_objects
+from ssad.rendering.camera.rig import RIG, rig_camera
 
 EGO = (120.0, -35.0, 2.1)
 

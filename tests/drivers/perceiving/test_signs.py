@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.camera.rig import rig_camera
 from ssad.core.detections import Detections
 from ssad.core.errors import ConfigError
 from ssad.core.rotations import upright_pose
 from ssad.drivers.perceiving.signs import FACE, SignMemory, SignReading, read_signs
-from ssad.recording.perceiving_loop import PerceivingSystem
+from ssad.experiments.gap.perceiving_loop import PerceivingSystem
+from ssad.rendering.camera.rig import rig_camera
 
 CLASSES = ("car", "stop_sign")
 EGO = (120.0, -35.0, 2.1)

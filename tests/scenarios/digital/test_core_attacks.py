@@ -11,10 +11,10 @@ import torch
 from helpers.mono3d import one_thread
 from torch import Tensor
 
+from ssad.cli.listing import LISTS
 from ssad.core.detections import Truth
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.detectors import make_detector
-from ssad.listing import LISTS
 from ssad.scenarios.static.digital import ATTACKS, Budget, default_loss, make_attack, needs, px, run_attack
 from ssad.scenarios.static.digital.apgd import checkpoints
 from ssad.scenarios.static.digital.budget import lengths
@@ -23,7 +23,7 @@ from ssad.scenarios.static.digital.gradient_check import check_gradient
 from ssad.scenarios.static.digital.objectives import Margin, Vanish, make_objective
 from ssad.scenarios.static.digital.victim import Precision, Victim
 from ssad.scenarios.static.physical import ATTACKS as PHYSICAL
-from ssad.scenarios.static.physical.noninvasive import LIGHTS
+from ssad.scenarios.static.physical.lights import LIGHTS
 
 from .toy_detector import ToyDetector, TrueLogits, best_linf, toy_scene
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.assets.mesh import Material, Mesh, box
-from ssad.camera.render import View, render
-from ssad.camera.rig import RIG, rig_camera
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.texture import PRINTABLE
 from ssad.core.errors import ConfigError
-from ssad.recording.target import TargetCar, TargetSign, TargetWalker
-from ssad.recording.viewpoints import look_at
+from ssad.recorders.viewpoints import look_at
+from ssad.rendering.camera.render import View, render
+from ssad.rendering.camera.rig import RIG, rig_camera
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.texture import PRINTABLE
+from ssad.rendering.meshes.mesh import Material, Mesh, box
+from ssad.rendering.target import TargetCar, TargetSign, TargetWalker
 from ssad.scenarios.static.physical import make_carrier
-from ssad.scenarios.static.physical.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
+from ssad.scenarios.static.physical.textures.carrier import Camouflage, Patch, Road, albedo_of, covered, metres_of
 
 PAINT = Material("paint", (0.5, 0.5, 0.5))
 CHANNEL = next(iter(RIG))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.scenarios.static.physical.carrier import albedo_of
-from ssad.scenarios.static.physical.inks import D50_TO_SRGB, FOGRA39, TONES, printable_colours
-from ssad.scenarios.static.physical.printing import non_printability
+from ssad.scenarios.static.physical.textures.carrier import albedo_of
+from ssad.scenarios.static.physical.textures.inks import D50_TO_SRGB, FOGRA39, TONES, printable_colours
+from ssad.scenarios.static.physical.textures.printing import non_printability
 
 
 def test_the_colours_are_those_of_the_patches() -> None:

@@ -12,17 +12,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssad.assets import mesh as meshes
-from ssad.assets.mesh import Material, build
-from ssad.camera.photometry import per_lux
-from ssad.camera.render import View, Weather, render
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.scene_edit import SceneEdit
-from ssad.camera.sensor import Sensor
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.frames import FORWARD, Camera
 from ssad.core.rotations import upright_pose
-from ssad.scenarios.static.physical.noninvasive import (
+from ssad.rendering.camera.photometry import per_lux
+from ssad.rendering.camera.render import View, Weather, render
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.meshes import mesh as meshes
+from ssad.rendering.meshes.mesh import Material, build
+from ssad.scenarios.static.physical.lights import (
     LIGHTS,
     Budget,
     Flashlight,
@@ -34,10 +34,10 @@ from ssad.scenarios.static.physical.noninvasive import (
     random_settings,
     search,
 )
-from ssad.scenarios.static.physical.noninvasive.kept import LightFolder, LightSpec, budget_of
-from ssad.scenarios.static.physical.noninvasive.laser import matching
-from ssad.scenarios.static.physical.noninvasive.light import LightAttack, Ranges, at_values
-from ssad.scenarios.static.physical.noninvasive.lit_picture import BLIND, LitPicture, lit_picture
+from ssad.scenarios.static.physical.lights.folder import LightFolder, LightSpec, budget_of
+from ssad.scenarios.static.physical.lights.laser import matching
+from ssad.scenarios.static.physical.lights.light import LightAttack, Ranges, at_values
+from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitPicture, lit_picture
 
 TAG = 5
 TARGET = Target(4.0, 2.0, 1.5)

@@ -12,18 +12,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssad.camera.scene import Layer
 from ssad.core.detections import Dense, Truth
 from ssad.core.errors import ConfigError, FormatError
+from ssad.rendering.camera.scene import Layer
 from ssad.scenarios.static.digital import Aim, make_objective
 from ssad.scenarios.static.digital.objectives import Hide, Situation
 from ssad.scenarios.static.physical import make_physical
-from ssad.scenarios.static.physical.carrier import Surface, albedo_of
-from ssad.scenarios.static.physical.invasive.attention import Distraction, Redistribution, _parts, attention
-from ssad.scenarios.static.physical.noninvasive.projector import AIMED, Projector
-from ssad.scenarios.static.physical.optimise import TARGET, TextureAttack, View, train_texture
-from ssad.scenarios.static.physical.printing import NOMINAL, Expectation, conspicuousness
-from ssad.scenarios.static.physical.textures import control
+from ssad.scenarios.static.physical.lights.projector import AIMED, Projector
+from ssad.scenarios.static.physical.textures.attention import Distraction, Redistribution, _parts, attention
+from ssad.scenarios.static.physical.textures.carrier import Surface, albedo_of
+from ssad.scenarios.static.physical.textures.controls import control
+from ssad.scenarios.static.physical.textures.optimise import TARGET, TextureAttack, View, train_texture
+from ssad.scenarios.static.physical.textures.printing import NOMINAL, Expectation, conspicuousness
 from tests.scenarios.digital.toy_detector import CELL, ToyDetector, pattern, toy_scene
 
 SURFACE = Surface(Layer(0), (CELL, CELL), np.ones((CELL, CELL), bool), (1.0, 1.0))
@@ -250,7 +250,7 @@ def test_an_expectation_is_said_as_a_mapping_of_what_differs() -> None:
 
 
 def test_an_attack_of_a_package_may_be_an_object_and_takes_settings_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ssad.scenarios.static.physical.attacks.resolve", lambda *_: PLAIN)
+    monkeypatch.setattr("ssad.scenarios.static.physical.textures.attacks.resolve", lambda *_: PLAIN)
     assert make_physical("mine", epochs=3) == replace(PLAIN, epochs=3)
 
 

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 
 from ssad.core.errors import ConfigError, UnknownNameError
 from ssad.core.schema import checked
-from ssad.scenarios.static.physical.printing import (
+from ssad.scenarios.static.physical.textures.controls import CELL, control
+from ssad.scenarios.static.physical.textures.printing import (
     NOMINAL,
     Expectation,
     conspicuousness,
     non_printability,
     total_variation,
 )
-from ssad.scenarios.static.physical.textures import CELL, control
 
 
 def test_total_variation_by_hand() -> None:

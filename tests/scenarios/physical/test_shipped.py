@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from ssad.bench.kinds.physical import Physical, PhysicalSuite
 from ssad.core.errors import ConfigError, FormatError, UnknownNameError
 from ssad.core.images import read_image, save_picture
 from ssad.core.types import U8
-from ssad.recording.target import parse_target
+from ssad.experiments.perception.physical.kind import Physical, PhysicalSuite
+from ssad.rendering.target import parse_target
 from ssad.scenarios.static.physical import TextureSpec, make_carrier
-from ssad.scenarios.static.physical.kept import TextureFolder
-from ssad.scenarios.static.physical.shipped import (
+from ssad.scenarios.static.physical.textures.card import (
     SHIPPED,
     TextureCard,
     load_texture,
     save_texture,
     shipped_textures,
 )
+from ssad.scenarios.static.physical.textures.folder import TextureFolder
 
 CARD = TextureCard(
     "vanishing", "camouflage", {"texels": 32}, "yolov5n", "abc", "sedan:silver:0", "d", "c", 3, {"AP50": 0.1}

@@ -11,12 +11,12 @@ from ssad.core.errors import ConfigError
 from ssad.core.seeding import generator
 from ssad.core.types import F64, Controller, End
 from ssad.drivers import make_system
-from ssad.roads import load_town
 from ssad.scenarios.dynamic import build_episode, load_scenarios
 from ssad.world.noise import Noise
 from ssad.world.rare.importance import LATER, Proposal, sample
 from ssad.world.rare.process import WorldProcess, closeness
 from ssad.world.rare.splitting import keys_of, splitting
+from ssad.world.roads import load_town
 from ssad.world.rollout import Loop
 from ssad.world.world import World
 from tests.world.worlds import GRAPHS, ego, episode, line_route

@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from ssad.camera.rig import rig_camera
 from ssad.core.boxes import UNIT_CORNERS, camera_axes, camera_yaw
 from ssad.core.detections import Detections, Solids
 from ssad.core.driving import Belief, Observation
@@ -27,6 +26,7 @@ from ssad.core.seeding import generator
 from ssad.core.types import F64, AgentKind, Episode
 from ssad.drivers.belief import in_sight
 from ssad.drivers.perceiving.objects import I64, SIZES
+from ssad.rendering.camera.rig import rig_camera
 
 FRONT = ("CAM_FRONT",)
 # what a perfect detector calls each kind

@@ -113,7 +113,7 @@ def _build(scenario: Scenario, graph: LaneGraph, route: Route, seed: int, *, eve
 @remembered()
 def _route(graph: LaneGraph, keypoints: tuple[Pose, ...]) -> Route:
     """The route through key points; its arrays are read-only, since all episodes on it share them."""
-    from ssad.roads import route_along
+    from ssad.world.roads import route_along
 
     route = route_along(graph, keypoints)
     for values in (route.xy, route.yaw, route.lane, route.speed_limit, route.width):

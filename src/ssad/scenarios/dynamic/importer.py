@@ -25,10 +25,10 @@ import numpy as np
 from ssad.core.errors import ConfigError, FormatError, SSADError
 from ssad.core.safeio import dotted, read_json, read_xml
 from ssad.core.types import Pose, Scenario
-from ssad.roads import load_town
-from ssad.roads.router import route_along
 from ssad.scenarios.dynamic.catalog import PRECRASH, scenario_type
 from ssad.scenarios.dynamic.schema import problems
+from ssad.world.roads import load_town
+from ssad.world.roads.router import route_along
 
 NATURAL_ID = 9
 _TYPES: dict[int, str] = {**dict(enumerate(PRECRASH, start=1)), NATURAL_ID: "NaturalJunction"}

@@ -12,9 +12,9 @@ from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import F64, AgentKind, EpisodeTrace
 from ssad.metrics.criticality import boxes
-from ssad.roads.query import LaneQuery
 from ssad.scenarios.dynamic.knowledge._remember import remembered
 from ssad.world.models import GRIP, model
+from ssad.world.roads.query import LaneQuery
 
 WINDOW = 0.5  # s over which accelerations and jerks are means
 MAX_JERK = 12.65  # m/s^3, of the careful and competent driver of UN Regulation 157

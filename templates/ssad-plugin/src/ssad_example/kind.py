@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-from ssad.bench.kind import Cell, Column, Job, Kind, Names, SuiteBase
 from ssad.core.seeding import generator
+from ssad.engine.kind import Cell, Column, Job, Kind, Names, SuiteBase
 
 
 class CoinSuite(SuiteBase):

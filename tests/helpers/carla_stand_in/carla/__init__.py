@@ -1,4 +1,4 @@
-"""A stand-in of CARLA's client interface over SSAD's own world: what `ssad.interchange.carla` uses of it, no more.
+"""A stand-in of CARLA's client interface over SSAD's own world: what `ssad.simulators.carla` uses of it, no more.
 
 Every name and argument here is checked against the stubs of the real wheel (tests/interchange/test_carla.py). Bodies
 with physics move as those of `ssad.world`, so that an episode must go as in the embedded world. The server's maps are
@@ -21,11 +21,11 @@ import numpy as np
 
 from ssad.core.lane_graph import Marking
 from ssad.core.types import AgentKind, Controller, Episode, EpisodeAgent, LaneType, Limits, Pose, Route, Scenario
-from ssad.interchange.bodies import MODEL_OF
-from ssad.roads import load_town, route_along, town_signals, town_xodr
-from ssad.roads.library import BUILT_IN
-from ssad.roads.query import LaneQuery
+from ssad.simulators.carla.blueprints import MODEL_OF
 from ssad.world.models import MODELS
+from ssad.world.roads import load_town, route_along, town_signals, town_xodr
+from ssad.world.roads.library import BUILT_IN
+from ssad.world.roads.query import LaneQuery
 from ssad.world.world import World as Engine
 
 FAULT = ""

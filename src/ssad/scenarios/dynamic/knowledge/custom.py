@@ -8,10 +8,10 @@ from ssad.core.errors import RouteError
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.rotations import wrap_angle
 from ssad.core.types import Actor, AgentKind, Controller, EpisodeAgent, Pose, Route, Scenario
-from ssad.roads import route_along
 from ssad.scenarios.dynamic.knowledge._kind import ScenarioType
 from ssad.scenarios.dynamic.knowledge._placing import polyline_route
 from ssad.world.models import model
+from ssad.world.roads import route_along
 
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:

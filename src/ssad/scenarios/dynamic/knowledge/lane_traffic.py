@@ -38,7 +38,7 @@ def lanes_beside(graph: LaneGraph, lane: int) -> list[int]:
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Vehicles of each lane's column, the nearest to the ego first."""
-    from ssad.roads import random_route
+    from ssad.world.roads import random_route
 
     plan = scenario.traffic or TRAFFIC
     value = SCENARIO.values(scenario.parameters)

@@ -131,7 +131,7 @@ def mixed_body(rng: np.random.Generator) -> str:
 
 def build(scenario: Scenario, graph: LaneGraph, route: Route, rng: np.random.Generator) -> list[EpisodeAgent]:
     """Vehicles that drive on their own."""
-    from ssad.roads import random_route
+    from ssad.world.roads import random_route
 
     plan = scenario.traffic or TRAFFIC
     value = SCENARIO.values(scenario.parameters)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ssad.core.lane_graph import LaneGraph
 from ssad.core.types import F64
-from ssad.roads.edge import CELL, edge_raster
-from ssad.roads.query import LaneQuery
+from ssad.world.roads.edge import CELL, edge_raster
+from ssad.world.roads.query import LaneQuery
 
 
 class RoadRaster:

@@ -163,7 +163,7 @@ def traffic() -> tuple[F64, F64]:
     Returns:
         Motions [K, LENGTH + 1, 3], x, y, yaw in the frame of their first pose, and their first speeds [K], m/s.
     """
-    from ssad.roads import load_town
+    from ssad.world.roads import load_town
     from ssad.world.rollout import rollout
     from ssad.world.world import World
 

@@ -20,11 +20,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ssad.camera.torch_jpeg import jpeg, quantisation
 from ssad.core.detections import Assignment, Dense, Detections, Truth
 from ssad.core.errors import ConfigError, unknown_name
 from ssad.core.protocols import Detector
 from ssad.core.seeding import generator
+from ssad.rendering.camera.torch_jpeg import jpeg, quantisation
 from ssad.scenarios.static.digital.budget import LEVELS
 
 SMALLEST = 8  # pixels of a side below which pictures are not shrunk

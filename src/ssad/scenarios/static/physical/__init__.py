@@ -5,12 +5,12 @@
 
 from __future__ import annotations
 
-from ssad.scenarios.static.physical.attacks import ATTACKS, default_carrier, make_physical, physical_names
-from ssad.scenarios.static.physical.carrier import Camouflage, Carrier, Patch, Surface, albedo_of
-from ssad.scenarios.static.physical.optimise import TextureAttack, Trained, View, train_texture
-from ssad.scenarios.static.physical.printing import Expectation
-from ssad.scenarios.static.physical.spec import CARRIERS, TextureSpec, make_carrier
-from ssad.scenarios.static.physical.textures import CONTROLS, control
+from ssad.scenarios.static.physical.textures.attacks import ATTACKS, default_carrier, make_physical, physical_names
+from ssad.scenarios.static.physical.textures.carrier import Camouflage, Carrier, Patch, Surface, albedo_of
+from ssad.scenarios.static.physical.textures.controls import CONTROLS, control
+from ssad.scenarios.static.physical.textures.optimise import TextureAttack, Trained, View, train_texture
+from ssad.scenarios.static.physical.textures.printing import Expectation
+from ssad.scenarios.static.physical.textures.spec import CARRIERS, TextureSpec, make_carrier
 
 __all__ = [
     "ATTACKS",

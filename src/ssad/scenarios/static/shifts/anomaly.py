@@ -1,9 +1,9 @@
 """Anomaly: objects of no class stand on the road of a scene, drawn into its pictures.
 
 They stand still in the world beside the way that the ego drives and on its continuation, clear of every annotated box,
-so that all cameras show the same objects over the whole scene. Each is rendered by `ssad.camera`, exposed by the
-brightness of the ground around it, and mixed into the picture in linear light behind what is nearer. Rays of the LiDAR
-that meet one return from it.
+so that all cameras show the same objects over the whole scene. Each is rendered by `ssad.rendering.camera`, exposed
+by the brightness of the ground around it, and mixed into the picture in linear light behind what is nearer. Rays of the
+LiDAR that meet one return from it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ssad.assets.bodies import draw_paint, draw_size, draw_style, make_body
-from ssad.assets.mesh import Material, Mesh, build
-from ssad.camera.render import PLAIN, View, Weather, render
-from ssad.camera.scene import Scene, Thing
-from ssad.camera.sensor import Sensor
 from ssad.core.boxes import UNIT_CORNERS, TrackedBoxes
 from ssad.core.frames import Applied, Camera, Frame, SceneContext, StandingObject, SweepFrame, camera_to_world
 from ssad.core.rotations import quaternion_to_yaw, upright_pose
 from ssad.core.seeding import generator
 from ssad.core.types import F32, F64, U8, Bool
+from ssad.rendering.bodies import draw_paint, draw_size, draw_style, make_body
+from ssad.rendering.camera.render import PLAIN, View, Weather, render
+from ssad.rendering.camera.scene import Scene, Thing
+from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.meshes.mesh import Material, Mesh, build
 from ssad.scenarios.static.shifts import parameters as table
 from ssad.scenarios.static.shifts.batch import Batch, to_batch
 from ssad.scenarios.static.shifts.light import to_codes, to_linear

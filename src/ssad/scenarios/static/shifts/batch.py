@@ -12,8 +12,8 @@ import warp as wp
 
 from ssad.core.errors import ConfigError
 from ssad.core.frames import Frame
+from ssad.core.machine import quiet_warp
 from ssad.core.types import U8
-from ssad.jobs.machine import quiet_warp
 from ssad.scenarios.static.shifts.spec import ShiftSpec
 
 

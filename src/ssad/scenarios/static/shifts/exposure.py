@@ -8,9 +8,9 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
-from ssad.camera.sensor import BRIGHTEST, KNEE, SHOULDER
 from ssad.core.frames import Applied
 from ssad.core.types import U8
+from ssad.rendering.camera.sensor import BRIGHTEST, KNEE, SHOULDER
 from ssad.scenarios.static.shifts.batch import Batch, on
 from ssad.scenarios.static.shifts.kernels.exposure import recode
 from ssad.scenarios.static.shifts.light import to_codes, to_linear
@@ -22,8 +22,8 @@ from ssad.scenarios.static.shifts.spec import ShiftSpec
 def exposure_table(stops: float) -> U8:
     """The code [256] of each code in a picture exposed by `stops` EV more.
 
-    The curve of `ssad.camera`: linear up to `KNEE`, a soft shoulder above, full at `BRIGHTEST`. What is white in the
-    given picture is taken for just so bright.
+    The curve of `ssad.rendering.camera`: linear up to `KNEE`, a soft shoulder above, full at `BRIGHTEST`. What is white
+    in the given picture is taken for just so bright.
     """
     shown = to_linear(np.arange(256))
     most = KNEE + (1 - KNEE) * (1 - np.exp(-(BRIGHTEST - KNEE) / SHOULDER))

@@ -1,1 +1,0 @@
-"""Procedural bodies and streets: what the camera sees."""

@@ -1,1 +1,0 @@
-"""Kinds of experiments, a file each."""

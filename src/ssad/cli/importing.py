@@ -1,0 +1,194 @@
+"""`ssad export SCENARIO... OUT` and the imports of other formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from ssad.core.errors import ConfigError
+
+
+class Format(StrEnum):
+    """What scenarios can be exported to."""
+
+    openscenario = "openscenario"
+    leaderboard = "leaderboard"
+    leaderboard1 = "leaderboard1"
+    commonroad = "commonroad"
+
+
+class ExportGroup(TyperGroup):
+    """Commands of `ssad export`; arguments that begin with none of them are scenarios."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the name of the command for scenarios where it was left out."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["scenarios", *args]
+        return super().parse_args(ctx, args)
+
+
+def register(exports: typer.Typer, imports: typer.Typer) -> None:
+    """Add the commands of this module to `ssad export` and `ssad import`."""
+    exports.command("scenarios")(export_scenarios)
+    imports.command("openscenario")(import_openscenario)
+    imports.command("leaderboard")(import_leaderboard)
+    imports.command("commonroad")(import_commonroad)
+    imports.command("scenic")(import_scenic)
+
+
+def export_scenarios(
+    scenarios: Annotated[
+        list[str], typer.Argument(metavar="SCENARIO...", help="Sets, classes, names or YAML files of scenarios.")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write to.")],
+    to: Annotated[Format, typer.Option("--format", help="Format.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the episodes: of their random traffic.")] = 0,
+    system: Annotated[
+        str, typer.Option(help="Drives the ego while others' trajectories are recorded (commonroad).")
+    ] = "autopilot",
+) -> None:
+    """Write scenarios for other programs, with the maps of their towns, and say what is not carried over.
+
+    The word `scenarios` may be left out: ssad export precrash OUT --format openscenario
+    """
+    from ssad.interchange.export import export_commonroad, export_openscenario
+    from ssad.interchange.leaderboard import export_leaderboard, export_leaderboard1
+    from ssad.scenarios.dynamic import load_scenarios
+
+    chosen = [scenario for ref in scenarios for scenario in load_scenarios(ref)]
+    writers: dict[Format, Callable[..., tuple[list[Path], list[str]]]] = {
+        Format.openscenario: export_openscenario,
+        Format.leaderboard: export_leaderboard,
+        Format.leaderboard1: export_leaderboard1,
+        Format.commonroad: partial(export_commonroad, system=system),
+    }
+    written, lost = writers[to](chosen, out, seed=seed)
+    print(f"{len(chosen)} scenarios: {len(written)} files written to {out}")
+    told("not carried over", lost)
+
+
+def import_openscenario(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xosc", help="OpenSCENARIO XML file.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: the file's own]")
+    ] = None,
+) -> None:
+    """Turn an OpenSCENARIO XML file (1.0 to 1.3) into a scenario, and say what it does not carry over."""
+    from ssad.interchange.openscenario_reader import read_openscenario
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    found = read_openscenario(file, map_name=on)
+    save_scenarios(out, found.scenario)
+    scenario = found.scenario
+    print(f"scenario {scenario.name}: {len(scenario.actors)} actors in {scenario.town}; written to {out}")
+    told("not carried over", found.lost)
+
+
+def import_leaderboard(
+    file: Annotated[Path, typer.Argument(metavar="ROUTES.xml", help="Routes of leaderboard 2.0 or Bench2Drive.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+) -> None:
+    """Turn routes of leaderboard 2.0 or Bench2Drive into scenarios; `ssad import routes` reads leaderboard 1.0.
+
+    Their towns must be imported before they are driven.
+    """
+    from ssad.interchange.leaderboard import read_leaderboard
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    found, lost = read_leaderboard(file)
+    save_scenarios(out, found)
+    print(f"{len(found)} scenarios on {', '.join(sorted({s.town for s in found}))}; written to {out}")
+    told("not carried over", lost)
+
+
+def import_commonroad(
+    file: Annotated[Path, typer.Argument(metavar="FILE.xml", help="CommonRoad XML file, 2020a.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="MAP", help="Town, or OpenDRIVE file.  [default: its lanelets]")
+    ] = None,
+) -> None:
+    """Turn a CommonRoad XML file (2020a) into a scenario, and say what it does not carry over.
+
+    Lanelets that are no town's yet are stored as a town beside OUT.yaml too.
+    """
+    from ssad.core.lane_graph import save_graph
+    from ssad.core.safeio import home
+    from ssad.interchange.commonroad_reader import read_commonroad
+    from ssad.scenarios.dynamic import save_scenarios
+    from ssad.world.roads import import_map, town_names
+
+    check_yaml(out)
+    found = read_commonroad(file, town=out.stem, map_name=on)
+    town = found.scenario.town
+    if not found.known:
+        if town_names().get(town) == "built-in":
+            raise ConfigError(f"'{town}' is a built-in town; choose another name for {out}")
+        save_graph(found.graph, out.with_suffix(".npz"))
+        import_map(out.with_suffix(".npz"), town, home())
+    save_scenarios(out, found.scenario)
+    print(f"scenario {found.scenario.name}: {len(found.scenario.actors)} actors in {town}; written to {out}")
+    told("not carried over", found.lost)
+
+
+def import_scenic(
+    file: Annotated[Path, typer.Argument(metavar="FILE.scenic", help="Scenic program. It is code: it is run.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.yaml", help="Scenario file to write.")],
+    on: Annotated[
+        str | None, typer.Option("--map", metavar="TOWN", help="Town.  [default: named as the program's map]")
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="Samples.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first sample; each has one more.")] = 0,
+    steps: Annotated[int, typer.Option(min=1, max=10_000, help="Most steps of a simulation, 0.1 s each.")] = 300,
+) -> None:
+    """Simulate samples of a Scenic program here, and turn what happens into scenarios. Needs the extra `scenic`.
+
+    The ego is driven anew; all others repeat what the program had them do.
+    """
+    from ssad.core.errors import MissingExtraError, SSADError
+    from ssad.interchange.scenic_programs import load_program, sample
+    from ssad.scenarios.dynamic import save_scenarios
+
+    check_yaml(out)
+    program = load_program(file, on)
+    found = []
+    failed: list[str] = []
+    lost: list[str] = []
+    for number in range(seed, seed + count):
+        try:
+            drawn = sample(program, number, steps=steps)
+        except MissingExtraError:
+            raise
+        except SSADError as error:
+            failed.append(str(error))
+            continue
+        found.append(drawn.scenario)
+        lost += drawn.lost
+    if not found:
+        raise ConfigError(failed[0])
+    save_scenarios(out, found)
+    print(f"{len(found)} scenarios in {program.town}; written to {out}")
+    told("not sampled", failed)
+    told("not carried over", lost)
+
+
+def check_yaml(out: Path) -> None:
+    """ConfigError where a scenario file would not end in .yaml."""
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a scenario file ends in .yaml")
+
+
+def told(what: str, lines: Sequence[str]) -> None:
+    """Print lines under a heading, each once, with how often it came."""
+    counted = {line: lines.count(line) for line in lines}
+    for line, count in counted.items():
+        print(f"{what}: {line}{f' ({count} scenarios)' if count > 1 else ''}")

@@ -1,0 +1,125 @@
+"""What `ssad list` shows: names that other commands and suites accept, each list looked up when it is asked for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Final
+
+
+def _scenario_list() -> dict[str, str]:
+    from ssad.core.registry import names
+    from ssad.scenarios.dynamic import SCENARIOS, load_scenarios, set_names
+    from ssad.scenarios.dynamic.sets import SHIPPED
+
+    sets = {name: load_scenarios(name) for name in set_names()}
+    rows = {name: f"set of {len(found)} scenarios" for name, found in sets.items()}
+    shipped = Counter(s.type for name in SHIPPED for s in sets[name])
+    for name, where in names("scenario", SCENARIOS).items():
+        rows[name] = f"class with {shipped[name]} scenarios" if name in SCENARIOS else f"class of your own: {where}"
+    return rows | {s.name: f"{s.type} in {s.town}" for found in sets.values() for s in found}
+
+
+def _system_list() -> dict[str, str]:
+    from ssad.core.registry import names
+    from ssad.drivers import SYSTEMS
+
+    rows = names("system", SYSTEMS) | {"ppo:FILE": "PPO with other weights, FILE.safetensors; also sac and td3"}
+    return rows | {"module:object": "a driving system of your own (README.md)"}
+
+
+def _kind_list() -> dict[str, str]:
+    from ssad.core.registry import names
+    from ssad.experiments.suites import KINDS
+
+    return names("kind", KINDS) | {"module:class": "a kind of your own (ARCHITECTURE.md)"}
+
+
+def _town_list() -> dict[str, str]:
+    from ssad.world.roads import town_names
+
+    return town_names()
+
+
+def _suite_list() -> dict[str, str]:
+    from ssad.core.safeio import read_yaml_document
+    from ssad.experiments.suites import suite_files
+
+    # as plain YAML: the schema of some needs an extra
+    return {name: str(read_yaml_document(path).data.get("title", "")) for name, path in suite_files().items()}
+
+
+def _shift_list() -> dict[str, str]:
+    from ssad.scenarios.static.shifts.spec import EXTRA, KNOWN
+
+    beside = dict.fromkeys(EXTRA, " (beside the paper's, only if named)")
+    return {name: f"{family}: {text}{beside.get(name, '')}" for name, (family, text) in KNOWN.items()}
+
+
+def _attack_list() -> dict[str, str]:
+    from ssad.scenarios.static.digital import ATTACKS, attack_names, default_loss, make_attack, needs
+    from ssad.scenarios.static.physical import default_carrier, physical_names
+    from ssad.scenarios.static.physical.lights import LIGHTS
+
+    def about(name: str, where: str) -> str:
+        if name not in ATTACKS:
+            return where
+        if needs(name):
+            return f"made in Python: needs {', '.join(needs(name))} (docs/attacks.md)"
+        access = make_attack(name).access
+        return f"{access}, loss {default_loss(name)}" if access != "none" else "random noise of the same size"
+
+    rows = {name: about(name, where) for name, where in attack_names().items()}
+    rows |= {name: f"physical: trains a {default_carrier(name)} (docs/physical.md)" for name in physical_names()}
+    rows |= dict.fromkeys(LIGHTS, "physical: light on a target, not on its paint (docs/physical.md)")
+    return rows | {"module:object": "an attack of your own (docs/attacks.md)"}
+
+
+def _generator_list() -> dict[str, str]:
+    from ssad.scenarios.dynamic.generate import generator_list
+
+    more = {
+        "scenic:FILE.scenic": "samples of a Scenic program (docs/interchange.md)",
+        "module:object": "a generator of your own (docs/generators.md)",
+    }
+    return generator_list() | more
+
+
+def _detector_list() -> dict[str, str]:
+    from ssad.detectors import SHIPPED, detector_names
+
+    def about(name: str, where: str) -> str:
+        if where.startswith("ssad."):
+            kind = "3D" if "fcos3d" in name or "pgd" in name else "2D"
+            return f"{kind}, weights shipped" if (SHIPPED / f"{name}.json").is_file() else f"{kind}, no weights shipped"
+        return where
+
+    rows = {name: about(name, where) for name, where in detector_names().items()}
+    return rows | {"module:object": "a detector of your own (docs/detectors.md)"}
+
+
+def _recipe_list() -> dict[str, str]:
+    from ssad.training.recipe import RECIPES
+    from ssad.training.reinforcement import LEARNINGS
+
+    detectors = {
+        name: f"{r.detector}: {r.epochs} epochs, batch {r.batch}, {r.optimizer}, lr {r.lr:g}"
+        for name, r in RECIPES.items()
+    }
+    return detectors | {name: f"driver: {r.steps:,} steps, lr {r.lr:g}" for name, r in LEARNINGS.items()}
+
+
+LISTS: Final[Mapping[str, Callable[[], dict[str, str]]]] = {
+    "suites": _suite_list,
+    "kinds": _kind_list,
+    "scenarios": _scenario_list,
+    "generators": _generator_list,
+    "systems": _system_list,
+    "detectors": _detector_list,
+    "recipes": _recipe_list,
+    "shifts": _shift_list,
+    "attacks": _attack_list,
+    "towns": _town_list,
+}
+"""What can be listed -> makes its rows: name, and what it is."""
+ALIASES: Final = {"agents": "systems"}

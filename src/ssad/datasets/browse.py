@@ -1,0 +1,200 @@
+"""`ssad show`: a page to look at a data set in the nuScenes schema, pictures with boxes and LiDAR from above."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
+
+from ssad.core.errors import ConfigError, SSADError
+from ssad.core.images import read_image, save_picture
+from ssad.core.nuscenes_names import CATEGORY_TO_CLASS
+from ssad.core.rotations import quaternion_to_matrix
+from ssad.core.safeio import make_folder, write_atomic
+from ssad.core.types import F64, U8
+from ssad.datasets.drawing import draw_edges
+from ssad.datasets.nuscenes.camera_truth import boxes_in_picture
+from ssad.datasets.nuscenes.files import read_points
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.datasets.nuscenes.scene import Annotations, SceneData, SensorFrame
+
+WIDTH, REACH, SIDE = 640, 50.0, 640  # pixels of a picture, m around the ego from above, pixels of that
+BOX, GROUND, EGO = (255, 170, 30), (15, 19, 26), (96, 165, 250)
+ORDER = ("CAM_FRONT_LEFT", "CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_LEFT", "CAM_BACK", "CAM_BACK_RIGHT")
+LOW, HIGH = -0.5, 3.0  # m above the road: the ends of the colours of LiDAR points
+
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ name }}</title><style>
+:root{color-scheme:light dark}body{font:15px/1.5 system-ui,sans-serif;margin:0 auto;padding:0 16px 40px;max-width:1400px}
+h1{font-size:24px;overflow-wrap:anywhere}h2{font-size:18px;margin-top:36px}p,figcaption{color:GrayText}
+nav{display:flex;flex-wrap:wrap;gap:6px 14px}.grid{display:grid;grid-template-columns:repeat(3,1fr);gap:6px}
+figure{margin:0}img{width:100%;height:auto;display:block;border-radius:6px}.above{max-width:640px;margin-top:6px}
+@media(max-width:700px){.grid{grid-template-columns:1fr}}
+</style></head><body>
+<h1>{{ name }}</h1>
+<p>Version {{ version }}: {{ total }} scenes, of which {{ scenes|length }} are shown, {{ per }} moments of each at most.
+Boxes are those of the annotation table, the ten classes of the detection task in the pictures and everything from
+above, where a line points ahead and points are coloured by their height.</p>
+<nav>{% for s in scenes %}<a href="#s{{ loop.index }}">{{ s.name }}</a>{% endfor %}</nav>
+{% for s in scenes %}
+<h2 id="s{{ loop.index }}">{{ s.name }}</h2>
+<p>{{ s.about }}{% if s.counts %} Objects: {% for k, v in s.counts %}{{ k }} {{ v }}{{ ", " if not loop.last }}{% endfor %}.{% endif %}</p>
+{% for m in s.moments %}
+<p>{{ m.title }}</p>
+<div class="grid">{% for p in m.pictures %}<figure><img loading="lazy" src="pictures/{{ p.file }}" alt="{{ p.title }}" width="{{ p.size[0] }}" height="{{ p.size[1] }}"><figcaption>{{ p.title }}</figcaption></figure>{% endfor %}</div>
+{% if m.above %}<figure class="above"><img loading="lazy" src="pictures/{{ m.above }}" alt="LiDAR from above" width="{{ side }}" height="{{ side }}"><figcaption>LiDAR from above, {{ reach }} m to each side</figcaption></figure>{% endif %}
+{% endfor %}{% endfor %}
+</body></html>
+"""  # noqa: E501
+
+
+def write_page(
+    data: NuScenes,
+    out: Path,
+    *,
+    scenes: Sequence[str] = (),
+    moments: int = 3,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Path:
+    """Write OUT/index.html and its pictures.
+
+    Args:
+        data: The data set.
+        out: Folder.
+        scenes: Names of the scenes; none: the first ten.
+        moments: How many samples of each scene are shown at most, spread over it.
+        progress: Called with the number of scenes that are done, and of all.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        ConfigError: There is no such scene.
+        FormatError: The tables are broken. A picture or sweep that cannot be read is named on the page instead.
+        StoreError: A file cannot be written.
+    """
+    names = list(scenes) or [scene.name for scene in data.scenes()][:10]
+    make_folder(out / "pictures")
+    shown = []
+    for number, name in enumerate(names):
+        shown.append(_scene(data.root, data.scene(name), out / "pictures", moments))
+        progress(number + 1, len(names))
+    page = (
+        jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+        .from_string(PAGE)
+        .render(
+            name=data.root.name,
+            version=data.version,
+            total=len(data.scenes()),
+            scenes=shown,
+            per=moments,
+            side=SIDE,
+            reach=f"{REACH:.0f}",
+        )
+    )
+    write_atomic(out / "index.html", page)
+    return out / "index.html"
+
+
+def _scene(root: Path, scene: SceneData, folder: Path, moments: int) -> dict[str, Any]:
+    """What the page says of a scene; its pictures are written."""
+    places = np.unique(np.linspace(0, len(scene.samples) - 1, min(moments, len(scene.samples))).round().astype(int))
+    counts: Counter[str] = Counter()
+    for sample in scene.samples:
+        counts.update(CATEGORY_TO_CLASS.get(c) or c for c in scene.annotations(sample.token).category)
+    shown = []
+    for place in places:
+        token = scene.samples[place].token
+        found = scene.annotations(token)
+        frames = {f.channel: f for f in scene.frames if f.sample_token == token and f.key_frame}
+        stem = f"{re.sub(r'[^A-Za-z0-9_-]', '-', scene.record.name)}-{place:03d}"
+        pictures = []
+        for channel in [*ORDER, *sorted(set(frames) - set(ORDER))]:
+            if channel in frames and frames[channel].modality == "camera":
+                pictures.append(_camera(root, frames[channel], found, folder / f"{stem}-{channel}.jpg"))
+        lidar = next((f for f in frames.values() if f.modality == "lidar"), None)
+        above = ""
+        if lidar is not None:
+            above = f"{stem}-above.jpg"
+            save_picture(folder / above, from_above(root, lidar, found))
+        seconds = (scene.samples[place].timestamp - scene.samples[0].timestamp) / 1e6
+        shown.append({"title": f"{seconds:.1f} s, {len(found)} boxes", "pictures": pictures, "above": above})
+    told = scene.record.description.rstrip(". ")
+    about = f"{told}. {len(scene.samples)} samples.".lstrip(". ")
+    return {"name": scene.record.name, "about": about, "counts": counts.most_common(), "moments": shown}
+
+
+def _camera(root: Path, frame: SensorFrame, found: Annotations, path: Path) -> dict[str, Any]:
+    """A picture with its boxes; one that cannot be read says why."""
+    title = frame.channel
+    try:
+        image = read_image(root / frame.filename)
+    except SSADError as error:
+        image, title = np.zeros((WIDTH * 9 // 16, WIDTH, 3), np.uint8), f"{title}: {error}"
+    scale = WIDTH / image.shape[1]
+    canvas: U8 = np.asarray(cv2.resize(image, (WIDTH, round(image.shape[0] * scale)), interpolation=cv2.INTER_AREA))
+    rows, _, turn = boxes_in_picture(frame, found, hit=False)
+    corners = found.take(rows).corners() @ turn[:3, :3].T + turn[:3, 3]
+    draw_edges(canvas, corners, np.asarray(frame.intrinsic, np.float64), scale, colour=BOX, width=1)
+    save_picture(path, canvas)
+    return {"file": path.name, "title": title, "size": (canvas.shape[1], canvas.shape[0])}
+
+
+def from_above(root: Path, lidar: SensorFrame, found: Annotations) -> U8:
+    """LiDAR points and boxes around the ego, which looks up; points are coloured by their height.
+
+    Args:
+        root: The nuScenes root.
+        lidar: A sweep.
+        found: Boxes of its sample.
+
+    Returns:
+        Picture [SIDE, SIDE, 3], RGB.
+    """
+    canvas: U8 = np.full((SIDE, SIDE, 3), GROUND, np.uint8)
+    try:
+        cloud = read_points(root / lidar.filename)[:, :3].astype(np.float64)
+    except SSADError:
+        cloud = np.zeros((0, 3))
+    points = cloud @ lidar.sensor_to_ego[:3, :3].T + lidar.sensor_to_ego[:3, 3]
+    points = points[(np.abs(points[:, :2]) < REACH).all(1)]
+    share = np.clip((points[:, 2] - LOW) / (HIGH - LOW), 0, 1) * 255
+    if len(points):
+        place = np.clip(_pixels(points), 0, SIDE - 1).astype(int)
+        colours = cv2.applyColorMap(share.astype(np.uint8)[:, None], cv2.COLORMAP_VIRIDIS)
+        canvas[place[:, 1], place[:, 0]] = colours[:, 0, ::-1]
+    turn = np.linalg.inv(lidar.ego_to_world)
+    if len(found):
+        axes = turn[:3, :3] @ quaternion_to_matrix(found.rotation)
+        centre = found.centre @ turn[:3, :3].T + turn[:3, 3]
+        half = 0.5 * found.size_lwh
+        signs = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
+        corners = centre[:, None] + np.einsum("nij,nkj->nki", axes, signs * half[:, None])
+        nose = centre + np.einsum("nij,nj->ni", axes, half * (1, 0, 0))
+        for ring, middle, ahead in zip(_pixels(corners), _pixels(centre), _pixels(nose), strict=True):
+            cv2.polylines(canvas, [np.round(ring * 16).astype(np.int32)], True, BOX, 1, cv2.LINE_AA, 4)
+            ends = [tuple(int(v) for v in np.round(p * 16)) for p in (middle, ahead)]
+            cv2.line(canvas, ends[0], ends[1], BOX, 1, cv2.LINE_AA, 4)
+    cv2.drawMarker(canvas, (SIDE // 2, SIDE // 2), EGO, cv2.MARKER_TRIANGLE_UP, 14, 2)
+    return canvas
+
+
+def _pixels(points: F64) -> F64:
+    """Ego frame (x ahead, y left) to pixels, x ahead up."""
+    flat = SIDE / 2 - np.asarray(points)[..., :2] * (SIDE / 2 / REACH)
+    return np.asarray(flat[..., ::-1], np.float64)
+
+
+def check_scenes(data: NuScenes, names: Sequence[str]) -> None:
+    """ConfigError for a data set without scenes or a name that is none, before anything is written."""
+    if not data.scenes():
+        raise ConfigError(f"{data.root / data.version}: it has no scene")
+    for name in names:
+        data.scene(name)

@@ -1,0 +1,141 @@
+"""Work shared out: one pool for suites, recordings and the toolbox, over processes of this machine or a Ray cluster."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from ssad.core.errors import StoreError
+from ssad.core.machine import default_workers, gpu_workers, visible_gpus
+from ssad.engine.cluster import RayCluster
+from ssad.engine.local import LocalProcesses, Start, ThisProcess
+from ssad.engine.task import Backend, Outcome, Task
+
+TICK_S = 0.2
+
+
+class Pool:
+    """A queue of tasks before a backend; a context.
+
+    Tasks may be added while outcomes are read. No task costs more than itself: see `Outcome.status`.
+
+    Args:
+        backend: where the tasks run; see `open_pool`.
+    """
+
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self._urgent: deque[Task] = deque()
+        self._queue: deque[Task] = deque()
+
+    def add(self, task: Task, *, first: bool = False) -> None:
+        """Add a task.
+
+        Args:
+            task: The task.
+            first: Whether it goes before all tasks that have not begun and were not added first themselves.
+        """
+        (self._urgent if first else self._queue).append(task)
+
+    def drop(self, unwanted: Callable[[Task], bool]) -> list[Task]:
+        """Takes back the tasks that have not begun and are not wanted any more; they are returned."""
+        dropped = [task for task in (*self._urgent, *self._queue) if unwanted(task)]
+        self._urgent = deque(task for task in self._urgent if not unwanted(task))
+        self._queue = deque(task for task in self._queue if not unwanted(task))
+        return dropped
+
+    def outcomes(self, tick: Callable[[], None] = lambda: None) -> Iterator[Outcome]:
+        """How each task ended, as they end, until nothing is left to do; `tick` is called several times a second.
+
+        Raises:
+            SSADError: no worker can start.
+        """
+        while self._urgent or self._queue or self.backend.busy:
+            while (self._urgent or self._queue) and self.backend.busy < self.backend.capacity:
+                self.backend.submit((self._urgent or self._queue).popleft())
+            yield from self.backend.wait(TICK_S)
+            tick()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.backend.close()
+
+
+def open_pool(
+    tasks: int,
+    *,
+    workers: int | None = None,
+    ray: str | None = None,
+    device: str = "cpu",
+    start: Start | None = None,
+) -> Pool:
+    """A pool for about so many tasks.
+
+    Args:
+        tasks: how many there will be at the most at a time; no more workers are started.
+        workers: processes of this machine (None: one a core, on GPUs what their memory takes); 0: this very process,
+            without isolation, for debugging.
+        ray: address of a Ray cluster instead; see `RayCluster`.
+        device: cpu or cuda; on cuda each worker sees one of the visible GPUs.
+        start: see `LocalProcesses`.
+
+    Raises:
+        ConfigError: there is no such cluster.
+    """
+    gpus = visible_gpus() if device != "cpu" else []
+    if ray is not None:
+        share = 1.0 / max(1, gpu_workers(len(gpus)) // max(len(gpus), 1)) if device != "cpu" else 0.0
+        return Pool(RayCluster(ray, start=start, gpu_share=share))
+    if workers == 0:
+        return Pool(ThisProcess(start))
+    count = workers or min(gpu_workers(len(gpus)) or default_workers(), default_workers())
+    count = max(1, min(count, tasks))
+    return Pool(LocalProcesses(count, start=start, gpus=gpus, threads=max(1, default_workers() // count)))
+
+
+def run_all(
+    pool: Pool,
+    function: Callable[[Any], Any],
+    arguments: Sequence[Any],
+    *,
+    timeout_s: float = float("inf"),
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> list[Any]:
+    """Call a function on each argument, for work that is of use only as a whole; finished results are on disk.
+
+    Args:
+        pool: Where the calls run; the pool is used up.
+        function: See `Task`.
+        arguments: What the function is called with, one task each; see `Task`.
+        timeout_s: Time limit of a task, s; see `Task`.
+        progress: Called with the number of finished tasks and the number of all tasks.
+
+    Returns:
+        The results, in the order of the arguments.
+
+    Raises:
+        SSADError: The first error that the function raised; no further task is started then.
+        StoreError: Some tasks crashed or took too long; raised once all others are done.
+    """
+    results: list[Any] = [None] * len(arguments)
+    lost: list[str] = []
+    with pool:
+        for number, argument in enumerate(arguments):
+            pool.add(Task(function, argument, timeout_s, label=number))
+        for done, outcome in enumerate(pool.outcomes(), 1):
+            progress(done, len(arguments))
+            results[outcome.task.label] = outcome.value
+            if outcome.error is not None:
+                raise outcome.error
+            if outcome.status != "ok":
+                lost.append(outcome.reason)
+    if lost:
+        more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+        raise StoreError(f"{len(lost)} of {len(arguments)} parts failed: {lost[0]}{more}; run the same command again")
+    return results

@@ -1,0 +1,43 @@
+"""`ssad replay`: run one cell again, alone, and compare every bit with what was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ssad.core.errors import StoreError
+from ssad.core.jsonl import read_lines
+from ssad.engine.kind import Plan, Replay, find_cell
+from ssad.engine.store import RESULTS
+
+
+def replay_cell(plan: Plan, folder: str | Path, name: str) -> Replay:
+    """Run the cell that `name` means (key, unique start of it, or "system/scenario") once more.
+
+    Raises:
+        StoreError: it was not recorded.
+        ConfigError: there is no such cell, or its kind has no replay.
+    """
+    cell = find_cell(plan.cells, name)
+    record = next((r for r in read_lines(Path(folder) / RESULTS) if r["key"] == cell.key), None)
+    if record is None:
+        raise StoreError(f"{folder}: cell {cell.key} ({cell.name}) has not run yet; run the suite again first")
+    if record["status"] != "ok":
+        raise StoreError(
+            f"{folder}: cell {cell.key} ({cell.name}) left no trace: {record['status']}, {record['reason']}"
+        )
+    return plan.kind.replay(plan, cell, record, Path(folder))
+
+
+def difference(recorded: Mapping[str, Any], result: Mapping[str, Any]) -> str | None:
+    """Where a result differs from the record, in words; None: nowhere."""
+    for part, value in result.items():
+        if isinstance(value, dict):
+            old = recorded.get(part, {})
+            for name in value:
+                if value[name] != old.get(name):
+                    return f"{part}: {name} is {value[name]}, was {old.get(name)}"
+        elif value != recorded.get(part):
+            return f"{part} is {value}, was {recorded.get(part)}"
+    return None

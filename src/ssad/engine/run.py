@@ -1,0 +1,297 @@
+"""The engine: cells become records in a folder; run again to go on where it stopped. One way for every kind."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.machine import default_workers, machine, versions
+from ssad.core.seeding import digest
+from ssad.engine.command import command_of
+from ssad.engine.kind import Cell, CellError, Job, Kind, Plan, Resources
+from ssad.engine.pool import Pool, open_pool
+from ssad.engine.progress import Live
+from ssad.engine.store import Store
+from ssad.engine.task import Outcome, Task
+
+MOST = 1 << 30  # bytes of an artefact that is hashed
+
+
+def run(
+    plan: Plan,
+    folder: str | Path,
+    resources: Resources | None = None,
+    *,
+    retry: bool = False,
+    only: Mapping[str, Sequence[str]] | None = None,
+) -> list[dict[str, Any]]:
+    """Run what is missing (retry: and what failed) and return the records that there are, in the order of the plan.
+
+    Args:
+        plan: The whole run.
+        folder: Where its records are.
+        resources: What may be used.
+        retry: Whether failed cells run again; of a slice, those that are in it.
+        only: Run a slice: the cells whose fields, or name, have one of these values, as text.
+
+    Raises:
+        ConfigError: no cell has such a value.
+        StoreError: the folder cannot be written, is in use, or holds another run.
+        SSADError: no worker can start, or data cannot be made.
+    """
+    resources = resources or Resources(device=plan.device)
+    chosen = slice_of(plan, only or {})  # a wrong name is told before there is a folder
+    header, out = run_json(plan), Path(folder).resolve()
+    with Store.open(folder, header, retry=[cell.key for cell in chosen] if retry else False) as store:
+        missing = sorted((c for c in chosen if c.key not in store.results), key=plan.kind.order)
+        if missing:
+            again = [cell for cell in missing if cell.key in store.retried]
+            settings = plan.kind.prepare(plan, out, resources, retry=again)
+            job = Job(out, plan.device, settings)
+            _Schedule(plan, job, store, header["versions"], resources).work(missing)
+        return [store.results[cell.key] for cell in plan.cells if cell.key in store.results]
+
+
+def slice_of(plan: Plan, only: Mapping[str, Sequence[str]]) -> list[Cell]:
+    """The cells whose fields, or name, have one of these values, as text.
+
+    A value "a,b" means a and b, unless a cell has that very value. ConfigError: no cell has such a field or value.
+    """
+    rows = [{"name": cell.name} | {key: str(value) for key, value in cell.fields.items()} for cell in plan.cells]
+    chosen = list(zip(plan.cells, rows, strict=True))
+    for field, texts in only.items():
+        known = dict.fromkeys(row[field] for row in rows if field in row)
+        if not known:
+            raise unknown_name("field of cells", field, dict.fromkeys(key for row in rows for key in row))
+        wanted = [value for text in map(str, texts) for value in ([text] if text in known else text.split(","))]
+        for value in wanted:
+            if value not in known:
+                raise unknown_name(field, value.strip(), known)
+        chosen = [(cell, row) for cell, row in chosen if row.get(field) in wanted]
+    if not chosen:
+        asked = " and ".join(f"{field}={','.join(map(str, texts))}" for field, texts in only.items())
+        raise ConfigError(f"no cell has {asked} at once")
+    return [cell for cell, _ in chosen]
+
+
+def run_json(plan: Plan) -> dict[str, Any]:
+    """What run.json says. `identity` covers all that results depend on, so a folder holds one run only."""
+    kind = plan.kind
+    return {
+        "identity": digest("run", plan.device, *[cell.key for cell in plan.cells])[:16],
+        "kind": kind.name,
+        "suite": plan.suite.model_dump(mode="json"),
+        "command": command_of(plan.suite, plan.device),
+        "versions": {**versions(plan.device), **plan.versions},
+        "code": kind.code,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "columns": [vars(column) for column in kind.columns],
+        "factors": list(kind.factors),
+        "cells": [{"key": c.key, "name": c.name, "seed": c.seed, **c.fields} for c in plan.cells],
+        **plan.inputs,
+    }
+
+
+class _Schedule:
+    """Who waits for what: shared pieces of work first, then cells in batches, one by one where a batch fails."""
+
+    def __init__(self, plan: Plan, job: Job, store: Store, versions: Mapping[str, str], resources: Resources) -> None:
+        self.plan, self.kind, self.job, self.store = plan, plan.kind, job, store
+        self.versions, self.resources = versions, resources
+        self.timeout: float = plan.suite.timeout_s
+        self.left: dict[str, set[str]] = {}  # cell key -> pieces that it waits for
+        self.users: dict[tuple[str, str], list[Cell]] = {}  # piece and system -> cells that wait for it
+        self.sharing: dict[str, dict[str, None]] = {}  # piece -> systems that wait for it, in order
+        self.data: dict[str, Any] = {}
+        self.shared: dict[str, float] = {}  # cell key -> its part of the seconds of its pieces
+        self.alone: set[str] = set()  # systems that share no pieces any more
+        self.trouble: Counter[str] = Counter()  # system -> its crashes and time-outs
+        self.given_up: dict[str, Outcome] = {}
+        self.pool: Pool
+        self.live: Live
+
+    def work(self, missing: Sequence[Cell]) -> None:
+        """Run cells until each has a record."""
+        for cell in missing:
+            pieces = self.kind.pieces(cell, self.job)
+            self.data |= pieces
+            self.left[cell.key] = set(pieces)
+            for name in pieces:
+                self.users.setdefault((name, cell.system), []).append(cell)
+                self.sharing.setdefault(name, {})[cell.system] = None
+        ready = [cell for cell in missing if not self.left[cell.key]]
+        count = len(self.data) + len(missing)
+        place = self.resources
+        workers = self.kind.workers(self.plan, place.workers)
+        start = (_start, (self.kind, self.job))  # of every kind: importing it takes seconds that are no cell's
+        total = len(self.plan.cells) + len(self.data)
+        done = len(self.plan.cells) - len(missing)
+        with (
+            open_pool(count, workers=workers, ray=place.ray, device=self.plan.device, start=start) as self.pool,
+            Live(self.plan.suite.name, total, done, console=place.console) as self.live,
+        ):
+            for batch in self.kind.batches(self.plan, ready, min(count, workers or default_workers())):
+                self._add(batch)
+            for name in self.data:
+                self._add_piece(name, list(self.sharing[name]))
+            for outcome in self.pool.outcomes(self.live.tick):
+                if isinstance(outcome.task.label, list):
+                    self._batch_ended(outcome.task.label, outcome)
+                else:
+                    name, systems = outcome.task.label
+                    self._piece_ended(name, systems, outcome)
+
+    def _add(self, batch: list[Cell], *, first: bool = False) -> None:
+        # a batch may take longer than one cell, but not the sum of all
+        limit = self.timeout * (1 if len(batch) == 1 else 2)
+        self.pool.add(Task(_execute, (self.kind, batch, self.job), limit, label=batch), first=first)
+
+    def _add_piece(self, name: str, systems: Sequence[str], *, first: bool = False) -> None:
+        argument = (self.kind, name, self.data[name], tuple(systems), self.job)
+        self.pool.add(Task(_make, argument, self.timeout, label=(name, tuple(systems))), first=first)
+
+    def _piece_ended(self, name: str, systems: Sequence[str], outcome: Outcome) -> None:
+        """Lets go the cells that waited; a piece that failed for several systems is done again for each alone."""
+        if outcome.status != "ok" and len(systems) > 1:
+            for system in systems:
+                if system in self.alone:
+                    self._release(name, system)
+                else:
+                    self._add_piece(name, [system], first=True)
+            return
+        for system in systems:
+            self._release(name, system, outcome.seconds / len(systems))
+        if outcome.status != "ok":
+            self._share_no_more(systems[0])
+            self._blame(systems[0], outcome)
+
+    def _release(self, name: str, system: str, seconds: float = 0.0) -> None:
+        waiting = self.users.pop((name, system), [])
+        self.sharing[name].pop(system, None)
+        if not self.sharing[name]:
+            self.live.advance(True)
+        for cell in waiting:
+            self.shared[cell.key] = self.shared.get(cell.key, 0.0) + seconds / len(waiting)
+            self.left[cell.key].discard(name)
+            if self.left[cell.key]:
+                continue
+            if cell.system in self.given_up:
+                self._give_up(cell)
+            else:
+                self._add([cell], first=True)
+
+    def _batch_ended(self, batch: list[Cell], outcome: Outcome) -> None:
+        if outcome.status == "ok":
+            for cell in batch:
+                result = dict(outcome.value[cell.key])
+                seconds = result.pop("wall_s", outcome.seconds / len(batch)) + self.shared.get(cell.key, 0.0)
+                self._record(cell, "ok", "", result, seconds)
+        elif len(batch) > 1:
+            for cell in batch:
+                self._add([cell], first=True)
+        else:
+            reason = outcome.reason
+            if outcome.status == "timeout":
+                reason = f"took longer than {self.timeout:g} s"
+            self._record(batch[0], outcome.status, reason, {}, outcome.seconds + self.shared.get(batch[0].key, 0.0))
+            self._blame(batch[0].system, outcome)
+
+    def _share_no_more(self, system: str) -> None:
+        """A system failed alone: its cells do without shared pieces from now on."""
+        if system in self.alone:
+            return
+        self.alone.add(system)
+        for task in self.pool.drop(lambda task: isinstance(task.label, tuple) and system in task.label[1]):
+            name, systems = task.label
+            others = [one for one in systems if one != system]
+            if others:
+                self._add_piece(name, others)
+            self._release(name, system)
+
+    def _blame(self, system: str, outcome: Outcome) -> None:
+        """A system has hung or died alone; after some times it is given up."""
+        if self.kind.patience is None or outcome.status not in ("timeout", "crashed"):
+            return
+        self.trouble[system] += 1
+        if self.trouble[system] == self.kind.patience:
+            self.given_up[system] = outcome
+            for task in self.pool.drop(lambda task: isinstance(task.label, list) and task.label[0].system == system):
+                for cell in task.label:
+                    self._give_up(cell)
+
+    def _give_up(self, cell: Cell) -> None:
+        outcome = self.given_up[cell.system]
+        why = f"not tried after {self.kind.patience} others of {cell.system} ended like this: {outcome.reason}"
+        self._record(cell, outcome.status, why, {}, 0.0)
+
+    def _record(self, cell: Cell, status: str, reason: str, result: dict[str, Any], seconds: float) -> None:
+        """A line for results.jsonl, and one for episodes.jsonl when the kind has one."""
+        common: dict[str, Any] = {"key": cell.key, "suite": self.plan.suite.name, **cell.fields, "seed": cell.seed}
+        episode = result.pop("episode", None)
+        record = (
+            common
+            | {
+                "status": status,
+                "reason": reason,
+                "spec": dict(cell.spec),
+                "metrics": {},
+                "n": 1,
+                "versions": dict(self.versions),
+                "wall_s": round(seconds, 4),
+                "artefacts": {},
+            }
+            | result
+        )
+        self.store.append(record, None if episode is None else common | episode)
+        self.live.advance(status == "ok")
+
+
+def _start(argument: tuple[Kind, Job]) -> None:
+    kind, job = argument
+    kind.start(job)
+
+
+def _make(argument: tuple[Kind, str, Any, Sequence[str], Job]) -> None:
+    kind, name, data, systems, job = argument
+    kind.make(name, data, systems, job)
+
+
+def _execute(argument: tuple[Kind, list[Cell], Job]) -> dict[str, Mapping[str, Any]]:
+    """Results of a batch, checked to be what a store can keep, with the hashes of their artefacts."""
+    kind, batch, job = argument
+    results = kind.execute(batch, job)
+    if set(results) != {cell.key for cell in batch}:
+        raise CellError(f"the kind {kind.name} answered for other cells")
+    checked: dict[str, Mapping[str, Any]] = {}
+    for key, result in results.items():
+        try:
+            safeio.dump_json(dict(result))
+        except (TypeError, ValueError) as error:
+            raise CellError(f"the result is not plain data: {error}") from None
+        paths = [
+            path
+            for value in result.get("artefacts", {}).values()
+            for path in ([value] if isinstance(value, str) else value)
+        ]
+        checked[key] = {**result, "hashes": hash_artefacts(job.folder, paths)}
+    return checked
+
+
+def hash_artefacts(folder: Path, paths: Iterable[str]) -> dict[str, str]:
+    """Path below the folder -> 32 hex digits of BLAKE2b, of files and of all files in folders."""
+    found = {}
+    for path in (folder / name for name in paths):
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_file():
+                data = safeio.read_bytes(file, limit=MOST)
+                name = os.path.relpath(file, folder)
+                found[name] = hashlib.blake2b(data, digest_size=16).hexdigest()
+    return found

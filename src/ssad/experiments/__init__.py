@@ -1,0 +1,4 @@
+"""Kinds of experiments, a folder each.
+
+A folder holds what one kind consists of: suite schema, cells, columns, page, verdict.
+"""

@@ -1,0 +1,1 @@
+"""Experiment `adversarial`: search for scenarios in which a driving system fails."""

@@ -1,0 +1,1 @@
+"""Experiment `driving`: driving systems in scenarios."""

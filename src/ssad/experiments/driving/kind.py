@@ -1,0 +1,172 @@
+"""Kind `driving`: driving systems x scenarios x repetitions in the embedded world; an episode a cell."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from ssad.core.errors import ConfigError, SSADError
+from ssad.core.safeio import plain
+from ssad.core.types import EpisodeTrace
+from ssad.engine.kind import Cell, Column, Job, Names, Plan, Resources, check_distinct
+from ssad.experiments.driving import page
+from ssad.experiments.driving.verdict import verdict
+from ssad.experiments.scenario_kind import (
+    ScenarioKind,
+    ScenarioSuite,
+    described,
+    drive_record,
+)
+from ssad.metrics import METRICS
+from ssad.report.load import Run
+from ssad.report.tables import Table
+from ssad.simulators.closed_loop import (
+    HIGHWAY_TYPE,
+    drive,
+    embedded,
+    episode_of,
+    grade_of,
+    in_highway,
+    system_version,
+)
+
+EMBEDDED = "embedded"  # the name of SSAD's own world as a simulator
+
+
+class DrivingSuite(ScenarioSuite):
+    """One table: systems x scenarios x repetitions.
+
+    Attributes:
+        systems: names, or module:object; arguments and a label may follow, as in mine:Mine?checkpoint=a.pt@first.
+        simulator: embedded, SSAD's own world; or carla://HOST:PORT, a CARLA server (docs/carla.md).
+        repetitions: episodes of each pair; the first is the nominal case.
+        spread: how far the other repetitions are drawn around it, 1 being the natural spread (docs/scenarios.md); 0:
+            not at all, then scenarios without traffic of their own give copies, which count once.
+        witness: grade each collision: which careful drivers avoid it, and could anybody (docs/careful.md).
+        pictures: what the report shows besides (shifts: contact sheets of the distribution shifts; camera: what the
+            camera sees).
+    """
+
+    kind: Literal["driving"] = "driving"
+    systems: Names
+    simulator: str = EMBEDDED
+    repetitions: int = Field(default=1, ge=1, le=100_000)
+    spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
+    timeout_s: float = Field(default=120.0, gt=0, allow_inf_nan=False)
+    chunk: int = Field(default=16, ge=1, le=4096)
+    witness: bool = True
+    pictures: list[Literal["shifts", "camera"]] = Field(default=[])
+
+
+class Driving(ScenarioKind):
+    """See the module."""
+
+    name = "driving"
+    suite = DrivingSuite
+    columns = tuple(Column(m.symbol, m.title, m.unit, m.better) for m in METRICS.values() if m.field)
+    factors = ("system", "group")
+
+    def plan(self, suite: DrivingSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Systems, scenarios and towns are looked up; with `check`, each scenario is built once."""
+        check_distinct(suite, "systems", suite.systems)
+        systems = {name: system_version(name) for name in suite.systems}
+        scenarios, towns = described(suite)
+        away: dict[str, Any] = {} if suite.simulator == EMBEDDED else {"simulator": suite.simulator}
+        if away:
+            from ssad.simulators.carla.server import Server, probe
+
+            server = Server.of(suite.simulator)
+            if any(one.scenario.type == HIGHWAY_TYPE for one in scenarios):
+                raise ConfigError(f"suite {suite.name}: scenarios of highway-env do not run in {server}")
+            if check:
+                probe(server)
+        # the seed does not depend on the system: systems meet the same episodes
+        cells = tuple(
+            self.scenario_cell(
+                suite,
+                one,
+                systems[system],
+                system=system,
+                chance=("episode", repetition),
+                title=f"{system}/{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+                repetition=repetition,
+                spread=suite.spread if repetition else 0.0,
+                **away,
+            )
+            for system in suite.systems
+            for one in scenarios
+            for repetition in range(suite.repetitions)
+        )
+        if check:
+            for cell in cells[: len(scenarios) * suite.repetitions : suite.repetitions]:
+                _check(cell)
+        return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """See `ScenarioKind`. ConfigError: a CARLA server on a cluster."""
+        super().prepare(plan, folder, resources)
+        if resources.ray and plan.suite.simulator != EMBEDDED:
+            raise ConfigError(f"suite {plan.suite.name}: one worker drives {plan.suite.simulator}; leave out --ray")
+        return {"witness": plan.suite.witness}
+
+    def workers(self, plan: Plan, asked: int | None) -> int | None:
+        """A CARLA server runs one world: one worker drives it."""
+        return asked if asked == 0 or plan.suite.simulator == EMBEDDED else 1
+
+    def alike(self, cell: Cell) -> Hashable:
+        """Cells of a system in one simulator; CARLA drives one at a time."""
+        return cell.key if "simulator" in cell.spec else (cell.system, in_highway(cell))
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Drives the episodes as one batch of the world, measures them, writes their traces."""
+        began = time.perf_counter()
+        episodes, traces, measured = drive(cells, device=job.device)
+        shared = (time.perf_counter() - began) / len(cells)
+        results: dict[str, dict[str, Any]] = {}
+        for cell, episode, trace in zip(cells, episodes, traces, strict=True):
+            began = time.perf_counter()
+            result = drive_record(cell, episode, trace, job.folder)
+            if measured:
+                result["metrics"]["lane_crossings"] = measured["lane_crossings"]
+                result["measured"] = plain(measured)
+            if job.settings["witness"] and trace.end == "collision" and embedded(cell):
+                found = grade_of(episode, trace, job.device)
+                result["metrics"] |= found.metrics()
+                result["witness"] = plain(found.as_dict())
+            results[cell.key] = result | {"wall_s": shared + time.perf_counter() - began}
+        return results
+
+    def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
+        """See `ScenarioKind`."""
+        _, (trace,), _ = drive([cell], device=plan.device)
+        return trace
+
+    def finish(self, plan: Plan, folder: Path) -> None:
+        """The pictures that the suite asks for, made once beside its results."""
+        from ssad.experiments.driving.run_images import write_pictures
+
+        write_pictures(plan.suite.pictures, folder)
+
+    def page(self, run: Run) -> tuple[str, Sequence[Table]]:
+        """Page of a run and its tables."""
+        return page.section(run, self.verdict(run))
+
+    def summary(self, run: Run) -> Table:
+        """Main table of a run."""
+        return page.summary(run)
+
+    def verdict(self, run: Run) -> list[str]:
+        """Findings of a run in sentences."""
+        return verdict(run)
+
+
+def _check(cell: Cell) -> None:
+    try:
+        episode_of(cell)
+    except SSADError as error:
+        name = f"scenario {cell.spec['scenario']['name']}"
+        raise type(error)(str(error) if name in str(error) else f"{name}: {error}") from None

@@ -1,0 +1,172 @@
+"""Drives as their drivers saw them: the picture that they got, and from above what is there, found and believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ssad.core.geometry import to_local
+from ssad.core.images import captioned
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.types import F64, U8, EpisodeTrace
+from ssad.experiments.gap.component_metrics import Perceived, in_view
+
+WIDTH, TALL, SCALE, BEHIND = 360, 360, 6.0, 8.0  # pixels, pixels a metre, m behind the ego
+GROUND, LANE, THERE, UNSEEN, FOUND, KNOWN, EGO = (
+    (34, 36, 40),
+    (70, 73, 80),
+    (205, 205, 205),
+    (110, 110, 110),
+    (255, 150, 30),
+    (80, 170, 255),
+    (90, 220, 120),
+)
+LEGEND = "grey: there (dark: out of view), orange: found, blue: believed"
+
+
+def drive_sheet(trace: EpisodeTrace, seen: Perceived, shots: Sequence[tuple[float, U8]], graph: LaneGraph) -> U8:
+    """A row for each of three moments: 2 and 1 s before the first contact and at it, or spread over the drive.
+
+    Args:
+        trace: The drive.
+        seen: What was perceived in it.
+        shots: Pictures that the driver got, with their times, s.
+        graph: The town.
+    """
+    struck, end = np.flatnonzero(trace.contact_agent > 0), (len(trace.x) - 1) * trace.dt
+    wanted = (
+        [max(struck[0] * trace.dt - s, 0.0) for s in (2.0, 1.0, 0.0)]
+        if len(struck)
+        else [end * k / 4 for k in (1, 2, 3)]
+    )
+    return np.vstack([_row(Seen("", trace, seen, shots), time, graph) for time in wanted])
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A drive and what was seen in it.
+
+    Attributes:
+        title: What the film calls it.
+        trace: The drive.
+        perceived: What was perceived in it.
+        shots: Pictures that the driver got, with their times, s.
+    """
+
+    title: str
+    trace: EpisodeTrace
+    perceived: Perceived
+    shots: Sequence[tuple[float, U8]]
+
+    @property
+    def end(self) -> float:
+        """When it ended, s."""
+        return (len(self.trace.x) - 1) * self.trace.dt
+
+
+def drive_film(drives: Sequence[Seen], graph: LaneGraph, *, every: float = 0.2) -> Iterator[U8]:
+    """Drives side by side, moment by moment; one that has ended stays at its last moment.
+
+    Args:
+        drives: The drives; none without pictures.
+        graph: Their town.
+        every: s from one frame to the next.
+
+    Yields:
+        RGB frames [H, W, 3] of one size.
+    """
+    last = max(drive.end for drive in drives)
+    for k in range(int(last / every + 1.5)):
+        yield np.hstack([_row(drive, min(k * every, drive.end), graph, exact=True) for drive in drives])
+
+
+def _row(drive: Seen, time: float, graph: LaneGraph, *, exact: bool = False) -> U8:
+    """A moment of a drive; unless `exact`, all of it is shown at the time of the picture nearest to it."""
+    trace, seen = drive.trace, drive.perceived
+    when, picture = min(drive.shots, key=lambda shot: abs(shot[0] - time))
+    when = time if exact else when
+    step = min(round(when / trace.dt), len(trace.x) - 1)
+    wide = picture.shape[1] * TALL // picture.shape[0]
+    shown = cv2.resize(np.ascontiguousarray(picture), (wide, TALL), interpolation=cv2.INTER_AREA)
+    text = f"{drive.title}{', ' if drive.title else ''}{when:.1f} s, {trace.speed[step, 0]:.1f} m/s"
+    left = captioned(np.asarray(_marked(shown, trace, step, when, seen), np.uint8), text, wide)
+    right = captioned(_above(trace, step, when, seen, graph), LEGEND, WIDTH)
+    tall = max(len(left), len(right))
+    return np.hstack([_padded(left, tall), _padded(right, tall)])
+
+
+def _padded(picture: U8, height: int) -> U8:
+    return np.pad(picture, ((0, height - len(picture)), (0, 0), (0, 0)))
+
+
+def _at(seen: Sequence[tuple[float, Any]], time: float) -> Any:
+    """What was noted nearest to a time; None: nothing."""
+    return min(seen, key=lambda one: abs(one[0] - time))[1] if seen else None
+
+
+def _marked(picture: U8, trace: EpisodeTrace, step: int, time: float, seen: Perceived) -> U8:
+    """A stake on the road for each object found (orange) and believed (blue)."""
+    camera = next(iter(seen.cameras.values()))
+    factor = picture.shape[1] / camera.width
+    ego = (float(trace.x[step, 0]), float(trace.y[step, 0]), float(trace.yaw[step, 0]))
+    found, tracks = _at(seen.looks, time), _at(seen.known, time)
+    for places, colour in (
+        ([] if found is None else found.place, FOUND),
+        ([] if tracks is None else tracks.mean[:, :2], KNOWN),
+    ):
+        for place in places:
+            local = to_local(np.array(ego), np.asarray(place))
+            ends = []
+            for height in (0.0, 1.6):
+                inside = np.linalg.inv(camera.to_ego) @ np.array([local[0], local[1], height, 1.0])
+                if inside[2] > 0.5:
+                    pixel = camera.intrinsic @ inside[:3] / inside[2] * factor
+                    ends.append((round(float(pixel[0])), round(float(pixel[1]))))
+            if len(ends) == 2:
+                cv2.line(picture, ends[0], ends[1], colour, 2, cv2.LINE_AA)
+                cv2.circle(picture, ends[0], 3, colour, -1, cv2.LINE_AA)
+    return picture
+
+
+def _above(trace: EpisodeTrace, step: int, time: float, seen: Perceived, graph: LaneGraph) -> U8:
+    """From above, the ego's heading up."""
+    canvas = np.full((TALL, WIDTH, 3), GROUND, np.uint8)
+    ego = np.array([trace.x[step, 0], trace.y[step, 0], trace.yaw[step, 0]], np.float64)
+
+    def pixels(points: Any) -> Any:
+        local = to_local(ego, np.asarray(points, np.float64).reshape(-1, 2))
+        x = WIDTH / 2 - SCALE * local[:, 1]
+        y = TALL - SCALE * (local[:, 0] + BEHIND)
+        return np.rint(np.stack([x, y], 1)).astype(np.int32)
+
+    near = np.hypot(graph.xy[:, 0] - ego[0], graph.xy[:, 1] - ego[1]) < 90.0
+    for lane in range(graph.lanes):
+        part = slice(graph.offset[lane], graph.offset[lane + 1])
+        if near[part].any():
+            cv2.polylines(canvas, [pixels(graph.xy[part])], False, LANE, 2, cv2.LINE_AA)
+    view = in_view(trace, [step], seen.cameras)[0]
+    for agent in np.flatnonzero(trace.active[step]):
+        colour = EGO if agent == 0 else THERE if view[agent] else UNSEEN
+        pose = np.array([trace.x[step, agent], trace.y[step, agent], trace.yaw[step, agent]], np.float64)
+        size = np.array([trace.length[agent], trace.width[agent]], np.float64)
+        cv2.fillPoly(canvas, [pixels(_corners(pose, size))], colour, cv2.LINE_AA)
+    found, tracks = _at(seen.looks, time), _at(seen.known, time)
+    if found is not None:
+        for x, y in pixels(found.place).tolist():
+            cv2.drawMarker(canvas, (x, y), FOUND, cv2.MARKER_TILTED_CROSS, 9, 2, cv2.LINE_AA)
+    if tracks is not None:
+        for mean, yaw, size in zip(tracks.mean, tracks.yaw, tracks.size, strict=True):
+            outline = pixels(_corners(np.array([mean[0], mean[1], yaw]), size))
+            cv2.polylines(canvas, [outline], True, KNOWN, 2, cv2.LINE_AA)
+            cv2.polylines(canvas, [pixels([mean[:2], mean[:2] + mean[2:]])], False, KNOWN, 1, cv2.LINE_AA)
+    return canvas
+
+
+def _corners(pose: F64, size: F64) -> F64:
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    local = 0.5 * size * np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+    return np.asarray(local @ np.array([[cos, sin], [-sin, cos]]) + pose[:2])

@@ -1,0 +1,269 @@
+"""Kind `gap`: perceiving systems x scenarios x perturbations of their cameras x severities; an episode a cell.
+
+The same drive gives metrics of the component, on the very pictures that the driver got, and metrics of the system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.images import save_picture
+from ssad.core.machine import quiet_warp
+from ssad.core.traces import first_difference, load_trace
+from ssad.engine.kind import Cell, Column, Job, Plan, Replay, Resources, check_distinct
+from ssad.experiments.gap import page
+from ssad.experiments.gap.component_metrics import (
+    BANDS,
+    SIGN_BANDS,
+    cause_of_collision,
+    component_metrics,
+    hard_braking,
+    impact_speed,
+    phantom_stop,
+    sign_metrics,
+)
+from ssad.experiments.gap.drive_sheet import Seen, drive_film, drive_sheet
+from ssad.experiments.gap.loop_perturbations import (
+    LIGHT,
+    NONE,
+    TEXTURE,
+    family_of,
+    has_severities,
+    is_worn,
+    signs_of_route,
+    texture_version,
+    wearer,
+)
+from ssad.experiments.gap.perceiving_loop import PerceivingSystem, drive_perceiving, drive_repaired
+from ssad.experiments.gap.verdict import verdict
+from ssad.experiments.scenario_kind import Described, ScenarioKind, ScenarioSuite, described, drive_record
+from ssad.report.load import Run
+from ssad.report.tables import Table
+from ssad.simulators.closed_loop import episode_of, system_version, town
+
+EVERY = 0.2  # s from one frame of a film to the next
+
+
+class GapSuite(ScenarioSuite):
+    """Systems x scenarios x perturbations.
+
+    Attributes:
+        systems: perceiving systems; names must differ.
+        ceilings: systems that are told the truth, without perturbations (`ssad list systems`).
+        perturbations: names (docs/gap.md); "none" always runs.
+        severities: 1 to 5.
+        repetitions, spread: as in suites of kind driving.
+        sheets: pictures of so many drives, collisions first.
+        repair: whether drives that end in a collision are driven again with the object that was hit found where it is,
+            which tells whether this error alone is to blame.
+    """
+
+    kind: Literal["gap"] = "gap"
+    systems: list[PerceivingSystem] = Field(min_length=1)
+    ceilings: list[str] = Field(default=["autopilot", "line-of-sight"])
+    perturbations: list[str] = Field(default=[])
+    severities: list[int] = Field(default=[3], min_length=1)
+    repetitions: int = Field(default=1, ge=1, le=100_000)
+    spread: float = Field(default=1.0, ge=0, le=10, allow_inf_nan=False)
+    timeout_s: float = Field(default=1200.0, gt=0, allow_inf_nan=False)
+    chunk: int = Field(default=4, ge=1, le=4096)
+    sheets: int = Field(default=6, ge=0)
+    repair: bool = True
+
+
+class Gap(ScenarioKind):
+    """See the module."""
+
+    name = "gap"
+    suite = GapSuite
+    columns = (
+        Column("AP", "AP of all objects, on the drive's pictures", "", "higher"),
+        Column("recall", "recall of the objects in view, within 2 m", "", "higher"),
+        Column("missed_burst", "looks in a row that an object in view is missed", "", "lower"),
+        Column("distance_share", "RMS error of the distances, as a share of them", "", "lower"),
+        Column("target_recall", "recall of the object that matters", "", "higher"),
+        *(
+            Column(f"target_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            for a, b in BANDS
+        ),
+        Column("distance_error", "error of its distance", "m", "lower"),
+        Column("phantoms", "phantoms a look", "", "lower"),
+        Column("believed", "share of the steps in which it is believed where it is", "", "higher"),
+        Column("switches", "changes of its track", "", "lower"),
+        Column("HOTA", "HOTA of what is believed", "", "higher"),
+        Column("MOTA", "MOTA of the same", "", "higher"),
+        Column("IDF1", "IDF1 of the same", "", "higher"),
+        Column("collision", "CR", "", "lower"),
+        Column("impact_speed", "impact speed", "m/s", "lower"),
+        Column("route_completion", "RC", "", "higher"),
+        Column("min_ttc", "least time to collision", "s", "higher"),
+        Column("stop_signs", "stop signs run", "", "lower"),
+        Column("sign_recall", "share of the looks in which the stop sign ahead was read", "", "higher"),
+        *(
+            Column(f"sign_recall_{a:.0f}_{b:.0f}", f"the same from {a:.0f} to {b:.0f} m", "", "higher")
+            for a, b in SIGN_BANDS
+        ),
+        Column("sign_read_at", "m from a stop sign at which one was first read", "m", "higher"),
+        Column("hard_braking", "times of braking above 4 m/s^2", "", "lower"),
+        Column("phantom_stop_s", "time stood before a phantom", "s", "lower"),
+    )
+    factors = ("system", "perturbation", "severity")
+
+    def plan(self, suite: GapSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Names are looked up, detectors are built once; with `check`, each scenario is built once."""
+        check_distinct(suite, "systems", [one.name for one in suite.systems] + suite.ceilings)
+        for name in suite.perturbations:
+            family_of(name)
+        if any(severity not in range(1, 6) for severity in suite.severities):
+            raise ConfigError(f"suite {suite.name}: severities are 1 to 5, not {suite.severities}")
+        for system in suite.systems:
+            system.check()
+        versions = {one.name: one.version for one in suite.systems}
+        versions |= {name: system_version(name) for name in suite.ceilings}
+        scenarios, towns = described(suite)
+        conditions = _conditions(suite)
+        wearers: dict[tuple[str, str], int | None] = {}
+        on_somebody = [name for name in suite.perturbations if is_worn(name)]
+        if check or on_somebody:
+            for one in scenarios:
+                episode = episode_of(self._cell(suite, one, conditions[0], 0, ""))
+                for name in on_somebody:
+                    wearers[name, one.scenario.name] = wearer(name, episode, town(one.scenario.town))
+        cells = [
+            self._cell(suite, one, condition, repetition, versions[_name(condition[0])], worn_by)
+            for condition in conditions
+            for one in scenarios
+            for worn_by in [wearers.get((condition[1], one.scenario.name))]
+            if worn_by is not None or not is_worn(condition[1])
+            for repetition in range(suite.repetitions)
+        ]
+        return Plan(self, suite, device, tuple(cells), {"towns": towns, "systems": versions})
+
+    def _cell(  # noqa: PLR0917  # plain values
+        self,
+        suite: GapSuite,
+        one: Described,
+        condition: tuple[str | PerceivingSystem, str, int],
+        repetition: int,
+        version: str,
+        worn_by: int | None = None,
+    ) -> Cell:
+        """The seed depends on the scenario and the repetition alone, so that all conditions meet the same drives."""
+        system, perturbation, severity = condition
+        own = None if isinstance(system, str) else system.model_dump(mode="json")
+        under = f"{perturbation}-{severity}/" if perturbation != NONE else ""
+        family = family_of(perturbation)
+        texture = texture_version(perturbation) if family in (TEXTURE, LIGHT) else ""
+        return self.scenario_cell(
+            suite,
+            one,
+            version,
+            suite.seed,
+            texture,
+            system=_name(system),
+            chance=("episode", repetition),
+            title=f"{_name(system)}/{under}{one.scenario.name}{f'#{repetition}' if repetition else ''}",
+            fields={"perturbation": perturbation, "severity": severity, "family": family},
+            repetition=repetition,
+            spread=suite.spread if repetition else 0.0,
+            settings=own,
+            perturbation=perturbation,
+            severity=severity,
+            repair=suite.repair and own is not None,
+            **({"wearer": worn_by} if is_worn(perturbation) else {}),
+        )
+
+    def prepare(self, plan: Plan, folder: Path, resources: Resources, *, retry: Sequence[Cell] = ()) -> dict[str, Any]:
+        """See `ScenarioKind`."""
+        super().prepare(plan, folder, resources)
+        return {"seed": plan.suite.seed, "sheets": plan.suite.sheets > 0}
+
+    def alike(self, cell: Cell) -> Hashable:
+        """Cells of one condition; a batch is of one town, whose street is then built once."""
+        spec = cell.spec
+        return spec["scenario"]["town"], cell.system, spec["perturbation"], spec["severity"], spec.get("wearer")
+
+    def execute(self, cells: Sequence[Cell], job: Job) -> dict[str, dict[str, Any]]:
+        """Drives the episodes as one batch, and measures component and system."""
+        seed = job.settings["seed"]
+        episodes, traces, seen = drive_perceiving(
+            cells, device=job.device, seed=seed, every=0.5 if job.settings["sheets"] else None
+        )
+        repair = cells[0].spec["repair"]
+        repaired = drive_repaired(cells, traces, device=job.device, seed=seed) if repair else {}
+        results: dict[str, dict[str, Any]] = {}
+        for k, (cell, episode, trace) in enumerate(zip(cells, episodes, traces, strict=True)):
+            result = drive_record(cell, episode, trace, job.folder)
+            metrics = result["metrics"] | {"impact_speed": impact_speed(trace), "hard_braking": hard_braking(trace)}
+            about: dict[str, Any] = {name: result["episode"][name] for name in ("end", "trace_hash", "town")}
+            if seen is not None:
+                own, perceived = PerceivingSystem.model_validate(cell.spec["settings"]), seen.perceived(k)
+                metrics |= component_metrics(trace, perceived, sure=own.tracking.high)
+                metrics |= sign_metrics(trace, perceived, signs_of_route(town(trace.town), trace.route))
+                metrics["phantom_stop_s"] = phantom_stop(trace, perceived)
+                about["cause"] = cause_of_collision(trace, perceived)
+                if job.settings["sheets"] and (shots := seen.shots(k)):
+                    result["artefacts"]["sheet"] = f"sheets/{cell.key}.jpg"
+                    safeio.make_folder(job.folder / "sheets")
+                    picture = drive_sheet(trace, perceived, shots, town(trace.town))
+                    save_picture(job.folder / result["artefacts"]["sheet"], picture)
+            metrics = {name: round(value, 6) if isinstance(value, float) else value for name, value in metrics.items()}
+            about |= {"repaired": repaired[k]} if k in repaired else {}
+            episode_line = result["episode"] | about | {"metrics": metrics}
+            results[cell.key] = result | about | {"metrics": metrics, "episode": episode_line}
+        return results
+
+    def replay(self, plan: Plan, cell: Cell, record: Mapping[str, Any], folder: Path) -> Replay:
+        """Drives the episode again and compares every bit of its trace; films it beside the clean drive."""
+        quiet_warp()
+        recorded = load_trace(folder / record["artefacts"]["trace"])
+        spec, graph = cell.spec, town(recorded.town)
+        clean = replace(cell, spec={k: v for k, v in spec.items() if k != "wearer"} | {"perturbation": NONE})
+        drives, again = [], []
+        for one in [cell] if spec["perturbation"] == NONE else [clean, cell]:
+            _, (trace,), seen = drive_perceiving([one], device=plan.device, seed=plan.suite.seed, every=EVERY)
+            again.append(trace)
+            if seen is not None:
+                shots = seen.shots(0)
+                title = f"{spec['perturbation']} {spec['severity']}" if one is cell and spec["severity"] else "clean"
+                drives.append(Seen(title, trace, seen.perceived(0), shots))
+        filmed = [drive for drive in drives if drive.shots]
+        film = (drive_film(filmed, graph, every=EVERY), EVERY) if filmed else None
+        own = drives[-1] if drives and drives[-1].trace is again[-1] else None
+        return Replay(cell, first_difference(recorded, again[-1]), again[-1], graph, film=film, seen=own)
+
+    def page(self, run: Run) -> tuple[str, Sequence[Table]]:
+        """Page of a run and its tables."""
+        return page.section(run, self.verdict(run))
+
+    def summary(self, run: Run) -> Table:
+        """Main table of a run."""
+        return page.summary(run)
+
+    def verdict(self, run: Run) -> list[str]:
+        """Findings of a run in sentences."""
+        return verdict(run)
+
+
+def _name(system: str | PerceivingSystem) -> str:
+    return system if isinstance(system, str) else system.name
+
+
+def _conditions(suite: GapSuite) -> list[tuple[str | PerceivingSystem, str, int]]:
+    """System, perturbation, severity; ceilings first, then each system clean and perturbed."""
+    found: list[tuple[str | PerceivingSystem, str, int]] = [(name, NONE, 0) for name in suite.ceilings]
+    for system in suite.systems:
+        found.append((system, NONE, 0))
+        if not system.perfect:
+            names = [name for name in dict.fromkeys(suite.perturbations) if name != NONE]
+            for name in names:
+                levels = dict.fromkeys(suite.severities) if has_severities(name) else [1]
+                found += [(system, name, severity) for severity in levels]
+    return found

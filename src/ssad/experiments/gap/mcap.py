@@ -1,0 +1,214 @@
+"""Drives as MCAP recordings with Foxglove's schemas, for Foxglove, Lichtblick and other viewers (the extra `view`).
+
+Topics: /tf (the ego in the world, its camera on the ego), /camera and /camera/calibration, /truth (who is there),
+/detections, /tracks (what is believed), /plan (the way that the planner follows), /map and /above (the scene from
+above). Topics of what a driver sees are there for perceiving drivers alone.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, install_extra
+from ssad.core.frames import Camera
+from ssad.core.images import encode_jpeg
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.rotations import matrix_to_quaternion, yaw_to_quaternion
+from ssad.core.types import F64, U8, AgentKind, EpisodeTrace, LaneType
+from ssad.drivers.perceiving.objects import SIZES
+from ssad.experiments.gap.drive_sheet import Seen
+
+WORLD, EGO, ABOVE = "world", "ego", "above"
+AHEAD: Final = 50.0  # m of the route that are shown as the plan
+QUALITY: Final = 90  # of JPEG
+COLOURS: Final = {
+    "truth": (0.8, 0.8, 0.8, 0.4),
+    "detections": (1.0, 0.6, 0.1, 0.6),
+    "tracks": (0.3, 0.65, 1.0, 0.6),
+    "plan": (0.35, 0.85, 0.45, 1.0),
+    "map": (0.45, 0.47, 0.5, 1.0),
+}
+Message = tuple[int, str, Any]  # ns, topic, message
+
+
+def need_mcap() -> None:
+    """ConfigError: the packages of the extra `view` are missing."""
+    try:
+        importlib.import_module("mcap_protobuf.writer")
+        importlib.import_module("foxglove_schemas_protobuf.SceneUpdate_pb2")
+    except ImportError:
+        raise ConfigError(f"--mcap needs mcap and Foxglove's schemas; {install_extra('view')}") from None
+
+
+def write_mcap(
+    path: Path,
+    trace: EpisodeTrace,
+    graph: LaneGraph,
+    *,
+    seen: Seen | None = None,
+    above: Iterable[U8] = (),
+) -> Path:
+    """Write a drive as MCAP, whole or not at all; its clock starts at 0.
+
+    Args:
+        path: Where to.
+        trace: The drive.
+        graph: Its town.
+        seen: What its driver saw, found and believed, if it is one that perceives.
+        above: The scene from above [H, W, 3], a picture a step.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: The extra `view` is missing.
+        StoreError: The file cannot be written.
+    """
+    need_mcap()
+    from mcap_protobuf.writer import Writer
+
+    told = [*_scene(trace, graph), *_from_above(trace, above), *(() if seen is None else _perceived(seen))]
+    with safeio.atomic_path(path) as temporary, temporary.open("wb") as file, Writer(file) as writer:
+        for number, (time, topic, message) in enumerate(sorted(told, key=lambda one: one[0])):
+            writer.write_message(topic, message, log_time=time, publish_time=time, sequence=number)
+    return path
+
+
+def _new(name: str, time: int | None = None, **fields: Any) -> Any:
+    """A message of Foxglove's schemas."""
+    message = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)(**fields)
+    if time is not None:
+        message.timestamp.FromNanoseconds(time)
+    return message
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+def _scene(trace: EpisodeTrace, graph: LaneGraph) -> Iterator[Message]:
+    """Where everybody is at each step, the way that is planned, and once the map."""
+    yield 0, "/map", _update("map", 0, lines=list(_lanes(graph)))
+    names = [f"{k} {name}" for k, name in enumerate(trace.names)]
+    for step in range(len(trace.x)):
+        time = _ns(step * trace.dt)
+        pose = np.stack([trace.x[step], trace.y[step], trace.yaw[step]], -1).astype(np.float64)
+        yield time, "/tf", _transform(time, WORLD, EGO, [*pose[0, :2], 0.0], yaw_to_quaternion(pose[0, 2]))
+        rows = np.flatnonzero(trace.active[step])
+        size = np.stack([trace.length[rows], trace.width[rows]], -1)
+        kind = trace.kind[rows].astype(np.int64)
+        cubes = _cubes("truth", pose[rows], size.astype(np.float64), kind)
+        yield time, "/truth", _update("truth", time, cubes=cubes, words={names[k]: "" for k in rows.tolist()})
+        route = trace.route.astype(np.float64)
+        first = int(np.hypot(*(route - pose[0, :2]).T).argmin())
+        gone = np.cumsum(np.concatenate([[0.0], np.hypot(*np.diff(route[first:], axis=0).T)]))
+        line = _line("plan", route[first:][gone <= AHEAD])
+        told = {name: f"{getattr(trace, name)[step]:.3f}" for name in ("throttle", "brake", "steer")}
+        yield time, "/plan", _update("plan", time, lines=[line], words=told)
+
+
+def _perceived(seen: Seen) -> Iterator[Message]:
+    """What the driver saw, found and believed."""
+    name, camera = next(iter(seen.perceived.cameras.items()))
+    turn, place = matrix_to_quaternion(camera.to_ego[:3, :3]), camera.to_ego[:3, 3].tolist()
+    for when, picture in seen.shots:
+        time = _ns(when)
+        data = encode_jpeg(np.ascontiguousarray(picture), QUALITY, "420")
+        yield time, "/tf", _transform(time, EGO, name, place, turn)
+        yield time, "/camera", _new("CompressedImage", time, frame_id=name, data=data, format="jpeg")
+        yield time, "/camera/calibration", _calibration(time, name, camera)
+    for when, found in seen.perceived.looks:
+        if found is not None:
+            pose = np.column_stack([found.place, np.nan_to_num(found.yaw)])
+            cubes = _cubes("detections", pose, found.size, found.kind)
+            words = {f"score {k}": f"{score:.3f}" for k, score in enumerate(found.score.tolist())}
+            yield _ns(when), "/detections", _update("detections", _ns(when), cubes=cubes, words=words)
+    for when, tracks in seen.perceived.known:
+        cubes = _cubes("tracks", np.column_stack([tracks.mean[:, :2], tracks.yaw]), tracks.size, tracks.kind)
+        words = {f"track {k}": str(ident) for k, ident in enumerate(tracks.ident.tolist())}
+        yield _ns(when), "/tracks", _update("tracks", _ns(when), cubes=cubes, words=words)
+
+
+def _from_above(trace: EpisodeTrace, pictures: Iterable[U8]) -> Iterator[Message]:
+    for step, picture in enumerate(pictures):
+        time, data = _ns(step * trace.dt), encode_jpeg(np.ascontiguousarray(picture), QUALITY, "420")
+        yield time, "/above", _new("CompressedImage", time, frame_id=ABOVE, data=data, format="jpeg")
+
+
+def _update(name: str, time: int, *, words: dict[str, str] | None = None, **parts: Any) -> Any:
+    """A scene in place of the one before under this name."""
+    metadata = [_new("KeyValuePair", key=key, value=value) for key, value in (words or {}).items()]
+    entity = _new("SceneEntity", time, frame_id=WORLD, id=name, metadata=metadata, **parts)
+    return _new("SceneUpdate", entities=[entity])
+
+
+def _colour(name: str) -> Any:
+    red, green, blue, opacity = COLOURS[name]
+    return _new("Color", r=red, g=green, b=blue, a=opacity)
+
+
+def _cubes(name: str, pose: F64, size: F64, kind: Any) -> list[Any]:
+    """Upright boxes at x, y, yaw [N, 3], of lengths and widths [N, 2], as high as their kinds [N] usually are."""
+    found = []
+    turns = yaw_to_quaternion(pose[:, 2]).reshape(-1, 4)
+    for (x, y, _), (length, width), turn, one in zip(pose.tolist(), size.tolist(), turns, kind, strict=True):
+        height = float(SIZES[min(int(one), len(AgentKind) - 1), 2])
+        place = _new("Pose", position=_vector([x, y, 0.5 * height]), orientation=_quaternion(turn))
+        found.append(_new("CubePrimitive", pose=place, size=_vector([length, width, height]), color=_colour(name)))
+    return found
+
+
+def _line(name: str, points: F64, height: float = 0.05) -> Any:
+    places = [_new("Point3", x=x, y=y, z=height) for x, y in points.tolist()]
+    return _new("LinePrimitive", thickness=0.15, points=places, color=_colour(name), pose=_origin())
+
+
+def _lanes(graph: LaneGraph) -> Iterator[Any]:
+    """The centre lines of what vehicles drive on."""
+    for lane in np.flatnonzero(graph.kind == LaneType.DRIVING).tolist():
+        yield _line("map", graph.xy[graph.offset[lane] : graph.offset[lane + 1]].astype(np.float64), 0.0)
+
+
+def _origin() -> Any:
+    return _new("Pose", position=_vector([0.0, 0.0, 0.0]), orientation=_quaternion(np.array([1.0, 0.0, 0.0, 0.0])))
+
+
+def _vector(values: Sequence[float]) -> Any:
+    return _new("Vector3", x=values[0], y=values[1], z=values[2])
+
+
+def _quaternion(turn: F64) -> Any:
+    w, x, y, z = turn.tolist()
+    return _new("Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _transform(time: int, parent: str, child: str, place: Sequence[float], turn: F64) -> Any:
+    return _new(
+        "FrameTransform",
+        time,
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(place),
+        rotation=_quaternion(turn),
+    )
+
+
+def _calibration(time: int, name: str, camera: Camera) -> Any:
+    lens = camera.intrinsic
+    projection = np.column_stack([lens, np.zeros(3)])
+    return _new(
+        "CameraCalibration",
+        time,
+        frame_id=name,
+        width=camera.width,
+        height=camera.height,
+        K=lens.ravel().tolist(),
+        P=projection.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+    )

@@ -1,0 +1,195 @@
+"""Perceiving systems in the closed loop, as plain data: made, and driven with perturbed cameras under observation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ssad.core.checkpoints import state_hash
+from ssad.core.errors import ConfigError
+from ssad.core.nuscenes_names import CAMERAS
+from ssad.core.schema import Schema
+from ssad.core.seeding import digest
+from ssad.core.types import Episode, EpisodeTrace
+from ssad.drivers.perceiving.driver import Known, Perceiving, Sighting
+from ssad.drivers.perceiving.eyes import CameraEyes, PerfectEyes, front
+from ssad.drivers.perceiving.repair import Repair
+from ssad.drivers.perceiving.signs import SignReading, sign_labels
+from ssad.drivers.perceiving.tracker import Tracking, tracking_of
+from ssad.experiments.gap.component_metrics import Watcher
+from ssad.experiments.gap.loop_perturbations import LIGHT, family_of, perturbed, worn
+from ssad.metrics import episode_metrics
+from ssad.rendering.hours import at_hour
+from ssad.rendering.onboard import DAY, Onboard
+from ssad.scenarios.static.physical.lights.loop import hour_of
+from ssad.simulators.closed_loop import Order, drive
+
+Share = Field(default=0.0, ge=0, lt=1, allow_inf_nan=False)
+
+
+class PerceivingSystem(Schema):
+    """A perceiving system of a suite.
+
+    Attributes:
+        name: what tables call it.
+        detector: `ssad list detectors`; truth: a perfect detector, which is told the truth.
+        weights: a file of weights; none: the shipped ones.
+        cameras: of the nuScenes rig.
+        width: of their pictures, pixels.
+        input_width: width to which a 3D detector resizes them; none: its own.
+        rate: looks a second.
+        latency: s from a picture to its detections.
+        confirm: hits from which an object is believed (H).
+        reserve: looks without a hit that it stays believed for (R).
+        high, low: scores of the tracker's two stages; none: those that suit the detector.
+        reads_signs: whether it knows of stop signs only what its detector reads; else those of the map.
+        sign_memory: s that a sign is remembered after it was last read; none: until it has been passed.
+        missed, burst, noise, phantoms: how a perfect detector fails (`ssad.drivers.perceiving.eyes.PerfectEyes`).
+    """
+
+    name: str = Field(min_length=1)
+    detector: str = "fcos3d-light"
+    weights: str | None = None
+    cameras: list[Literal[CAMERAS]] = Field(default=["CAM_FRONT"], min_length=1)  # type: ignore[valid-type]
+    width: int = Field(default=640, ge=64, le=1600)
+    input_width: int | None = Field(default=None, ge=64, le=3200)
+    rate: float = Field(default=5.0, gt=0, le=100, allow_inf_nan=False)
+    latency: float = Field(default=0.1, ge=0, le=10, allow_inf_nan=False)
+    confirm: int = Field(default=2, ge=1)
+    reserve: int = Field(default=6, ge=0)
+    high: float | None = Field(default=None, ge=0, le=1)
+    low: float | None = Field(default=None, ge=0, le=1)
+    reads_signs: bool = False
+    sign_memory: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    missed: float = Share
+    burst: float = Field(default=3.0, ge=1, allow_inf_nan=False)
+    noise: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    phantoms: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+    @property
+    def version(self) -> str:
+        """Hash of the weights of its detector; "" without one."""
+        return "" if self.perfect else state_hash(_detector(self.detector, self.weights, self.input_width))
+
+    @property
+    def perfect(self) -> bool:
+        """Whether it is told the truth."""
+        return self.detector == "truth"
+
+    @property
+    def tracking(self) -> Tracking:
+        """Settings of the tracker, with the scores that suit the detector unless others are said."""
+        return tracking_of(self.detector, high=self.high, low=self.low, confirm=self.confirm, reserve=self.reserve)
+
+    def check(self) -> None:
+        """ConfigError: scores cross, settings of stop signs do not fit, or its detector knows no stop signs."""
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ConfigError(f"system {self.name}: low {self.low:g} is above high {self.high:g}")
+        if self.sign_memory is not None and not self.reads_signs:
+            raise ConfigError(f"system {self.name}: sign_memory can only be used with reads_signs: true")
+        if self.reads_signs:
+            try:
+                sign_labels(self.make().eyes.classes)
+            except ConfigError as error:
+                raise ConfigError(f"system {self.name}, detector {self.detector}: {error}") from None
+
+    def make(
+        self,
+        watch: Callable[[Sighting | Known], None] | None = None,
+        *,
+        repair: Repair | None = None,
+        device: str = "cpu",
+    ) -> Perceiving:
+        """The driver, its detector on a device; `watch` is told what it sees, `repair` mends one error of it."""
+        cameras, tracking = front(self.width, self.cameras), self.tracking
+        eyes: CameraEyes | PerfectEyes
+        if self.perfect:
+            eyes = PerfectEyes(cameras, missed=self.missed, burst=self.burst, noise=self.noise, phantoms=self.phantoms)
+        else:
+            detector = _detector(self.detector, self.weights, self.input_width, device)
+            eyes = CameraEyes(detector, cameras, threshold=tracking.low, device=device)
+        memory = float("inf") if self.sign_memory is None else self.sign_memory
+        signs = SignReading(confirm=self.confirm, memory=memory, score=tracking.high) if self.reads_signs else None
+        return Perceiving(
+            eyes, rate=self.rate, latency=self.latency, tracking=tracking, watch=watch, repair=repair, signs=signs
+        )
+
+
+def drive_perceiving(
+    orders: Sequence[Order],
+    *,
+    device: str,
+    seed: int,
+    repair: Repair | None = None,
+    every: float | None = 0.5,
+) -> tuple[list[Episode], list[EpisodeTrace], Watcher | None]:
+    """Episodes and traces of orders of one system under one perturbation, and what was perceived in them.
+
+    Args:
+        orders: What is to be driven; their specs say settings (of a `PerceivingSystem`; None: another driver),
+            perturbation, severity, and for a texture its wearer.
+        device: Where the world and the cameras compute.
+        seed: Of the perturbations.
+        repair: What mends one error of the driver.
+        every: s from one picture that is kept to the next; None: none are kept.
+    """
+    spec = orders[0].spec
+    if spec["settings"] is None:
+        return *drive(orders, device=device, key=_paired)[:2], None
+    own = PerceivingSystem.model_validate(spec["settings"])
+    watcher = Watcher(front(own.width, own.cameras), len(orders), every)
+    driver = own.make(watcher, repair=repair, device=device)
+    name, severity = spec["perturbation"], spec["severity"]
+    attack = worn(name, spec["wearer"], severity=severity, seed=seed) if "wearer" in spec else None
+    weather = at_hour(DAY, hour_of(name)) if family_of(name) == LIGHT else DAY
+    onboard = Onboard(weather=weather, device=device, resident=True, attack=attack)
+    sensors, changes = perturbed(onboard, driver.cameras, name, severity, detector=driver.detector, seed=seed)
+    found = drive(orders, device=device, key=_paired, driver=driver, sensors=sensors, perturbation=changes)
+    return *found[:2], watcher
+
+
+def drive_repaired(
+    orders: Sequence[Order], traces: Sequence[EpisodeTrace], *, device: str, seed: int
+) -> dict[int, dict[str, Any]]:
+    """Drives that ended in a collision driven again with whom they hit found where it is: does that one error decide?
+
+    Args:
+        orders: What was driven.
+        traces: What happened.
+        device: See `drive_perceiving`.
+        seed: See `drive_perceiving`.
+
+    Returns:
+        By the drive's number: whether there is a collision now, and whether with the same agent.
+    """
+    first = {k: np.flatnonzero(trace.contact_agent > 0) for k, trace in enumerate(traces)}
+    hit = {k: int(traces[k].contact_agent[steps[0]]) for k, steps in first.items() if len(steps)}
+    if not hit:
+        return {}
+    repair = Repair(dict(enumerate(hit.values())))
+    _, again, _ = drive_perceiving([orders[k] for k in hit], device=device, seed=seed, repair=repair, every=None)
+    return {
+        k: {
+            "collision": bool(episode_metrics(one, stop_signs=False).collision),
+            "same": bool((one.contact_agent == agent).any()),
+        }
+        for (k, agent), one in zip(hit.items(), again, strict=True)
+    }
+
+
+def _paired(order: Order) -> str:
+    """Pictures are keyed by the episode: conditions of one drive must share their noise and weather."""
+    return digest("gap", order.spec["scenario"]["name"], order.seed)[:16]
+
+
+@lru_cache(maxsize=4)
+def _detector(name: str, weights: str | None, width: int | None, device: str = "cpu") -> Any:
+    """A detector, made once a process."""
+    from ssad.detectors import make_detector
+
+    options: dict[str, Any] = {} if width is None else {"input_width": width}
+    return make_detector(name, weights=weights, device=device, **options)

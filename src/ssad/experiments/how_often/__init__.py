@@ -1,0 +1,1 @@
+"""Experiment `how-often`: failure rates of driving systems in random traffic."""

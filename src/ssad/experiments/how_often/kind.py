@@ -1,0 +1,137 @@
+"""Kind `how-often`: how often a driving system fails where traffic has chance in it, by several estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import product
+from typing import Any, Literal
+
+from pydantic import Field
+
+from ssad.core.errors import ConfigError
+from ssad.core.machine import quiet_warp
+from ssad.core.safeio import plain
+from ssad.core.schema import Schema
+from ssad.core.traces import save_trace
+from ssad.core.types import EpisodeTrace
+from ssad.engine.kind import Cell, Column, Job, Names, Plan
+from ssad.experiments.how_often.failure_rate import ChanceEpisode, Method
+from ssad.experiments.how_often.verdict import verdict
+from ssad.experiments.scenario_kind import ScenarioKind, ScenarioSuite, described
+from ssad.report.load import Run
+from ssad.simulators.closed_loop import system_of, system_version, town
+
+SETTINGS = ("episodes", "particles", "repeats", "components", "batch")  # of the estimators, as suites name them
+
+
+class NoiseSuite(Schema):
+    """The chance in traffic: `ssad.world.noise.Noise`, in its own words."""
+
+    accel: float = Field(default=0.0, ge=0.0, le=10.0)
+    accel_time: float = Field(default=1.0, gt=0.0)
+    lapse: float = Field(default=0.0, ge=0.0, le=0.5)
+    careless: float = Field(default=0.0, ge=0.0, le=0.5)
+    choice_time: float = Field(default=1.0, gt=0.0)
+
+
+class HowOftenSuite(ScenarioSuite):
+    """Failure probabilities: scenarios x systems x methods.
+
+    Attributes:
+        systems: driving systems under test, such that remember nothing: the Autopilot, the blind one, learned policies.
+        noise: the chance in traffic.
+        methods: estimators; each gets cells of its own.
+        episodes: of Monte Carlo, and of importance sampling after it has learned.
+        particles: of each repeat of splitting, and of the splitting that a proposal is first learned from.
+        repeats: of splitting, independent of each other; at least 8 for an interval.
+        components: of the learned proposal.
+        batch: episodes side by side.
+    """
+
+    kind: Literal["how-often"] = "how-often"
+    systems: Names
+    noise: NoiseSuite = NoiseSuite()
+    methods: list[Method] = Field(default=["monte-carlo", "splitting", "importance"], min_length=1)
+    episodes: int = Field(default=4000, ge=10)
+    particles: int = Field(default=200, ge=10, le=100_000)
+    repeats: int = Field(default=10, ge=1, le=1000)
+    components: int = Field(default=4, ge=1, le=20)
+    batch: int = Field(default=500, ge=1, le=1 << 21)
+
+
+class HowOften(ScenarioKind):
+    """See the module."""
+
+    name = "how-often"
+    suite = HowOftenSuite
+    factors = ("system", "group", "method")
+    columns = (
+        Column("per_million", "collisions in a million episodes", "", "lower"),
+        Column("low", "lower 95 % limit"),
+        Column("high", "upper 95 % limit"),
+        Column("effective", "effective number of collisions", "", "higher"),
+        Column("events", "collisions simulated"),
+        Column("episodes", "episodes"),
+        Column("work", "million agent-steps"),
+        Column("training", "of these for learning"),
+        Column("hours", "simulated", "h"),
+        Column("km", "simulated", "km"),
+        Column("per_hour", "collisions in 1,000 h", "", "lower"),
+        Column("per_km", "collisions in 1,000 km", "", "lower"),
+    )
+
+    def plan(self, suite: HowOftenSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Systems, scenarios and towns are looked up; with `check`, each is tried once."""
+        systems = {name: system_version(name) for name in suite.systems}
+        scenarios, towns = described(suite)
+        settings = {"noise": suite.noise.model_dump()} | {name: getattr(suite, name) for name in SETTINGS}
+        cells = tuple(
+            self.scenario_cell(
+                suite,
+                one,
+                systems[system],
+                title=f"{method}/{system}/{one.scenario.name}",
+                system=system,
+                chance=("how often", method),
+                fields={"method": method},
+                method=method,
+                **settings,
+            )
+            for system, one, method in product(suite.systems, scenarios, suite.methods)
+        )
+        if check:
+            for cell in cells:
+                chance_of(cell, device).process(1)
+        return Plan(self, suite, device, cells, {"towns": towns, "systems": systems})
+
+    def result(self, cell: Cell, job: Job) -> dict[str, Any]:
+        """Estimates the probability; keeps the likeliest collision that was found."""
+        quiet_warp()
+        chance = chance_of(cell, job.device)
+        metrics, crash = chance.estimate(cell.spec["method"], **{name: cell.spec[name] for name in SETTINGS})
+        result: dict[str, Any] = {"metrics": plain(metrics), "case": cell.key, "n": metrics["episodes"]}
+        if crash is None:
+            return result
+        artefact = f"traces/{cell.key}.npz"
+        save_trace(job.folder / artefact, chance.run_again(crash))
+        return result | {"crash": crash, "artefacts": {"trace": artefact}}
+
+    def drive_again(self, plan: Plan, cell: Cell, record: Mapping[str, Any]) -> EpisodeTrace:
+        """Drives the collision that was kept again. ConfigError: there is none."""
+        if "crash" not in record:
+            raise ConfigError(f"cell {cell.key} ({cell.name}) has found no collision to replay")
+        return chance_of(cell, plan.device).run_again(record["crash"])
+
+    def verdict(self, run: Run) -> list[str]:
+        """Findings of a run in sentences."""
+        return verdict(run)
+
+
+def chance_of(cell: Cell, device: str) -> ChanceEpisode:
+    """The scenario of a cell, with its driver and its noise."""
+    from ssad.scenarios.dynamic import build_episode, scenario_from
+
+    scenario = scenario_from(cell.spec["scenario"])
+    graph = town(scenario.town)
+    episode = build_episode(scenario, graph, seed=scenario.seed)
+    return ChanceEpisode(episode, graph, system_of(cell.system), cell.spec["noise"], device, cell.seed)

@@ -1,0 +1,1 @@
+"""Open-loop experiments: detectors on recorded data under perturbations."""

@@ -1,0 +1,1 @@
+"""Preset `digital`: 3D detectors under digital attacks."""

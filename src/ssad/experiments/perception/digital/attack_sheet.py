@@ -1,0 +1,74 @@
+"""What a detector sees under digital attacks: one moment, what was changed, and its boxes before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from ssad.core.images import read_image
+from ssad.core.types import U8
+from ssad.datasets.drawing import title_on
+from ssad.datasets.nuscenes.camera_truth import scenes_of
+from ssad.datasets.nuscenes.reader import NuScenes
+from ssad.experiments.perception.digital.attacked_scenes import AttackedScene, AttackSpec, SceneAttacker
+from ssad.experiments.perception.scene_boxes import Examination, Watched, detector_of
+from ssad.experiments.perception.sheets import WIDTH, richest, tile
+
+
+def attack_sheet(examination: Examination, split: str, specs: Sequence[AttackSpec]) -> U8:
+    """A row for the clean moment and for each attack: the picture, its change, and what the detector finds in it.
+
+    Args:
+        examination: data, detector, device, seed.
+        split: of which the moment with most to see is taken.
+        specs: the attacks; one that the detector gives no gradient for has no row.
+
+    Returns:
+        Picture [H, W, 3], RGB.
+
+    Raises:
+        FormatError: a picture cannot be read.
+    """
+    name, weights = examination.detectors[0]
+    detector = detector_of(name, weights, examination.device)
+    rows = []
+    with NuScenes(examination.root, examination.version) as data:
+        scene, frame = richest(data, scenes_of(data, split))
+        clean = read_image(examination.root / frame.filename)
+        for spec in [None, *specs]:
+            watched, picture = Watched(detector), clean
+            if spec is not None:
+                attacker = SceneAttacker(AttackedScene(spec, scene.record.name), examination, scene, watched)
+                (picture,) = attacker.look([frame])
+                if watched.reason:
+                    continue
+            title = "clean" if spec is None else f"{spec.attack}, loss {spec.loss}, {spec.radius:g} px {spec.norm}"
+            title += f", {spec.target}" if spec and spec.target else ""
+            seen = tile((watched, examination.device), scene, frame, picture, title="what it finds")
+            change = magnified(picture, clean)
+            rows.append(np.concatenate([_shrunk(picture, title), _shrunk(change, "change, magnified"), seen], 1))
+    return np.concatenate(rows)
+
+
+def magnified(picture: U8, clean: U8) -> U8:
+    """The change of a picture around middle grey, its largest value made black or white.
+
+    Args:
+        picture: [H, W, 3].
+        clean: [H, W, 3].
+
+    Returns:
+        [H, W, 3].
+    """
+    change = picture.astype(np.float64) - clean
+    return np.asarray(np.rint(127.5 + 127.5 * change / max(float(np.abs(change).max()), 1.0)), np.uint8)
+
+
+def _shrunk(picture: U8, title: str) -> U8:
+    """A picture at the width of a tile, with its name; not averaged, so that noise stays noise."""
+    size = (WIDTH, round(picture.shape[0] * WIDTH / picture.shape[1]))
+    canvas = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST))
+    title_on(canvas, title)
+    return canvas

@@ -1,0 +1,1 @@
+"""Preset `physical`: detectors under textures and lights on a target."""

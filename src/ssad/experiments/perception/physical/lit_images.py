@@ -1,0 +1,186 @@
+"""Recorded pictures at another hour, with lamps and shadows on their target: as functions of light, and in full."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, Self
+
+import torch
+from torch import Tensor
+
+from ssad.core.detections import Truth
+from ssad.core.images import decode_image, encode_jpeg
+from ssad.core.types import U8
+from ssad.experiments.perception.physical.target_views import TargetClips, drive_of, target_truth
+from ssad.experiments.perception.physical.textured_images import BLOCK, MARGIN, TexturedClip, seen_part
+from ssad.recorders.target_images import TARGET, ClipView, clip_rows, clip_views
+from ssad.rendering.camera.render import Weather, render
+from ssad.rendering.camera.scene import Scene
+from ssad.rendering.camera.scene_edit import NO_EDIT, SceneEdit, render_with
+from ssad.rendering.hours import at_hour
+from ssad.scenarios.static.physical.lights.light import Target
+from ssad.scenarios.static.physical.lights.lit_image import BLIND, LitPicture, lit_picture
+
+QUALITY: Final = 92  # of JPEG, as it is recorded
+
+
+@dataclass(frozen=True, slots=True)
+class LitClip:
+    """A recorded picture at an hour.
+
+    Attributes:
+        clip: The picture.
+        scene: Its street and bodies, and `BLIND`.
+        cards: Index of `BLIND` in the scene.
+    """
+
+    clip: ClipView
+    scene: Scene
+    cards: int
+
+    @property
+    def target(self) -> Target:
+        """The size of the target."""
+        length, width, height = self.clip.row["target_size"]
+        return Target(length, width, height)
+
+    def render(self, edit: SceneEdit = NO_EDIT) -> U8:
+        """The picture [H, W, 3] with an edit, as the recorder would have written it."""
+        scene, first = self.scene, self.cards + 1
+        if edit.cards:
+            key = ("cards", *((card.away, card.outline.tobytes()) for card in edit.cards))
+            scene = self.scene.kept(
+                key, lambda: Scene(self.scene.street, [*self.scene.meshes, *edit.meshes()], device=self.scene.device)
+            )
+        view = edit.on(self.clip.view, TARGET, cards=range(first, first + len(edit.cards)))
+        picture = render_with(scene, [view], edit.textures, edit.masks)
+        return decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+
+    def projected(self, edit: SceneEdit) -> TexturedClip:
+        """The picture as a function of what the lamps of an edit project; it can be prepared and shown as any other."""
+        picture = render(self.scene, [edit.on(self.clip.view, TARGET)])
+        arrays = seen_part(picture)
+        corner = int(arrays["corner"][0]), int(arrays["corner"][1])
+        image = decode_image(encode_jpeg(picture.image[0], QUALITY, "420"))
+        return TexturedClip(
+            self.clip.file,
+            self.clip.row,
+            self.clip.objects,
+            image,
+            corner,
+            arrays["radiance"],
+            float(arrays["exposure"]),
+            arrays["fragments"],
+        )
+
+    def lit(self, device: str | torch.device = "cpu") -> LitPicture:
+        """The picture as a function of the light on its target."""
+        rows, columns = _part(self.clip)
+        return lit_picture(self.scene, self.clip.view, TARGET, rows, columns, blind=self.cards, device=device)
+
+
+def _part(clip: ClipView) -> tuple[slice, slice]:
+    """The rows and columns around the target that light on it can change: its box, and half as much to each side."""
+    (x, y, wide, high) = next(one["bbox"] for one in clip.objects if one["target"])
+    height, width = clip.view.camera.height, clip.view.camera.width
+    reach = max(wide, high) / 2 + MARGIN / 2
+    found = []
+    for low, side, most in ((y, high, height), (x, wide, width)):
+        first = max(int(low - reach), 0) // BLOCK * BLOCK
+        found.append(slice(first, min(int(low + side + reach) + 1, most) // 2 * 2))
+    return found[0], found[1]
+
+
+def lit_clips(
+    folder: Path,
+    hour: str,
+    *,
+    device: str = "cpu",
+    count: int | None = None,
+    split: str = "all",
+    stages: dict[Any, Any] | None = None,
+) -> Iterator[LitClip]:
+    """The pictures of a recording at an hour, in order.
+
+    Args:
+        folder: What `record_clips` wrote.
+        hour: See `HOURS`.
+        device: Where to render.
+        count: How many; None for all.
+        split: train, test or all.
+        stages: See `clip_views`.
+
+    Raises:
+        FormatError: No recording of this version.
+        UnknownNameError: There is no such hour.
+    """
+    at_hour(Weather(), hour)
+    wanted = {row["file_name"] for row, _ in clip_rows(folder, split)[:count]}
+    made: tuple[Scene, Scene] | None = None
+    for clip in clip_views(
+        folder,
+        split=split,
+        device=device,
+        only=wanted,
+        hour=lambda weather, heading: at_hour(weather, hour, heading),
+        stages=stages,
+    ):
+        if made is None or made[0] is not clip.scene:
+            made = clip.scene, Scene(clip.scene.street, [*clip.scene.meshes, BLIND.mesh()], device=device)
+        yield LitClip(clip, made[1], len(clip.scene.meshes))
+
+
+@dataclass(frozen=True, slots=True)
+class LitPictures:
+    """The first pictures of a recording at an hour, for a detector.
+
+    Attributes:
+        folder: What `record_clips` wrote.
+        hour: See `HOURS`.
+        count: Number of pictures.
+        classes: Names of the detector's classes, in its order.
+        device: Where they are rendered and shown.
+    """
+
+    folder: Path
+    hour: str
+    count: int
+    classes: tuple[str, ...]
+    device: str = "cpu"
+
+    @classmethod
+    def of(cls, clips: TargetClips, hour: str) -> Self:
+        """The same pictures at an hour."""
+        return cls(clips.folder, hour, clips.count, clips.classes, clips.device)
+
+    def clips(self) -> tuple[LitClip, ...]:
+        """Kept, since their scenes take longer to make than their pictures. FormatError as for `lit_clips`."""
+        return _kept(self.folder, self.hour, self.count, self.device)
+
+    def truth(self, clip: LitClip) -> Truth:
+        """What is annotated in a picture, the target first."""
+        return target_truth(clip.clip.row, clip.clip.objects, self.classes)
+
+    def under(self, edit: SceneEdit) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, with an edit around the target."""
+        for clip in self.clips():
+            image = torch.from_numpy(clip.render(edit)).to(self.device).permute(2, 0, 1)[None].float() / 255
+            yield drive_of(clip.clip.row), image, self.truth(clip)
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """The same without an edit."""
+        return self.under(NO_EDIT)
+
+
+@lru_cache(maxsize=4)
+def _kept(folder: Path, hour: str, count: int, device: str) -> tuple[LitClip, ...]:
+    return tuple(lit_clips(folder, hour, count=count, device=device, stages=_stages(folder, device)))
+
+
+@lru_cache(maxsize=2)
+def _stages(folder: Path, device: str) -> dict[Any, Any]:
+    """The scenes of a recording, which are the same at all hours."""
+    return {}

@@ -1,0 +1,454 @@
+"""The page of a physical run: textures on a car, the paper's two tables beside ours, controls, heat maps, pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from ssad.experiments.perception.physical.heatmap import HeatMap, heat_maps
+from ssad.metrics import replicate_difference
+from ssad.report.artefacts import pictures
+from ssad.report.load import Run
+from ssad.report.pages import render
+from ssad.report.paper import PHYSICAL as PUBLISHED
+from ssad.report.tables import Cell, Row, Table
+
+TEMPLATE = Path(__file__).with_name("page.html")
+
+SOURCE = "published by the paper: CARLA, YoloV5 and YoloV3 fine-tuned there, a camera 20 m behind"
+TITLES = {"adv-patch": "Adv. Patch", "das": "DAS", "tpa": "TPA", "vanishing": "vanishing (strong)"}
+PAPER = {
+    ("clean", ""): "Benign",
+    ("random", "patch"): "Random patch",
+    ("adv-patch", "patch"): "Adv. Patch",
+    ("random", "camouflage"): "Random camouflage",
+    ("das", "camouflage"): "DAS",
+    ("tpa", "camouflage"): "TPA",
+}
+DETECTORS = {"yolov5": "YoloV5", "yolov3": "YoloV3"}  # how a detector's name begins -> its column in the paper
+BESIDE = {"Oldmarket": "Town04", "Larkhill": "Town03"}  # town of a test -> the paper's that stands in its place
+LIGHT = "light, "  # carriers of light attacks begin so; the hour follows
+CONTROLS = ("random", "noise", "grey", "shuffled")
+SCORES = {"AP50": "AP50", "AP50_25": "AP50 > 0.25", "ASR_25": "ASR", "ASR_any_25": "ASR, any class"}
+OTHERS = {
+    "ASR_50": "ASR at 0.5",
+    "AP50_all": "AP50, whole class",
+    "AP50_all_25": "AP50 > 0.25, whole class",
+    "ASR_all_25": "ASR, whole class",
+    "confidence": "mean score",
+}
+
+Line = Mapping[str, Any]
+Shown = tuple[str, str, str]
+"""Attack, carrier, and the detector that it was trained against ("" for what is not trained)."""
+
+
+@dataclass(frozen=True)
+class PhysicalRun:
+    """A physical run and its records, several of a control that was drawn several times."""
+
+    run: Run
+
+    @cached_property
+    def records(self) -> Mapping[tuple[str, str, str, Shown], list[Line]]:
+        """By town of the test, view, detector, and what it was shown."""
+        found: dict[tuple[str, str, str, Shown], list[Line]] = {}
+        for line in self.run.lines:
+            shown = (line["attack"], line["carrier"], line["source"])
+            found.setdefault((line["test"], line.get("view", "drive"), line["detector"], shown), []).append(line)
+        return found
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Towns of training and test."""
+        return list(dict.fromkeys((line["train"], line["test"]) for line in self.run.lines))
+
+    @property
+    def detectors(self) -> list[str]:
+        """Those that textures were trained against."""
+        return list(self.run.suite["detectors"])
+
+    @property
+    def judges(self) -> list[str]:
+        """All that were shown textures."""
+        return list(dict.fromkeys(line["detector"] for line in self.run.lines))
+
+    @property
+    def attacks(self) -> list[tuple[str, str]]:
+        """Attacks and controls with their carriers, in the order of the suite, clean first."""
+        return list(dict.fromkeys((line["attack"], line["carrier"]) for line in self.run.lines))
+
+    def lines(
+        self, test: str, view: str, detector: str, attack: tuple[str, str], source: str | None = None
+    ) -> list[Line]:
+        """Records of an attack on a detector, of a texture that was trained against itself unless a source is said."""
+        for known in ((detector if source is None else source), ""):
+            found = self.records.get((test, view, detector, (*attack, known)))
+            if found:
+                return [line for line in found if line["status"] == "ok"]
+        return []
+
+
+def title_of(attack: tuple[str, str]) -> str:
+    """What people call an attack or control on a carrier."""
+    name, carrier = attack
+    first, _, rest = name.partition(" ")
+    if carrier.startswith(LIGHT):
+        return f"{name}, {carrier.removeprefix(LIGHT)}"
+    _, _, options = carrier.partition(", ")
+    if first == "shuffled":
+        title = f"shuffled {_attack(rest)}"
+    elif name in CONTROLS:
+        return f"{name} {carrier}"
+    else:
+        title = _attack(name)
+    return f"{title}, {options}" if options else title
+
+
+def _attack(name: str) -> str:
+    """The title of an attack's name, which may end in ", all sides"."""
+    first, comma, rest = name.partition(", ")
+    return f"{TITLES.get(first, first)}{comma}{rest}"
+
+
+def score(lines: Sequence[Line], metric: str) -> Cell:
+    """A metric in percent, the mean over draws of a control, and how sure it is.
+
+    The interval is over drives; of several draws it goes from the lowest to the highest end of theirs, so that it
+    covers drives and draws. Where a draw has none it is the range of the draws.
+    """
+    own = [line for line in lines if line["metrics"].get(metric) is not None]
+    if not own:
+        return Cell(math.nan)
+    known = [100.0 * float(line["metrics"][metric]) for line in own]
+    mean, n = math.fsum(known) / len(known), int(own[0]["n"])
+    limits = [ends for line in own if (ends := (line.get("intervals") or {}).get(metric))]
+    if len(limits) < len(own) > 1:
+        return Cell(mean, min(known), max(known), n, clusters=len(known), method="range")
+    low = 100.0 * min((float(ends[0]) for ends in limits), default=math.nan)
+    high = 100.0 * max((float(ends[1]) for ends in limits), default=math.nan)
+    return Cell(mean, low, high, n, clusters=int(own[0]["drives"]), method="given")
+
+
+def main_table(run: PhysicalRun, number: int) -> Table:
+    """Attack x detector in one pair of towns, as the paper's table, with its rows between ours."""
+    train, test = run.pairs[number]
+    told = BESIDE.get(test, dict(enumerate(PUBLISHED)).get(number)) if run.run.suite.get("reference") else None
+    names = [next((v for k, v in DETECTORS.items() if d.startswith(k)), "") for d in run.detectors]
+    rows = []
+    known = {metric for line in run.run.lines for metric in line.get("metrics") or ()}
+    scores = {metric: title for metric, title in SCORES.items() if metric in known or metric != "ASR_any_25"}
+    for attack in run.attacks:
+        cells = [
+            score(run.lines(test, "drive", detector, attack), metric) for detector in run.detectors for metric in scores
+        ]
+        rows.append(Row((title_of(attack),), tuple(cells)))
+        if told and attack in PAPER and any(names):
+            own = PUBLISHED[told][PAPER[attack]]
+            cells = []
+            for name in names:
+                precision, rate = own.get(name, (math.nan, None))
+                printed = {"AP50": precision, "ASR_25": math.nan if rate is None else rate}
+                cells += [Cell(printed.get(metric, math.nan)) for metric in scores]
+            rows.append(Row((f"{PAPER[attack]}, {told}",), tuple(cells), published=True))
+    columns = tuple(f"{detector} {title}" for detector in run.detectors for title in scores.values())
+    note = (
+        f"Percent, of the target alone, {_place(run.run.suite)}. AP50 counts "
+        "boxes of any score, AP50 > 0.25 those above it; ASR is the share of the targets found clean above 0.25 and "
+        "not found attacked; any class: and no box of any class above 0.25 covers a quarter of them. [a, b]: 95 % "
+        "interval over drives, of several draws of a control from the lowest to the highest end of theirs; a–b: the "
+        "range over the draws, where drives are too few for intervals."
+    )
+    if told:
+        note += (
+            f" Shaded rows: {SOURCE}, {told}. Other towns, pictures and detectors: what can be compared is the order."
+        )
+    title = f"Trained in {train}, tested in {test}"
+    return Table(f"physical-{test.lower()}", title, ("Attack",), columns, tuple(rows), note, SOURCE)
+
+
+def _place(suite: Mapping[str, Any]) -> str:
+    """From where the pictures of a test are taken."""
+    kind = str(suite.get("target", "")).partition(":")[0]
+    distances = ", ".join(f"{one:g}" for one in suite.get("distances", ()))
+    if kind == "stop_sign":
+        return f"{distances} m before it, as cars see it"
+    if kind == "pedestrian":
+        return f"{distances} m from it on all sides, as cars see it"
+    return f"from {float(suite['behind']):g} m behind it as it drives"
+
+
+def margin_table(run: PhysicalRun) -> Table:
+    """Each trained texture against that draw of a control of its carrier which comes nearest to it."""
+    rows = []
+    for (_, test), detector in ((pair, d) for pair in run.pairs for d in run.detectors):
+        for attack in run.attacks:
+            name, carrier = attack
+            own = [] if name == "clean" or is_control(name) else run.lines(test, "drive", detector, attack)
+            controls = [other for other in run.attacks if other[1] == carrier and learns_nothing(other[0], name)]
+            gaps = [
+                (paired_gap(draw, line), other)
+                for other, line in product(controls, own)
+                for draw in run.lines(test, "drive", detector, other)
+            ]
+            if gaps:
+                gap, best = min(gaps, key=lambda one: lower(one[0]))
+                cells = score(own, "AP50"), score(run.lines(test, "drive", detector, best), "AP50"), gap
+                rows.append(Row((test, detector, title_of(attack), title_of(best)), cells))
+    note = (
+        "AP50 in percent. The difference is what a control leaves less what the attack leaves in the same pictures; "
+        "its interval is of paired replicates of the bootstrap over drives. Of all controls and all their draws it is "
+        "that with the least lower end; above 0 the attack is stronger than all that learns nothing."
+    )
+    heads = ("Town", "Detector", "Attack", "Nearest control")
+    return Table("margins", "Attacks against controls", heads, ("attack", "control", "difference"), tuple(rows), note)
+
+
+def is_control(name: str) -> bool:
+    """Whether a row such as "shuffled das" or "random laser" has learned nothing."""
+    return name.split(maxsplit=1)[0] in CONTROLS
+
+
+def learns_nothing(control: str, attack: str) -> bool:
+    """Whether it is a control of an attack; of a light ("random laser") only of its own kind ("laser, searches 4")."""
+    first, _, rest = control.partition(" ")
+    return first in CONTROLS and (first != "random" or rest in ("", attack.partition(", ")[0]))
+
+
+def lower(cell: Cell) -> float:
+    """The lower end of a cell's interval, or its number."""
+    return cell.mean if math.isnan(cell.low) else cell.low
+
+
+def transfer_table(run: PhysicalRun) -> Table:
+    """Textures trained against one detector, shown to all; beside them the clean target and controls."""
+    sources = list(dict.fromkeys(["", *run.detectors, *(shown[2] for *_, shown in run.records)]))
+    rows = []
+    for _, test in run.pairs:
+        own = []
+        for attack, source in product(run.attacks, sources):
+            found = [run.records.get((test, "drive", d, (*attack, source))) for d in run.judges]
+            if sum(bool(lines) for lines in found) >= 2:
+                cells = [score([one for one in lines or () if one["status"] == "ok"], "AP50") for lines in found]
+                own.append(Row((test, title_of(attack), source), tuple(cells)))
+        rows += own if any(row.head[2] for row in own) else []
+    note = "AP50 in percent of the target; n/a where the detector does not find the clean target often enough."
+    heads = ("Town", "Attack", "Trained against")
+    return Table("transfer", "Transfer between detectors", heads, tuple(run.judges), tuple(rows), note)
+
+
+def others_table(run: PhysicalRun) -> Table:
+    """The other scores: at a higher confidence, and of its whole class."""
+    rows = []
+    for _, test in run.pairs:
+        for detector in run.judges:
+            for attack in run.attacks:
+                lines = run.lines(test, "drive", detector, attack)
+                if lines:
+                    cells = (*(score(lines, metric) for metric in OTHERS), _difference(lines))
+                    rows.append(Row((test, detector, title_of(attack)), cells))
+    heads, columns = ("Town", "Detector", "Attack"), (*OTHERS.values(), "colour difference")
+    note = (
+        "Percent; the colour difference (CIE 1976) is the mean between a texture and the paint that it covers: 0 for "
+        "the paint itself, 100 for white on black."
+    )
+    return Table("others", "Other scores", heads, columns, tuple(rows), note)
+
+
+def _difference(lines: Sequence[Line]) -> Cell:
+    """How far the colours of a texture are from what it covers, the mean over draws of a control."""
+    known = [float(line["delta_e"]) for line in lines if line.get("delta_e") is not None]
+    return Cell(math.fsum(known) / len(known)) if known else Cell(math.nan)
+
+
+def grid_table(run: PhysicalRun) -> Table:
+    """All views of the grid together, and the cell in which an attack does least."""
+    rows = []
+    for (test, view, detector, shown), lines in run.records.items():
+        good = [line for line in lines if line["status"] == "ok"]
+        if view != "grid" or not good:
+            continue
+        worst = [line["worst"] for line in good if line["worst"]]
+        cell = max(worst, key=lambda one: one[2]) if worst else None
+        where = f"{cell[0]:g} m, {cell[1]:g}°" if cell else ""
+        head = (test, detector, title_of(shown[:2]), shown[2] if shown[2] != detector else "", where)
+        rows.append(Row(head, (score(good, "AP50"), score(good, "ASR_25"), Cell(100 * cell[2] if cell else math.nan))))
+    note = (
+        "Percent. The worst cell of distance and azimuth (0° is the front, 90° the left) is the one in which the "
+        "attack does least; of the clean pictures the one in which the detector does."
+    )
+    heads = ("Town", "Detector", "Attack", "Trained against", "Worst cell")
+    return Table("grid", "Views from all around", heads, ("AP50", "ASR", "AP50 in the worst cell"), tuple(rows), note)
+
+
+def comparison_table(run: PhysicalRun) -> Table:
+    """In each town and view the strongest attack with a carrier beside each other one, with the paired difference."""
+    rows = []
+    carriers = list(dict.fromkeys(carrier for _, carrier in run.attacks))
+    for (_, test), view, detector, carrier in product(run.pairs, ("drive", "grid"), run.detectors, carriers):
+        own = {}
+        for attack in run.attacks:
+            lines = [] if is_control(attack[0]) else run.lines(test, view, detector, attack)
+            if attack[1] == carrier and lines and lines[0]["source"] and lines[0].get("replicates"):
+                own[attack] = lines[0]
+        best = min(own, key=lambda attack: own[attack]["metrics"]["AP50"], default=("", ""))
+        for attack, line in own.items():
+            if attack != best:
+                cells = score([own[best]], "AP50"), score([line], "AP50"), paired_gap(line, own[best])
+                head = (test, "all around" if view == "grid" else "behind", detector, title_of(best), title_of(attack))
+                rows.append(Row(head, cells))
+    note = (
+        "AP50 in percent. The difference is what the other leaves less what the strongest leaves in the same pictures. "
+        "Its interval is of paired replicates of the bootstrap over drives, so it can exclude zero where the two "
+        "intervals overlap: some drives are harder for both."
+    )
+    heads, columns = ("Town", "View", "Detector", "Strongest", "Other"), ("strongest", "other", "difference")
+    return Table("comparison", "Attacks against each other", heads, columns, tuple(rows), note)
+
+
+def paired_gap(more: Line, less: Line) -> Cell:
+    """Difference of the AP50 of two records in percent; its interval where both are of the same pictures."""
+    gap, n, drives = more["metrics"]["AP50"] - less["metrics"]["AP50"], int(more["n"]), int(more["drives"])
+    if (n, drives) != (less["n"], less["drives"]) or not (more.get("replicates") and less.get("replicates")):
+        return Cell(100.0 * gap)
+    pairs = zip(*(line["replicates"]["AP50"] for line in (more, less)), strict=False)
+    return Cell.of(replicate_difference(gap, [a - b for a, b in pairs], n=n, clusters=drives).scaled(100.0))
+
+
+def effort_table(run: PhysicalRun) -> Table:
+    """How the textures were trained."""
+    rows = {}
+    for line in run.run.lines:
+        if line["status"] == "ok" and "epochs" in line and line["attack"].split()[0] not in CONTROLS:
+            head = (line["train"], line["source"], title_of((line["attack"], line["carrier"])))
+            names = ("epochs", "loss_before", "loss_after")
+            rows[head] = Row(head, tuple(Cell(float(line[name])) for name in names))
+    note = "The loss is ascended; means over the first and the last epoch, each picture with its own print and noise."
+    columns = ("epochs", "loss in the first epoch", "in the last")
+    return Table("effort", "Training", ("Town", "Detector", "Attack"), columns, tuple(rows.values()), note)
+
+
+def maps(run: PhysicalRun) -> list[tuple[str, str]]:
+    """For each town and detector: a title, and heat maps of the clean car beside the attacked one as SVG text."""
+    return _drawn(run, _map, "AP50 by distance and azimuth")
+
+
+def weather_maps(run: PhysicalRun) -> list[tuple[str, str]]:
+    """The same by elevation and weather: shares of the views in which the target is found above 0.25."""
+    return _drawn(run, _weather_map, "share of views in which the target is found, by elevation and weather")
+
+
+def _drawn(run: PhysicalRun, draw: Callable[..., HeatMap], label: str) -> list[tuple[str, str]]:
+    """For each town and detector: a title, and the maps of the attacks that were seen on the grid."""
+    found = []
+    for _, test in run.pairs:
+        for detector in run.detectors:
+            seen = [(attack, run.lines(test, "grid", detector, attack)) for attack in run.attacks]
+            drawn = [draw(lines[0], title_of(attack), clean=attack[0] == "clean") for attack, lines in seen if lines]
+            if drawn:
+                found.append((f"{detector}, {test}", heat_maps(drawn, label=f"{label}, {detector} in {test}")))
+    return found
+
+
+def _weather_map(line: Line, title: str, *, clean: bool) -> HeatMap:
+    """The map of a record by elevation and weather."""
+    sums: dict[tuple[str, str], list[bool]] = {}
+    for _, _, elevation, weather, before, after in line["views"]:
+        sums.setdefault((f"{elevation:g}°", weather), []).append((before if clean else after) > 0.25)
+    rows, columns = (list(dict.fromkeys(place[k] for place in sums)) for k in (0, 1))
+    values = {place: sum(own) / len(own) for place, own in sums.items()}
+    tips = {place: f"{title}: {sum(own)} of {len(own)} views" for place, own in sums.items()}
+    rows.sort(key=lambda text: float(text[:-1]))
+    return HeatMap(title, rows, sorted(columns), values, None, tips)
+
+
+def _map(line: Line, title: str, *, clean: bool) -> HeatMap:
+    """The map of a record."""
+    values: dict[tuple[str, str], float | None] = {}
+    tips = {}
+    for distance, azimuth, count, before, after in line["cells"]:
+        place = (f"{distance:g} m", f"{azimuth:g}°")
+        values[place] = before if clean else after
+        left = "n/a" if after is None else f"{100 * after:.1f}"
+        was = "n/a" if before is None else f"{100 * before:.1f}"
+        tips[place] = (
+            f"{title}, {place[0]}, {place[1]}: AP50 clean {was}{'' if clean else f', attacked {left}'}, {count} views"
+        )
+    rows, columns = (list(dict.fromkeys(place[k] for place in values)) for k in (0, 1))
+    worst = line["worst"]
+    marked = (f"{worst[0]:g} m", f"{worst[1]:g}°") if worst else None
+    return HeatMap(title, rows, columns, values, marked, tips)
+
+
+def tiles(run: PhysicalRun) -> list[dict[str, Any]]:
+    """For each detector that is attacked: the clean AP50 and the strongest attack, in the first town."""
+    _, test = run.pairs[0]
+    found = []
+    for detector in run.detectors:
+        scores = {attack: score(run.lines(test, "drive", detector, attack), "AP50") for attack in run.attacks}
+        trained = {
+            attack: cell
+            for attack, cell in scores.items()
+            if attack[0] != "clean" and attack[0].split()[0] not in CONTROLS and not math.isnan(cell.mean)
+        }
+        worst = min(trained, key=lambda attack: trained[attack].mean, default=None)
+        carrier = worst[1] if worst else ""
+        # of lights the clean pictures of their hour
+        clean = next(
+            (cell for (name, own), cell in scores.items() if name == "clean" and f"{carrier}, ".startswith(f"{own}, ")),
+            next((cell for (name, _), cell in scores.items() if name == "clean"), Cell(math.nan)),
+        )
+        found.append(
+            {
+                "name": detector,
+                "town": test,
+                "clean": clean,
+                "worst": title_of(worst) if worst else "none has run",
+                "left": trained[worst] if worst else Cell(math.nan),
+            }
+        )
+    return found
+
+
+def summary(found: Run) -> Table:
+    """The table that is shown on the terminal."""
+    return replace(main_table(PhysicalRun(found), 0), note="percent, of the target alone")
+
+
+def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+    """The page of a physical run and its tables."""
+    run = PhysicalRun(found)
+    main = [main_table(run, number) for number in range(len(run.pairs))]
+    margins, others, effort = margin_table(run), others_table(run), effort_table(run)
+    further = [table for table in (comparison_table(run), transfer_table(run), grid_table(run)) if table.rows]
+    page = render(
+        TEMPLATE,
+        found,
+        verdict=verdict,
+        main=main,
+        margins=margins,
+        further=further,
+        others=others,
+        effort=effort,
+        tiles=tiles(run),
+        maps=maps(run),
+        weathers=weather_maps(run),
+        pictures=pictures(found.folder),
+        failures=[
+            (
+                line["test"],
+                line["view"],
+                line["detector"],
+                title_of((line["attack"], line["carrier"])),
+                line["source"],
+                line.get("reason", ""),
+            )
+            for line in found.failures
+        ],
+    )
+    return page, [*main, margins, *further, others, effort]

@@ -1,0 +1,75 @@
+"""`ssad export texture` and `ssad export light`: what a cell of a physical run shows, for use outside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ssad.core.errors import ConfigError, StoreError
+from ssad.experiments.perception.physical.target_attacks import TargetAttacks, surface_of
+from ssad.scenarios.static.physical import TextureSpec
+from ssad.scenarios.static.physical.lights.export import Shining, export_light
+from ssad.scenarios.static.physical.lights.folder import LightSpec
+from ssad.scenarios.static.physical.textures.export import Print, export_texture
+
+
+def export_shown_texture(
+    attacks: TargetAttacks, row: Mapping[str, Any], out: Path, *, name: str, dots: int = 1000
+) -> list[Path]:
+    """Write the texture of a row.
+
+    Args:
+        attacks: Where it is kept.
+        row: Its spec, as of `TargetRow`.
+        out: Where to write.
+        name: What it is called.
+        dots: Of the print for each metre.
+
+    Returns:
+        What was written (see `ssad.scenarios.static.physical.textures.export.export_texture`).
+
+    Raises:
+        ConfigError: The row shows no texture.
+        StoreError: The texture has not been trained yet.
+    """
+    if row["attack"] is None:
+        if row.get("light", {}).get("attack"):
+            raise ConfigError(f"{name} shows a light: ssad export light writes it")
+        raise ConfigError(f"{name} shows no texture; choose one of an attack or control")
+    spec = TextureSpec.of_row(row)
+    if spec.trained and not attacks.textures.kept(spec).is_file():
+        raise StoreError(f"{attacks.folder}: the texture of {name} is not trained yet; run the suite")
+
+    def never() -> list[object]:
+        raise StoreError(f"{attacks.folder}: the texture of {name} is gone; run the suite again")
+
+    surface = surface_of(attacks.target, spec.surface)
+    colour = attacks.textures.texture(spec, surface, views=never, detector=never)  # type: ignore[arg-type]
+    return export_texture(out, Print(colour, spec.carrier, spec.options, attacks.target), dots=dots, name=name)
+
+
+def export_shown_light(attacks: TargetAttacks, row: Mapping[str, Any], out: Path, *, name: str) -> list[Path]:
+    """Write the light attack of a row.
+
+    Args:
+        attacks: Where it is kept.
+        row: Its spec, as of `TargetRow`.
+        out: Where to write.
+        name: What it is called.
+
+    Returns:
+        What was written (see `ssad.scenarios.static.physical.lights.export.export_light`).
+
+    Raises:
+        ConfigError: The row shows no light.
+        StoreError: The light has not been searched yet.
+    """
+    light = row.get("light")
+    if light is None or light["attack"] is None:
+        raise ConfigError(f"{name} shows no light; choose one of a light attack")
+    spec = LightSpec.of_row(light)
+    if not attacks.lights.kept(spec).is_file():
+        raise StoreError(f"{attacks.folder}: the light of {name} is not searched yet; run the suite")
+    values, colour = attacks.lights.found(spec)
+    return export_light(out, Shining(spec.device, spec.options, spec.hour, attacks.target, values, colour), name=name)

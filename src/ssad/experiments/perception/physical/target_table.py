@@ -1,0 +1,464 @@
+"""A table of physical attacks as a suite says it: what is recorded, and rows as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from ssad.core.errors import ConfigError
+from ssad.core.schema import Names, Schema
+from ssad.experiments.perception.digital.points import named
+from ssad.recorders.nuscenes import WEATHERS
+from ssad.recorders.target_recording import AZIMUTHS, ELEVATIONS, Clips
+from ssad.rendering.camera.render import Weather
+from ssad.rendering.hours import at_hour
+from ssad.rendering.target import Target, TargetCar, parse_target
+from ssad.scenarios.static.physical import CONTROLS, default_carrier, make_carrier, make_physical
+from ssad.scenarios.static.physical.lights import Projector, make_light
+from ssad.scenarios.static.physical.lights.folder import budget_of
+from ssad.scenarios.static.physical.textures.card import load_texture
+
+CLEAN, RANDOM = "clean", "random"
+GRID = "grid"
+VIEWS = ("drive", GRID)
+
+
+class Pair(Schema):
+    """Where textures are trained and where they are tested: two towns, and numbers of pictures."""
+
+    train: str
+    test: str
+    train_images: int = Field(default=600, ge=1)
+    test_images: int = Field(default=400, ge=1)
+
+    @model_validator(mode="after")
+    def _held_out(self) -> Self:
+        """What a texture was trained on says nothing of other pictures."""
+        if self.train == self.test:
+            raise ValueError(f"trained and tested in {self.train}: name another town for the test")
+        return self
+
+
+class Grid(Schema):
+    """Views from all around the target: each combination once in each town of a test.
+
+    Attributes:
+        distances: m.
+        azimuths: degrees from the front to the left of the target.
+        elevations: degrees.
+        weathers: kinds (`ssad.recorders.nuscenes.WEATHERS`).
+        towns: Of the tests that are seen from all around; None: all.
+    """
+
+    distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0, 30.0], min_length=1)
+    azimuths: list[float] = Field(default=list(AZIMUTHS), min_length=1)
+    elevations: list[float] = Field(default=list(ELEVATIONS), min_length=1)
+    weathers: list[str] = Field(default=list(WEATHERS), min_length=1)
+    towns: list[str] | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of views."""
+        return len(self.distances) * len(self.azimuths) * len(self.elevations) * len(self.weathers)
+
+
+class Entry(Schema):
+    """A row of the table.
+
+    Attributes:
+        name: an attack (`ssad.scenarios.static.physical`), or a control: random, noise, grey, shuffled.
+        carrier: patch, camouflage or road, with its settings as `options`; default: the attack's own.
+        options: of the carrier.
+        settings: fields of `TextureAttack` that differ; titles name those in which two rows of one attack differ.
+        around: pictures from all around the target, in the town of the training, that the texture is trained on beside
+            those from behind.
+        of: of the control shuffled: the attack whose texture is shuffled. Of several it is the one with the same
+            `around` and with all that is said here of carrier, options, settings and texture; of several such, the one
+            that says nothing beyond what the others say too.
+        texture: a shipped texture, or the card of one (NAME.json): it is shown in place of training; carrier, options
+            and the detector that it was trained against are those of the card.
+    """
+
+    name: str = Field(min_length=1)
+    carrier: Literal["patch", "camouflage", "road"] | None = None
+    options: dict[str, Any] = Field(default={})
+    settings: dict[str, Any] = Field(default={})
+    around: int = Field(default=0, ge=0)
+    of: str | None = None
+    texture: str | None = None
+
+
+class LightEntry(Schema):
+    """Rows of the table for one light: searched, and with settings drawn at random.
+
+    Attributes:
+        name: an attack (`ssad.scenarios.static.physical.lights`).
+        hour: noon, low_sun, night, or recorded: as the pictures were.
+        options: fields of the attack that differ.
+        settings: of its search (`Budget`); of a projector, of `TextureAttack`.
+    """
+
+    name: str = Field(min_length=1)
+    hour: str = "night"
+    options: dict[str, Any] = Field(default={})
+    settings: dict[str, Any] = Field(default={})
+
+
+class TargetTable(Schema):
+    """Textures on a target and lights on it, trained on drives in one town and tested in another.
+
+    Attributes:
+        name: of the table.
+        seed: root of all random numbers.
+        detectors: detectors with a class `car`, 2D or, for textures, 3D; of 3D detectors the hulls of their boxes in
+            the picture count.
+        judges: further detectors, 2D or 3D, that no texture is trained against and that all are shown to.
+        transfer: whether a texture is shown to the other detectors too.
+        target: a car, stop_sign or pedestrian, as for `ssad record --target`; what is no car is seen from all around.
+        pairs: towns.
+        attacks: names, or mappings with the keys of `Entry`.
+        lights: names of light attacks, or mappings with the keys of `LightEntry`.
+        epochs: of all trained textures, in place of their own; None: their own.
+        window: side of the part around the target that trainings show to a 2D detector, px, a multiple of 32; None:
+            whole pictures, as for 3D detectors always. A window of 192 takes a sixth of the time.
+        seeds: of each control that is drawn at random.
+        grid: views from all around, beside those from behind; None: none.
+        behind: m from the camera to a car that drives.
+        distances: m from the camera to a target that is no car.
+        size: of the pictures, px a side.
+    """
+
+    name: str
+    seed: int
+    detectors: Names = Field(default=["yolov5n", "yolov3-tiny"], min_length=1)
+    judges: list[str] = Field(default=[])
+    transfer: bool = False
+    target: str = "sedan:silver:0"
+    pairs: list[Pair] = Field(default=[Pair(train="Twinford", test="Oldmarket")], min_length=1)
+    attacks: list[Entry] = Field(default=[])
+    lights: list[LightEntry] = Field(default=[])
+    epochs: int | None = Field(default=None, ge=1)
+    window: int | None = None
+    seeds: int = Field(default=3, ge=1)
+    grid: Grid | None = None
+    behind: float = Field(default=20.0, ge=3.0, le=60.0)
+    distances: list[float] = Field(default=[5.0, 10.0, 15.0, 20.0], min_length=1)
+    size: int = Field(default=640, ge=64)
+
+    @field_validator("attacks", "lights", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        """A name alone is an attack with nothing else said."""
+        return named(value)
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        """There must be something to test."""
+        if not self.attacks and not self.lights:
+            raise ValueError("name attacks, lights or both")
+        return self
+
+    @property
+    def place(self) -> float | list[float]:
+        """Where the camera is: m behind a car, or the distances of what is no car."""
+        return self.behind if isinstance(parse_target(self.target), TargetCar) else self.distances
+
+    def seen_around(self, pair: Pair) -> bool:
+        """Whether the grid is seen in the test of a pair."""
+        return self.grid is not None and (self.grid.towns is None or pair.test in self.grid.towns)
+
+    def recordings(self, folder: Path, device: str) -> list[Clips]:
+        """What is recorded below a folder: drives of each town, the grid, and views from all around for trainings.
+
+        Raises:
+            ConfigError: A value that cannot be.
+            UnknownNameError: A town, or a weather.
+        """
+        images: dict[str, int] = {}
+        for pair in self.pairs:
+            for town, count in ((pair.train, pair.train_images), (pair.test, pair.test_images)):
+                images[town] = max(images.get(town, 0), count)
+        target = target_of(self)
+        usual = partial(Clips, held_out=(), target=target, size=self.size, seed=self.seed, device=device)
+        mode: Literal["drive", "orbit"] = "drive" if isinstance(target, TargetCar) else "orbit"
+        found = [
+            usual(
+                folder / "data" / town,
+                ((town, count),),
+                mode=mode,
+                behind=self.behind,
+                distances=tuple(self.distances),
+            )
+            for town, count in images.items()
+        ]
+        if self.grid is not None:
+            grid = self.grid
+            found += [
+                usual(
+                    folder / "data" / f"{town}-grid",
+                    ((town, grid.count),),
+                    mode="orbit",
+                    distances=tuple(grid.distances),
+                    azimuths=tuple(grid.azimuths),
+                    elevations=tuple(grid.elevations),
+                    weathers=tuple(grid.weathers),
+                )
+                for town in dict.fromkeys(pair.test for pair in self.pairs if self.seen_around(pair))
+            ]
+        further = max((entry.around for entry in self.attacks), default=0)
+        for town in dict.fromkeys(pair.train for pair in self.pairs) if further else ():
+            found.append(usual(folder / "data" / f"{town}-around", ((town, further),), mode="orbit"))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class TargetRow:
+    """What a detector is shown, as plain data.
+
+    Attributes:
+        title: Of the cell.
+        fields: Columns of its record.
+        spec: What it takes to make it: see `TextureSpec.of_row`, or `light` for `LightSpec.of_row`.
+    """
+
+    title: str
+    fields: Mapping[str, Any]
+    spec: Mapping[str, Any]
+
+
+def rows_of(table: TargetTable) -> Iterator[TargetRow]:
+    """All rows of a table: textures, each beside the clean pictures, then lights.
+
+    Raises:
+        UnknownNameError: There is no such attack.
+        ConfigError: An attack or a carrier has no such setting.
+    """
+    rows = [row_of(table, entry) for entry in table.attacks]
+    for row in rows:
+        try:
+            make_carrier(row["carrier"], row["options"]).on(target_of(table).mesh())
+        except ConfigError as error:
+            raise ConfigError(f"attack {row['attack']}: {error}") from None
+    titled = [({"attack": None}, CLEAN), *((row, _title(table, row, rows)) for row in rows)]
+    for pair, view, detector in product(table.pairs, VIEWS, [*table.detectors, *table.judges]):
+        if view == GRID and not table.seen_around(pair):
+            continue
+        for row, title in titled if rows or not table.lights else []:
+            yield from _texture_rows(table, pair, view, detector, row, title)
+    yield from _light_rows(table)
+
+
+def _texture_rows(  # noqa: PLR0917
+    table: TargetTable, pair: Pair, view: str, detector: str, row: Mapping[str, Any], called: str
+) -> Iterator[TargetRow]:
+    """A texture before a detector, from each detector that it is trained against, and with each seed."""
+    attack = row["attack"]
+    trained = attack is not None and (attack not in CONTROLS or row["of"] is not None)
+    moved = trained and ((table.transfer and row["of"] is None) or detector in table.judges)
+    sources = [row["source"]] if "file" in row else table.detectors if moved else [detector]
+    seeds = range(table.seeds) if attack in ("random", "noise", "shuffled") else (0,)
+    for source, seed in product(sources, seeds):
+        spec = {"pair": pair.model_dump(), "number": seed, "view": view, "file": None, "around": 0, **row}
+        spec["source"] = source if trained else ""
+        fields = {
+            "test": pair.test,
+            "train": pair.train,
+            "view": view,
+            "detector": detector,
+            "carrier": carrier_title(row),
+            "attack": called,
+            "source": spec["source"],
+            "number": seed,
+        }
+        words = [detector, pair.test, fields["attack"], fields["carrier"], source, seed]
+        title = "/".join(map(str, words)) + (f"/{GRID}" if view == GRID else "")
+        yield TargetRow(title, fields, spec)
+
+
+def _light_rows(table: TargetTable) -> Iterator[TargetRow]:
+    """For each hour the clean pictures, then each light and its controls."""
+    check_lights(table)
+    for pair, detector in product(table.pairs, table.detectors):
+        rows: list[dict[str, Any]] = [
+            {"attack": None, "of": None, "options": {}, "settings": {}, "hour": hour}
+            for hour in dict.fromkeys(entry.hour for entry in table.lights)
+        ]
+        for entry in table.lights:
+            own = {"of": None, "options": entry.options, "settings": entry.settings, "hour": entry.hour}
+            rows.append({"attack": entry.name, **own})
+            rows += [
+                {**own, "attack": RANDOM, "of": entry.name, "settings": {}, "number": number}
+                for number in range(table.seeds)
+            ]
+        for row in rows:
+            source = detector if row["attack"] not in (None, RANDOM) else ""
+            light = {"number": 0, **row, "source": source, "pair": pair.model_dump()}
+            fields = {
+                "test": pair.test,
+                "train": pair.train,
+                "view": "drive",
+                "detector": detector,
+                "carrier": carrier_title({**row, "carrier": f"light, {row['hour']}"}),
+                "attack": _light_title(table, row),
+                "source": source,
+                "number": light["number"],
+            }
+            words = [detector, pair.test, fields["attack"], row["hour"], options_title(row), light["number"]]
+            yield TargetRow("/".join(map(str, words)), fields, {"attack": None, "light": light})
+
+
+def _title(table: TargetTable, row: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
+    """What tables call a row: such as "shuffled vanishing, all sides", "das, stealth 0.5" or "vanishing, rate 0.01"."""
+
+    def place(one: Mapping[str, Any]) -> tuple[str, str, bool]:
+        return one["of"] or one["attack"], carrier_title(one), bool(one["around"])
+
+    def sources(one: Mapping[str, Any]) -> set[str]:
+        return {one["source"]} if "file" in one else set(table.detectors)
+
+    alike = [_said(table, one) for one in rows if place(one) == place(row) and sources(one) & sources(row)]
+    name, _, around = place(row)
+    sides, shuffled = ", all sides" if around else "", "shuffled " if row["of"] else ""
+    return f"{shuffled}{name}{sides}{_differing(_said(table, row), alike)}"
+
+
+def _said(table: TargetTable, row: Mapping[str, Any]) -> dict[str, Any]:
+    """What decides a row beside its attack, its carrier and what the whole table says."""
+    usual = {"epochs": table.epochs, "window": table.window}
+    more = {"around": row["around"] or None, "texture": row.get("file")}
+    return {key: value for key, value in {**row["settings"], **more}.items() if value != usual.get(key)}
+
+
+def _differing(own: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> str:
+    """Stealth, and what others do not say alike: such as ", rate 0.01"."""
+    told = (
+        (key, value)
+        for key, value in own.items()
+        if (key == "stealth" and value) or any(one.get(key) != value for one in others)
+    )
+    return "".join(f", {key} {_words(value)}" for key, value in told)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return " ".join(f"{key} {_words(one)}" for key, one in value.items())
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _light_title(table: TargetTable, row: Mapping[str, Any]) -> str:
+    if row["attack"] is None:
+        return CLEAN
+    if row["of"]:
+        return f"{RANDOM} {row['of']}"
+    place = row["attack"], row["hour"], row["options"]
+    alike = [one.settings for one in table.lights if (one.name, one.hour, one.options) == place]
+    return f"{row['attack']}{_differing(row['settings'], alike)}"
+
+
+def options_title(row: Mapping[str, Any]) -> str:
+    """The options of a light, in words."""
+    return ",".join(f"{key}={value}" for key, value in row["options"].items()) or "as it is"
+
+
+def row_of(table: TargetTable, entry: Entry) -> dict[str, Any]:
+    """A row as plain data: attack, carrier, options, settings, of.
+
+    Raises:
+        UnknownNameError, ConfigError: No such attack, or settings that it does not have.
+    """
+    if (entry.name == "shuffled") != (entry.of is not None):
+        raise ConfigError(f"suite {table.name}: shuffled, and it alone, says of which attack (of: NAME)")
+    if entry.of is not None:
+        return {**_shuffled(table, entry), "attack": "shuffled", "of": entry.of}
+    carrier = entry.carrier or default_carrier(entry.name)
+    found: dict[str, Any] = {"attack": entry.name, "carrier": carrier, "options": dict(entry.options), "settings": {}}
+    found |= {"of": None, "around": entry.around}
+    if entry.texture is not None:
+        return found | _ready(table, entry)
+    if entry.name not in CONTROLS:
+        settings = {"epochs": table.epochs, "window": table.window}
+        settings = {key: value for key, value in settings.items() if value is not None} | entry.settings
+        make_physical(entry.name, **settings)
+        return found | {"settings": settings}
+    if entry.settings or entry.around:
+        raise ConfigError(f"suite {table.name}: {entry.name} is not trained and has no settings")
+    return found
+
+
+def _shuffled(table: TargetTable, entry: Entry) -> dict[str, Any]:
+    """The row whose texture is shuffled (see `Entry.of`). ConfigError: there is none, or more than one."""
+    rows = [
+        row_of(table, one)
+        for one in table.attacks
+        if (one.name, one.around) == (entry.of, entry.around) and one.name not in CONTROLS
+    ]
+    fit = [
+        row
+        for row in rows
+        if entry.carrier in (None, row["carrier"])
+        and entry.texture in (None, row.get("file"))
+        and _within({**entry.options, **entry.settings}, {**row["options"], **row["settings"]})
+    ]
+    said = [{"carrier": row["carrier"], **row["options"], **_said(table, row)} for row in fit]
+    plain = [row for row, own in zip(fit, said, strict=True) if all(_within(own, other) for other in said)]
+    if not plain:
+        known = "; ".join(f"{carrier_title(row)}{_differing(_said(table, row), [{}])}" for row in fit or rows)
+        which = f"; {'several fit' if fit else 'none fits'}, say carrier, options, settings or texture of one: {known}"
+        raise ConfigError(
+            f"suite {table.name}: shuffled of '{entry.of}': there must be one such attack{which if rows else ''}"
+        )
+    return plain[0]
+
+
+def _within(some: Mapping[str, Any], more: Mapping[str, Any]) -> bool:
+    """Whether all that one says the other says too."""
+    return {**more, **some} == more
+
+
+def check_lights(table: TargetTable) -> None:
+    """ConfigError, UnknownNameError: an attack, an hour or a setting that does not exist."""
+    for entry in table.lights:
+        attack = make_light(entry.name, entry.options)
+        at_hour(Weather(), entry.hour)
+        if isinstance(attack, Projector):
+            attack.training(**entry.settings)
+        else:
+            budget_of(entry.settings, entry.name)
+
+
+def carrier_title(row: Mapping[str, Any]) -> str:
+    """The carrier of a row and its options, in words: such as "patch, height 0.86, width 1.9"; "" for no texture."""
+    options = sorted((row.get("options") or {}).items())
+    return ", ".join([row.get("carrier", ""), *(f"{key} {value}" for key, value in options)])
+
+
+def _ready(table: TargetTable, entry: Entry) -> dict[str, Any]:
+    """What the card of a texture says of a row. ConfigError: the suite says otherwise."""
+    assert entry.texture is not None
+    colour, card = load_texture(entry.texture)
+    if entry.carrier or entry.options or entry.settings or entry.around:
+        raise ConfigError(f"suite {table.name}: texture {entry.texture}: its card says carrier, options and settings")
+    if (card.attack, card.target) != (entry.name, table.target):
+        raise ConfigError(
+            f"suite {table.name}: texture {entry.texture} is of {card.attack} on {card.target}, not of {entry.name} on "
+            f"{table.target}"
+        )
+    size = make_carrier(card.carrier, card.options).on(target_of(table).mesh()).size
+    if tuple(colour.shape[1:]) != size:
+        raise ConfigError(f"texture {entry.texture}: {list(colour.shape[1:])} texels, its surface has {list(size)}")
+    about = {"carrier": card.carrier, "options": dict(card.options), "source": card.source}
+    return about | {"file": entry.texture, "hash": card.hash}
+
+
+def target_of(table: TargetTable) -> Target:
+    """The target of a table. ConfigError: what it asks for is only there for cars."""
+    target = parse_target(table.target)
+    if not isinstance(target, TargetCar) and (table.lights or any(entry.around for entry in table.attacks)):
+        raise ConfigError(f"suite {table.name}: target {table.target}: lights and around are for cars")
+    return target

@@ -1,0 +1,135 @@
+"""Recorded clips as detectors are shown them: clean, or with a target that waits for a texture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core.boxes import camera_yaw
+from ssad.core.detections import Solids, Truth
+from ssad.core.errors import ConfigError
+from ssad.core.images import read_image
+from ssad.core.nuscenes_names import NO_ATTRIBUTE
+from ssad.experiments.perception.physical.textured_images import textured_clips
+from ssad.recorders.target_images import CLASSES, clip_rows
+from ssad.scenarios.static.physical import Surface, View
+
+
+@dataclass(frozen=True, slots=True)
+class TargetClips:
+    """The first pictures of a recording, for a detector.
+
+    Attributes:
+        folder: What `record_clips` wrote.
+        count: Number of pictures.
+        classes: Names of the detector's classes, in its order.
+        device: Where pictures are rendered and shown.
+        whole: Whether true boxes are those around the whole 3D boxes, as 3D detectors give them, and not around what is
+            seen.
+    """
+
+    folder: Path
+    count: int
+    classes: tuple[str, ...] = CLASSES
+    device: str = "cpu"
+    whole: bool = False
+
+    def rows(self) -> list[Mapping[str, Any]]:
+        """What the annotation file says of each picture. FormatError: no recording of this version."""
+        return [row for row, _ in clip_rows(self.folder)[: self.count]]
+
+    def clean(self) -> Iterator[tuple[str, Tensor, Truth]]:
+        """Drive, picture [1, 3, H, W] in 0 to 1 and truth, as they were recorded. FormatError as for `rows`."""
+        for row, objects in clip_rows(self.folder)[: self.count]:
+            image = torch.tensor(read_image(self.folder / "images" / row["file_name"])).to(self.device)
+            yield (
+                drive_of(row),
+                image.permute(2, 0, 1)[None].float() / 255,
+                target_truth(row, objects, self.classes, whole=self.whole),
+            )
+
+    def wearing(self, surface: Surface, *, solid: bool = False) -> Iterator[tuple[str, View]]:
+        """Drive and picture with a target that waits for a texture, one after another.
+
+        Args:
+            surface: What the target wears.
+            solid: Whether the truth is the target alone, with its 3D box: what a training against a 3D detector needs.
+
+        Raises:
+            FormatError: No recording of this version.
+            ConfigError: None of the pictures shows any of the texture; said after the last.
+        """
+        seen = False
+        for clip in islice(textured_clips(self.folder, (surface.layer,), device=self.device), self.count):
+            wearing = clip.prepare({0: surface.size}, masks={0: surface.mask}, device=self.device)
+            seen |= bool(len(wearing.taps[0].pixel))
+            truth = target_truth(clip.row, clip.objects, self.classes, whole=self.whole)
+            yield drive_of(clip.row), View(wearing, solid_target(clip.row, truth) if solid else truth)
+        if not seen:
+            raise ConfigError(
+                f"the texture is never in view in the {self.count} pictures of {self.folder.name}; choose a panel that "
+                "the camera sees, or another camera"
+            )
+
+
+def target_truth(
+    row: Mapping[str, Any], objects: Sequence[Mapping[str, Any]], classes: Sequence[str], *, whole: bool = False
+) -> Truth:
+    """What is annotated in a picture, the target first, in a detector's classes; what it does not know is left out.
+
+    Args:
+        row: Of the picture.
+        objects: What is in it.
+        classes: Names of the detector's classes.
+        whole: See `TargetClips`.
+
+    Raises:
+        ConfigError: The detector does not know the target's class.
+    """
+    ordered = sorted(objects, key=lambda one: not one["target"])
+    names = [CLASSES[int(one["category_id"]) - 1] for one in ordered]
+    if names[0] not in classes:
+        raise ConfigError(f"a detector without a class {names[0]} cannot find the target")
+    known = [k for k, name in enumerate(names) if name in classes]
+    x, y, width, height = np.array([ordered[k]["hull" if whole else "bbox"] for k in known], np.float64).T
+    return Truth(
+        torch.tensor([list(classes).index(names[k]) for k in known]),
+        torch.from_numpy(np.stack([x, y, x + width, y + height], 1)).float(),
+        intrinsic=torch.tensor(row["intrinsic"], dtype=torch.float32),
+        crowd=torch.tensor([bool(ordered[k]["iscrowd"]) for k in known]),
+    )
+
+
+def solid_target(row: Mapping[str, Any], truth: Truth) -> Truth:
+    """The target of a picture alone, with its 3D box, of which velocity and attribute are unknown.
+
+    Args:
+        row: Of the picture: poses of camera (x right, y down, z forward) and target in the world, its size, m.
+        truth: What `target_truth` says of it.
+
+    Returns:
+        One object; its box is in the camera's frame, m and rad, centred at the middle of its height.
+    """
+    turn = np.linalg.inv(np.array(row["pose"])) @ np.array(row["target_pose"])
+    length, width, height = row["target_size"]
+    centre = turn[:3, 3] + 0.5 * height * turn[:3, 2]  # a pose is that of the middle of the bottom
+    solid = Solids(
+        torch.tensor(centre[None], dtype=torch.float32),
+        torch.tensor([[length, height, width]], dtype=torch.float32),
+        torch.tensor(camera_yaw(turn[None, :3, 0]), dtype=torch.float32),
+        torch.full((1, 2), torch.nan),
+        torch.tensor([NO_ATTRIBUTE]),
+    )
+    return Truth(truth.label[:1], truth.box[:1], solid, truth.intrinsic)
+
+
+def drive_of(row: Mapping[str, Any]) -> str:
+    """Name of the drive that a picture is of."""
+    return f"{row['part']}/{row['attempt']}"

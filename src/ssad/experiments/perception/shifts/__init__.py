@@ -1,0 +1,1 @@
+"""Preset `detection`: 3D detectors under distribution shifts."""

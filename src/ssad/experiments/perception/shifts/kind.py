@@ -1,0 +1,136 @@
+"""Kind `detection`: 3D detectors x distribution shifts x severities over a data set in the nuScenes schema."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.types import U8
+from ssad.engine.kind import Cell, Job, Names, Plan
+from ssad.experiments.perception.detector_kind import DetectorKind, DetectorSuite
+from ssad.experiments.perception.scene_boxes import (
+    Examination,
+    ShiftedScene,
+    boxes_path,
+)
+from ssad.experiments.perception.scored_data import data_of, detectors_of
+from ssad.experiments.perception.sheets import STRONG, detection_sheet
+from ssad.experiments.perception.shifts import page
+from ssad.experiments.perception.shifts.verdict import verdict
+from ssad.report.load import Run
+from ssad.report.tables import Table
+from ssad.scenarios.static.shifts import KNOWN, SHIFTS, VERSIONS, ShiftSpec, dealt_severities
+
+Severity = Annotated[int, Field(ge=1, le=5)] | Literal["random"]
+
+
+class DetectionSuite(DetectorSuite):
+    """One table: 3D detectors x shifts x severities, beside the clean data; the first detector is the baseline of mCE.
+
+    Attributes:
+        shifts: names.
+        severities: 1 to 5, or random (dealt to the scenes, all as often, give or take one; drawn by sample in the
+            calibration of the paper).
+        calibration: of the shifts.
+    """
+
+    kind: Literal["detection"]
+    shifts: Names = Field(default=list(SHIFTS), min_length=1)
+    severities: Annotated[list[Severity], Field(min_length=1)] = Field(default=[1, 2, 3, 4, 5, "random"], min_length=1)
+    calibration: Literal["physical", "paper"] = "physical"
+
+
+class Detection(DetectorKind):
+    """See the module. Cells of all detectors share the work of shifting a scene: a piece is a scene under a shift."""
+
+    name = "detection"
+    suite = DetectionSuite
+    factors = ("detector", "shift", "severity")
+
+    def plan(self, suite: DetectionSuite, *, device: str = "cpu", check: bool = True) -> Plan:
+        """Detectors are built once, the data set is looked at."""
+        lists: dict[str, Sequence[object]] = {"shift": suite.shifts, "severity": suite.severities}
+        for what, values in lists.items():
+            if len(set(values)) != len(values):
+                raise ConfigError(f"suite {suite.name}: a {what} appears twice")
+        for known in suite.shifts:
+            ShiftSpec(known, calibration=suite.calibration)
+        weights, detectors, _ = detectors_of(suite)
+        data = data_of(suite)
+        conditions: list[tuple[str | None, int | str]] = [
+            (None, 0),
+            *((shift, s) for shift in suite.shifts for s in suite.severities),
+        ]
+        cells = []
+        for detector in detectors:
+            for shift, severity in conditions:
+                family = KNOWN[shift][0] if shift else "clean"
+                fields = {"detector": detector, "shift": shift, "family": family, "severity": severity}
+                spec = {"calibration": suite.calibration, "labels": "original"}
+                title = f"{detector}/{shift or 'clean'}/{severity}"
+                inputs = weights[detector], safeio.dump_json(data), device, suite.replicates
+                cells.append(self.make_cell(title, detector, suite.seed, fields, spec, *inputs))
+        versions = {"shifts": str(VERSIONS[suite.calibration])}
+        return Plan(self, suite, device, tuple(cells), {"weights": weights, "data": data}, versions, detectors)
+
+    def order(self, cell: Cell) -> float:
+        """Clean first, then what the main table tells, the middle severity, the others."""
+        severity = cell.fields["severity"]
+        if cell.fields["shift"] is None:
+            return 0
+        return 1 if isinstance(severity, str) else 2 + abs(severity - 3)
+
+    def pieces(self, cell: Cell, job: Job) -> Mapping[str, Any]:
+        """Scenes whose boxes are still to be found."""
+        scenes = self.scenes(cell, job)
+        missing = [one for one in scenes if not boxes_path(job.folder, cell.system, one).is_file()]
+        return {one.name: [one.shift, one.severity, one.scene] for one in missing}
+
+    def scenes(self, cell: Cell, job: Job) -> list[ShiftedScene]:
+        """See `DetectorKind`. A severity dealt to a scene is one of the five: nothing runs twice."""
+        tokens: Mapping[str, str] = job.settings["scenes"]
+        shift, severity = cell.fields["shift"], cell.fields["severity"]
+        if shift is None or severity != "random" or cell.spec["calibration"] == "paper":
+            return [ShiftedScene(shift, severity, scene) for scene in tokens]
+        spec = ShiftSpec(shift, seed=cell.seed, calibration=cell.spec["calibration"])
+        dealt = dealt_severities(spec, tokens.values())
+        return [ShiftedScene(shift, dealt[token], scene) for scene, token in tokens.items()]
+
+    def condition(self, data: Any) -> ShiftedScene:
+        """See `DetectorKind`."""
+        return ShiftedScene(*data)
+
+    def settings(self, suite: DetectionSuite) -> dict[str, Any]:
+        """See `DetectorKind`."""
+        return {"calibration": suite.calibration}
+
+    def sheet(
+        self, examination: Examination, suite: DetectionSuite, cell: Cell | None = None
+    ) -> tuple[Callable[[], U8], str]:
+        """One moment under each shift."""
+        shifts, severities = suite.shifts, suite.severities
+        if cell is not None:
+            shifts = [cell.fields["shift"]] if cell.fields["shift"] else []
+            severities = [cell.fields["severity"]]
+        severity = min([s for s in severities if isinstance(s, int)] or [STRONG], key=lambda s: abs(s - STRONG))
+        caption = (
+            f"What {examination.detectors[0][0]} finds (orange, score at least 0.3) and what is there (white), clean "
+            f"and under each shift at severity {severity}."
+        )
+        return lambda: detection_sheet(examination, suite.split, shifts, severity), caption
+
+    def page(self, run: Run) -> tuple[str, Sequence[Table]]:
+        """Page of a run and its tables."""
+        return page.section(run, self.verdict(run))
+
+    def summary(self, run: Run) -> Table:
+        """Main table of a run."""
+        return page.summary(run)
+
+    def verdict(self, run: Run) -> list[str]:
+        """Findings of a run in sentences."""
+        return verdict(run)

@@ -1,0 +1,17 @@
+"""Clean accuracy and the shift that costs most, in sentences."""
+
+from __future__ import annotations
+
+from ssad.report.load import Run
+from ssad.report.verdict import lines_by, mean_of, metric_of, worst_condition
+
+
+def verdict(run: Run) -> list[str]:
+    """The mAP clean and under the shift that costs most."""
+    found = []
+    for detector, lines in lines_by(run, "detector").items():
+        scores: dict[str, list[float]] = {}
+        for line in lines:
+            scores.setdefault(str(line.get("shift") or ""), []).append(metric_of(line, "mAP"))
+        found.append(worst_condition(detector, "mAP", {name: mean_of(v) for name, v in scores.items()}, "shift"))
+    return found

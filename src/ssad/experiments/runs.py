@@ -1,0 +1,104 @@
+"""Runs on disk, with what their kind knows of them: the plan, one cell again, the report, the terminal's table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import rich.table
+from pydantic import ValidationError
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, SSADError, StoreError
+from ssad.engine.kind import Kind, Plan, Replay
+from ssad.engine.replay import replay_cell
+from ssad.engine.run import run_json
+from ssad.engine.store import read_run
+from ssad.experiments.suites import kind_of
+from ssad.report.load import Run, load_run
+from ssad.report.pages import TABLE_HASH, table_hash
+from ssad.report.tables import write_tables
+from ssad.report.terminal import terminal_table
+
+
+def read_plan(folder: str | Path) -> Plan:
+    """The plan of a folder that holds a run. ConfigError when code or inputs have changed since."""
+    header = read_run(folder)
+    try:
+        kind = kind_of(str(header["suite"]["kind"]))
+        suite, device = kind.suite.model_validate(header["suite"]), str(header["versions"]["device"])
+    except (KeyError, TypeError, ValidationError) as error:
+        what = f"no key {error}" if isinstance(error, KeyError) else "its suite is of another version of SSAD"
+        raise StoreError(f"{folder}/run.json: not what ssad run writes: {what}; run the suite again") from None
+    plan = kind.plan(suite, device=device, check=False)
+    now = run_json(plan)
+    if now["identity"] != header["identity"]:
+        what = ", ".join(name for name in ("code", *plan.inputs) if now[name] != header.get(name)) or "scenarios"
+        raise ConfigError(f"{folder}: {what} changed since this run was made; run the suite again to compare")
+    return plan
+
+
+def replay(folder: str | Path, name: str) -> Replay:
+    """Run one cell of a results folder again, alone, and compare it with its record.
+
+    Args:
+        folder: Results folder.
+        name: Key of the cell, the unique start of one, or its name, such as "blind/StraightObstacle/00".
+
+    Raises:
+        StoreError: It was not recorded.
+        ConfigError: There is no such cell, its kind has no replay, or code or inputs have changed since.
+    """
+    return replay_cell(read_plan(folder), folder, name)
+
+
+def kind_of_run(run: Run) -> Kind:
+    """The kind of a run, which knows its page; a plain `Kind` where it is not installed.
+
+    A results folder may come from anywhere, so a kind that it names as "module:Class" is not imported: its page is the
+    plain one unless the caller has the kind at hand, as `ssad run` does.
+    """
+    name = str(run.suite.get("kind") or run.kind)
+    if ":" in name:
+        return Kind()
+    try:
+        return kind_of(name)
+    except SSADError:
+        return Kind()
+
+
+def write_report(folder: Path | str, kind: Kind | None = None) -> Path:
+    """Write DIR/report.html and DIR/tables/*.csv|md|tex from the records in DIR.
+
+    Missing or altered artefacts are named on the page.
+
+    Args:
+        folder: Results folder.
+        kind: Kind of the run, which makes the page; None: the one that the run names.
+
+    Returns:
+        Path of the page.
+
+    Raises:
+        StoreError: The folder holds no run, has no results, or cannot be written.
+    """
+    run = load_run(folder)
+    page, tables = (kind or kind_of_run(run)).page(run)
+    write_tables(run.folder, tables)
+    page = page.replace(TABLE_HASH, table_hash(tables[0]) if tables else "none")
+    path = run.folder / "report.html"
+    safeio.write_atomic(path, page)
+    return path
+
+
+def summary(folder: Path | str, kind: Kind | None = None) -> rich.table.Table:
+    """Main table of a run for the terminal: n and interval of the first metric, the values of the others.
+
+    Args:
+        folder: Results folder.
+        kind: Kind of the run; None: the one that the run names.
+
+    Raises:
+        StoreError: The folder holds no run with results.
+    """
+    run = load_run(folder)
+    return terminal_table(run, (kind or kind_of_run(run)).summary(run))

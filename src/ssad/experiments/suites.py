@@ -1,0 +1,153 @@
+"""Suites: YAML files with a strict schema, one a table; which schema, their kind says."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+import ssad
+from ssad.core.errors import ConfigError, UnknownNameError, unknown_name
+from ssad.core.registry import resolve
+from ssad.core.safeio import Document, dotted, parse_yaml, read_yaml_document
+from ssad.engine.kind import Kind, SuiteBase
+
+KINDS: dict[str, str] = {
+    "driving": "ssad.experiments.driving.kind:Driving",
+    "detection": "ssad.experiments.perception.shifts.kind:Detection",
+    "digital": "ssad.experiments.perception.digital.kind:Digital",
+    "physical": "ssad.experiments.perception.physical.kind:Physical",
+    "adversarial": "ssad.experiments.adversarial.kind:Adversarial",
+    "gap": "ssad.experiments.gap.kind:Gap",
+    "how-often": "ssad.experiments.how_often.kind:HowOften",
+    "tour": "ssad.experiments.tour.kind:Tour",
+}
+"""Kind of experiment -> "module:class"; packages add theirs by the entry-point group `ssad.kinds`."""
+
+
+def kind_of(name: str) -> Kind:
+    """The kind of that name, entry point or "module:class".
+
+    Raises:
+        UnknownNameError: there is none.
+        ConfigError: it cannot be imported, or is no kind.
+    """
+    found = resolve("kind", KINDS, name)
+    if not isinstance(found, type) or not issubclass(found, Kind):
+        raise ConfigError(f"kind '{name}': expected a class derived from ssad.engine.kind.Kind")
+    return found()
+
+
+def suite_folders() -> list[Path]:
+    """Where suites lie: the repository of a source checkout, or inside the installed package."""
+    package = Path(ssad.__file__).resolve().parent
+    root = package.parent.parent
+    folders = [package / "suites"]
+    if (root / "pyproject.toml").is_file() and (root / "src" / "ssad") == package:
+        folders.insert(0, root / "suites")
+    return [folder for folder in folders if folder.is_dir()]
+
+
+def suite_files() -> dict[str, Path]:
+    """Suite name -> its file."""
+    files: dict[str, Path] = {}
+    for folder in suite_folders():
+        for path in sorted(folder.glob("*.yaml")):
+            files.setdefault(path.stem, path)
+    return files
+
+
+def load_suite(ref: str, settings: Sequence[str] = ()) -> Any:
+    """The suite of that name or YAML file, with `--set key=value` settings applied; its key `kind` says of which kind.
+
+    ConfigError or FormatError say file, line and key; UnknownNameError shows the closest names.
+    """
+    files = suite_files()
+    path = files.get(ref)
+    if path is None:
+        if not ref.endswith((".yaml", ".yml")) and not Path(ref).is_file():
+            raise unknown_name("suite", ref, files)
+        path = Path(ref)
+    document = read_yaml_document(path)
+    if not isinstance(document.data, dict):
+        raise document.error((), "a suite is a mapping with the keys kind, name and those of its kind")
+    data = dict(document.data)
+    try:
+        schema = kind_of(str(data.setdefault("kind", "driving"))).suite
+    except UnknownNameError:
+        raise document.error(
+            ("kind",), f"'{data['kind']}' is no kind of suite; choose from: {', '.join(KINDS)}"
+        ) from None
+    changed: dict[str, str] = {}
+    for setting in settings:
+        changed[_apply(data, setting, schema)] = setting
+    try:
+        found = schema.model_validate(data).beside(path)
+    except ValidationError as error:
+        raise _explain(error, document, changed, list(schema.model_fields)) from None
+    found._origin = ref
+    try:
+        found._stock = schema.model_validate(document.data).beside(path).model_dump(mode="json")
+    except ValidationError:  # complete with the settings alone
+        found._stock = found.model_dump(mode="json")
+    return found
+
+
+def _apply(data: dict[str, Any], setting: str, schema: type[SuiteBase]) -> str:
+    """Put one `key=value` into the data; returns the top-level key."""
+    key, equals, text = setting.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError(f"--set {setting}: expected key=value, such as --set repetitions=3")
+    if parts[0] not in schema.model_fields:
+        raise ConfigError(f"--set {setting}: {_unknown_key(parts[0], list(schema.model_fields))}")
+    value = parse_yaml(text, f"--set {key}")
+    if len(parts) == 1 and _is_list(schema, parts[0]) and isinstance(value, str | int):
+        value = [value]
+    place = data
+    for part in parts[:-1]:
+        place.setdefault(part, {})
+        if not isinstance(place.get(part), dict):
+            raise ConfigError(f"--set {setting}: '{part}' has no keys of its own")
+        place[part] = dict(place[part])
+        place = place[part]
+    place[parts[-1]] = value
+    return parts[0]
+
+
+def _is_list(schema: type[SuiteBase], key: str) -> bool:
+    """Whether a key takes a list; one value alone then is a list of one."""
+    return typing.get_origin(schema.model_fields[key].annotation) is list
+
+
+def _unknown_key(key: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=3, cutoff=0.0)
+    return f"unknown key '{key}'; closest: {', '.join(close)}"
+
+
+UNION = re.compile(r"constrained-\w+|literal\[.*\]")  # how pydantic names the members of a union in a location
+
+
+def _explain(error: ValidationError, document: Document, changed: dict[str, str], known: Sequence[str]) -> ConfigError:
+    """The first problem as one line with file, line and key, or with the setting that caused it."""
+    problem = error.errors(include_url=False)[0]
+    location = tuple(part for part in problem["loc"] if not UNION.fullmatch(str(part)))
+    if problem["type"] == "extra_forbidden":
+        text = _unknown_key(str(location[-1]), known)
+        location = (*location[:-1], str(location[-1]))
+    elif problem["type"] == "missing":
+        text = f"the key '{location[-1]}' is missing"
+        location = location[:-1]
+    elif problem["type"] == "value_error":  # a check of ours, which says it all
+        text = problem["msg"].removeprefix("Value error, ")
+    else:
+        shown = repr(problem["input"])
+        text = f"{problem['msg']}, not {shown if len(shown) < 60 else shown[:57] + '...'}"
+    if location and location[0] in changed:
+        return ConfigError(f"--set {changed[str(location[0])]}: {dotted(location)}: {text}")
+    return document.error(location, text)

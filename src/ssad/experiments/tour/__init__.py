@@ -1,0 +1,1 @@
+"""Experiment `tour`: several suites, one after the other."""

@@ -1,1 +1,0 @@
-"""How work is done anywhere: worker processes, stores that survive a kill, progress."""

@@ -1,0 +1,1 @@
+"""Recorders of simulated drives as datasets, and of shifted copies of datasets."""

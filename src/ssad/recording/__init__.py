@@ -1,1 +1,0 @@
-"""Drives and clips from the world into data sets."""

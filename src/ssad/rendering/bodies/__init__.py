@@ -1,0 +1,365 @@
+"""Bodies of road users and street furniture: parametric meshes with named panels, by kind and style.
+
+Sizes are (length along x, width along y, height), m. Where none is given it is drawn about the mean of the style; the
+means over styles are near those of the boxes in nuScenes (Caesar et al. 2020) where it has the class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.seeding import generator as seeded
+from ssad.rendering.bodies import anomalies, cycles, furniture, heavy, machines, people, strollers
+from ssad.rendering.bodies import car as _car
+from ssad.rendering.meshes.mesh import Mesh, Point, Rectangle
+
+DETAILS = (0, 1, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyStyle:
+    """Mean size (length, width, height) m, its relative spread, and how often the style is drawn."""
+
+    size: Point
+    spread: float = 0.04
+    weight: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A kind of body: its maker and its styles. `phased` bodies move with a phase (rad)."""
+
+    make: Callable[..., Mesh]
+    styles: Mapping[str, BodyStyle]
+    phased: bool = False
+
+
+BODIES: dict[str, Body] = {
+    "car": Body(
+        _car.car,
+        {
+            "sedan": BodyStyle((4.75, 1.93, 1.47), 0.035, 3.0),
+            "hatchback": BodyStyle((4.15, 1.89, 1.50), 0.04, 2.0),
+            "estate": BodyStyle((4.70, 1.94, 1.52), 0.03, 1.0),
+            "suv": BodyStyle((4.70, 2.00, 1.76), 0.05, 3.0),
+            "van": BodyStyle((5.00, 2.08, 2.05), 0.05, 1.0),
+            "pickup": BodyStyle((5.45, 2.07, 1.87), 0.04, 0.7),
+        },
+    ),
+    "truck": Body(
+        heavy.truck,
+        {
+            "box": BodyStyle((7.6, 2.52, 3.30), 0.09, 3.0),
+            "flatbed": BodyStyle((7.0, 2.50, 2.80), 0.08, 1.0),
+            "tractor": BodyStyle((6.2, 2.60, 3.60), 0.05, 1.0),
+            "tipper": BodyStyle((7.6, 2.55, 3.15), 0.06, 1.0),
+        },
+    ),
+    "bus": Body(
+        heavy.bus,
+        {
+            "city": BodyStyle((11.3, 2.94, 3.40), 0.05, 3.0),
+            "coach": BodyStyle((12.1, 2.94, 3.60), 0.04, 1.0),
+            "bendy": BodyStyle((17.8, 2.94, 3.35), 0.02, 0.5),
+        },
+    ),
+    "trailer": Body(
+        heavy.trailer,
+        {
+            "box": BodyStyle((12.6, 2.65, 3.95), 0.06, 3.0),
+            "flatbed": BodyStyle((12.0, 2.60, 2.60), 0.06, 1.0),
+            "tank": BodyStyle((11.3, 2.55, 3.65), 0.05, 0.7),
+            "utility": BodyStyle((3.6, 1.90, 1.55), 0.10, 0.6),
+        },
+    ),
+    "construction": Body(
+        machines.construction,
+        {
+            "excavator": BodyStyle((7.2, 2.80, 3.30), 0.06),
+            "wheel_loader": BodyStyle((6.5, 2.60, 3.10), 0.06),
+        },
+    ),
+    "motorcycle": Body(
+        cycles.motorcycle,
+        {
+            "ridden": BodyStyle((2.10, 0.80, 1.62), 0.04),
+            "parked": BodyStyle((2.08, 0.78, 1.22), 0.04),
+        },
+    ),
+    "bicycle": Body(
+        cycles.bicycle,
+        {
+            "ridden": BodyStyle((1.73, 0.60, 1.72), 0.03),
+            "parked": BodyStyle((1.71, 0.60, 1.06), 0.03),
+        },
+        phased=True,
+    ),
+    "pedestrian": Body(
+        people.pedestrian,
+        {
+            "adult": BodyStyle((0.76, 0.66, 1.74), 0.05, 6.0),
+            "child": BodyStyle((0.55, 0.48, 1.28), 0.09, 1.0),
+            "standing": BodyStyle((0.42, 0.62, 1.74), 0.05, 1.0),
+            "elderly": BodyStyle((0.70, 0.66, 1.60), 0.05, 0.8),
+            "worker": BodyStyle((0.44, 0.66, 1.80), 0.04, 0.4),
+            "stroller": BodyStyle((0.80, 0.62, 1.70), 0.05, 0.5),
+        },
+        phased=True,
+    ),
+    "stroller": Body(
+        strollers.stroller,
+        {
+            "buggy": BodyStyle((0.92, 0.55, 1.02), 0.04, 3.0),
+            "pram": BodyStyle((1.00, 0.58, 1.04), 0.04, 1.0),
+        },
+    ),
+    "traffic_cone": Body(
+        furniture.traffic_cone,
+        {
+            "cone": BodyStyle((0.41, 0.41, 0.80), 0.08, 3.0),
+            "tall": BodyStyle((0.36, 0.36, 1.07), 0.05, 2.0),
+            "drum": BodyStyle((0.56, 0.56, 1.05), 0.04, 1.0),
+        },
+    ),
+    "barrier": Body(
+        furniture.barrier,
+        {
+            "jersey": BodyStyle((0.60, 2.60, 0.90), 0.06, 2.0),
+            "fence": BodyStyle((0.50, 2.30, 1.10), 0.04),
+            "board": BodyStyle((0.50, 1.80, 1.15), 0.06),
+            "water": BodyStyle((0.50, 2.20, 0.95), 0.05),
+        },
+    ),
+    "traffic_signal": Body(
+        furniture.traffic_signal,
+        {
+            "post": BodyStyle((0.55, 0.48, 3.60), 0.02),
+            "mast": BodyStyle((0.62, 5.60, 6.20), 0.03),
+            "walker": BodyStyle((0.55, 0.48, 3.00), 0.02),
+        },
+    ),
+    "street_lamp": Body(
+        furniture.street_lamp,
+        {
+            "curved": BodyStyle((2.20, 0.34, 8.50), 0.06),
+            "straight": BodyStyle((1.80, 0.34, 7.50), 0.06),
+        },
+    ),
+    "sign": Body(
+        furniture.sign,
+        {
+            "limit": BodyStyle((0.10, 0.66, 2.80), 0.02),
+            "warning": BodyStyle((0.10, 0.85, 2.75), 0.02),
+            "direction": BodyStyle((0.10, 1.80, 3.60), 0.02),
+        },
+    ),
+    "stop_sign": Body(
+        furniture.stop_sign,
+        {
+            "standard": BodyStyle((0.08, 0.76, 2.86), 0.03, 4.0),
+            "large": BodyStyle((0.10, 0.89, 3.02), 0.02, 1.0),
+            "all_way": BodyStyle((0.08, 0.76, 2.92), 0.03, 1.5),
+            "worn": BodyStyle((0.08, 0.70, 2.78), 0.06, 1.5),
+        },
+    ),
+    "yield_sign": Body(
+        furniture.yield_sign,
+        {
+            "standard": BodyStyle((0.08, 0.90, 2.90), 0.03, 3.0),
+            "worn": BodyStyle((0.08, 0.86, 2.82), 0.04, 1.0),
+        },
+    ),
+    "debris": Body(
+        anomalies.debris,
+        {
+            "tyre": BodyStyle((0.68, 0.68, 0.22), 0.05),
+            "pallet": BodyStyle((1.20, 1.00, 0.145), 0.04),
+            "boxes": BodyStyle((1.15, 0.80, 0.85), 0.08),
+            "mattress": BodyStyle((1.95, 1.10, 0.22), 0.06),
+            "ladder": BodyStyle((3.00, 0.42, 0.09), 0.12),
+            "branch": BodyStyle((2.40, 1.20, 0.60), 0.12),
+        },
+    ),
+    "animal": Body(
+        anomalies.animal,
+        {
+            "dog": BodyStyle((1.05, 0.26, 0.82), 0.08, 2.0),
+            "deer": BodyStyle((1.55, 0.46, 1.55), 0.06, 2.0),
+            "cow": BodyStyle((2.45, 0.72, 1.50), 0.05),
+            "horse": BodyStyle((2.35, 0.56, 2.00), 0.05),
+        },
+    ),
+    "overturned": Body(
+        anomalies.overturned,
+        {
+            "car_side": BodyStyle((4.75, 1.47, 1.93), 0.035, 2.0),
+            "suv_side": BodyStyle((4.70, 1.76, 2.00), 0.04),
+            "car_roof": BodyStyle((4.15, 1.89, 1.50), 0.04),
+            "truck_side": BodyStyle((7.60, 3.30, 2.52), 0.06),
+        },
+    ),
+    "fallen_tree": Body(
+        anomalies.fallen_tree,
+        {
+            "leafy": BodyStyle((8.50, 3.80, 2.60), 0.10, 2.0),
+            "bare": BodyStyle((7.50, 3.20, 2.20), 0.10),
+        },
+    ),
+}
+
+# common car paints, linear RGB, and rough shares of new cars
+PAINTS: dict[str, tuple[float, float, float]] = {
+    "white": (0.80, 0.80, 0.79),
+    "pearl": (0.72, 0.70, 0.65),
+    "silver": (0.46, 0.47, 0.48),
+    "grey": (0.17, 0.175, 0.18),
+    "graphite": (0.055, 0.058, 0.062),
+    "black": (0.010, 0.010, 0.011),
+    "blue": (0.015, 0.065, 0.26),
+    "navy": (0.010, 0.020, 0.065),
+    "sky": (0.14, 0.30, 0.46),
+    "red": (0.38, 0.012, 0.015),
+    "maroon": (0.11, 0.010, 0.014),
+    "green": (0.012, 0.075, 0.038),
+    "olive": (0.085, 0.090, 0.045),
+    "beige": (0.42, 0.36, 0.26),
+    "brown": (0.085, 0.045, 0.025),
+    "orange": (0.62, 0.15, 0.012),
+    "yellow": (0.72, 0.46, 0.02),
+    "teal": (0.01, 0.12, 0.14),
+}
+PAINT_SHARES: dict[str, float] = {
+    "white": 0.27,
+    "pearl": 0.04,
+    "silver": 0.11,
+    "grey": 0.14,
+    "graphite": 0.08,
+    "black": 0.16,
+    "blue": 0.07,
+    "navy": 0.03,
+    "sky": 0.01,
+    "red": 0.045,
+    "maroon": 0.01,
+    "green": 0.01,
+    "olive": 0.005,
+    "beige": 0.01,
+    "brown": 0.01,
+    "orange": 0.007,
+    "yellow": 0.006,
+    "teal": 0.007,
+}
+
+
+def draw_paint(generator: np.random.Generator) -> tuple[float, float, float]:
+    """A car paint (linear RGB), as common as on the road, with a small shift of its brightness."""
+    shares = np.array([PAINT_SHARES[name] for name in PAINTS])
+    r, g, b = list(PAINTS.values())[int(generator.choice(len(shares), p=shares / shares.sum()))]
+    k = float(generator.uniform(0.9, 1.1))
+    return r * k, g * k, b * k
+
+
+def draw_style(kind: str, *, generator: np.random.Generator) -> str:
+    """Draw a style of a kind, by the weights of its styles.
+
+    Raises:
+        UnknownNameError: There is no such kind.
+    """
+    styles = _body(kind).styles
+    weights = np.array([s.weight for s in styles.values()])
+    return list(styles)[int(generator.choice(len(weights), p=weights / weights.sum()))]
+
+
+def draw_size(kind: str, style: str, *, generator: np.random.Generator) -> Point:
+    """Draw a size (length, width, height, m) of a style: normal around its mean, truncated at two standard deviations.
+
+    Raises:
+        UnknownNameError: There is no such kind or style.
+    """
+    entry = _style(kind, style)
+    share = 1.0 + entry.spread * np.clip(generator.normal(size=3), -2.0, 2.0) * [1.0, 0.5, 0.7]
+    length, width, height = (float(v) for v in np.asarray(entry.size) * share)
+    return (length, length, height) if kind == "traffic_cone" else (length, width, height)
+
+
+def make_body(
+    kind: str,
+    *,
+    style: str | None = None,
+    size: Point | None = None,
+    generator: np.random.Generator,
+    detail: int = 2,
+    phase: float | None = None,
+) -> Mesh:
+    """The mesh of a kind of road user or furniture, see `BODIES`; base centred on the origin, x forward.
+
+    The mesh fills its size exactly; a walker fills it over the whole walking cycle. A panel has the same place in the
+    texture atlas in every body of a style, whatever its size and detail. The generator always yields the same number of
+    draws for a style.
+
+    Args:
+        kind: Name of the kind.
+        style: Name of the style; None: drawn.
+        size: Length, width and height, m; None: drawn.
+        generator: Source of randomness.
+        detail: 2 is full, 0 is for far away; draws and size do not depend on it.
+        phase: Place in the cycle of a walker, or angle of a bicycle's crank, rad.
+
+    Raises:
+        UnknownNameError: There is no such kind or style.
+        ConfigError: The size is not three lengths in [0.01, 100] m, or there is no such detail.
+    """
+    body = _body(kind)
+    drawn_style = draw_style(kind, generator=generator)
+    chosen = drawn_style if style is None else style
+    _style(kind, chosen)
+    drawn_size = draw_size(kind, chosen, generator=generator)
+    full = drawn_size if size is None else size
+    lengths = np.asarray(full, np.float64)
+    if lengths.shape != (3,) or not ((lengths >= 0.01) & (lengths <= 100.0)).all():
+        raise ConfigError(f"{kind}: size {full} is not three lengths in [0.01, 100] m")
+    if detail not in DETAILS:
+        raise ConfigError(f"{kind}: detail {detail} is not one of 0, 1, 2")
+    extra = {"phase": phase} if body.phased else {}
+    length, width, height = (float(v) for v in lengths)
+    mesh = body.make(chosen, (length, width, height), generator=generator, detail=detail, **extra)
+    return _in_atlas(mesh, _atlas(kind, chosen))
+
+
+@lru_cache
+def _atlas(kind: str, style: str) -> Mapping[str, Rectangle]:
+    """The rectangle of each panel of a style: that of its mean size, so that one texture fits every size."""
+    body = BODIES[kind]
+    mean = body.make(style, body.styles[style].size, generator=seeded("atlas", kind, style), detail=0)
+    return dict(zip(mean.panels, mean.rectangles, strict=True))
+
+
+def _in_atlas(mesh: Mesh, atlas: Mapping[str, Rectangle]) -> Mesh:
+    """The mesh with each panel moved and stretched into its rectangle of the atlas, parts of one panel together."""
+    uv = mesh.uv.astype(np.float64)
+    whole = [name.split("/")[0] for name in mesh.panels]
+    places = tuple(atlas[name] for name in mesh.panels)
+    for panel in set(whole):
+        parts = [k for k, name in enumerate(whole) if name == panel]
+        own, wanted = (np.array([table[k] for k in parts]) for table in (mesh.rectangles, places))
+        (low, high), (left, right) = ((r[:, :2].min(0), r[:, 2:].max(0)) for r in (own, wanted))
+        faces = np.isin(mesh.panel, parts)
+        uv[faces] = left + (uv[faces] - low) / np.maximum(high - low, 1e-9) * (right - left)
+    return replace(mesh, uv=np.clip(uv, 0.0, 1.0).astype(np.float32), rectangles=places)
+
+
+def _body(kind: str) -> Body:
+    if kind not in BODIES:
+        raise unknown_name("body", kind, BODIES)
+    return BODIES[kind]
+
+
+def _style(kind: str, style: str) -> BodyStyle:
+    styles = _body(kind).styles
+    if style not in styles:
+        raise unknown_name(f"{kind} style", style, styles)
+    return styles[style]

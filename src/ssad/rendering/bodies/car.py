@@ -1,0 +1,287 @@
+"""Cars in six body styles: sedan, hatchback, estate, SUV, van and pickup."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ssad.rendering.bodies.parts import (
+    CHROME,
+    DARK,
+    HEAD,
+    PLATE,
+    RIM,
+    STEEL,
+    TAIL,
+    TRIM,
+    as_point,
+    both_sides,
+    finish,
+    wheels,
+)
+from ssad.rendering.bodies.shell import B3, S3, S4, S5, U0, U2, Shell, axle_x, charts, end_x, sections, skin
+from ssad.rendering.meshes.mesh import Material, Mesh, Point, box, build, sphere
+
+_PLAN = ((0.0, 0.83), (0.02, 0.90), (0.06, 0.955), (0.18, 1.0), (0.80, 1.0), (0.94, 0.955), (0.98, 0.91), (1.0, 0.86))
+_BOXY = ((0.0, 0.88), (0.02, 0.95), (0.06, 0.98), (0.15, 1.0), (0.90, 1.0), (0.98, 0.97), (1.0, 0.93))
+
+SEDAN = Shell(
+    top=(
+        (0.0, 0.50),
+        (0.03, 0.545),
+        (0.12, 0.59),
+        (0.27, 0.655),
+        (0.43, 0.965),
+        (0.53, 1.0),
+        (0.62, 0.99),
+        (0.71, 0.945),
+        (0.87, 0.715),
+        (0.93, 0.705),
+        (1.0, 0.68),
+    ),
+    belt=((0.0, 0.47), (0.05, 0.525), (0.27, 0.615), (0.60, 0.645), (0.87, 0.675), (1.0, 0.65)),
+    plan=_PLAN,
+    cowl=0.27,
+    screen=0.43,
+    roof=0.71,
+    deck=0.87,
+    windows=((0.335, 0.512), (0.532, 0.690), (0.700, 0.765)),
+    doors=(("front_door", 0.300, 0.520), ("rear_door", 0.520, 0.700)),
+    axles=(0.165, 0.785),
+    radius=0.226,
+)
+HATCHBACK = replace(
+    SEDAN,
+    top=(
+        (0.0, 0.48),
+        (0.03, 0.53),
+        (0.12, 0.575),
+        (0.27, 0.65),
+        (0.45, 0.965),
+        (0.56, 1.0),
+        (0.75, 0.985),
+        (0.93, 0.93),
+        (1.0, 0.91),
+    ),
+    belt=((0.0, 0.45), (0.05, 0.51), (0.27, 0.60), (0.60, 0.635), (0.93, 0.675), (1.0, 0.68)),
+    screen=0.45,
+    roof=1.0,
+    deck=1.0,
+    lean=0.085,
+    windows=((0.345, 0.555), (0.578, 0.765), (0.790, 0.870)),
+    doors=(("front_door", 0.310, 0.565), ("rear_door", 0.565, 0.775)),
+    axles=(0.175, 0.835),
+    radius=0.215,
+    tail_from=0.62,
+    tail_lamps=(S4, U0),
+)
+ESTATE = replace(
+    SEDAN,
+    top=(
+        (0.0, 0.50),
+        (0.03, 0.545),
+        (0.12, 0.59),
+        (0.26, 0.655),
+        (0.42, 0.965),
+        (0.52, 1.0),
+        (0.75, 0.99),
+        (1.0, 0.93),
+    ),
+    belt=((0.0, 0.47), (0.05, 0.525), (0.26, 0.61), (0.60, 0.64), (1.0, 0.67)),
+    cowl=0.26,
+    screen=0.42,
+    roof=1.0,
+    deck=1.0,
+    lean=0.055,
+    windows=((0.325, 0.500), (0.520, 0.680), (0.695, 0.900)),
+    doors=(("front_door", 0.290, 0.508), ("rear_door", 0.508, 0.690)),
+    axles=(0.165, 0.790),
+    tail_from=0.60,
+    tail_lamps=(S4, U0),
+)
+SUV = replace(
+    SEDAN,
+    top=(
+        (0.0, 0.52),
+        (0.03, 0.575),
+        (0.12, 0.605),
+        (0.26, 0.645),
+        (0.40, 0.965),
+        (0.50, 1.0),
+        (0.78, 0.99),
+        (1.0, 0.955),
+    ),
+    belt=((0.0, 0.49), (0.04, 0.555), (0.26, 0.615), (0.60, 0.635), (1.0, 0.66)),
+    plan=_BOXY,
+    cowl=0.26,
+    screen=0.40,
+    roof=1.0,
+    deck=1.0,
+    lean=0.035,
+    sill=0.155,
+    tumble=0.16,
+    clad=True,
+    windows=((0.318, 0.495), (0.515, 0.690), (0.705, 0.915)),
+    doors=(("front_door", 0.288, 0.503), ("rear_door", 0.503, 0.700)),
+    axles=(0.160, 0.800),
+    radius=0.222,
+    tail_from=0.66,
+    tail_lamps=(S4, U0),
+    wheel_width=0.25,
+)
+VAN = replace(
+    SEDAN,
+    top=(
+        (0.0, 0.40),
+        (0.03, 0.455),
+        (0.08, 0.49),
+        (0.15, 0.545),
+        (0.30, 0.955),
+        (0.38, 1.0),
+        (0.90, 1.0),
+        (1.0, 0.985),
+    ),
+    belt=((0.0, 0.37), (0.04, 0.44), (0.15, 0.52), (0.32, 0.535), (1.0, 0.545)),
+    plan=_BOXY,
+    cowl=0.15,
+    screen=0.30,
+    roof=1.0,
+    deck=1.0,
+    lean=0.015,
+    sill=0.11,
+    tumble=0.11,
+    windows=((0.205, 0.395), (0.430, 0.640), (0.665, 0.930)),
+    doors=(("front_door", 0.175, 0.410), ("rear_door", 0.410, 0.650)),
+    axles=(0.135, 0.795),
+    radius=0.172,
+    tail_from=0.80,
+    tail_lamps=(S3, U0),
+    lamp_from=0.6,
+)
+PICKUP = replace(
+    SEDAN,
+    top=(
+        (0.0, 0.54),
+        (0.03, 0.595),
+        (0.10, 0.62),
+        (0.245, 0.65),
+        (0.35, 0.965),
+        (0.43, 1.0),
+        (0.54, 0.99),
+        (0.585, 0.965),
+        (0.615, 0.655),
+        (0.70, 0.65),
+        (1.0, 0.65),
+    ),
+    belt=((0.0, 0.51), (0.04, 0.575), (0.245, 0.615), (0.60, 0.625), (1.0, 0.625)),
+    plan=_BOXY,
+    cowl=0.245,
+    screen=0.35,
+    roof=0.585,
+    deck=0.615,
+    sill=0.19,
+    tumble=0.15,
+    clad=False,
+    windows=((0.285, 0.430), (0.447, 0.572)),
+    doors=(("front_door", 0.262, 0.438), ("rear_door", 0.438, 0.590)),
+    axles=(0.150, 0.770),
+    radius=0.215,
+    tail_from=0.80,
+    tail_lamps=(S3, U0),
+    bed=(0.635, 0.975),
+    trunk="tailgate",
+    tail=0.012,
+    wheel_width=0.26,
+)
+
+STYLES: dict[str, Shell] = {
+    "sedan": SEDAN,
+    "hatchback": HATCHBACK,
+    "estate": ESTATE,
+    "suv": SUV,
+    "van": VAN,
+    "pickup": PICKUP,
+}
+
+
+def car(style: str, size: Point, *, generator: np.random.Generator, detail: int) -> Mesh:
+    """A car of a style that fills its size (length, width with mirrors, height), m."""
+    base = STYLES[style]
+    shift = generator.normal(0.0, 1.0, 4).clip(-2.0, 2.0)
+    chrome, roof_rails = generator.random(2)
+    spokes = int(generator.integers(5, 8))
+    shell = replace(
+        base,
+        radius=base.radius * (1.0 + 0.02 * shift[0]),
+        sill=base.sill * (1.0 + 0.04 * shift[1]),
+        tumble=base.tumble * (1.0 + 0.06 * shift[2]),
+        lamp_from=float(np.clip(base.lamp_from + 0.05 * shift[3], 0.45, 0.75)),
+    )
+    parts = [skin(shell, size, detail=detail)]
+    radius = shell.radius * size[2]
+    outer = 0.5 * size[1] * shell.body - 0.012
+    places = [(axle_x(shell, size, a), outer) for a in shell.axles]
+    rim = 0.60 if style in ("suv", "pickup", "van") else 0.66
+    metal = STEEL if style == "van" else RIM
+    look: dict[str, object] = {"rim": rim, "spokes": spokes, "steel": metal, "top": False}
+    parts.append(wheels(places, radius, shell.wheel_width, detail=detail, **look))
+    rails = roof_rails > 0.4 and style in ("suv", "estate")
+    parts += fittings(shell, size, detail=detail, chrome=chrome > 0.6, rails=rails)
+    return finish(parts, charts(shell, size), size)
+
+
+def fittings(shell: Shell, size: Point, *, detail: int, chrome: bool, rails: bool) -> list[Mesh]:
+    """Mirrors, plates, handles, roof rails, exhaust; at detail 0 mirrors and lamps alone."""
+    _, width, height = size
+    at = np.array([shell.windows[0][0] + 0.012, 0.0, 1.0, shell.doors[0][2] - 0.02, shell.doors[-1][2] - 0.02])
+    cut = sections(shell, size, at, detail=2)
+    base = cut[0, U0]
+    reach = 0.5 * width - base[1]
+    bright: Material = CHROME if chrome else TRIM
+    middle = (base[0], 0.5 * width - 0.5 * reach, base[2] + 0.075)
+    if detail == 2:
+        mirror = sphere((0.075, 0.5 * reach, 0.085), material=TRIM, centre=middle, segments=10)
+    elif detail == 1:
+        mirror = box((0.12, reach, 0.15), material=TRIM, centre=middle)
+    else:
+        mirror = _plate_x(middle, (reach, 0.14), TRIM)
+    parts = [both_sides(mirror)]
+    lamps = ((cut[1], shell.lamps, HEAD, 1.0, shell.lamp_from), (cut[2], shell.tail_lamps, TAIL, -1.0, shell.tail_from))
+    if detail == 0:
+        for section, rows, look, sign, start in lamps:
+            low, high = section[rows[0]], section[min(rows[1], S5)]
+            y = 0.5 * (1.0 + start) * low[1]
+            centre = (low[0] + sign * 0.012, y, 0.5 * (low[2] + high[2]))
+            parts.append(both_sides(_plate_x(centre, ((1.0 - start) * low[1], high[2] - low[2]), look, sign)))
+        return parts
+    plate_z = (cut[1, S3][2] - 0.10, cut[2, S4][2] - 0.02 if shell.deck < 0.97 else cut[2, S3][2] + 0.04)
+    for front, z in zip((True, False), plate_z, strict=True):
+        x = end_x(shell, size, float(z), front=front)
+        parts.append(box((0.03, 0.50, 0.115), material=PLATE, centre=(x, 0.0, float(z))))
+    if detail == 2:
+        for section in cut[3:]:
+            handle = as_point(section[S5] - [0.0, 0.0, 0.03])
+            parts.append(both_sides(box((0.17, 0.03, 0.028), material=bright, centre=handle)))
+        outlet = (float(cut[2, B3][0]) + 0.02, 0.3 * width, 0.8 * shell.sill * height)
+        parts.append(box((0.09, 0.10, 0.07), material=DARK, centre=outlet))
+        if chrome:
+            low, high = cut[1, shell.grille[0]], cut[1, shell.grille[1]]
+            z = float(0.5 * (low[2] + high[2]))
+            centre = (end_x(shell, size, z, front=True), 0.0, z)
+            parts.append(box((0.02, 0.78 * low[1], 0.025), material=CHROME, centre=centre))
+        if rails:
+            ends = sections(shell, size, np.array([shell.screen + 0.05, 0.90]), detail=2)[:, U2 + 1]
+            middle = tuple(0.5 * (ends[0] + ends[1]) + [0.0, -0.05, 0.05])
+            parts.append(both_sides(box((float(ends[0, 0] - ends[1, 0]), 0.035, 0.04), material=bright, centre=middle)))
+    return parts
+
+
+def _plate_x(centre: Point, size: tuple[float, float], material: Material, sign: float = 0.0) -> Mesh:
+    """A flat rectangle (width, height) across the vehicle: seen from the front (1), the rear (-1) or both (0)."""
+    x, y, z = centre
+    w, h = 0.5 * size[0], 0.5 * size[1]
+    points = [(x, y - w, z - h), (x, y + w, z - h), (x, y + w, z + h), (x, y - w, z + h)]
+    faces = [(0, 1, 2), (0, 2, 3)] if sign >= 0.0 else []
+    faces += [(0, 2, 1), (0, 3, 2)] if sign <= 0.0 else []
+    return build(points, faces, materials=material, smooth=0.0)

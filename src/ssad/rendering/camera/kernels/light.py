@@ -1,0 +1,223 @@
+"""Light that is near: lamps, and what keeps the light of the sky from the ground below and beside it.
+
+Both are found through a grid of squares around the camera, so that a pixel asks only those that can reach it.
+"""
+
+import warp as wp
+
+from ssad.rendering.camera.kernels.raster import NONE
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+CELLS = wp.constant(32)  # squares along each side of the grid
+CELL = wp.constant(8.0)  # m
+
+
+@wp.struct
+class Lamp:
+    """A lamp in the world.
+
+    Attributes:
+        place: Position, m.
+        across: Axis across its light, divided by the tangent of the spread.
+        down: Axis down its light, divided by the tangent of the spread.
+        ahead: Axis of its light.
+        light: Irradiance / pi on a plane 1 m ahead, RGB.
+        inner: Square of the share of the spread that is fully lit.
+        square: 1 where it lights a rectangle, else an ellipse.
+        reach: Distance beyond which it lights nothing, m.
+        layer: Layer of the lamp shadow maps; -1 for none.
+        texture: Texture that it projects; -1 for plain light.
+        spread: Area that it lights on a plane 1 m ahead, m^2.
+    """
+
+    place: wp.vec3
+    across: wp.vec3
+    down: wp.vec3
+    ahead: wp.vec3
+    light: wp.vec3
+    inner: float
+    square: int
+    reach: float
+    layer: int
+    texture: int
+    spread: float
+
+
+@wp.struct
+class Occluder:
+    """A body that stands on the ground and keeps the light of the sky from it.
+
+    Attributes:
+        place: Position, m.
+        heading: Cosine and sine.
+        half: Half length and half width of what it covers, m.
+        under: Height of its underside, m.
+        middle: Height of its middle, m.
+        reach: Distance from its place beyond which it hides nothing, m.
+    """
+
+    place: wp.vec3
+    heading: wp.vec2
+    half: wp.vec2
+    under: float
+    middle: float
+    reach: float
+
+
+@wp.struct
+class Near:
+    """Lamps and occluders of all views, with their grids.
+
+    Attributes:
+        lamps: All lamps.
+        lamp_start: Where the lamps of a square begin in `lamp_list`, in row `view * CELLS * CELLS + cell`; the next row
+            says where they end.
+        lamp_list: Indices of the lamps that can reach each square.
+        occluders: All occluders.
+        occluder_start: The same as `lamp_start`, for occluders.
+        occluder_list: The same as `lamp_list`, for occluders.
+        shadows: Shadow maps of lamps.
+    """
+
+    lamps: wp.array(dtype=Lamp)
+    lamp_start: wp.array(dtype=int)
+    lamp_list: wp.array(dtype=int)
+    occluders: wp.array(dtype=Occluder)
+    occluder_start: wp.array(dtype=int)
+    occluder_list: wp.array(dtype=int)
+    shadows: wp.array3d(dtype=wp.uint64)
+
+
+@wp.func
+def cell_of(p: wp.vec3, eye: wp.vec3) -> int:
+    """The square of the grid around the camera in which a point lies, -1 outside."""
+    column = int(wp.floor((p[0] - eye[0]) / CELL)) + CELLS / 2
+    row = int(wp.floor((p[1] - eye[1]) / CELL)) + CELLS / 2
+    if column < 0 or row < 0 or column >= CELLS or row >= CELLS:
+        return -1
+    return row * CELLS + column
+
+
+@wp.func
+def corner(x: float, y: float, height: float) -> float:
+    """Share of the sky that a horizontal rectangle from straight above to (x, y) at a height hides, signed."""
+    a = wp.sqrt(height * height + x * x)
+    b = wp.sqrt(height * height + y * y)
+    return (x / a * wp.atan(y / a) + y / b * wp.atan(x / b)) * 0.15915494
+
+
+@wp.func
+def hidden(half: wp.vec2, x: float, y: float, height: float) -> float:
+    """Share of the light of an even sky that a rectangle at a height above a point keeps from flat ground there.
+
+    The configuration factor between an element and a parallel rectangle (Howell, catalog of factors, B-4).
+    """
+    height = max(height, 0.02)
+    return (
+        corner(half[0] - x, half[1] - y, height)
+        + corner(half[0] + x, half[1] - y, height)
+        + corner(half[0] - x, half[1] + y, height)
+        + corner(half[0] + x, half[1] + y, height)
+    )
+
+
+@wp.func
+def openness(near: Near, row: int, p: wp.vec3) -> float:
+    """Share of the sky's light that bodies leave to flat ground at a point."""
+    free = float(1.0)
+    for at in range(near.occluder_start[row], near.occluder_start[row + 1]):
+        body = near.occluders[near.occluder_list[at]]
+        if p[2] < body.place[2] + body.under:
+            dx = p[0] - body.place[0]
+            dy = p[1] - body.place[1]
+            if dx * dx + dy * dy < body.reach * body.reach:
+                x = dx * body.heading[0] + dy * body.heading[1]
+                y = dy * body.heading[0] - dx * body.heading[1]
+                low = hidden(body.half, x, y, body.place[2] + body.under - p[2])
+                high = hidden(body.half, x, y, body.place[2] + body.middle - p[2])
+                fade = wp.clamp((1.0 - wp.sqrt(dx * dx + dy * dy) / body.reach) * 3.0, 0.0, 1.0)
+                free = free * (1.0 - fade * wp.max(low, high))
+    return wp.max(free, 0.0)
+
+
+@wp.func
+def passes(shadows: wp.array3d(dtype=wp.uint64), layer: int, row: int, column: int, depth: float) -> float:
+    """1 where a texel of a lamp's shadow map holds nothing nearer to the lamp (depth: inverse, 1/m)."""
+    key = shadows[layer, row, column]
+    if key == NONE or wp.cast(wp.uint32(key >> wp.uint64(32)), float) <= depth:
+        return 1.0
+    return 0.0
+
+
+@wp.func
+def lamp_shadow(shadows: wp.array3d(dtype=wp.uint64), layer: int, x: float, y: float, z: float) -> float:
+    """Share of a lamp that reaches a point: x and y in -1..1 of its spread, z m ahead; four texels, weighted."""
+    size = shadows.shape[1]
+    u = (0.5 * x + 0.5) * float(size) - 0.5
+    v = (0.5 * y + 0.5) * float(size) - 0.5
+    i = wp.clamp(int(wp.floor(u)), 0, size - 2)
+    j = wp.clamp(int(wp.floor(v)), 0, size - 2)
+    u = wp.clamp(u - float(i), 0.0, 1.0)
+    v = wp.clamp(v - float(j), 0.0, 1.0)
+    depth = 1.0 / z
+    low = passes(shadows, layer, j, i, depth) * (1.0 - u) + passes(shadows, layer, j, i + 1, depth) * u
+    high = passes(shadows, layer, j + 1, i, depth) * (1.0 - u) + passes(shadows, layer, j + 1, i + 1, depth) * u
+    return low * (1.0 - v) + high * v
+
+
+@wp.func
+def lamp_at(
+    lamps: wp.array(dtype=Lamp), k: int, shadows: wp.array3d(dtype=wp.uint64), p: wp.vec3, n: wp.vec3, fog: float
+) -> float:
+    """Irradiance / pi that a lamp, were its light 1, gives a point with a normal."""
+    to = p - lamps[k].place
+    turned = wp.dot(n, to)
+    ahead = wp.dot(to, lamps[k].ahead)
+    # most lamps that can reach the square leave the point dark: these tests cost least
+    if turned >= 0.0 or ahead <= 0.02:
+        return 0.0
+    square = wp.max(wp.dot(to, to), 1.0e-4)
+    distance = wp.sqrt(square)
+    reach = lamps[k].reach
+    if distance >= reach:
+        return 0.0
+    x = wp.dot(to, lamps[k].across) / ahead
+    y = wp.dot(to, lamps[k].down) / ahead
+    weight = float(1.0)
+    if lamps[k].square == 1:
+        if wp.abs(x) > 1.0 or wp.abs(y) > 1.0:
+            weight = 0.0
+    else:
+        radius = x * x + y * y
+        inner = lamps[k].inner
+        if radius > inner:
+            weight = wp.max((1.0 - radius) / (1.0 - inner), 0.0)
+    if weight <= 0.0:
+        return 0.0
+    layer = lamps[k].layer
+    if layer >= 0:
+        weight = weight * lamp_shadow(shadows, layer, x, y, ahead - 0.02 - 0.004 * ahead)
+    # the last third of the reach fades, so that no edge shows
+    weight = weight * wp.clamp(3.0 * (1.0 - distance / reach), 0.0, 1.0)
+    if fog > 0.0:
+        weight = weight * wp.exp(-fog * distance)
+    # a plane across the axis is lit evenly: the intensity grows with the cube of the secant
+    secant = distance / ahead
+    return weight * (secant * secant * secant * (-turned / distance) / square)
+
+
+@wp.func
+def spot_of(lamp: Lamp, p: wp.vec3, n: wp.vec3) -> wp.vec3:
+    """Where a lamp lights a point.
+
+    Returns x and y in the lamp's spread (-1 to 1), and the share of the spread that an area of 1 m^2 at the point
+    takes.
+    """
+    to = p - lamp.place
+    square = wp.max(wp.dot(to, to), 1.0e-4)
+    distance = wp.sqrt(square)
+    ahead = wp.dot(to, lamp.ahead)
+    secant = distance / ahead
+    bundle = secant * secant * secant * (-wp.dot(n, to) / distance) / square
+    return wp.vec3(wp.dot(to, lamp.across) / ahead, wp.dot(to, lamp.down) / ahead, bundle / lamp.spread)

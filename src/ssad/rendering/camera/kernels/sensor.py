@@ -1,0 +1,238 @@
+"""The sensor: linear light to photosites, photosites to 8 bits. See `ssad.rendering.camera.sensor` for the chain."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class Response:
+    """A view's sensor.
+
+    Attributes:
+        exposure: Factor of the light.
+        centre: Weight of a pixel in the lens's blur along an axis.
+        side: Weight of each of its two neighbours.
+        full: Light at which a photosite is full.
+        photons: Variance for each unit of light.
+        dark: Standard deviation without light.
+        seed: Seed of the noise.
+        mosaic: 1 for a sensor with a colour mosaic.
+    """
+
+    exposure: float
+    centre: float
+    side: float
+    full: float
+    photons: float
+    dark: float
+    seed: int
+    mosaic: int
+
+
+@wp.func
+def mirrored(index: int, count: int) -> int:
+    """An index no further out than the picture, mirrored at its outermost pixel."""
+    inside = wp.abs(index)
+    if inside >= count:
+        inside = 2 * count - 2 - inside
+    return wp.max(inside, 0)
+
+
+@wp.func
+def code_of(curve: wp.array(dtype=wp.uint8), light: float) -> wp.uint8:
+    """The camera's curve, listed over the square root of light in 0..4."""
+    v = wp.sqrt(wp.clamp(light, 0.0, 3.999)) * 0.5 * float(curve.shape[0])
+    return curve[int(v)]
+
+
+@wp.func
+def filled(response: Response, light: float, normal: float) -> float:
+    """What a photosite holds: light with noise, and no more than fits."""
+    spread = wp.sqrt(response.photons * wp.max(light, 0.0) + response.dark * response.dark)
+    return wp.min(light + spread * normal, response.full)
+
+
+@wp.func
+def spread_row(
+    radiance: wp.array3d(dtype=wp.vec3), b: int, y: int, left: int, x: int, right: int, c: int, response: Response
+) -> float:
+    """One colour of a row, spread along it."""
+    return response.centre * radiance[b, y, x][c] + response.side * (radiance[b, y, left][c] + radiance[b, y, right][c])
+
+
+@wp.func
+def site(
+    radiance: wp.array3d(dtype=wp.vec3),
+    b: int,
+    y: int,
+    x: int,
+    above: int,
+    below: int,
+    left: int,
+    right: int,
+    c: int,
+    response: Response,
+) -> float:
+    """What the photosite of colour c at y, x holds."""
+    light = response.centre * spread_row(radiance, b, y, left, x, right, c, response)
+    light += response.side * (
+        spread_row(radiance, b, above, left, x, right, c, response)
+        + spread_row(radiance, b, below, left, x, right, c, response)
+    )
+    light = light * response.exposure
+    if response.dark > 0.0:
+        state = wp.rand_init(response.seed, y * radiance.shape[2] + x)
+        return filled(response, light, wp.randn(state))
+    return wp.min(light, response.full)
+
+
+@wp.kernel
+def expose(
+    radiance: wp.array3d(dtype=wp.vec3), responses: wp.array(dtype=Response), raw: wp.array3d(dtype=float)
+):  # fmt: skip
+    """Light to photosites raw [B, H, W], for views with a mosaic.
+
+    Each thread handles a square of four, so that no thread has to choose its colour.
+    """
+    b, row, column = wp.tid()
+    response = responses[b]
+    if response.mosaic == 0:
+        return
+    height = radiance.shape[1]
+    width = radiance.shape[2]
+    y = 2 * row
+    x = 2 * column
+    above = mirrored(y - 1, height)
+    left = mirrored(x - 1, width)
+    y1 = mirrored(y + 1, height)
+    x1 = mirrored(x + 1, width)
+    raw[b, y, x] = site(radiance, b, y, x, above, y1, left, x1, 0, response)
+    if x + 1 < width:
+        raw[b, y, x1] = site(radiance, b, y, x1, above, y1, x, mirrored(x + 2, width), 1, response)
+    if y + 1 < height:
+        y2 = mirrored(y + 2, height)
+        raw[b, y1, x] = site(radiance, b, y1, x, y, y2, left, x1, 1, response)
+        if x + 1 < width:
+            raw[b, y1, x1] = site(radiance, b, y1, x1, y, y2, x, mirrored(x + 2, width), 2, response)
+
+
+@wp.kernel
+def develop(
+    raw: wp.array3d(dtype=float),
+    responses: wp.array(dtype=Response),
+    curve: wp.array(dtype=wp.uint8),
+    out: wp.array4d(dtype=wp.uint8),
+):
+    """Photosites to 8 bits out [B, H, W, 3], for views with a mosaic.
+
+    First the missing colours are interpolated (Malvar, He and Cutler 2004), then the curve is applied. Each thread
+    handles a square of four.
+    """
+    b, row, column = wp.tid()
+    if responses[b].mosaic == 0:
+        return
+    height = raw.shape[1]
+    width = raw.shape[2]
+    y2 = 2 * row
+    x2 = 2 * column
+    y0 = mirrored(y2 - 2, height)
+    y1 = mirrored(y2 - 1, height)
+    y3 = mirrored(y2 + 1, height)
+    y4 = mirrored(y2 + 2, height)
+    y5 = mirrored(y2 + 3, height)
+    x0 = mirrored(x2 - 2, width)
+    x1 = mirrored(x2 - 1, width)
+    x3 = mirrored(x2 + 1, width)
+    x4 = mirrored(x2 + 2, width)
+    x5 = mirrored(x2 + 3, width)
+    # the 6 x 6 photosites around the square, but for its far corners; letters by colour
+    g01 = raw[b, y0, x3]
+    r00 = raw[b, y0, x2]
+    b10 = raw[b, y1, x1]
+    g10 = raw[b, y1, x2]
+    b11 = raw[b, y1, x3]
+    g11 = raw[b, y1, x4]
+    r20 = raw[b, y2, x0]
+    g20 = raw[b, y2, x1]
+    r21 = raw[b, y2, x2]
+    g21 = raw[b, y2, x3]
+    r22 = raw[b, y2, x4]
+    g22 = raw[b, y2, x5]
+    g30 = raw[b, y3, x0]
+    b30 = raw[b, y3, x1]
+    g31 = raw[b, y3, x2]
+    b31 = raw[b, y3, x3]
+    g32 = raw[b, y3, x4]
+    b32 = raw[b, y3, x5]
+    g40 = raw[b, y4, x1]
+    r41 = raw[b, y4, x2]
+    g41 = raw[b, y4, x3]
+    r42 = raw[b, y4, x4]
+    g51 = raw[b, y5, x2]
+    b51 = raw[b, y5, x3]
+    # red's site
+    green = 0.5 * r21 + 0.25 * (g20 + g21 + g10 + g31) - 0.125 * (r20 + r22 + r00 + r41)
+    blue = 0.75 * r21 + 0.25 * (b10 + b11 + b30 + b31) - 0.1875 * (r20 + r22 + r00 + r41)
+    out[b, y2, x2, 0] = code_of(curve, r21)
+    out[b, y2, x2, 1] = code_of(curve, green)
+    out[b, y2, x2, 2] = code_of(curve, blue)
+    if x2 + 1 < width:
+        # green's, red left and right
+        near = 0.625 * g21 - 0.125 * (g10 + g11 + g31 + g32)
+        red = near + 0.5 * (r21 + r22) - 0.125 * (g20 + g22) + 0.0625 * (g01 + g41)
+        blue = near + 0.5 * (b11 + b31) - 0.125 * (g01 + g41) + 0.0625 * (g20 + g22)
+        out[b, y2, x3, 0] = code_of(curve, red)
+        out[b, y2, x3, 1] = code_of(curve, g21)
+        out[b, y2, x3, 2] = code_of(curve, blue)
+    if y2 + 1 < height:
+        # green's, red above and below
+        near = 0.625 * g31 - 0.125 * (g20 + g21 + g40 + g41)
+        red = near + 0.5 * (r21 + r41) - 0.125 * (g10 + g51) + 0.0625 * (g30 + g32)
+        blue = near + 0.5 * (b30 + b31) - 0.125 * (g30 + g32) + 0.0625 * (g10 + g51)
+        out[b, y3, x2, 0] = code_of(curve, red)
+        out[b, y3, x2, 1] = code_of(curve, g31)
+        out[b, y3, x2, 2] = code_of(curve, blue)
+    if x2 + 1 < width and y2 + 1 < height:
+        # blue's
+        green = 0.5 * b31 + 0.25 * (g31 + g32 + g21 + g41) - 0.125 * (b30 + b32 + b11 + b51)
+        red = 0.75 * b31 + 0.25 * (r21 + r22 + r41 + r42) - 0.1875 * (b30 + b32 + b11 + b51)
+        out[b, y3, x3, 0] = code_of(curve, red)
+        out[b, y3, x3, 1] = code_of(curve, green)
+        out[b, y3, x3, 2] = code_of(curve, b31)
+
+
+@wp.kernel
+def develop_plain(
+    radiance: wp.array3d(dtype=wp.vec3),
+    responses: wp.array(dtype=Response),
+    curve: wp.array(dtype=wp.uint8),
+    out: wp.array4d(dtype=wp.uint8),
+):
+    """Light to 8 bits, for views without a mosaic: every photosite has three colours. out [B, H, W, 3]."""
+    b, y, x = wp.tid()
+    response = responses[b]
+    if response.mosaic == 1:
+        return
+    height = radiance.shape[1]
+    width = radiance.shape[2]
+    light = radiance[b, y, x]
+    if response.side > 0.0:
+        left = mirrored(x - 1, width)
+        right = mirrored(x + 1, width)
+        above = mirrored(y - 1, height)
+        below = mirrored(y + 1, height)
+        across = radiance[b, y, left] + radiance[b, y, right]
+        over = (
+            radiance[b, above, left] + radiance[b, above, right] + radiance[b, below, left] + radiance[b, below, right]
+        )
+        along = radiance[b, above, x] + radiance[b, below, x]
+        light = light * (response.centre * response.centre) + (across + along) * (response.centre * response.side)
+        light += over * (response.side * response.side)
+    light = light * response.exposure
+    if response.dark > 0.0:
+        state = wp.rand_init(response.seed, y * width + x)
+        for c in range(3):
+            light[c] = filled(response, light[c], wp.randn(state))
+    for c in range(3):
+        out[b, y, x, c] = code_of(curve, wp.min(light[c], response.full))

@@ -1,0 +1,575 @@
+"""Shading: what light comes from each sample, averaged to pixels. Linear in the colour of every surface.
+
+One evaluation a pixel and triangle, at the mean of the samples that the triangle covers. Sun with two shadow maps (one
+fine, where it matters), sky and ground as ambient light that bodies keep from the ground below them, lamps, a mirror
+term for glass, paint and wet roads, fog by distance.
+"""
+
+import warp as wp
+
+from ssad.rendering.camera.kernels.layers import Fragment, Layers, on_decal, on_layer
+from ssad.rendering.camera.kernels.light import CELLS, Near, cell_of, lamp_at, openness, spot_of
+from ssad.rendering.camera.kernels.matter import Surface, textured
+from ssad.rendering.camera.kernels.raster import LAST, REGISTERS
+from ssad.rendering.camera.kernels.sky import Light, cloudy, sky, surroundings
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class Geometry:
+    """What a scene is made of, see `ssad.rendering.camera.scene.Scene`."""
+
+    vertices: wp.array(dtype=wp.vec3)
+    faces: wp.array2d(dtype=int)
+    normals: wp.array2d(dtype=wp.vec3)
+    uvs: wp.array2d(dtype=wp.vec2)
+    material: wp.array(dtype=int)
+    surfaces: wp.array(dtype=Surface)
+    wearable: wp.array(dtype=int)
+
+
+@wp.struct
+class Drawn:
+    """Ranges of listed faces, each under one matrix (see `ssad.rendering.camera.scene.Draws`).
+
+    Attributes:
+        samples: Key of what each sample shows.
+        owners: Draw and face of each key.
+        matrices: Object to camera, of each draw.
+        paints: Linear RGB of each draw.
+        tags: Tag of each draw.
+        lit: 1 where the lamps of the draw's body are on.
+    """
+
+    samples: wp.array3d(dtype=wp.uint64)
+    owners: wp.array(dtype=wp.vec2i)
+    matrices: wp.array(dtype=wp.mat44)
+    paints: wp.array(dtype=wp.vec3)
+    tags: wp.array(dtype=int)
+    lit: wp.array(dtype=int)
+
+
+@wp.struct
+class SunShadows:
+    """Shadow maps of the sun: one wide, one fine; matrices from the world to texels; m a texel."""
+
+    wide: wp.array3d(dtype=wp.uint64)
+    fine: wp.array3d(dtype=wp.uint64)
+    to_wide: wp.array(dtype=wp.mat44)
+    to_fine: wp.array(dtype=wp.mat44)
+    wide_texel: float
+    fine_texel: float
+
+
+@wp.struct
+class Output:
+    """What `shade` writes.
+
+    Attributes:
+        radiance: [B, H, W].
+        tag: [B, H, W].
+        depth: [B, H, W], m.
+        fragments: Pieces of textured surfaces.
+        found: How many fragments were found.
+        surface: 1 where the following four are wanted, [B, H, W] each; they describe what covers most of a pixel.
+        albedo: Linear.
+        normal: Unit vectors, world.
+        irradiance: Of all light, over pi.
+        gain: What the pixel's radiance gains per unit of albedo.
+    """
+
+    radiance: wp.array3d(dtype=wp.vec3)
+    tag: wp.array3d(dtype=int)
+    depth: wp.array3d(dtype=float)
+    fragments: wp.array(dtype=Fragment)
+    found: wp.array(dtype=int)
+    surface: int
+    albedo: wp.array3d(dtype=wp.vec3)
+    normal: wp.array3d(dtype=wp.vec3)
+    irradiance: wp.array3d(dtype=wp.vec3)
+    gain: wp.array3d(dtype=wp.vec3)
+
+
+@wp.struct
+class Hit:
+    """Where a ray meets a face.
+
+    Attributes:
+        draw: Its draw.
+        face: Its face.
+        place: Point in the world, m.
+        normal: Unit normal in the world.
+        uv: Texture coordinates.
+        z: Depth along the optical axis, m.
+        distance: Distance from the camera, m.
+        slant: Cosine between the ray and the face's normal.
+        stretch: Texture area for 1 m^2 of the face.
+    """
+
+    draw: int
+    face: int
+    place: wp.vec3
+    normal: wp.vec3
+    uv: wp.vec2
+    z: float
+    distance: float
+    slant: float
+    stretch: float
+
+
+@wp.struct
+class Lit:
+    """Light on a point.
+
+    Attributes:
+        light: Irradiance / pi of all light.
+        sun: Part that comes straight from the sun, as a share of the sun's light, 0 to 1.
+        open_: Share of the sky that the point sees.
+    """
+
+    light: wp.vec3
+    sun: float
+    open_: float
+
+
+@wp.struct
+class Seen:
+    """What a surface sends to the camera: its colour, and what it gains per unit of albedo."""
+
+    colour: wp.vec3
+    gain: wp.vec3
+
+
+@wp.func
+def open_texel(shadows: wp.array3d(dtype=wp.uint64), view: int, row: int, column: int, depth: float) -> float:
+    """1 where the texel holds nothing nearer to the light."""
+    if wp.cast(wp.uint32(shadows[view, row, column] >> wp.uint64(32)), float) <= depth:
+        return 1.0
+    return 0.0
+
+
+@wp.func
+def sunlit(shadows: wp.array3d(dtype=wp.uint64), view: int, p: wp.vec3, bias: float) -> float:
+    """Share of the sun that reaches a point, from four texels of a shadow map, weighted; -1 outside the map.
+
+    p: the point in texels, and in metres along the light.
+    """
+    size = shadows.shape[1]
+    if size < 4:
+        return -1.0
+    x = p[0] - 0.5
+    y = p[1] - 0.5
+    i = int(wp.floor(x))
+    j = int(wp.floor(y))
+    if i < 0 or j < 0 or i >= size - 1 or j >= size - 1:
+        return -1.0
+    u = x - float(i)
+    v = y - float(j)
+    depth = (1.0e3 - p[2] + bias) * 1.0e-3
+    low = open_texel(shadows, view, j, i, depth) * (1.0 - u) + open_texel(shadows, view, j, i + 1, depth) * u
+    high = open_texel(shadows, view, j + 1, i, depth) * (1.0 - u) + open_texel(shadows, view, j + 1, i + 1, depth) * u
+    return low * (1.0 - v) + high * v
+
+
+@wp.func
+def sun_at(shadows: SunShadows, view: int, p: wp.vec3, n: wp.vec3) -> float:
+    """Share of the sun that reaches a point with a normal: by the fine map where it has the point."""
+    texel = shadows.fine_texel
+    share = sunlit(shadows.fine, view, wp.transform_point(shadows.to_fine[view], p + n * (texel * 1.5)), texel)
+    if share < 0.0:
+        texel = shadows.wide_texel
+        share = sunlit(shadows.wide, view, wp.transform_point(shadows.to_wide[view], p + n * (texel * 1.5)), texel)
+    if share < 0.0:
+        share = 1.0
+    return share
+
+
+@wp.func
+def hit_of(geometry: Geometry, drawn: Drawn, slot: int, ray: wp.vec3, pose: wp.mat44) -> Hit:
+    """Where a ray (camera frame, z = 1) meets the plane of a slot's face, no further out than its edges."""
+    hit = Hit()
+    owner = drawn.owners[slot / 2]
+    hit.draw = owner[0]
+    hit.face = owner[1]
+    face = hit.face
+    m = drawn.matrices[hit.draw]
+    a = wp.transform_point(m, geometry.vertices[geometry.faces[face, 0]])
+    b = wp.transform_point(m, geometry.vertices[geometry.faces[face, 1]])
+    c = wp.transform_point(m, geometry.vertices[geometry.faces[face, 2]])
+    ab = b - a
+    ac = c - a
+    plane = wp.cross(ab, ac)
+    along = wp.dot(plane, ray)
+    if wp.abs(along) < 1.0e-12:
+        along = -1.0e-12
+    hit.z = wp.clamp(wp.dot(plane, a) / along, 0.05, 2.0e3)
+    # in shares of the corners
+    inside = ray * hit.z - a
+    square = wp.dot(plane, plane)
+    sb = wp.clamp(wp.dot(wp.cross(inside, ac), plane) / square, 0.0, 1.0)
+    sc = wp.clamp(wp.dot(wp.cross(ab, inside), plane) / square, 0.0, 1.0 - sb)
+    sa = 1.0 - sb - sc
+    hit.uv = geometry.uvs[face, 0] * sa + geometry.uvs[face, 1] * sb + geometry.uvs[face, 2] * sc
+    bent = geometry.normals[face, 0] * sa + geometry.normals[face, 1] * sb + geometry.normals[face, 2] * sc
+    hit.normal = wp.normalize(wp.transform_vector(pose, wp.transform_vector(m, bent)))
+    length = wp.length(ray)
+    hit.distance = hit.z * length
+    hit.place = wp.transform_point(pose, ray * hit.z)
+    hit.slant = wp.max(wp.abs(along) / (wp.sqrt(square) * length), 0.05)
+    ua = geometry.uvs[face, 1] - geometry.uvs[face, 0]
+    ub = geometry.uvs[face, 2] - geometry.uvs[face, 0]
+    hit.stretch = wp.abs(ua[0] * ub[1] - ua[1] * ub[0]) / wp.sqrt(square)
+    return hit
+
+
+@wp.func
+def lit_at(
+    light: Light, shadows: SunShadows, near: Near, view: int, row: int, p: wp.vec3, n: wp.vec3, open_: float
+) -> Lit:
+    """All light on a point with a normal, but for lamps that project a texture."""
+    lit = Lit()
+    lit.open_ = open_
+    facing = wp.dot(n, light.sun)
+    if facing > 0.0:
+        lit.sun = facing * sun_at(shadows, view, p, n)
+    up = 0.5 + 0.5 * n[2]
+    lit.light = light.sun_colour * lit.sun
+    lit.light += (light.zenith * (0.65 * up) + light.horizon * (0.35 * up)) * open_ + light.ground * (1.0 - up)
+    if row >= 0:
+        for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+            k = near.lamp_list[at]
+            if near.lamps[k].texture < 0:
+                given = lamp_at(near.lamps, k, near.shadows, p, n, light.fog)
+                if given > 0.0:
+                    lit.light += near.lamps[k].light * (given * open_)
+    return lit
+
+
+@wp.func
+def seen_from(
+    light: Light,
+    near: Near,
+    row: int,
+    surface: Surface,
+    albedo: wp.vec3,
+    glow: float,
+    hit: Hit,
+    lit: Lit,
+    away: wp.vec3,
+) -> Seen:
+    """What a lit surface sends back along a unit ray: its own colour, what it mirrors, fog."""
+    seen = Seen()
+    n = hit.normal
+    p = hit.place
+    colour = wp.cw_mul(albedo, lit.light) + surface.colour * glow
+    gain = lit.light
+    mirror = surface.specular
+    gloss = surface.gloss
+    if surface.paint == 1:
+        mirror = 0.05
+    wet = int(0)
+    if light.wet > 0.0 and n[2] > 0.9:
+        wet = 1
+        # a film of water: darker, and a mirror the better the deeper it stands
+        film = light.wet * wp.clamp(0.25 + 1.5 * (cloudy(p[0] * 0.35, p[1] * 0.35) - 0.3), 0.0, 1.0)
+        dark = 1.0 - 0.45 * light.wet
+        colour = colour * dark
+        gain = gain * dark
+        mirror = wp.max(mirror, 0.02)
+        gloss = wp.max(gloss, 0.35 * light.wet + 0.6 * film)
+    sharp = float(1.0)
+    if wet == 1:
+        sharp = 0.1
+    back = away - n * (2.0 * wp.dot(n, away))
+    glance = 1.0 - wp.max(-wp.dot(n, away), 0.0)
+    fresnel = glance * glance * glance * glance * glance
+    # no step where the mirror begins to count: the first hundredths are given away
+    share = wp.max((mirror + (1.0 - mirror) * fresnel) * gloss - 0.02, 0.0) / 0.98
+    if share > 0.0:
+        colour = colour * (1.0 - share) + surroundings(light, back, p, sharp) * (share * lit.open_)
+        gain = gain * (1.0 - share)
+    if gloss > 0.2:
+        power = 8.0 + 400.0 * gloss * gloss
+        bright = (mirror + fresnel) * gloss * 6.0
+        if lit.sun > 0.0:
+            colour += light.sun_colour * (wp.pow(wp.max(wp.dot(back, light.sun), 0.0), power) * bright)
+        if light.lamps > 0.0 and row >= 0:
+            # a lamp seen in the mirror, drawn long on a wet road as by its small waves
+            rough = power
+            if wet == 1:
+                rough = 60.0
+            # what is turned further away than this shines by less than a thousandth: no power of it is taken
+            least = 0.99 * wp.pow(0.001, 1.0 / rough)
+            for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+                k = near.lamp_list[at]
+                if near.lamps[k].texture < 0:
+                    toward = wp.normalize(near.lamps[k].place - p)
+                    along = wp.dot(back, toward)
+                    if along > least:
+                        shine = wp.pow(along, rough)
+                        if shine > 0.001:
+                            given = lamp_at(near.lamps, k, near.shadows, p, toward, light.fog)
+                            colour += near.lamps[k].light * (given * shine * bright * 0.5)
+    if light.fog > 0.0:
+        clear = wp.exp(-light.fog * hit.distance)
+        colour = colour * clear + light.horizon * (1.0 - clear)
+        gain = gain * clear
+    seen.colour = colour
+    seen.gain = gain
+    return seen
+
+
+@wp.func
+def keep(out: Output, fragment: Fragment):
+    """Lists a fragment as long as there is room."""
+    at = wp.atomic_add(out.found, 0, 1)
+    if at < out.fragments.shape[0]:
+        out.fragments[at] = fragment
+
+
+@wp.func
+def project(
+    out: Output,
+    near: Near,
+    row: int,
+    fragment: Fragment,
+    hit: Hit,
+    albedo: wp.vec3,
+    through: wp.vec3,
+    span: float,
+    open_: float,
+    fog: float,
+):
+    """Lists what lamps that project a texture add to a pixel.
+
+    through: share of the light that the surface sends on to the camera; span: area of the surface in the pixel, m^2.
+    """
+    for at in range(near.lamp_start[row], near.lamp_start[row + 1]):
+        k = near.lamp_list[at]
+        if near.lamps[k].texture >= 0:
+            given = lamp_at(near.lamps, k, near.shadows, hit.place, hit.normal, fog)
+            if given > 0.0:
+                lamp = near.lamps[k]
+                spot = spot_of(lamp, hit.place, hit.normal)
+                piece = fragment
+                piece.texture = lamp.texture
+                piece.u = 0.5 + 0.5 * spot[0]
+                piece.v = 0.5 + 0.5 * spot[1]
+                piece.area = spot[2] * span
+                piece.light = wp.cw_mul(wp.cw_mul(albedo, through), lamp.light) * (given * open_)
+                keep(out, piece)
+
+
+@wp.func
+def left_by(all: Layers, view: int, draw: int, wearable: int, hit: Hit, tag: int) -> float:
+    """Share of a surface's own colour that its layers and the decals leave."""
+    left = float(1.0)
+    if wearable == 1:
+        for k in range(all.start[draw], all.start[draw + 1]):
+            left = left * (1.0 - on_layer(all, all.layers[k], hit.uv)[2])
+    for k in range(all.decal_start[view], all.decal_start[view + 1]):
+        left = left * (1.0 - on_decal(all, all.decals[k], hit.place, hit.normal, tag)[2])
+    return left
+
+
+@wp.func
+def wear(
+    out: Output,
+    all: Layers,
+    view: int,
+    draw: int,
+    wearable: int,
+    fragment: Fragment,
+    hit: Hit,
+    tag: int,
+    gain: wp.vec3,
+    span: float,
+):
+    """Lists what decals and layers add to a pixel, from the uppermost down; span: area of the surface in it, m^2."""
+    left = float(1.0)
+    count = all.decal_start[view + 1] - all.decal_start[view]
+    for k in range(count):
+        decal = all.decals[all.decal_start[view + 1] - 1 - k]
+        at = on_decal(all, decal, hit.place, hit.normal, tag)
+        if at[2] > 0.0:
+            piece = fragment
+            piece.texture = decal.texture
+            piece.u = at[0]
+            piece.v = at[1]
+            piece.area = span * wp.abs(wp.dot(hit.normal, decal.ahead)) / decal.area
+            piece.light = gain * (left * at[2])
+            keep(out, piece)
+            left = left * (1.0 - at[2])
+    if wearable == 1:
+        count = all.start[draw + 1] - all.start[draw]
+        for k in range(count):
+            layer = all.layers[all.start[draw + 1] - 1 - k]
+            at = on_layer(all, layer, hit.uv)
+            if at[2] > 0.0:
+                piece = fragment
+                piece.texture = layer.texture
+                piece.u = at[0]
+                piece.v = at[1]
+                piece.area = hit.stretch / ((layer.box[2] - layer.box[0]) * (layer.box[3] - layer.box[1])) * span
+                piece.light = gain * (left * at[2])
+                keep(out, piece)
+                left = left * (1.0 - at[2])
+
+
+@wp.func
+def shade_pixel(
+    geometry: Geometry,
+    drawn: Drawn,
+    layers: Layers,
+    focal: wp.vec4,
+    pose: wp.mat44,
+    light: Light,
+    shadows: SunShadows,
+    near: Near,
+    projecting: int,
+    scale: int,
+    out: Output,
+    view: int,
+    y: int,
+    x: int,
+):
+    """Shades one pixel, see `shade`."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    best = int(0)
+    most = int(-1)
+    far = float(wp.inf)
+    count = scale * scale
+    step = 1.0 / float(scale)
+    eye = wp.vec3(pose[0, 3], pose[1, 3], pose[2, 3])
+    # the lower half of a key names the triangle, 0 the sky
+    top = y * scale
+    left = x * scale
+    name = drawn.samples[view, top, left] & LAST
+    different = int(0)
+    for dy in range(scale):
+        for dx in range(scale):
+            if (drawn.samples[view, top + dy, left + dx] & LAST) != name:
+                different += 1
+    rounds = count
+    if different == 0:
+        rounds = 1
+    for s in range(rounds):
+        key = name
+        covered = count
+        px = 0.5 * float(count * (scale - 1))
+        py = px
+        fresh = int(1)
+        if different > 0:
+            # a triangle is shaded where it comes first
+            key = drawn.samples[view, top + s / scale, left + s % scale] & LAST
+            covered = int(0)
+            px = float(0.0)
+            py = float(0.0)
+            e = int(0)
+            for dy in range(scale):
+                for dx in range(scale):
+                    if (drawn.samples[view, top + dy, left + dx] & LAST) == key:
+                        if e < s:
+                            fresh = 0
+                        covered += 1
+                        px += float(dx)
+                        py += float(dy)
+                    e += 1
+        if fresh == 1:
+            u = float(x) + (px / float(covered) + 0.5) * step - 0.5
+            v = float(y) + (py / float(covered) + 0.5) * step - 0.5
+            ray = wp.vec3((u - focal[2]) / focal[0], (v - focal[3]) / focal[1], 1.0)
+            away = wp.normalize(wp.transform_vector(pose, ray))
+            colour = wp.vec3(0.0, 0.0, 0.0)
+            mine = int(-1)
+            z = float(wp.inf)
+            if key == wp.uint64(0):
+                colour = sky(light, away, 1)
+                if light.fog > 0.0:
+                    veil = wp.exp(-light.fog * 300.0 / (0.15 + wp.max(away[2], 0.0) * 3.0))
+                    colour = colour * veil + light.horizon * (1.0 - veil)
+            else:
+                slot = int(LAST - key)
+                hit = hit_of(geometry, drawn, slot, ray, pose)
+                z = hit.z
+                mine = drawn.tags[hit.draw]
+                surface = geometry.surfaces[geometry.material[hit.face]]
+                albedo = surface.colour
+                if surface.paint == 1:
+                    albedo = drawn.paints[hit.draw]
+                albedo = textured(surface, albedo, hit.uv, hit.distance / (focal[0] * hit.slant))
+                if layers.any == 1:
+                    albedo = albedo * left_by(layers, view, hit.draw, geometry.wearable[hit.face], hit, mine)
+                row = cell_of(hit.place, eye)
+                open_ = float(1.0)
+                if row >= 0:
+                    row = view * CELLS * CELLS + row
+                    if hit.normal[2] > 0.7:
+                        open_ = openness(near, row, hit.place)
+                lit = lit_at(light, shadows, near, view, row, hit.place, hit.normal, open_)
+                glow = surface.emission + surface.night * light.lamps
+                if surface.lamp == 1 and drawn.lit[hit.draw] == 0:
+                    glow = 0.0
+                shown = seen_from(light, near, row, surface, albedo, glow, hit, lit, away)
+                colour = shown.colour
+                share = float(covered) / float(count)
+                if layers.any == 1 or (projecting == 1 and row >= 0):
+                    piece = Fragment()
+                    piece.place = (view * out.radiance.shape[1] + y) * out.radiance.shape[2] + x
+                    piece.slot = slot
+                    # area of the surface that the pixel spans
+                    span = hit.distance * hit.distance / (focal[0] * focal[1] * hit.slant)
+                    span = span / (wp.length(ray) * wp.dot(ray, ray))
+                    gain = shown.gain * share
+                    if layers.any == 1:
+                        wear(out, layers, view, hit.draw, geometry.wearable[hit.face], piece, hit, mine, gain, span)
+                    if projecting == 1 and row >= 0:
+                        through = wp.cw_div(gain, wp.max(lit.light, wp.vec3(1.0e-6, 1.0e-6, 1.0e-6)))
+                        project(out, near, row, piece, hit, albedo, through, span, open_, light.fog)
+                if out.surface == 1 and (covered > best or (covered == best and z < far)):
+                    out.albedo[view, y, x] = albedo
+                    out.normal[view, y, x] = hit.normal
+                    out.irradiance[view, y, x] = lit.light
+                    out.gain[view, y, x] = shown.gain * share
+            total = total + colour * float(covered)
+            if covered > best or (covered == best and z < far):
+                best = covered
+                most = mine
+                far = z
+    out.radiance[view, y, x] = total / float(count)
+    out.tag[view, y, x] = most
+    out.depth[view, y, x] = far
+
+
+@wp.kernel(cuda_max_registers=REGISTERS)
+def shade(
+    geometry: Geometry,
+    drawn: Drawn,
+    layers: Layers,
+    lens: wp.array(dtype=wp.vec4),
+    to_world: wp.array(dtype=wp.mat44),
+    lights: wp.array(dtype=Light),
+    shadows: SunShadows,
+    near: Near,
+    projecting: int,
+    scale: int,
+    lanes: int,
+    out: Output,
+):
+    """Linear light, tag of what covers most of a pixel (-1 sky), depth along the axis (inf sky), see `Output`.
+
+    The radiance is without layers and decals, as if they were black; they are listed as fragments, in any order, and so
+    is what lamps that project a texture add to a surface's own colour (`projecting`: 1 if there are any).
+
+    Each row has `lanes` threads, which take its pixels in turn: as many as pixels on a GPU, one on a CPU, where every
+    thread copies all the arguments anew.
+    """
+    view, y, lane = wp.tid()
+    focal = lens[view]
+    light = lights[view]
+    pose = to_world[view]
+    for x in range(lane, out.radiance.shape[2], lanes):
+        shade_pixel(
+            geometry, drawn, layers, focal, pose, light, shadows, near, projecting, scale, out, view, y, x
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Triangle meshes: data structure, readers and writers."""

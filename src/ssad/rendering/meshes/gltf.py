@@ -1,0 +1,256 @@
+"""Reader of glTF 2.0 meshes (.gltf with data URIs or files beside it, and .glb): geometry and material factors.
+
+Source: Khronos glTF 2.0 specification. Sparse accessors, compressed geometry, skins and animations are not read; a
+file that requires an extension is refused.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core import safeio
+from ssad.core.errors import FormatError
+from ssad.core.rotations import pose_matrix
+from ssad.rendering.meshes.face_list import DEFAULT, MAX_BYTES, MAX_FACES, MAX_VERTICES, FaceList, beside
+from ssad.rendering.meshes.mesh import F64, Material
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_HARMLESS = ("KHR_materials_", "KHR_texture_transform", "KHR_mesh_quantization")
+MAX_NODES = 20_000
+
+
+def read_gltf(file: Path) -> FaceList:
+    """Triangles of the default scene, in the frame of the file.
+
+    Raises:
+        FormatError: The file is broken, or uses what is not supported.
+    """
+    data = safeio.read_bytes(file, limit=MAX_BYTES)
+    chunk = None
+    if file.suffix.lower() == ".glb":
+        data, chunk = _split_glb(data, file)
+    tree = safeio.parse_json(data, str(file))
+    if not isinstance(tree, dict):
+        raise FormatError(f"{file}: not a glTF file (an object is expected)")
+    try:
+        return _Reader(file, tree, chunk).read()
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError, OverflowError) as error:
+        raise FormatError(f"{file}: not a valid glTF file: {type(error).__name__} {error}") from None
+
+
+def _split_glb(data: bytes, file: Path) -> tuple[bytes, bytes | None]:
+    """JSON text and binary chunk of a .glb."""
+    if len(data) < 20 or data[:4] != b"glTF":
+        raise FormatError(f"{file}: not a binary glTF file")
+    version, total = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise FormatError(f"{file}: glTF version {version}; only version 2 is read")
+    if total > len(data):
+        raise FormatError(f"{file}: cut short: {len(data)} of {total} bytes")
+    chunks: dict[int, bytes] = {}
+    at = 12
+    while at + 8 <= total:
+        size, kind = struct.unpack_from("<II", data, at)
+        if at + 8 + size > total:
+            raise FormatError(f"{file}: a chunk of {size} bytes is cut short")
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+        at += 8 + size
+    if 0x4E4F534A not in chunks:
+        raise FormatError(f"{file}: no JSON chunk")
+    return chunks[0x4E4F534A], chunks.get(0x004E4942)
+
+
+class _Reader:
+    """One pass over the scene graph of a parsed glTF tree."""
+
+    def __init__(self, file: Path, tree: dict[str, Any], chunk: bytes | None) -> None:
+        self.file, self.tree, self.chunk = file, tree, chunk
+        self.buffers: dict[int, bytes] = {}
+        self.triangles = FaceList()
+        self.faces = self.visited = 0
+
+    def fail(self, message: str) -> FormatError:
+        return FormatError(f"{self.file}: {message}")
+
+    def item(self, kind: str, index: Any) -> Any:
+        table = self.tree.get(kind, [])
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(table):
+            raise self.fail(f"{kind}[{index}] does not exist (there are {len(table)})")
+        return table[index]
+
+    def read(self) -> FaceList:
+        version = str(self.tree.get("asset", {}).get("version", ""))
+        if not version.startswith("2"):
+            raise self.fail(f"glTF version '{version[:20]}'; only version 2 is read")
+        needed = [e for e in self.tree.get("extensionsRequired", []) if not str(e).startswith(_HARMLESS)]
+        if needed:
+            raise self.fail(f"requires the extension {str(needed[0])[:60]}; export without it")
+        self.triangles.materials = [self.material(m, k) for k, m in enumerate(self.tree.get("materials", []))] + [
+            DEFAULT
+        ]
+        scenes = self.tree.get("scenes", [])
+        nodes = self.tree.get("nodes", [])
+        if scenes:
+            roots = self.item("scenes", self.tree.get("scene", 0)).get("nodes", [])
+        else:
+            children = {c for n in nodes for c in n.get("children", [])}
+            roots = [k for k in range(len(nodes)) if k not in children]
+        for root in roots:
+            self.node(root, np.eye(4), ())
+        return self.triangles
+
+    def node(self, index: int, parent: F64, above: tuple[int, ...]) -> None:
+        self.visited += 1
+        if index in above or len(above) > safeio.MAX_DEPTH or self.visited > MAX_NODES:
+            raise self.fail(f"nodes[{index}]: the tree of nodes is a loop or too large")
+        node = self.item("nodes", index)
+        matrix = parent @ _local(node)
+        if not np.isfinite(matrix).all():
+            raise self.fail(f"nodes[{index}]: the matrix holds NaN or infinity")
+        if "mesh" in node:
+            mesh = self.item("meshes", node["mesh"])
+            name = str(node.get("name") or mesh.get("name") or f"mesh {node['mesh']}")[:80]
+            for k, primitive in enumerate(mesh["primitives"]):
+                self.primitive(primitive, matrix, name, f"meshes[{node['mesh']}].primitives[{k}]")
+        for child in node.get("children", []):
+            self.node(child, matrix, (*above, index))
+
+    def primitive(self, data: dict[str, Any], matrix: F64, name: str, where: str) -> None:
+        attributes = data["attributes"]
+        mode = data.get("mode", 4)
+        if mode not in (4, 5, 6):
+            return  # points and lines have no surface
+        points = self.accessor(attributes["POSITION"], "VEC3", where)
+        if "TEXCOORD_0" not in attributes:
+            raise self.fail(f"{where}: no texture coordinates (UVs); unwrap the mesh before the export")
+        uv = self.accessor(attributes["TEXCOORD_0"], "VEC2", where)
+        normals = (
+            self.accessor(attributes["NORMAL"], "VEC3", where) if "NORMAL" in attributes else np.zeros_like(points)
+        )
+        if not len(points) == len(uv) == len(normals):
+            raise self.fail(f"{where}: attributes have different lengths")
+        if "indices" in data:
+            index = self.accessor(data["indices"], "SCALAR", where)[:, 0].astype(np.int64)
+        else:
+            index = np.arange(len(points))
+        if len(index) and (index.min() < 0 or index.max() >= len(points)):
+            raise self.fail(f"{where}: index {int(index.max())} is out of range (there are {len(points)} vertices)")
+        faces = _triangles(index, mode)
+        self.faces += len(faces)
+        if self.faces > MAX_FACES:
+            raise self.fail(f"more than {MAX_FACES} triangles; simplify the mesh")
+        linear = matrix[:3, :3]
+        determinant = float(np.linalg.det(linear))
+        if abs(determinant) < 1e-18:
+            raise self.fail(f"{where}: its node has a singular matrix")
+        if determinant < 0.0:
+            faces = faces[:, ::-1]
+        placed = points @ linear.T + matrix[:3, 3]
+        turned = normals @ np.linalg.inv(linear)
+        turned /= np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
+        look = len(self.triangles.materials) - 1
+        if "material" in data:
+            self.item("materials", data["material"])
+            look = data["material"]
+        if name not in self.triangles.groups:
+            self.triangles.groups.append(name)
+        group = self.triangles.groups.index(name)
+        self.triangles.add(placed[faces], uv[faces], turned[faces], material=look, group=group)
+
+    def accessor(self, index: int, kind: str, where: str) -> F64:
+        """Values [n, width] of an accessor as float64."""
+        data = self.item("accessors", index)
+        label = f"accessors[{index}]"
+        if "sparse" in data or "bufferView" not in data:
+            raise self.fail(f"{label}: sparse accessors are not read; export without them")
+        if data.get("type") != kind or data.get("componentType") not in _TYPES:
+            raise self.fail(
+                f"{label}: type {data.get('type')} of {data.get('componentType')} where {kind} is needed ({where})"
+            )
+        count, width = int(data["count"]), _WIDTHS[kind]
+        if not 0 <= count <= 3 * MAX_VERTICES:
+            raise self.fail(f"{label}: {count} entries; simplify the mesh")
+        dtype = np.dtype(_TYPES[data["componentType"]])
+        view = self.item("bufferViews", data["bufferView"])
+        buffer = self.buffer(view["buffer"])
+        start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
+        step = int(view.get("byteStride", 0)) or dtype.itemsize * width
+        offset = int(data.get("byteOffset", 0))
+        last = offset + (count - 1) * step + dtype.itemsize * width if count else 0
+        if min(start, size, offset) < 0 or step < dtype.itemsize * width or start + size > len(buffer) or last > size:
+            raise self.fail(f"{label}: reaches past the end of its buffer ({len(buffer)} bytes): the file is cut short")
+        if not count:
+            return np.zeros((0, width))
+        flat = np.frombuffer(buffer, np.uint8, count=last, offset=start)[offset:]
+        rows = np.lib.stride_tricks.as_strided(flat, (count, dtype.itemsize * width), (step, 1))
+        values = np.ascontiguousarray(rows).view(dtype).astype(np.float64)
+        if data.get("normalized") and dtype.kind in "iu":
+            values = np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return np.asarray(values)
+
+    def buffer(self, index: int) -> bytes:
+        if index in self.buffers:
+            return self.buffers[index]
+        data = self.item("buffers", index)
+        uri = data.get("uri")
+        if uri is None:
+            if self.chunk is None or index != 0:
+                raise self.fail(f"buffers[{index}] has no data")
+            content = self.chunk
+        elif uri.startswith("data:"):
+            try:
+                content = base64.b64decode(uri.split(",", 1)[1], validate=True)
+            except (IndexError, binascii.Error):
+                raise self.fail(f"buffers[{index}]: the data URI is not base64") from None
+        else:
+            content = safeio.read_bytes(beside(self.file, unquote(uri)), limit=MAX_BYTES)
+        if len(content) < int(data["byteLength"]):
+            raise self.fail(f"buffers[{index}] is cut short: {len(content)} of {data['byteLength']} bytes")
+        self.buffers[index] = content
+        return content
+
+    def material(self, data: dict[str, Any], index: int) -> Material:
+        """Base colour (linear), metal share as specular share, roughness as lack of gloss."""
+        rough = data.get("pbrMetallicRoughness", {})
+        colour = [float(v) for v in rough.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])][:3]
+        glow = [float(v) for v in data.get("emissiveFactor", [0.0, 0.0, 0.0])]
+        metal, roughness = float(rough.get("metallicFactor", 1.0)), float(rough.get("roughnessFactor", 1.0))
+        values = np.array([*colour, *glow, metal, roughness])
+        if len(colour) != 3 or not np.isfinite(values).all():
+            raise self.fail(f"materials[{index}]: a colour is not three finite numbers")
+        r, g, b = (float(np.clip(v, 0.0, 1.0)) for v in colour)
+        share = 0.04 + 0.46 * float(np.clip(metal, 0.0, 1.0)) if "metallicFactor" in rough else 0.04
+        gloss = 1.0 - float(np.clip(roughness, 0.0, 1.0))
+        name = str(data.get("name") or f"material {index}")[:80]
+        return Material(name, (r, g, b), specular=share, gloss=gloss, emission=max(0.0, *glow))
+
+
+def _local(node: dict[str, Any]) -> F64:
+    """Matrix [4, 4] of a node: given as a whole (column by column), or as translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = (float(v) for v in node.get("rotation", (0.0, 0.0, 0.0, 1.0)))
+    matrix = pose_matrix(np.array(node.get("translation", (0.0, 0.0, 0.0)), np.float64).reshape(3), (w, x, y, z))
+    matrix[:3, :3] *= np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64).reshape(3)
+    return matrix
+
+
+def _triangles(index: npt.NDArray[np.int64], mode: int) -> npt.NDArray[np.int64]:
+    """Faces [n, 3] of a list (4), strip (5) or fan (6) of triangles."""
+    if mode == 4:
+        return index[: len(index) // 3 * 3].reshape(-1, 3)
+    count = max(len(index) - 2, 0)
+    k = np.arange(count)
+    if mode == 6:
+        return np.stack([index[np.zeros(count, np.int64)], index[k + 1], index[k + 2]], 1)
+    odd = k % 2
+    return np.stack([index[k], index[k + 1 + odd], index[k + 2 - odd]], 1)

@@ -1,0 +1,117 @@
+"""From the lane graph of a town to its street: all parts in order, deterministic for town, seed and style."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+
+import numpy as np
+
+from ssad.core.errors import FormatError, StoreError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.safeio import home
+from ssad.core.seeding import generator
+from ssad.rendering.meshes.mesh import F32
+from ssad.rendering.street.dressing import Masts, furnish, light_streets, plant, signals
+from ssad.rendering.street.free_ground import FreeGround, sides
+from ssad.rendering.street.markings import paint
+from ssad.rendering.street.model import FORMAT, TILE, Street, load_street, save_street
+from ssad.rendering.street.palette import STYLES, Look, style_of
+from ssad.rendering.street.paving import pave
+from ssad.rendering.street.plots import fill_blocks, line_streets
+from ssad.rendering.street.region import survey
+from ssad.rendering.street.triangles import Palette, TriangleBuilder, join, tiles
+from ssad.world.roads.library import load_town
+
+REVISION = 3  # of what is built: a cached street of another revision is not used
+
+
+def build_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
+    """The static geometry of a town; equal arguments give equal bytes.
+
+    Args:
+        town: A lane graph, or the name of a town.
+        seed: Draws facades, colours and plants.
+        style: One of STYLES; None: that of the town.
+
+    Raises:
+        MapError: The town is not flat, or has no drivable lane.
+        UnknownNameError: There is no such town or style.
+    """
+    graph = load_town(town) if isinstance(town, str) else town
+    name = style_of(graph.name, style)
+    look = Look(STYLES[name], Palette(), generator("street", graph.name, seed, name))
+    soup, ground = TriangleBuilder(), survey(graph)
+    site, masts, along = FreeGround(graph, ground), Masts(), sides(graph)
+    pave(soup, graph, ground, look)
+    paint(soup, graph, look)
+    signals(soup, graph, site, look, masts)
+    light_streets(soup, site, look, along, masts)
+    plots = line_streets(soup, site, look, along)
+    fill_blocks(soup, site, look, tries=int(ground.paved.size / 700))
+    furnish(soup, site, look, along)
+    plant(soup, site, look, plots.parks)
+    piece = join(soup.pieces)
+    origin, nx, ny, order, offset = tiles(np.concatenate(soup.owner), piece.levels)
+    return Street(
+        name=graph.name,
+        style=name,
+        vertices=_f32(piece.vertices, 3),
+        faces=np.ascontiguousarray(piece.faces, np.int32),
+        normals=np.ascontiguousarray(piece.normals, np.float32),
+        uv=np.ascontiguousarray(piece.uv, np.float32),
+        material=np.ascontiguousarray(piece.material, np.int32),
+        materials=tuple(look.palette.table),
+        tile=TILE,
+        origin=origin,
+        nx=nx,
+        ny=ny,
+        order=order,
+        offset=offset,
+        lamps=_f32(masts.lamps, 4),
+        heads=_f32(masts.heads, 4),
+        head_signal=np.array(masts.signal, np.int32),
+        head_lens=np.array(masts.lens, np.int32).reshape(-1, 3, 2),
+        parking=_f32(plots.parking, 3),
+    )
+
+
+def _f32(rows: object, columns: int) -> F32:
+    return np.asarray(rows, np.float32).reshape(-1, columns)
+
+
+def cached_street(town: LaneGraph | str, *, seed: int = 0, style: str | None = None) -> Street:
+    """`build_street`, kept in $SSAD_HOME/cache/streets; where that cannot be written the street is built each time."""
+    graph = load_town(town) if isinstance(town, str) else town
+    name = style_of(graph.name, style)
+    what = hashlib.sha256(f"{FORMAT} {REVISION} {graph.name} {seed} {name}".encode())
+    for key in (
+        "xy",
+        "width",
+        "offset",
+        "kind",
+        "junction",
+        "left",
+        "right",
+        "left_marking",
+        "right_marking",
+        "signal_xy",
+        "signal_yaw",
+        "signal_virtual",
+        "stop_s",
+        "stop_lane",
+        "crosswalk_xy",
+        "sign_xy",
+        "sign_kind",
+        "rule_sign",
+        "rule_lane",
+    ):
+        what.update(getattr(graph, key).tobytes())
+    path = home() / "cache" / "streets" / f"{what.hexdigest()[:24]}.npz"
+    if path.exists():
+        with contextlib.suppress(FormatError):  # broken: built again below
+            return load_street(path)
+    street = build_street(graph, seed=seed, style=name)
+    with contextlib.suppress(StoreError):
+        save_street(street, path)
+    return street

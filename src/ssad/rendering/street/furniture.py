@@ -1,0 +1,222 @@
+"""Things that stand along streets: lamps, signals, signs, benches, bins, fences. Frame: x towards the road."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ssad.rendering.street.model import MID, NEAR
+from ssad.rendering.street.palette import Look
+from ssad.rendering.street.triangles import ALL, Piece, box, cylinder, flat, join
+
+VISIBLE = NEAR | MID
+LENS = 0.11  # m, radius of a signal's lens
+
+
+def disc(
+    centre: tuple[float, float, float],
+    radius: float,
+    material: int,
+    *,
+    sides: int = 10,
+    turn: float = 0.0,
+    levels: int = NEAR,
+) -> Piece:
+    """A flat disc that faces along x."""
+    angle = turn + np.arange(sides) * 2.0 * np.pi / sides
+    ring = np.column_stack([0 * angle, np.cos(angle), np.sin(angle)]) * radius + centre
+    return flat(ring[None], material, levels=levels)
+
+
+def lamp(look: Look) -> tuple[Piece, tuple[float, float]]:
+    """A street lamp, and the reach and height of its light, m."""
+    if look.style.old:
+        parts = [
+            cylinder((0.10, 0.07), (0.0, 0.6), look.pole, sides=6, levels=VISIBLE),
+            cylinder((0.055, 0.04), (0.6, 3.5), look.pole, sides=6, levels=VISIBLE),
+            box((-0.16, -0.16, 3.5), (0.16, 0.16, 3.95), look.glow, levels=VISIBLE, base=True),
+            box((-0.2, -0.2, 3.95), (0.2, 0.2, 4.0), look.pole, levels=VISIBLE, base=True),
+            cylinder((0.26, 0.0), (4.0, 4.25), look.pole, sides=4, levels=VISIBLE),
+        ]
+        return join(parts), (0.0, 3.7)
+    under = ((-0.3, -0.1), (-0.3, 0.1), (0.3, 0.1), (0.3, -0.1))
+    tall, reach = (8.5, 1.9) if look.style.lamp >= 30.0 else (6.5, 1.2)
+    parts = [
+        cylinder((0.09, 0.05), (0.0, tall), look.pole, sides=6, levels=VISIBLE),
+        box((0.0, -0.03, tall - 0.08), (reach, 0.03, tall - 0.02), look.pole, levels=VISIBLE, base=True),
+        box((reach - 0.35, -0.13, tall - 0.12), (reach + 0.35, 0.13, tall), look.pole, levels=VISIBLE, base=True),
+        flat(np.array([[[reach + u, v, tall - 0.125] for u, v in under]]), look.glow, levels=VISIBLE),
+    ]
+    return join(parts), (reach, tall - 0.15)
+
+
+@dataclass(frozen=True)
+class SignalMast:
+    """A signal post in its own frame: x towards the traffic that it faces, the road towards -y.
+
+    Attributes:
+        piece: Its triangles.
+        heads: y, z of the middle of each head, m.
+        lens: First face of the red, amber and green lens of each head.
+        sides: Number of faces of a lens.
+    """
+
+    piece: Piece
+    heads: tuple[tuple[float, float], ...]
+    lens: tuple[tuple[int, int, int], ...]
+    sides: int
+
+
+def signal_mast(look: Look, reach: float) -> SignalMast:
+    """A post with a head; with `reach` > 0 also an arm that holds a second head `reach` m over the road."""
+    post = look.black if look.style.old else look.metal
+    tall = 6.2 if reach > 0.0 else 3.5
+    parts = [cylinder((0.10, 0.07), (0.0, tall), post, sides=8, levels=VISIBLE)]
+    heads = [(0.0, 2.95)]
+    if reach > 0.0:
+        parts.append(box((-0.05, -reach - 0.3, 5.85), (0.05, 0.0, 5.97), post, levels=VISIBLE, base=True))
+        heads.append((-reach, 5.6))
+    lens = []
+    count, sides = sum(len(p.faces) for p in parts), 10
+    for y, z in heads:
+        face = 0.06 if y == 0.0 else -0.1
+        case = box((face, y - 0.17, z - 0.5), (0.24, y + 0.17, z + 0.5), look.black, levels=ALL, base=True)
+        plate = box((0.10, y - 0.30, z - 0.62), (0.12, y + 0.30, z + 0.62), look.black, levels=VISIBLE, base=True)
+        parts += [case, plate]
+        count += len(case.faces) + len(plate.faces)
+        mine = []
+        for k, material in enumerate((look.red, look.amber, look.green)):
+            up = z + 0.31 - 0.31 * k
+            roof = (0.24, y - 0.13, up + LENS), (0.42, y + 0.13, up + LENS + 0.02)
+            hood = box(*roof, look.black, levels=VISIBLE, base=True)
+            light = disc((0.25, y, up), LENS, material, sides=sides, levels=ALL)
+            mine.append(count)
+            parts += [light, hood]
+            count += len(light.faces) + len(hood.faces)
+        lens.append((mine[0], mine[1], mine[2]))
+    return SignalMast(join(parts), tuple(heads), tuple(lens), sides - 2)
+
+
+def sign(kind: str, look: Look) -> Piece:
+    """A traffic sign on a post, facing along x: give_way, limit, crossing, parking."""
+    s = look.sign
+    parts = [cylinder((0.035, 0.035), (0.0, 2.75), look.metal, sides=5, levels=VISIBLE)]
+    z, turn = 2.35, np.pi / 2
+    shapes: dict[str, list[tuple[float, int, float, int]]] = {  # radius, sides, turn, material
+        "give_way": [(0.48, 3, -turn, s["red"]), (0.30, 3, -turn, s["white"])],
+        "limit": [(0.36, 16, 0.0, s["red"]), (0.275, 16, 0.0, s["white"])],
+        "crossing": [(0.46, 4, np.pi / 4, s["blue"]), (0.34, 3, turn, s["white"])],
+        "parking": [(0.44, 4, np.pi / 4, s["blue"])],
+    }
+    for k, (radius, sides, angle, material) in enumerate(shapes[kind]):
+        parts.append(disc((0.05 + 0.006 * k, 0.0, z), radius, material, sides=sides, turn=angle, levels=VISIBLE))
+    radius, sides, angle, _ = shapes[kind][0]
+    back = disc((0.0, 0.0, z), radius, s["back"], sides=sides, turn=angle, levels=VISIBLE)
+    away = back.vertices + np.array([0.045, 0, 0])
+    faces, uv = back.faces[:, ::-1].copy(), back.uv[:, ::-1]
+    parts.append(Piece(away, faces, -back.normals, uv, back.material, back.levels))
+    bars: dict[str, list[tuple[float, float, float, float]]] = {  # y0, z0, y1, z1 of letters, roughly
+        "limit": [(-0.14, -0.11, -0.03, 0.11), (0.03, -0.11, 0.14, 0.11)],
+        "parking": [(-0.1, -0.18, -0.03, 0.18), (-0.03, 0.0, 0.12, 0.18)],
+    }
+    for y0, z0, y1, z1 in bars.get(kind, []):
+        quad = [[0.065, y0, z + z0], [0.065, y1, z + z0], [0.065, y1, z + z1], [0.065, y0, z + z1]]
+        parts.append(flat(np.array([quad]), look.black if kind == "limit" else s["white"], levels=NEAR))
+    return join(parts)
+
+
+def bench(look: Look) -> Piece:
+    """A bench that faces along x."""
+    wood = look.wood[0]
+    slats = np.array([[0.02 + 0.14 * k, -0.9, 0.42] for k in range(3)])
+    backs = np.array([[-0.08, -0.9, 0.56], [-0.08, -0.9, 0.74]])
+    legs = np.array([[0.0, -0.75, 0.0], [0.0, 0.70, 0.0]])
+    return join(
+        [
+            box(slats, slats + np.array([0.12, 1.8, 0.04]), wood, levels=NEAR, base=True),
+            box(backs, backs + np.array([0.04, 1.8, 0.13]), wood, levels=NEAR, base=True),
+            box(legs, legs + np.array([0.40, 0.05, 0.42]), look.iron, levels=NEAR),
+            box(legs + np.array([-0.08, 0, 0.42]), legs + np.array([-0.03, 0.05, 0.88]), look.iron, levels=NEAR),
+            box((-0.05, -0.9, 0.40), (0.42, 0.9, 0.46), wood, levels=MID),
+        ]
+    )
+
+
+def litter_bin(look: Look) -> Piece:
+    """A litter bin."""
+    return join(
+        [
+            cylinder((0.22, 0.25), (0.05, 0.85), look.pole if look.style.old else look.metal, sides=8, levels=VISIBLE),
+            cylinder((0.27, 0.20), (0.85, 0.98), look.black, sides=8, levels=NEAR),
+        ]
+    )
+
+
+def wheelie_bin(look: Look) -> Piece:
+    """A household bin on wheels."""
+    colour = look.walls["awning"][int(look.generator.integers(2, 6))]
+    return join(
+        [
+            box((-0.28, -0.25, 0.06), (0.28, 0.25, 0.95), look.palette.shade(colour, 0.5, "bin"), levels=NEAR),
+            box((-0.30, -0.28, 0.95), (0.33, 0.28, 1.02), look.black, levels=NEAR, base=True),
+        ]
+    )
+
+
+def bollard(look: Look) -> Piece:
+    """A bollard."""
+    post = cylinder((0.07, 0.06), (0.0, 0.9), look.iron, sides=6, levels=NEAR)
+    return join([post, disc((0.071, 0.0, 0.78), 0.03, look.white)])
+
+
+def shelter(look: Look) -> Piece:
+    """A bus shelter, open along x, 4 m wide."""
+    post = np.array([[x, y, 0.0] for x in (-0.55, 0.55) for y in (-2.0, 1.94)])
+    pane = box((-0.57, -1.95, 0.25), (-0.54, 1.95, 2.2), look.glass[3], levels=VISIBLE, base=True)
+    return join(
+        [
+            box(post, post + np.array([0.06, 0.06, 2.35]), look.metal, levels=VISIBLE),
+            box((-0.7, -2.15, 2.35), (0.8, 2.15, 2.47), look.metal, levels=VISIBLE, base=True),
+            pane,
+            box((-0.45, -1.4, 0.45), (-0.10, 1.4, 0.5), look.wood[0], levels=NEAR, base=True),
+            box((-0.5, 1.9, 0.4), (0.4, 1.96, 2.1), look.pick("awning"), levels=VISIBLE, base=True),
+        ]
+    )
+
+
+def planter(look: Look) -> Piece:
+    """A stone trough; a bush goes into it."""
+    return box((-0.45, -0.45, 0.0), (0.45, 0.45, 0.55), look.stone[1], levels=VISIBLE)
+
+
+def fence(kind: str, look: Look) -> Piece:
+    """A metre of fence along x: pickets, planks, wall, rail, chain."""
+    if kind == "pickets":
+        wood = look.wood[1]
+        bar = np.array([[-0.5 + 0.2 * k, -0.012, 0.08] for k in range(5)])
+        rail = np.array([[-0.5, 0.012, 0.25], [-0.5, 0.012, 0.7]])
+        return join(
+            [
+                box(bar, bar + np.array([0.1, 0.024, 0.87]), wood, levels=NEAR),
+                box(rail, rail + np.array([1.0, 0.03, 0.07]), wood, levels=NEAR),
+                box((-0.5, -0.01, 0.2), (0.5, 0.01, 0.9), look.palette.shade(wood, 0.7), levels=MID),
+            ]
+        )
+    if kind == "planks":
+        return join(
+            [
+                box((-0.5, -0.02, 0.05), (0.5, 0.02, 1.65), look.wood[2], levels=VISIBLE),
+                box((-0.5, -0.05, 0.0), (-0.42, 0.05, 1.72), look.wood[0], levels=NEAR),
+            ]
+        )
+    if kind == "wall":
+        return join(
+            [
+                box((-0.5, -0.12, -0.1), (0.5, 0.12, 0.85), look.walls["brick"][2], levels=VISIBLE),
+                box((-0.5, -0.16, 0.85), (0.5, 0.16, 0.93), look.stone[1], levels=VISIBLE),
+            ]
+        )
+    post = box((-0.5, -0.03, 0.0), (-0.44, 0.03, 1.1), look.metal, levels=NEAR)
+    rails = np.array([[-0.5, -0.015, z] for z in (0.45, 0.98)])
+    return join([post, box(rails, rails + np.array([1.0, 0.03, 0.05]), look.metal, levels=VISIBLE)])

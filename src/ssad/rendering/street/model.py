@@ -1,0 +1,182 @@
+"""The static geometry of a town as a camera sees it: triangles, materials, tiles with levels of detail, masts.
+
+Shape letters: V vertices, F faces, M masts, H signal heads. World frame, metres, radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.errors import FormatError
+from ssad.core.safeio import load_npz, save_npz
+from ssad.core.types import array_dtypes
+from ssad.rendering.meshes.mesh import F32, I32, Material
+
+FORMAT = 1  # of the .npz file
+TILE = 32.0  # m
+LEVELS = 3
+NEAR, MID, FAR = 1, 2, 4  # bits of the levels at which a face is drawn
+REACH = (70.0, 180.0)  # m from the eye up to which tiles are drawn at level 0 and 1
+
+
+@dataclass(frozen=True)
+class Street:
+    """Triangles of a town. Arrays are read-only.
+
+    Tiles are squares of `tile` m: tile iy * nx + ix begins at `origin` + tile * (ix, iy). Level k (0 full, 1 without
+    small things, 2 boxes and crowns) of tile t draws the faces order[offset[k, t] : offset[k, t + 1]]; those of the
+    last tile, nx * ny, are far ground and hills, which belong to every view at every level. A thing is wholly in the
+    tile of its middle. Ground shared by levels is listed in each.
+
+    Attributes:
+        name: Name of the town.
+        style: Name of its style.
+        vertices: [V, 3], m.
+        faces: Counter-clockwise seen from outside [F, 3].
+        normals: Unit vectors, one for each corner [F, 3, 3].
+        uv: Metres on the surface [F, 3, 2]: x and y of the world on the ground; on walls u runs right and v up from the
+            ground.
+        material: Index into `materials` [F].
+        materials: All materials.
+        tile: Side of a tile, m.
+        origin: x, y of the first tile, m.
+        nx: Number of tiles along x.
+        ny: Number of tiles along y.
+        order: See above.
+        offset: See above.
+        lamps: x, y, z of a street lamp's light, and its heading from the post to the road [M, 4].
+        heads: x, y, z of the middle of a signal head, and the heading that it faces [H, 4].
+        head_signal: Signal of each head in the lane graph [H].
+        head_lens: First face and end of the faces of its red, amber and green lens [H, 3, 2].
+        parking: x, y, yaw of places for parked cars, off the road [., 3].
+    """
+
+    name: str
+    style: str
+    vertices: F32
+    faces: I32
+    normals: F32
+    uv: F32
+    material: I32
+    materials: tuple[Material, ...]
+    tile: float
+    origin: tuple[float, float]
+    nx: int
+    ny: int
+    order: I32
+    offset: I32
+    lamps: F32
+    heads: F32
+    head_signal: I32
+    head_lens: I32
+    parking: F32
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    def tile_faces(self, tile: int, level: int = 0) -> I32:
+        """Faces of one tile at one level (0 full, 2 coarsest)."""
+        return self.order[self.offset[level, tile] : self.offset[level, tile + 1]]
+
+    def select(self, eye: tuple[float, float], *, far: float = 500.0, reach: tuple[float, float] = REACH) -> I32:
+        """Faces that a camera at x, y needs: near tiles at level 0, then 1, then 2 up to `far` m, and the horizon.
+
+        The distance of a tile is that of its nearest point.
+        """
+        parts = [self.tile_faces(self.nx * self.ny)]
+        for tile, away in enumerate(self._away(eye)):
+            if away <= far:
+                parts.append(self.tile_faces(tile, 0 if away <= reach[0] else 1 if away <= reach[1] else 2))
+        return np.concatenate(parts)
+
+    def _away(self, eye: tuple[float, float]) -> npt.NDArray[np.float64]:
+        """Distance [nx * ny] of each tile from a point, m."""
+        gaps = []
+        for axis, count in ((0, self.nx), (1, self.ny)):
+            low = self.origin[axis] + self.tile * np.arange(count)
+            gaps.append(np.maximum(np.maximum(low - eye[axis], eye[axis] - low - self.tile), 0.0))
+        return np.asarray(np.hypot(gaps[0][None, :], gaps[1][:, None]).reshape(-1))
+
+    def check(self) -> None:
+        """FormatError (one line): arrays that contradict each other."""
+        f, tiles = len(self.faces), self.nx * self.ny + 1
+
+        def require(ok: bool, what: str) -> None:
+            if not ok:
+                raise FormatError(f"street of {self.name}: {what}; delete the cached file and build it again")
+
+        shapes = {"normals": (f, 3, 3), "uv": (f, 3, 2), "material": (f,), "offset": (LEVELS, tiles + 1)}
+        for name, shape in shapes.items():
+            require(getattr(self, name).shape == shape, f"{name} has shape {getattr(self, name).shape}, not {shape}")
+        for name in ("vertices", "normals", "uv", "lamps", "heads", "parking"):
+            require(bool(np.isfinite(getattr(self, name)).all()), f"{name} holds a number that is not finite")
+        for name, size in (("faces", len(self.vertices)), ("material", len(self.materials)), ("order", f)):
+            value = getattr(self, name)
+            require(value.size > 0 and value.min() >= 0 and value.max() < size, f"{name} points outside the table")
+        require(bool((np.diff(self.offset, axis=1) >= 0).all()), "offset does not grow")
+        require(int(self.offset.max()) == len(self.order), "offset does not cover the order")
+        require(len(self.head_signal) == len(self.heads) == len(self.head_lens), "heads do not agree")
+
+
+_MATERIAL = ("specular", "gloss", "emission")
+_ARRAYS = array_dtypes(Street)
+
+
+def save_street(street: Street, path: Path | str) -> None:
+    """Write a street as .npz, whole or not at all; equal streets give equal bytes.
+
+    Raises:
+        StoreError: The file cannot be written.
+    """
+    table = street.materials
+    head = [f"ssad-street {FORMAT}", street.name, street.style]
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "header": np.array(head),
+        "size": np.array([street.tile, *street.origin, street.nx, street.ny], np.float64),
+        "material_name": np.array([m.name for m in table]),
+        "material_value": np.array([[*m.colour, *(getattr(m, k) for k in _MATERIAL), m.paint] for m in table]),
+    }
+    save_npz(path, arrays | {name: getattr(street, name) for name in _ARRAYS})
+
+
+def load_street(path: Path | str) -> Street:
+    """Read what `save_street` wrote.
+
+    Raises:
+        FormatError: The file is missing, broken, or not a street.
+    """
+    arrays = load_npz(path)
+    header = arrays.get("header")
+    wanted = {"header", "size", "material_name", "material_value", *_ARRAYS}
+    if header is None or header.shape != (3,) or str(header[0]) != f"ssad-street {FORMAT}" or set(arrays) != wanted:
+        raise FormatError(f"{path}: not a street of format {FORMAT}; delete it and build the street again")
+    for name, dtype in _ARRAYS.items():
+        if arrays[name].dtype != dtype:
+            raise FormatError(f"{path}: array {name} is {arrays[name].dtype}; delete it and build the street again")
+    size, value = arrays["size"], arrays["material_value"]
+    if size.shape != (5,) or value.shape != (len(arrays["material_name"]), 7):
+        raise FormatError(f"{path}: its tables are cut short; delete it and build the street again")
+    materials = tuple(
+        Material(str(name), (row[0], row[1], row[2]), row[3], row[4], row[5], bool(row[6]))
+        for name, row in zip(arrays["material_name"].tolist(), value.tolist(), strict=True)
+    )
+    street = Street(
+        name=str(header[1]),
+        style=str(header[2]),
+        materials=materials,
+        tile=float(size[0]),
+        origin=(float(size[1]), float(size[2])),
+        nx=int(size[3]),
+        ny=int(size[4]),
+        **{name: arrays[name] for name in _ARRAYS},
+    )
+    street.check()
+    return street

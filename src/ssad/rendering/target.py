@@ -1,0 +1,129 @@
+"""The target of attacks, a car, a stop sign or a walker, named once: the same metal in every town and clip."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ssad.core.errors import ConfigError, unknown_name
+from ssad.core.seeding import generator
+from ssad.rendering.bodies import BODIES, PAINTS, make_body
+from ssad.rendering.meshes.mesh import Mesh, Point
+
+
+@dataclass(frozen=True, slots=True)
+class TargetCar:
+    """A car that is the same wherever it is made.
+
+    Attributes:
+        style: Body style, see `ssad.rendering.bodies.BODIES`.
+        paint: Name of its paint, see `ssad.rendering.bodies.PAINTS`.
+        size: Length, width, height, m; the mean of the style where None.
+        seed: Of what else differs between cars of a style.
+    """
+
+    style: str = "sedan"
+    paint: str = "silver"
+    size: Point | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        styles = BODIES["car"].styles
+        if self.style not in styles:
+            raise unknown_name("car style", self.style, styles)
+        if self.paint not in PAINTS:
+            raise unknown_name("paint", self.paint, PAINTS)
+
+    @property
+    def full_size(self) -> Point:
+        """Length, width, height, m."""
+        return self.size or BODIES["car"].styles[self.style].size
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """Linear RGB of its paint."""
+        return PAINTS[self.paint]
+
+    def mesh(self) -> Mesh:
+        """Its body."""
+        draws = generator("target car", self.style, self.seed)
+        return make_body("car", style=self.style, size=self.full_size, generator=draws)
+
+
+@dataclass(frozen=True, slots=True)
+class _Standing:
+    """What is no car and the same wherever it is made.
+
+    Attributes:
+        style: Body style, see `ssad.rendering.bodies.BODIES`.
+        size: Length, width, height, m; the mean of the style where None.
+        seed: Of what else differs between bodies of a style.
+        kind: Of its body.
+    """
+
+    style: str
+    size: Point | None = None
+    seed: int = 0
+    kind: str = ""
+
+    def __post_init__(self) -> None:
+        styles = BODIES[self.kind].styles
+        if self.style not in styles:
+            raise unknown_name(f"{self.kind} style", self.style, styles)
+
+    @property
+    def full_size(self) -> Point:
+        """Length, width, height, m."""
+        return self.size or BODIES[self.kind].styles[self.style].size
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """Linear RGB: what has no paint is grey."""
+        return (0.5, 0.5, 0.5)
+
+    def mesh(self) -> Mesh:
+        """Its body; of a sign plate and post."""
+        noun = "sign" if self.kind == "stop_sign" else self.kind
+        draws = generator(f"target {noun}", self.style, self.seed)
+        return make_body(self.kind, style=self.style, size=self.full_size, generator=draws)
+
+
+@dataclass(frozen=True, slots=True)
+class TargetSign(_Standing):
+    """A stop sign that is the same wherever it is made."""
+
+    style: str = "standard"
+    kind: str = field(default="stop_sign", init=False)
+
+
+@dataclass(frozen=True, slots=True)
+class TargetWalker(_Standing):
+    """A person on foot who is the same wherever they are; their shirt is the panels torso_front and torso_back."""
+
+    style: str = "standing"
+    kind: str = field(default="pedestrian", init=False)
+
+
+Target = TargetCar | TargetSign | TargetWalker
+STANDING: dict[str, type[TargetSign] | type[TargetWalker]] = {"stop_sign": TargetSign, "pedestrian": TargetWalker}
+
+
+def class_of_target(target: Target) -> str:
+    """The class of detectors that finds a target."""
+    return "car" if isinstance(target, TargetCar) else target.kind
+
+
+def parse_target(text: str) -> Target:
+    """STYLE[:PAINT[:SEED]] of a car, stop_sign[:STYLE[:SEED]] or pedestrian[:STYLE[:SEED]] as a target. ConfigError."""
+    kind = text.partition(":")[0]
+    if kind in STANDING:
+        _, style, seed = [*text.split(":"), "", ""][:3]
+        if text.count(":") > 2 or (seed and not seed.isdigit()):
+            raise ConfigError(f"--target {text}: expected {kind}, {kind}:STYLE or {kind}:STYLE:SEED")
+        make = STANDING[kind]
+        return make(style or make().style, seed=int(seed or 0))
+    style, paint, seed = [*text.split(":"), "", "", ""][:3]
+    if text.count(":") > 2 or (seed and not seed.isdigit()):
+        raise ConfigError(f"--target {text}: expected STYLE, STYLE:PAINT or STYLE:PAINT:SEED, such as sedan:silver:0")
+    if style not in BODIES["car"].styles:
+        raise unknown_name("target", style, (*BODIES["car"].styles, *STANDING))
+    return TargetCar(style, paint or TargetCar().paint, seed=int(seed or 0))

@@ -1,1 +1,0 @@
-"""Baked towns that ship with SSAD (*.npz); `ssad.roads.designs` gives their OpenDRIVE."""

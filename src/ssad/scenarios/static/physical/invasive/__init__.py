@@ -1,1 +1,0 @@
-"""Physical attacks that touch their target: patches and camouflages, printed and stuck on (paper III.A.1)."""

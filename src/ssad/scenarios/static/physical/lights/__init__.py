@@ -1,0 +1,57 @@
+"""Non-invasive physical attacks (paper III.A.1): light and shadow on a target, which itself stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from ssad.core.errors import unknown_name
+from ssad.core.schema import checked
+from ssad.scenarios.static.physical.lights.flashlight import Flashlight
+from ssad.scenarios.static.physical.lights.laser import Laser
+from ssad.scenarios.static.physical.lights.light import LightAttack, Target
+from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+from ssad.scenarios.static.physical.lights.projector import Projector
+from ssad.scenarios.static.physical.lights.search import Budget, Found, LitView, random_settings, search_light
+from ssad.scenarios.static.physical.lights.shadow import Shadow
+
+LIGHTS: dict[str, Callable[..., Shadow | Laser | Projector | Flashlight]] = {
+    "shadow": Shadow,
+    "laser": Laser,
+    "projector": Projector,
+    "flashlight": Flashlight,
+}
+
+
+def make_light(name: str, options: Mapping[str, Any]) -> Shadow | Laser | Projector | Flashlight:
+    """A light attack by name.
+
+    Args:
+        name: Of `LIGHTS`.
+        options: Its fields that differ.
+
+    Raises:
+        UnknownNameError: There is no such attack.
+        ConfigError: An option that it does not have, or a value that it refuses.
+    """
+    if name not in LIGHTS:
+        raise unknown_name("light attack", name, LIGHTS)
+    return checked(LIGHTS[name], options, what=f"attack {name}")
+
+
+__all__ = [
+    "LIGHTS",
+    "Budget",
+    "Flashlight",
+    "Found",
+    "Laser",
+    "LightAttack",
+    "LitPicture",
+    "LitView",
+    "Projector",
+    "Shadow",
+    "Target",
+    "make_light",
+    "random_settings",
+    "search_light",
+]

@@ -1,0 +1,97 @@
+"""Flashlight: one strong spot light from behind; where it stands, where it aims, how wide, which colour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from ssad.core.schema import VALUES, Least, Number, Part, Span
+from ssad.core.types import F64
+from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.scenarios.static.physical.lights.lamps import added_light
+from ssad.scenarios.static.physical.lights.light import Away, Ranges, Target, aimed, at_values, numbers
+from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+
+
+@dataclass(frozen=True, slots=True, config=VALUES)
+class Flashlight:
+    """A spot light with a colour filter, held by somebody behind the target or carried by a drone.
+
+    No paper gives one for vehicles; this is the smallest light attack, against which the others can be compared.
+
+    Attributes:
+        lumens: Most that it gives, lumen (3000 is a strong hand lamp).
+        distance: Least and greatest distance from the target's rear, m.
+        height: Least and greatest height above the road, m.
+        aside: Greatest angle from straight behind, rad.
+        beam: Least and greatest tangent of the half angle of its beam.
+        soft: Share of the beam over which it fades.
+        name: What tables call it.
+        search: Its light has exact gradients.
+    """
+
+    lumens: Least = 3000.0
+    distance: Span[Away] = (4.0, 12.0)
+    height: Span[Least] = (0.5, 3.0)
+    aside: Number = 0.6
+    beam: Span[Annotated[Number, Field(ge=1e-3)]] = (0.03, 0.3)
+    soft: Part = 0.5
+    name: str = "flashlight"
+    search: Literal["swarm", "greedy", "gradient"] = "gradient"
+
+    def ranges(self, target: Target) -> Ranges:
+        """See `LightAttack`."""
+        return {
+            "lumens": (0.0, self.lumens),
+            "distance": self.distance,
+            "height": self.height,
+            "aside": (-self.aside, self.aside),
+            "aim_left": (-0.5 * target.width, 0.5 * target.width),
+            "aim_up": (0.2 * target.height, target.height),
+            "beam": self.beam,
+            "red": (0.0, 1.0),
+            "green": (0.0, 1.0),
+            "blue": (0.0, 1.0),
+        }
+
+    def _lamp(self, values: Mapping[str, Tensor], target: Target) -> dict[str, Tensor]:
+        """Pose, power, spread and colour of N settings."""
+        away, aside = values["distance"], values["aside"]
+        place = torch.stack([target.rear - away * torch.cos(aside), away * torch.sin(aside), values["height"]], -1)
+        point = torch.stack([torch.full_like(away, target.rear), values["aim_left"], values["aim_up"]], -1)
+        colour = torch.stack([values["red"], values["green"], values["blue"]], -1)
+        return {
+            "pose": aimed(place, point),
+            "power": values["lumens"],
+            "spread": values["beam"][:, None].expand(-1, 2),
+            "colour": colour,
+        }
+
+    def change(self, values: Mapping[str, Tensor], picture: LitPicture, target: Target) -> Tensor:
+        """See `LightAttack`."""
+        return added_light(Lamp(_IDENTITY, 1.0, soft=self.soft), picture, **self._lamp(values, target))
+
+    def edit(self, values: Mapping[str, float], target: Target) -> SceneEdit:
+        """See `LightAttack`."""
+        found = {name: numbers(value) for name, value in self._lamp(at_values(values), target).items()}
+        return SceneEdit(lamps=(lamp_of(found, soft=self.soft),))
+
+    def power(self, values: Mapping[str, float]) -> float:
+        """See `LightAttack`: what passes the filter."""
+        return values["lumens"] * (0.2126 * values["red"] + 0.7152 * values["green"] + 0.0722 * values["blue"])
+
+
+_IDENTITY: F64 = numbers(torch.eye(4, dtype=torch.float64)[None])
+
+
+def lamp_of(found: Mapping[str, F64], **more: Any) -> Lamp:
+    """A lamp with a pose, a power, a spread and a colour."""
+    across, down = found["spread"].tolist()
+    red, green, blue = found["colour"].tolist()
+    return Lamp(found["pose"], float(found["power"]), (across, down), (red, green, blue), **more)

@@ -1,0 +1,34 @@
+"""What lamps add to pictures, many settings at once."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ssad.rendering.camera.lamps import Lamp
+from ssad.rendering.camera.torch_lamp import lamp_light
+from ssad.scenarios.static.physical.lights.lit_image import LitPicture
+
+
+def added_light(
+    lamp: Lamp, picture: LitPicture, *, pose: Tensor, power: Tensor, spread: Tensor, colour: Tensor
+) -> Tensor:
+    """What a lamp adds to the radiance of a picture under N settings [N, h, w, 3], without shadows; differentiable.
+
+    Args:
+        lamp: Its edge and reach; the rest of it is replaced.
+        picture: The picture.
+        pose: In the target's frame [N, 4, 4].
+        power: Lumen [N].
+        spread: Tangents of the half angles [N, 2].
+        colour: Linear RGB [N, 3].
+    """
+
+    def light(pose: Tensor, power: Tensor, spread: Tensor) -> Tensor:
+        return lamp_light(
+            lamp, picture.position, picture.normal, pose=pose, power=power, spread=spread, fog=picture.fog
+        )
+
+    kind = picture.position
+    given = torch.vmap(light)(pose.to(kind), power.to(kind) * picture.per_lux, spread.to(kind))
+    return given * colour.to(kind)[:, None, None] * picture.answer

@@ -1,0 +1,122 @@
+"""A picture as a function of the light on its target.
+
+A search asks for thousands of pictures. So a picture is rendered once, with what its surfaces are; what a lamp adds to
+it, or a shadow takes away, then follows for many settings at once. What is found is rendered in full afterwards: lamps
+with their shadows and mirror images, cards with the sun's shadow maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core.types import F64
+from ssad.rendering.camera.photometry import per_lux
+from ssad.rendering.camera.render import View, light_of, render
+from ssad.rendering.camera.scene import Scene
+from ssad.rendering.camera.scene_edit import Card, SceneEdit
+from ssad.rendering.camera.sensor import Sensor
+from ssad.rendering.camera.torch_sensor import develop
+
+BLIND: Final = Card(np.array([[0.0, y, z] for y, z in ((-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))]))
+"""Keeps the whole sun off a target."""
+
+
+@dataclass(frozen=True, slots=True)
+class LitPicture:
+    """A picture whose target can be lit and shaded.
+
+    Attributes:
+        before: The whole picture without any attack [1, 3, H, W] in 0 to 1.
+        corner: Row and column at which the part around the target begins, both even.
+        radiance: Of this part, linear [h, w, 3].
+        sun: What of it comes from the sun [h, w, 3].
+        answer: What the radiance gains for irradiance over pi of 1 [h, w, 3].
+        position: What each pixel shows, in the target's frame, m [h, w, 3].
+        normal: Its normal there [h, w, 3].
+        sun_direction: Towards the sun, in the target's frame [3]; None by night.
+        exposure: What radiance is multiplied by.
+        per_lux: Irradiance over pi of one lux (see `ssad.rendering.camera.photometry`).
+        fog: Extinction, 1/m.
+        sensor: The camera's.
+    """
+
+    before: Tensor
+    corner: tuple[int, int]
+    radiance: Tensor
+    sun: Tensor
+    answer: Tensor
+    position: Tensor
+    normal: Tensor
+    sun_direction: F64 | None
+    exposure: float
+    per_lux: float
+    fog: float
+    sensor: Sensor
+
+    def show(self, change: Tensor) -> Tensor:
+        """Pictures with more or less light in the part around the target.
+
+        Args:
+            change: What is added to its radiance [N, h, w, 3].
+
+        Returns:
+            [N, 3, H, W] in 0 to 1, differentiable in the change.
+        """
+        part = develop((self.radiance + change).clamp_min(0.0), self.exposure, self.sensor)
+        (top, left), (height, width) = self.corner, self.radiance.shape[:2]
+        margin = 4 if min(height, width) > 16 else 0  # at the border of the part the lens lacks what lies beyond it
+        whole = self.before.repeat(len(change), 1, 1, 1)
+        rows, columns = slice(margin, height - margin), slice(margin, width - margin)
+        whole[:, :, top + margin : top + height - margin, left + margin : left + width - margin] = part[
+            :, :, rows, columns
+        ]
+        return whole
+
+
+def lit_picture(
+    scene: Scene, view: View, tag: int, rows: slice, columns: slice, *, blind: int, device: str | torch.device = "cpu"
+) -> LitPicture:
+    """Render a view once, as a function of the light on a target.
+
+    Args:
+        scene: Its street and bodies, and the body of `BLIND`.
+        view: The view.
+        tag: Of the target in it.
+        rows: The part around the target; its first row and column are even.
+        columns: See `rows`.
+        blind: Index of the body of `BLIND` in the scene.
+        device: Where pictures are made.
+    """
+    picture = render(scene, [view], surface=True)
+    surface, place = picture.surface, (0, rows, columns)
+    assert surface is not None
+    pose = next(thing.pose for thing in view.things if thing.tag == tag)
+    sun = np.array(light_of(view.weather)[0][0])
+    shaded = picture.radiance
+    if sun[2] > 0.0:
+        shaded = render(scene, [SceneEdit(cards=(BLIND,)).on(view, tag, cards=(blind,))]).radiance
+    irradiance = surface.irradiance[place]
+    gain = np.where(irradiance > 0.0, surface.gain[place] / np.maximum(irradiance, 1e-12), 0.0)
+
+    def on_device(array: Any) -> Tensor:
+        return torch.from_numpy(np.array(array, np.float32)).to(device)
+
+    return LitPicture(
+        on_device(picture.image).permute(0, 3, 1, 2) / 255,
+        (rows.start, columns.start),
+        on_device(picture.radiance[place]),
+        on_device((picture.radiance - shaded)[place]),
+        on_device(surface.albedo[place] * gain),
+        on_device((surface.position[place].astype(np.float64) - pose[:3, 3]) @ pose[:3, :3]),
+        on_device(surface.normal[place] @ pose[:3, :3]),
+        pose[:3, :3].T @ sun if sun[2] > 0.0 else None,
+        float(picture.exposure[0]),
+        per_lux(view.weather),
+        view.weather.fog,
+        view.sensor,
+    )

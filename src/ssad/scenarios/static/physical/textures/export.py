@@ -1,0 +1,191 @@
+"""A texture for printing and for other programs: pictures at true size, and the target as OBJ that wears it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError, FormatError
+from ssad.core.types import U8
+from ssad.rendering.agent_edit import LiveAttack
+from ssad.rendering.camera.scene import Decal
+from ssad.rendering.camera.scene_edit import SceneEdit
+from ssad.rendering.meshes.mesh import Mesh
+from ssad.rendering.meshes.obj_writer import write_obj
+from ssad.rendering.target import Target, parse_target
+from ssad.scenarios.static.physical import Surface, albedo_of, make_carrier
+from ssad.scenarios.static.physical.textures.carrier import covered, metres_of
+from ssad.scenarios.static.physical.textures.inks import printable_colours
+from ssad.scenarios.static.physical.textures.printing import conspicuousness, non_printability
+
+LARGEST = 16384  # dots of a side
+ATLAS = 2048  # texels of a side of the atlas that shows a patch
+
+
+@dataclass(frozen=True, slots=True)
+class Print:
+    """A texture with what it takes to put it on its target again.
+
+    Attributes:
+        colour: sRGB [3, H, W] in 0 to 1.
+        carrier: Name of its carrier (`ssad.scenarios.static.physical.CARRIERS`).
+        options: Of the carrier.
+        target: Whom it is made for, as for `ssad record --target`.
+        hour: When it is shown: as it comes.
+    """
+
+    colour: Tensor
+    carrier: str
+    options: Mapping[str, Any]
+    target: str
+    hour: str = field(default="recorded", init=False)
+
+    def on(self, mesh: Mesh) -> Surface:
+        """Where it goes on a body. ConfigError: it does not fit."""
+        surface = make_carrier(self.carrier, self.options).on(mesh)
+        if surface.size != tuple(self.colour.shape[1:]):
+            raise ConfigError(
+                f"the texture has {self.colour.shape[2]} x {self.colour.shape[1]} texels, a {self.carrier} on this "
+                f"body {surface.size[1]} x {surface.size[0]}"
+            )
+        return surface
+
+    def edit(self, mesh: Mesh) -> SceneEdit:
+        """The body wears it."""
+        surface = self.on(mesh)
+        shown, masks = {0: albedo_of(self.colour)}, {0: surface.mask}
+        if isinstance(surface.layer, Decal):
+            return SceneEdit(decals=(surface.layer,), textures=shown, masks=masks)
+        return SceneEdit((surface.layer,), textures=shown, masks=masks)
+
+    def live(self, agent: int) -> LiveAttack:
+        """An agent of the closed loop, a car or a walker, wears it, or every stop sign."""
+        return LiveAttack(self.edit, parse_target(self.target), agent)
+
+
+def load_print(folder: Path) -> Print:
+    """What `export_texture` wrote.
+
+    Raises:
+        FormatError: A file is missing or broken, or the numbers are not those that were exported.
+    """
+    about, numbers = safeio.read_json(folder / "texture.json"), safeio.read_bytes(folder / "texture.npz")
+    try:
+        if hashlib.sha256(numbers).hexdigest() != about["sha256"]:
+            raise FormatError(f"{folder / 'texture.npz'}: not the texture that texture.json describes; export it again")
+        colour = torch.from_numpy(safeio.load_npz(folder / "texture.npz")["colour"].copy())
+        return Print(colour, about["carrier"], about["options"], about["target"])
+    except (KeyError, TypeError) as error:
+        raise FormatError(f"{folder / 'texture.json'}: no exported texture ({error}); export it again") from None
+
+
+def export_texture(out: Path, made: Print, *, dots: int = 1000, name: str = "") -> list[Path]:
+    """Write a texture for a printer, and for programs that show meshes.
+
+    Args:
+        out: Folder: print.png, atlas.png, target.obj, target.mtl, texture.npz and texture.json.
+        made: The texture, its carrier and its target.
+        dots: Of print.png for each metre.
+        name: What texture.json calls it.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ConfigError: The print has too many dots, or none; the texture does not fit on the target.
+    """
+    target, colour = parse_target(made.target), made.colour
+    mesh = target.mesh()
+    surface = made.on(mesh)
+    width, height = (round(metres * dots) for metres in surface.metres)
+    if dots < 1 or not (1 <= width <= LARGEST and 1 <= height <= LARGEST):
+        raise ConfigError(
+            f"{surface.metres[0]:.2f} x {surface.metres[1]:.2f} m with {dots} dots per metre are {width} x {height} "
+            f"dots; from 1 to {LARGEST} a side can be written"
+        )
+    texels = np.ascontiguousarray(colour.permute(1, 2, 0).numpy().astype(np.float32))
+    safeio.make_folder(out)
+    _save(out / "print.png", _resized(texels, (height, width)), dots)
+    _save(out / "atlas.png", _atlas(texels, surface, target), None)
+    painted = replace(mesh, materials=tuple(replace(m, colour=target.colour) if m.paint else m for m in mesh.materials))
+    write_obj(out / "target.obj", painted, texture="atlas.png")
+    numbers = safeio.npz_bytes({"colour": colour.numpy()})
+    safeio.write_atomic(out / "texture.npz", numbers)
+    mask = torch.from_numpy(surface.mask.copy())
+    score = float(non_printability(colour, printable_colours(), mask))
+    away = float(conspicuousness(albedo_of(colour), covered(surface, mesh, target.colour), mask))
+    about = {
+        "name": name,
+        "target": made.target,
+        "carrier": made.carrier,
+        "options": dict(made.options),
+        "dots_per_metre": dots,
+        "sha256": hashlib.sha256(numbers).hexdigest(),
+        "metres": [round(one, 4) for one in surface.metres],
+        "texels": [colour.shape[2], colour.shape[1]],
+        "rectangle": [round(v, 6) for v in _rectangle(surface)],
+        "panels": _panels(mesh),
+        "non_printability": round(score, 4),
+        "delta_e": round(away, 2),
+    }
+    safeio.write_atomic(out / "texture.json", safeio.dump_json(about, indent=1) + "\n")
+    return [
+        out / file for file in ("print.png", "atlas.png", "target.obj", "target.mtl", "texture.npz", "texture.json")
+    ]
+
+
+def _resized(texels: Any, size: tuple[int, int]) -> U8:
+    """A texture with more texels, as the renderer looks it up between them, RGB."""
+    whole = cv2.resize(texels, (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray((whole.clip(0.0, 1.0) * 255).round(), np.uint8)
+
+
+def _rectangle(surface: Surface) -> tuple[float, float, float, float]:
+    """What a texture covers of the atlas; nothing if it lies beside the target."""
+    return (0.0, 0.0, 0.0, 0.0) if isinstance(surface.layer, Decal) else surface.layer.rectangle
+
+
+def _atlas(texels: Any, surface: Surface, target: Target) -> U8:
+    """The picture of the whole atlas: paint, and the texture where it is."""
+    u0, v0, u1, v1 = _rectangle(surface)
+    if (u0, v0, u1, v1) == (0.0, 0.0, 1.0, 1.0):
+        return _resized(texels, (max(ATLAS, texels.shape[0]), max(ATLAS, texels.shape[1])))
+    paint = np.asarray(target.colour)
+    srgb = np.where(paint <= 0.0031308, 12.92 * paint, 1.055 * paint ** (1 / 2.4) - 0.055)
+    whole = np.empty((ATLAS, ATLAS, 3), np.uint8)
+    whole[:] = (srgb * 255).round()
+    left, top, right, bottom = (round(v * ATLAS) for v in (u0, v0, u1, v1))
+    if right > left and bottom > top:  # else smaller than a texel
+        whole[top:bottom, left:right] = _resized(texels, (bottom - top, right - left))
+    return whole
+
+
+def _panels(mesh: Mesh) -> dict[str, dict[str, list[float]]]:
+    """Where each panel is in the atlas, and how large it is."""
+    found = {}
+    for panel in mesh.panels:
+        u0, v0, u1, v1 = mesh.panel_rectangle(panel)
+        try:
+            across, down = metres_of(mesh, panel)
+        except ConfigError:  # a panel without faces at this level of detail
+            continue
+        metres = [round((u1 - u0) * across, 3), round((v1 - v0) * down, 3)]
+        found[panel] = {"rectangle": [round(v, 6) for v in (u0, v0, u1, v1)], "metres": metres}
+    return found
+
+
+def _save(path: Path, image: U8, dots: int | None) -> None:
+    """A PNG that says how many dots a metre has."""
+    options: dict[str, Any] = {} if dots is None else {"dpi": (dots * 0.0254, dots * 0.0254)}
+    with safeio.atomic_path(path) as file:
+        Image.fromarray(image).save(file, "PNG", **options)

@@ -1,0 +1,127 @@
+"""The textures of a folder: each trained once and kept, as numbers and as a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.errors import ConfigError
+from ssad.core.images import save_picture
+from ssad.core.protocols import Detector
+from ssad.scenarios.static.physical.textures.attacks import make_physical
+from ssad.scenarios.static.physical.textures.card import load_texture
+from ssad.scenarios.static.physical.textures.carrier import Surface
+from ssad.scenarios.static.physical.textures.controls import control, texture_picture
+from ssad.scenarios.static.physical.textures.inks import printable_colours
+from ssad.scenarios.static.physical.textures.optimise import View, train_texture
+from ssad.scenarios.static.physical.textures.spec import TextureSpec
+
+
+@dataclass(frozen=True, slots=True)
+class TextureFolder:
+    """Textures that are kept.
+
+    Attributes:
+        path: The folder.
+        seed: Root of the random numbers of trainings.
+        device: Where textures are trained.
+    """
+
+    path: Path
+    seed: int = 0
+    device: str = "cpu"
+
+    def kept(self, spec: TextureSpec) -> Path:
+        """Where a trained texture is when it is done."""
+        return self.path / f"{spec.name}.npz"
+
+    def picture(self, spec: TextureSpec) -> Path:
+        """Where a texture is as a picture."""
+        return self.path / spec.picture
+
+    def texture(
+        self,
+        spec: TextureSpec,
+        surface: Surface,
+        *,
+        views: Callable[[], Sequence[View]],
+        detector: Callable[[], Detector],
+        paint: Tensor | None = None,
+    ) -> Tensor:
+        """A texture; trained now if it has to be. Written as a picture too.
+
+        Args:
+            spec: Which.
+            surface: What it is printed on.
+            views: Makes the pictures of the training.
+            detector: Makes the detector that is attacked.
+            paint: Linear RGB [3] of what the texture covers, for attacks with `stealth`.
+
+        Returns:
+            sRGB [3, H, W] in 0 to 1.
+
+        Raises:
+            ConfigError: It cannot be trained (see `train_texture`).
+        """
+        if spec.source:
+            trained = spec.file is None
+            colour = self._trained(spec, surface, views, detector, paint) if trained else _read(spec, surface)
+            if spec.attack == "shuffled":
+                colour = control("shuffled", surface.size, seed=spec.number, trained=colour)
+        else:
+            colour = control(spec.attack, surface.size, seed=spec.number)
+        if not self.picture(spec).is_file():
+            save_picture(self.picture(spec), texture_picture(colour, surface.mask))
+        return colour
+
+    def _trained(
+        self,
+        spec: TextureSpec,
+        surface: Surface,
+        views: Callable[[], Sequence[View]],
+        detector: Callable[[], Detector],
+        paint: Tensor | None,
+    ) -> Tensor:
+        path = self.kept(spec)
+        if not path.is_file():
+            trained = train_texture(
+                make_physical(spec.trained, **spec.settings),
+                detector(),
+                surface,
+                views(),
+                start=control("grey", surface.size),
+                printable=printable_colours(),
+                paint=paint,
+                device=self.device,
+                key=(self.seed, spec.name),
+                checkpoint=path.with_suffix(".checkpoint.npz"),
+            )
+            losses, gradients = np.array(trained.losses), np.array(trained.gradients)
+            safeio.save_npz(path, {"colour": trained.colour.numpy(), "losses": losses, "gradients": gradients})
+        return torch.from_numpy(safeio.load_npz(path)["colour"].copy())
+
+    def history(self, spec: TextureSpec) -> dict[str, Any]:
+        """How a texture was trained, for records; empty for what is not trained."""
+        if not spec.trained:
+            return {}
+        losses = safeio.load_npz(self.kept(spec))["losses"]
+        return {"epochs": len(losses), "loss_before": float(losses[0]), "loss_after": float(losses[-1])}
+
+
+def _read(spec: TextureSpec, surface: Surface) -> Tensor:
+    """A texture from its file. ConfigError: it is of another size than the surface."""
+    assert spec.file is not None
+    colour, _ = load_texture(spec.file)
+    if tuple(colour.shape[1:]) != surface.size:
+        raise ConfigError(
+            f"texture {spec.file}: {colour.shape[1]} x {colour.shape[2]} texels, the {spec.carrier} has "
+            f"{surface.size[0]} x {surface.size[1]}"
+        )
+    return colour

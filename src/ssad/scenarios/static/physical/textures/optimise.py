@@ -1,0 +1,302 @@
+"""Textures that are trained: gradient descent through camera, print and detector, with checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
+
+import numpy as np
+import torch
+from pydantic import Field, PlainValidator
+from pydantic.dataclasses import dataclass as checked_dataclass
+from torch import Tensor
+
+from ssad.core import safeio
+from ssad.core.detections import Truth
+from ssad.core.errors import ConfigError, FormatError, UnknownNameError
+from ssad.core.protocols import Detector
+from ssad.core.schema import VALUES, Above, Least, Part, Whole
+from ssad.core.seeding import digest, generator
+from ssad.scenarios.static.digital.objectives import Aim, Objective, Situation, make_objective
+from ssad.scenarios.static.digital.victim import steady
+from ssad.scenarios.static.physical.textures.carrier import Surface, albedo_of
+from ssad.scenarios.static.physical.textures.printing import (
+    Expectation,
+    conspicuousness,
+    non_printability,
+    total_variation,
+)
+from ssad.scenarios.static.physical.zoom import STEP, around_target
+
+TARGET = Aim(objects=(0,))
+"""The target is the first object of each picture's truth."""
+
+
+class Shows(Protocol):
+    """A picture that waits for textures (see `ssad.experiments.perception.physical.textured_images.Wearing`)."""
+
+    @classmethod
+    def together(
+        cls, pictures: Sequence[Any], textures: Mapping[int, Tensor], noise: Sequence[torch.Generator] | None = None
+    ) -> Tensor:
+        """Pictures [B, 3, H, W] in 0 to 1, differentiable in the textures [B, 3, h, w] of linear albedo."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A picture to train or test on.
+
+    Attributes:
+        picture: The picture; its target wears texture 0.
+        truth: What is in it, the target first.
+    """
+
+    picture: Shows
+    truth: Truth
+
+
+def _loss(value: Any) -> Any:
+    """A loss, or the name of one, as it is."""
+    if isinstance(value, str):
+        try:
+            make_objective(value)
+        except UnknownNameError as error:
+            raise ValueError(str(error)) from None
+    elif not callable(value):
+        raise ValueError("expected a loss, or the name of one")
+    return value
+
+
+@checked_dataclass(frozen=True, slots=True, config=VALUES)
+class TextureAttack:
+    """How a texture is trained.
+
+    Attributes:
+        name: What tables call it.
+        objective: The loss that is ascended, or its name.
+        epochs: Times that each picture is shown.
+        rate: Learning rate, in units of colour (0 to 1).
+        optimiser: adam, or sgd with momentum 0.9.
+        decay: Weight decay towards mid-grey.
+        batch: Pictures a step.
+        smooth: Weight of the total variation.
+        printed: Weight of the non-printability.
+        stealth: Weight of the conspicuousness, of 100: how far the colours are from those that the texture covers.
+        expectation: What differs from print to print.
+        worst: Share of the pictures of an epoch that are drawn by how badly the attack does on them, in place of once
+            each; 0: none.
+        window: Side of the square part around the target that a 2D detector is shown, px; None: the whole picture, as
+            3D detectors are always shown, since their boxes belong to its camera.
+    """
+
+    name: str
+    objective: Annotated[str | Objective, PlainValidator(_loss)] = "hide"
+    epochs: Whole = 20
+    rate: Above = 0.04
+    optimiser: Literal["adam", "sgd"] = "adam"
+    decay: Least = 0.0
+    batch: Whole = 8
+    smooth: Least = 0.1
+    printed: Least = 0.01
+    stealth: Least = 0.0
+    expectation: Expectation = field(default_factory=Expectation)
+    worst: Part = 0.0
+    window: Annotated[int, Field(ge=4 * STEP, multiple_of=STEP)] | None = None
+
+
+@dataclass(slots=True)
+class Trained:
+    """A trained texture and how it came about.
+
+    Attributes:
+        colour: sRGB [3, H, W] in 0 to 1, on the CPU.
+        losses: Mean of the ascended loss in each epoch.
+        gradients: Greatest length of a texel's gradient in each epoch; 0 means that nothing reaches the texture.
+    """
+
+    colour: Tensor
+    losses: list[float]
+    gradients: list[float]
+
+
+def train_texture(
+    attack: TextureAttack,
+    detector: Detector,
+    surface: Surface,
+    views: Sequence[View],
+    *,
+    start: Tensor,
+    printable: Tensor | None = None,
+    paint: Tensor | None = None,
+    shown: Callable[[Tensor], Tensor] = albedo_of,
+    key: tuple[object, ...] = (),
+    device: str | torch.device = "cpu",
+    checkpoint: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Trained:
+    """Train a texture on pictures of its target.
+
+    Args:
+        attack: How.
+        detector: What is attacked; its modes, flags and buffers are the same afterwards.
+        surface: What the texture is printed on.
+        views: Pictures whose target wears texture 0 on that surface; with 3D truth and a camera matrix for a 3D
+            detector.
+        start: The first texture, sRGB [3, H, W].
+        printable: Colours [N, 3] that can be printed, for `attack.printed`; None: that term is left out.
+        paint: Linear RGB [3] of what the texture covers, for `attack.stealth`.
+        shown: What pictures take of a texture's colours: the albedo of print, or the light of a projector.
+        key: What all draws come from.
+        device: Where the detector is.
+        checkpoint: Where the state is kept after each epoch; what is there already is continued, to the bit on the CPU,
+            also by more epochs than it was begun with.
+        progress: Called with epochs done, and of how many.
+
+    Raises:
+        ConfigError: No pictures, a texture of another size, a target that is never in view, a loss that does not
+            depend on the texture, or stealth without the paint.
+        FormatError: The checkpoint is of another training, or broken.
+    """
+    if not views:
+        raise ConfigError("no pictures to train a texture on")
+    if tuple(start.shape) != (3, *surface.size):
+        raise ConfigError(f"the texture is {list(start.shape)}, the surface takes {[3, *surface.size]}")
+    if not (float(start.min()) >= 0.0 and float(start.max()) <= 1.0):
+        raise ConfigError("a texture's colours lie in 0 to 1")
+    if attack.stealth > 0.0 and paint is None:
+        raise ConfigError(f"attack {attack.name}: stealth is for what is printed on something, whose colour is known")
+    objective = make_objective(attack.objective) if isinstance(attack.objective, str) else attack.objective
+    colour = start.detach().to(device, torch.float32).clone().requires_grad_()
+    optimiser: torch.optim.Optimizer
+    if attack.optimiser == "adam":
+        optimiser = torch.optim.Adam([colour], lr=attack.rate, eps=1e-8)
+    else:
+        optimiser = torch.optim.SGD([colour], lr=attack.rate, momentum=0.9)
+    state = _State(colour, optimiser, np.zeros(len(views)), [], [])
+    name = digest("texture", replace(attack, epochs=1), surface.size, surface.place, len(views), key)
+    if checkpoint is not None and checkpoint.is_file():
+        state.load(checkpoint, name)
+    mask = torch.as_tensor(surface.mask, device=device)
+    inks = None if printable is None else printable.to(colour)
+    with steady(detector):
+        for epoch in range(len(state.losses), attack.epochs):
+            order = _order(attack, state.hard, generator("texture order", *key, epoch))
+            total, steepest = 0.0, 0.0
+            for step, first in enumerate(range(0, len(order), attack.batch)):
+                chosen = order[first : first + attack.batch]
+                losses = _ascended(
+                    attack, objective, detector, views, colour, chosen.tolist(), shown, (*key, epoch, step)
+                )
+                loss = -losses.mean() + attack.smooth * total_variation(colour, mask)
+                if inks is not None and attack.printed > 0.0:
+                    loss = loss + attack.printed * non_printability(colour, inks, mask)
+                if paint is not None and attack.stealth > 0.0:
+                    loss = loss + attack.stealth * conspicuousness(albedo_of(colour), paint.to(colour), mask) / 100.0
+                optimiser.zero_grad()
+                torch.autograd.backward(loss)
+                assert colour.grad is not None
+                if not bool(colour.grad.isfinite().all()):
+                    raise ConfigError(f"attack {attack.name}: the gradient is not finite in epoch {epoch + 1}")
+                if attack.decay > 0.0:
+                    colour.grad += attack.decay * (colour.detach() - 0.5)
+                steepest = max(steepest, float(colour.grad.square().sum(0).max().sqrt()))
+                optimiser.step()
+                with torch.no_grad():
+                    colour.clamp_(0.0, 1.0)
+                total += float(losses.detach().sum())
+                state.hard[chosen] = losses.detach().cpu().double().numpy()
+            state.losses.append(total / len(order))
+            state.gradients.append(steepest)
+            if not any(state.gradients):  # later it means that nothing is left to hide
+                raise ConfigError(
+                    f"attack {attack.name}: loss '{objective.name}' has no slope in the texture: the target is never "
+                    "in view, or is not found even without it"
+                )
+            if checkpoint is not None:
+                state.save(checkpoint, name)
+            progress(epoch + 1, attack.epochs)
+    return Trained(colour.detach().cpu(), state.losses, state.gradients)
+
+
+def _ascended(  # noqa: PLR0917
+    attack: TextureAttack,
+    objective: Objective,
+    detector: Detector,
+    views: Sequence[View],
+    colour: Tensor,
+    chosen: list[int],
+    shown: Callable[[Tensor], Tensor],
+    key: tuple[object, ...],
+) -> Tensor:
+    """The loss [B] of some pictures, with texture, print and noise of their own."""
+    draws = [torch.Generator().manual_seed(int(digest("texture draw", *key, k)[:15], 16)) for k in chosen]
+    pictures, truth = [views[k].picture for k in chosen], [views[k].truth for k in chosen]
+    printed = shown(attack.expectation.draw(colour, draws))
+    images = type(pictures[0]).together(pictures, {0: printed}, draws)
+    three = detector.task == "3d"
+    if attack.window is not None and not three:
+        parts = [
+            around_target(image[None], seen, attack.window, own)
+            for image, seen, own in zip(images, truth, draws, strict=True)
+        ]
+        images, truth = torch.cat([part for part, _ in parts]), [seen for _, seen in parts]
+    cameras = [one.intrinsic for one in truth if one.intrinsic is not None and three]
+    dense = detector.dense(images, torch.stack(cameras).to(images) if cameras else None)
+    with torch.no_grad():
+        assignment = detector.assign(dense, truth)
+    return objective(dense, Situation(detector, assignment, TARGET))
+
+
+def _order(attack: TextureAttack, hard: Any, draws: np.random.Generator) -> Any:
+    """Numbers of the pictures of an epoch: each once, a share of them replaced by those that the attack fails on."""
+    order = draws.permutation(len(hard))
+    count = int(attack.worst * len(hard))
+    if count and np.ptp(hard) > 0.0:
+        scaled = -(hard - hard.mean()) / hard.std()  # a low value: still found
+        chance = np.exp(np.clip(scaled, -3.0, 3.0))
+        order[:count] = draws.choice(len(hard), size=count, p=chance / chance.sum())
+    return order
+
+
+@dataclass(slots=True)
+class _State:
+    """All that changes in a training."""
+
+    colour: Tensor
+    optimiser: torch.optim.Optimizer
+    hard: Any
+    losses: list[float]
+    gradients: list[float]
+
+    def save(self, path: Path, name: str) -> None:
+        """Write everything, in one piece."""
+        kept = self.optimiser.state[self.colour]
+        arrays = {"colour": self.colour.detach().cpu().numpy(), "hard": self.hard}
+        arrays |= {"losses": np.array(self.losses), "gradients": np.array(self.gradients)}
+        for key, value in kept.items():
+            arrays[f"optimiser.{key}"] = torch.as_tensor(value).cpu().numpy()
+        arrays["name"] = np.frombuffer(name.encode(), np.uint8)
+        safeio.make_folder(path.parent)
+        safeio.save_npz(path, arrays)
+
+    def load(self, path: Path, name: str) -> None:
+        """Read it again. FormatError: it is of another training."""
+        arrays = safeio.load_npz(path)
+        try:
+            if arrays["name"].tobytes().decode() != name or arrays["colour"].shape != tuple(self.colour.shape):
+                raise FormatError(f"{path}: the checkpoint of another training; remove it, or choose another file")
+            with torch.no_grad():
+                self.colour.copy_(torch.from_numpy(arrays["colour"].copy()))
+            self.hard = arrays["hard"].copy()
+            self.losses = arrays["losses"].tolist()
+            self.gradients = arrays["gradients"].tolist()
+            kept = {}
+            for key, value in arrays.items():
+                if key.startswith("optimiser."):
+                    tensor = torch.from_numpy(value.copy())
+                    kept[key.removeprefix("optimiser.")] = tensor if tensor.ndim == 0 else tensor.to(self.colour.device)
+            self.optimiser.state[self.colour] = kept
+        except KeyError as error:
+            raise FormatError(f"{path}: no checkpoint of a texture ({error} is missing)") from None

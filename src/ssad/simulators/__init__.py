@@ -1,0 +1,1 @@
+"""Simulators that run episodes: the embedded world, highway-env and CARLA."""

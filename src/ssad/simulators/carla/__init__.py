@@ -1,0 +1,1 @@
+"""CARLA as a simulator of episodes."""

@@ -1,0 +1,473 @@
+"""CARLA as a simulator: a server in synchronous mode at 10 Hz, with SSAD's drivers, scenarios, metrics and reports.
+
+Everybody is spawned in CARLA, which moves them; after each tick they are mirrored in a `World` in which each is placed
+where CARLA has it. The mirror knows lanes, routes, signals and contacts, so that all that SSAD has for its own world
+works here too: scripts, the Autopilot and the blind follower plan in the mirror and act in CARLA by throttle, brake and
+steering. Who follows a trajectory is put where it has them. CARLA's traffic lights show what the mirror's signals say.
+
+A server runs one world, so a batch has one scene. Needs the extra `carla`. CARLA's frame is left-handed: y and yaw
+change sign here and nowhere else. Facts of the interface: carla.readthedocs.io, version 0.9.16.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from ssad.core.driving import Scenes
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.safeio import parse_xml
+from ssad.core.types import (
+    F32,
+    I32,
+    U8,
+    AgentKind,
+    Contact,
+    Controller,
+    End,
+    Episode,
+    Pose,
+    SignalState,
+)
+from ssad.simulators.carla.blueprints import BLUEPRINTS
+from ssad.simulators.carla.events import Events
+from ssad.simulators.carla.sensors import Carried, Eye
+from ssad.simulators.carla.server import Server, T, asked, connect
+from ssad.simulators.carla.traffic import Traffic
+from ssad.simulators.mirrored import Mirrored
+from ssad.world.kernels.data import Presence
+from ssad.world.models import MODELS, WALKER_RATE
+from ssad.world.roads import town_signals, town_xodr
+from ssad.world.world import World
+
+if TYPE_CHECKING:
+    import carla
+
+ABOVE: Final = 0.3  # m above the road at which bodies are spawned, so that none sticks in it; they drop at once
+SAME: Final = 0.05  # m by which the length of a road may differ between two copies of a map
+GROUND: Final = ("static.road", "static.sidewalk", "static.ground", "static.terrain", "static.roadline")
+_FREE = (Controller.TRAJECTORY, Controller.PLACED, Controller.NONE)  # those that CARLA's physics do not move
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A connection that stays open from one simulator of this process to the next, so that no map is loaded twice."""
+
+    client: carla.Client
+    world: carla.World
+    town: str = ""
+    lights: dict[int, carla.TrafficLight] = field(default_factory=dict)
+
+
+_KEPT: dict[Server, _Kept] = {}
+
+
+class Carla(Mirrored):
+    """A `Simulator` of `ssad.core.driving` in which a CARLA server moves everybody; see the module.
+
+    `mirror` is the `World` that mirrors it. `close` gives the server back as it was found.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[Episode],
+        graphs: Mapping[str, LaneGraph],
+        *,
+        server: Server,
+        assign: Scenes | None = None,
+        eyes: Mapping[str, Eye] | None = None,
+    ) -> None:
+        self.mirror = World(episodes, graphs, assign=assign)
+        if self.mirror.batch != 1:
+            raise ConfigError(f"{server} runs one world: it takes one scene at a time, not {self.mirror.batch}")
+        self.dt, self.batch, self.agents = self.mirror.dt, self.mirror.batch, self.mirror.agents
+        self.episodes, self.graphs = self.mirror.episodes, self.mirror.graphs
+        self.server = server
+        kept = _KEPT.pop(server, None)
+        self.client = connect(server) if kept is None else kept.client
+        self.world: carla.World = self._ask("get its world", self.client.get_world)
+        if kept is None or self.world.id != kept.world.id:
+            kept = _Kept(self.client, self.world)
+        self.town, self._lights = kept.town, kept.lights
+        self._found: carla.WorldSettings = self._ask("get its settings", self.world.get_settings)
+        self._bodies: dict[int, carla.Actor] = {}
+        self._middle: dict[int, float] = {}  # m from an actor's origin forward to the centre of its body
+        self._events = Events(str(server))
+        self._carried = Carried(dict(eyes or {}), server.timeout, str(server))
+        self._frame = 0
+        self._traffic: Traffic | None = None
+        if server.traffic == "manager":
+            self._traffic = self._ask("reach its Traffic Manager", lambda: Traffic(self.client, server.port))
+        self._touching: set[int] = set()
+        self._shown: dict[int, int] = {}
+        self._controls: F32 = np.zeros((1, self.agents, 4), np.float32)
+        try:
+            self.reset()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def assigned(self) -> I32:
+        """[B] number of the episode that each scene runs."""
+        return self.mirror.assigned
+
+    @property
+    def _episode(self) -> Episode:
+        return self.episodes[int(self.assigned[0])]
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """What the ego's own sensors have counted in this episode, as `Events.measured`."""
+        return self._events.measured
+
+    def _ask(self, doing: str, call: Callable[[], T]) -> T:
+        return asked(self.server, doing, call)
+
+    # ------------------------------------------------------------ the start
+
+    def reset(self, scenes: Scenes | None = None, *, episodes: Scenes | None = None) -> None:
+        """Start the scene again, with another episode if given; the map is loaded only where the town is another."""
+        if scenes is not None and not len(scenes):
+            return
+        self.mirror.reset(scenes, episodes=episodes)
+        self._controls[:] = 0.0
+        self._clear()
+        self._shown = {}
+        episode = self._episode
+        if episode.town != self.town:
+            self._load(episode.town)
+        self._ask("change its settings", self._synchronise)
+        self._ask("set the weather", self._weather)
+        active = self.mirror.array("active")[0]
+        for i, agent in enumerate(episode.agents):
+            if active[i] != Presence.ABSENT:
+                self._spawn(i, agent.pose)
+        self._ask("attach its collision and lane sensors", lambda: self._events.attach(self.world, self._bodies[0]))
+        self._ask("attach its sensors", lambda: self._carried.attach(self.world, self._bodies[0], self._middle[0]))
+        if self._traffic is not None:
+            self._ask("begin with its Traffic Manager", partial(self._traffic.begin, episode))
+        self._tick()  # everybody drops onto the road
+        for i, agent in enumerate(episode.agents):
+            if agent.speed != 0.0 and i in self._bodies and agent.controller not in _FREE:
+                self._ask(f"set the speed of {agent.name}", partial(self._speed, i, agent.pose, agent.speed))
+        self._events.begin(self._frame)
+
+    def _load(self, town: str) -> None:
+        import carla
+
+        text = town_xodr(town)
+        self.client.set_timeout(5.0 * self.server.timeout)
+        known = [name.rsplit("/", 1)[-1] for name in self._ask("list its maps", self.client.get_available_maps)]
+        if town in known:
+            self.world = self._ask(f"load the map {town}", lambda: self.client.load_world(town))
+        else:
+            rules = carla.OpendriveGenerationParameters(
+                vertex_distance=2.0,
+                max_road_length=50.0,
+                wall_height=0.0,
+                additional_width=0.6,
+                smooth_junctions=True,
+                enable_mesh_visibility=True,
+            )
+            self.world = self._ask(
+                f"make a world of the map of {town}", lambda: self.client.generate_opendrive_world(text, rules)
+            )
+        self.client.set_timeout(self.server.timeout)
+        told = self._ask("get its map", lambda: self.world.get_map().to_opendrive())
+        if not _same_roads(text, told, str(self.server)):
+            raise ConfigError(
+                f"{self.server}: its map {town} has other roads than the town here; import the server's map under "
+                "that name (ssad import map)"
+            )
+        self._lights = {}
+        for signal, name in town_signals(town).items():
+            light = self._ask("find a traffic light", partial(self.world.get_traffic_light_from_opendrive_id, name))
+            if light is not None:
+                self._lights[signal] = light
+        self.town = town
+
+    def _synchronise(self) -> None:
+        settings = self.world.get_settings()
+        settings.synchronous_mode = True
+        settings.fixed_delta_seconds = self.dt
+        settings.substepping = True
+        settings.max_substep_delta_time = 0.01
+        settings.max_substeps = 10
+        settings.no_rendering_mode = not any("camera" in eye.kind for eye in self._carried.eyes.values())
+        self.world.apply_settings(settings)
+        self.world.freeze_all_traffic_lights(True)
+
+    def _weather(self) -> None:
+        import carla
+
+        self.world.set_weather(getattr(carla.WeatherParameters, self.server.weather))
+
+    def _spawn(self, i: int, pose: Pose) -> None:
+        agent = self._episode.agents[i]
+
+        def spawn() -> carla.Actor | None:
+            blueprint = self.world.get_blueprint_library().find(BLUEPRINTS.get(agent.model, agent.model))
+            if blueprint.has_attribute("role_name"):
+                blueprint.set_attribute("role_name", "hero" if i == 0 else f"ssad {i}")
+            if blueprint.has_attribute("is_invincible"):
+                blueprint.set_attribute("is_invincible", "true")
+            return self.world.try_spawn_actor(blueprint, self._transform(pose))
+
+        try:
+            body = self._ask(f"spawn {agent.name}", spawn)
+        except IndexError:  # what the library raises for a name that it does not have
+            raise ConfigError(f"{self.server}: it has no blueprint {BLUEPRINTS.get(agent.model)}") from None
+        if body is None:
+            raise ConfigError(
+                f"{self.server}: cannot put {agent.name} at ({pose.x:.1f}, {pose.y:.1f}): something is in the way"
+            )
+        self._bodies[i] = body
+        kind = MODELS[agent.model].kind
+        self._middle[i] = 0.0 if kind in (AgentKind.PROP, AgentKind.WALKER) else float(body.bounding_box.location.x)
+        if abs(self._middle[i]) > 0.01:
+            self._ask(f"place {agent.name}", lambda: body.set_transform(self._transform(pose, i)))
+        if agent.controller in _FREE and i > 0:
+            self._ask(f"hold {agent.name}", lambda: body.set_simulate_physics(False))
+
+    def _transform(self, pose: Pose, i: int = -1) -> carla.Transform:
+        import carla
+
+        back = self._middle.get(i, 0.0)
+        x, y = pose.x - back * math.cos(pose.yaw), pose.y - back * math.sin(pose.yaw)
+        return carla.Transform(carla.Location(x, -y, ABOVE), carla.Rotation(yaw=-math.degrees(pose.yaw)))
+
+    def _speed(self, i: int, pose: Pose, speed: float) -> None:
+        import carla
+
+        ahead = carla.Vector3D(speed * math.cos(pose.yaw), -speed * math.sin(pose.yaw), 0.0)
+        self._bodies[i].set_target_velocity(ahead)
+
+    # ------------------------------------------------------------ a step
+
+    def step(self, controls: npt.ArrayLike | None = None) -> None:
+        """Advance a running scene by 0.1 s: plan in the mirror, act in CARLA, tick, mirror what it made of it."""
+        world = self.mirror
+        if controls is not None:
+            world.set_controls(controls)
+            self._controls[:] = world.array("controls")
+        if world.ended()[0] != End.RUNNING:
+            return
+        world.plan()
+        said: I32 = world.array("controller").copy()
+        control = np.where((said == Controller.EXTERNAL)[..., None], self._controls, world.array("control"))
+        active = world.array("active").copy()
+        time = (int(world.array("step")[0]) + 1) * self.dt
+        self._ask("show its traffic lights", self._signals)
+        self._drive(said[0], control[0], active[0], time)
+        self._tick()
+        places = self._places(time)
+        world.put("control", control.astype(np.float32))
+        world.put("active", active)
+        world.place(places)
+        world.put("controller", np.full_like(said, Controller.PLACED))
+        world.advance()
+        removed = (active != Presence.ABSENT) & (world.array("active") == Presence.ABSENT)  # whom the ego has touched
+        world.put("controller", np.where(removed, int(Controller.NONE), said).astype(said.dtype))
+        self._leave(said[0], active[0])
+        self._felt()
+
+    def _signals(self) -> None:
+        import carla
+
+        lamp = carla.TrafficLightState
+        shows = {
+            SignalState.RED: lamp.Red,
+            SignalState.YELLOW: lamp.Yellow,
+            SignalState.GREEN: lamp.Green,
+            SignalState.OFF: lamp.Off,
+        }
+        states = self.mirror.state().signal[0]
+        for signal, light in self._lights.items():
+            state = int(states[signal])
+            if self._shown.get(signal) != state:
+                light.set_state(shows[SignalState(state)])
+                self._shown[signal] = state
+
+    def _drive(self, said: I32, control: F32, active: I32, time: float) -> None:
+        """Hand everybody their controls; who follows a trajectory appears, is put, and goes."""
+        poses = self.mirror.array("pose")[0]
+        for i, agent in enumerate(self._episode.agents):
+            if said[i] == Controller.TRAJECTORY:
+                pose = _on(agent.trajectory, time)
+                active[i] = Presence.ABSENT if pose is None else Presence.AWAKE
+                if pose is None:
+                    self._destroy(i)
+                elif i in self._bodies:
+                    self._ask(f"place {agent.name}", partial(self._bodies[i].set_transform, self._transform(pose, i)))
+                else:
+                    self._spawn(i, pose)
+            elif i in self._bodies and active[i] != Presence.ABSENT and MODELS[agent.model].max_speed > 0.0:
+                if said[i] in _FREE and i > 0:
+                    continue
+                walks = MODELS[agent.model].kind == AgentKind.WALKER
+                if self._traffic is not None and i > 0 and said[i] == Controller.AUTOPILOT and not walks:
+                    if active[i] == Presence.AWAKE and i not in self._traffic.driven:
+                        told = partial(self._traffic.take, i, self._bodies[i], self._episode)
+                        self._ask(f"hand {agent.name} to its Traffic Manager", told)
+                    continue
+                order = self._walk if walks else self._control
+                yaw, told, who = float(poses[i, 2]), control[i], Controller(int(said[i]))
+                self._ask(f"control {agent.name}", partial(order, i, told, yaw, who))
+
+    def _control(self, i: int, control: F32, yaw: float, who: Controller) -> None:
+        import carla
+
+        throttle, brake, steer, reverse = (float(v) for v in control)
+        cast("carla.Vehicle", self._bodies[i]).apply_control(
+            carla.VehicleControl(
+                throttle=min(max(throttle, 0.0), 1.0),
+                steer=-min(max(steer, -1.0), 1.0),
+                brake=min(max(brake, 0.0), 1.0),
+                hand_brake=False,
+                reverse=reverse > 0.5,
+            )
+        )
+
+    def _walk(self, i: int, control: F32, yaw: float, who: Controller) -> None:
+        import carla
+
+        agent = self._episode.agents[i]
+        turn = float(control[2]) * WALKER_RATE * self.dt if who == Controller.EXTERNAL else 0.0
+        ahead = carla.Vector3D(math.cos(yaw + turn), -math.sin(yaw + turn), 0.0)
+        speed = min(max(float(control[0]), 0.0), 1.0) * MODELS[agent.model].max_speed
+        walker = cast("carla.Walker", self._bodies[i])
+        walker.apply_control(carla.WalkerControl(direction=ahead, speed=speed, jump=False))
+
+    def _tick(self) -> None:
+        self._frame = self._ask("advance", lambda: self.world.tick(self.server.timeout))
+
+    def seen(self, name: str, who: Sequence[int]) -> F32 | U8:
+        """What one of CARLA's own sensors shows an agent (scene, number) now; only the ego carries them."""
+        if who[1] != 0:
+            raise ConfigError(f"{self.server}: only the ego carries its sensors, not agent {who[1]}")
+        if self.mirror.ended()[0] != End.RUNNING:
+            return self._carried.eyes[name].empty
+        return self._carried.reading(name, self._frame)
+
+    def _places(self, time: float) -> F32:
+        """[1, A, 4] x, y, yaw, speed of the bodies' centres after the tick; who is not there stays where it was."""
+        world = self.mirror
+        places = np.concatenate([world.array("pose"), world.array("speed")[..., None]], -1)
+        snapshot = self._ask("tell where everybody is", self.world.get_snapshot)
+        for i, body in self._bodies.items():
+            seen = snapshot.find(body.id)
+            if seen is None:
+                name = self._episode.agents[i].name
+                raise ConfigError(f"{self.server}: {name} is gone: somebody has destroyed it")
+            place, velocity = seen.get_transform(), seen.get_velocity()
+            yaw = -math.radians(place.rotation.yaw)
+            x = place.location.x + self._middle[i] * math.cos(yaw)
+            y = -place.location.y + self._middle[i] * math.sin(yaw)
+            agent = self._episode.agents[i]
+            speed = velocity.x * math.cos(yaw) - velocity.y * math.sin(yaw)
+            if agent.controller == Controller.TRAJECTORY:  # it is put, and CARLA knows no speed of it
+                speed = _speed_on(agent.trajectory, time, yaw)
+            places[0, i] = x, y, yaw, speed
+        if not np.isfinite(places).all():
+            raise ConfigError(f"{self.server}: it tells places that are no numbers")
+        return places.astype(np.float32)
+
+    def _leave(self, said: I32, before: I32) -> None:
+        """Background traffic leaves at the end of its route; who was taken out of the mirror leaves CARLA too."""
+        world = self.mirror
+        gone = np.zeros((1, self.agents), bool)
+        route = world.state().route[0]
+        at_end = world.array("progress")[0] >= route[:, 1] - 3
+        gone[0] = at_end & (said == Controller.AUTOPILOT) & (route[:, 1] > 0) & (np.arange(self.agents) > 0)
+        if gone.any():
+            world.remove(gone)
+        for i in list(self._bodies):
+            if world.array("active")[0, i] == Presence.ABSENT:
+                self._destroy(i)
+
+    def _felt(self) -> None:
+        """What the collision sensor felt and the mirror did not see: bodies of another shape, things of the town."""
+        self._ask("look after its sensors", self._events.check)
+        hits, self._events.hits = self._events.hits, []
+        number = {body.id: i for i, body in self._bodies.items()}
+        felt = {number.get(who, -1 - abs(who)) for who, kind in hits if not kind.startswith(GROUND)} - {0}
+        fresh = felt - self._touching
+        self._touching = felt
+        world = self.mirror
+        touched = int(world.array("touch")[0, 0])
+        for i in sorted(fresh):
+            if i >= 0 and touched >> i & 1:
+                continue
+            episode = self._episode
+            bit = _bit(MODELS[episode.agents[i].model].kind) if i >= 0 else Contact.STATIC
+            world.put("ego.contact", world.array("ego.contact") | int(bit))
+            if int(world.array("ego.contact_agent")[0]) == -1:
+                world.put("ego.contact_agent", np.full_like(world.array("ego.contact_agent"), i if i >= 0 else -2))
+            if episode.limits.contact == "end" and world.ended()[0] in (End.RUNNING, End.COMPLETE):
+                world.put("end", np.full_like(world.array("end"), int(End.COLLISION)))
+
+    # ------------------------------------------------------------ the end
+
+    def _destroy(self, i: int) -> None:
+        body = self._bodies.pop(i, None)
+        if body is not None:
+            self._ask("take somebody out", body.destroy)
+
+    def _clear(self) -> None:
+        """Take out all that was spawned."""
+        self._touching = set()
+        self._ask("take its collision and lane sensors out", self._events.detach)
+        self._ask("take its sensors out", self._carried.detach)
+        for i in list(self._bodies):
+            self._destroy(i)
+
+    def close(self) -> None:
+        """Take out all that was spawned and give the server its settings back; a dead server is left alone."""
+        with suppress(ConfigError):
+            self._clear()
+            if self._traffic is not None:
+                self._ask("leave its Traffic Manager", self._traffic.end)
+            self._ask("change its settings", lambda: self.world.apply_settings(self._found))
+            _KEPT[self.server] = _Kept(self.client, self.world, self.town, self._lights)
+
+
+def _same_roads(ours: str, theirs: str, where: str) -> bool:
+    """Whether two OpenDRIVE texts have the same roads, of the same lengths."""
+
+    def roads(text: str, name: str) -> dict[str, float]:
+        found = parse_xml(text.encode(), name).findall("road")
+        return {road.get("id", ""): float(road.get("length", "nan")) for road in found}
+
+    one, other = roads(ours, "the town here"), roads(theirs, f"the map of {where}")
+    return one.keys() == other.keys() and all(abs(one[name] - other[name]) <= SAME for name in one)
+
+
+def _on(rows: Sequence[tuple[float, float, float, float]], time: float) -> Pose | None:
+    """Where a trajectory is at a time; None before its first and after its last row."""
+    table = np.array(rows)
+    if not table[0, 0] - 1e-6 <= time <= table[-1, 0] + 1e-6:
+        return None
+    yaw = np.unwrap(table[:, 3])
+    return Pose(*(float(np.interp(time, table[:, 0], column)) for column in (table[:, 1], table[:, 2], yaw)))
+
+
+def _speed_on(rows: Sequence[tuple[float, float, float, float]], time: float, yaw: float) -> float:
+    """Speed along the heading of a trajectory in the piece that a time is in, m/s."""
+    table = np.array(rows)
+    k = int(np.clip(np.searchsorted(table[:, 0], time, side="left") - 1, 0, len(table) - 2))
+    dt, dx, dy, _ = (table[k + 1] - table[k]).tolist()
+    return float((dx * math.cos(yaw) + dy * math.sin(yaw)) / dt)
+
+
+def _bit(kind: AgentKind) -> Contact:
+    known = {AgentKind.WALKER: Contact.WALKER, AgentKind.BICYCLE: Contact.CYCLIST, AgentKind.PROP: Contact.STATIC}
+    return known.get(kind, Contact.VEHICLE)

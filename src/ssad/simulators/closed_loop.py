@@ -1,0 +1,271 @@
+"""Scenarios driven in the closed loop: towns, systems, episodes, and one loop over the simulators that there are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import lru_cache
+from importlib.metadata import version
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ssad.core import safeio
+from ssad.core.driving import Driver, Perturbation, Sensor, Simulator
+from ssad.core.errors import ConfigError
+from ssad.core.lane_graph import LaneGraph
+from ssad.core.machine import quiet_warp
+from ssad.core.nuscenes_names import CAMERAS, LIDAR
+from ssad.core.source import source_version
+from ssad.core.types import Episode, EpisodeTrace, Scenario
+
+if TYPE_CHECKING:
+    from ssad.core.frames import Camera
+    from ssad.drivers.careful.grade import Grade
+    from ssad.rendering.lidar import Lidar
+
+STEP = 0.1  # s
+WIDTH = 640  # pixels of a picture of nuScenes' rig
+HIGHWAY = "highway-env"  # as a set of scenarios
+HIGHWAY_TYPE = "ssad.simulators.highway_env:SCENARIO"
+
+
+class Order(Protocol):
+    """An episode that is to be driven, as plain data."""
+
+    @property
+    def key(self) -> str:
+        """Of the episode and its trace."""
+
+    @property
+    def system(self) -> str:
+        """Who drives."""
+
+    @property
+    def seed(self) -> int:
+        """Of the episode."""
+
+    @property
+    def spec(self) -> Mapping[str, Any]:
+        """Scenario (see `scenario_json`), repetition (0: the nominal case), spread; simulator, if it is not ours."""
+
+
+def load_world(device: str) -> None:
+    """Loads the world's kernels, which are compiled on first use."""
+    import warp
+
+    import ssad.world.rollout  # noqa: F401  its kernels are what is loaded
+
+    quiet_warp()
+    warp.force_load(device=device)
+
+
+@lru_cache(maxsize=8)
+def town(name: str) -> LaneGraph:
+    """A town, read once a process."""
+    from ssad.simulators.highway_env import PLACES, highway_town
+    from ssad.world.roads import load_town
+
+    return highway_town(name) if name in PLACES else load_town(name)
+
+
+@lru_cache(maxsize=4)
+def system_of(name: str) -> Driver:
+    """A driving system, made once a process."""
+    from ssad.drivers import make_system
+
+    return make_system(name)
+
+
+def system_version(name: str) -> str:
+    """12 hex digits over the source of a system and all that it imports, and those of its weights if it was trained.
+
+    Raises:
+        UnknownNameError, ConfigError: there is no such system.
+        FormatError: its weights cannot be used.
+    """
+    from ssad.drivers import find_system, weights_version
+
+    found = find_system(name)
+    if not callable(getattr(found, "act", None)) or not callable(getattr(found, "reset", None)):
+        raise ConfigError(f"system '{name}' needs the methods reset(episodes) and act(observation)")
+    source = source_version((found if isinstance(found, type) else type(found)).__module__)
+    detector = getattr(found, "weights", "")
+    if detector:  # of a perceiving system, with the weights that are shipped
+        from ssad.detectors import SHIPPED
+
+        return f"{source} {safeio.read_json(SHIPPED / f'{detector}.json')['hash'][:12]}"
+    return f"{source} {weights_version(name)[:12]}".strip()
+
+
+def policies_of(scenario: Scenario) -> list[str]:
+    """The drivers that a scenario names for its actors, each once."""
+    return sorted({actor.policy for actor in scenario.actors} - {""})
+
+
+def type_version(name: str) -> str:
+    """12 hex digits over the source of a scenario type of the user's own ("module:object"); "" for a built-in one.
+
+    For the type that highway-env runs, with its version.
+    """
+    found = source_version(name.partition(":")[0]) if ":" in name else ""
+    return f"{found} {version('highway-env')}" if name == HIGHWAY_TYPE else found
+
+
+def in_highway(order: Order) -> bool:
+    """Whether highway-env runs an episode, and not the embedded world."""
+    return bool(order.spec["scenario"]["type"] == HIGHWAY_TYPE)
+
+
+def embedded(order: Order) -> bool:
+    """Whether SSAD's own world runs an episode."""
+    return not in_highway(order) and "simulator" not in order.spec
+
+
+def town_version(graph: LaneGraph) -> str:
+    """12 hex digits over every array of a lane graph."""
+    total = hashlib.sha256()
+    for name, value in sorted(vars(graph).items()):
+        if hasattr(value, "tobytes"):
+            total.update(f"{name}{value.dtype.str}{value.shape}".encode() + value.tobytes())
+    return total.hexdigest()[:12]
+
+
+def scenario_json(scenario: Scenario) -> dict[str, Any]:
+    """A scenario as plain data, as it stands in YAML, with its defaults written out."""
+    data: dict[str, Any] = safeio.parse_json(safeio.dump_json(asdict(scenario)))
+    return data
+
+
+def episode_of(order: Order) -> Episode:
+    """The concrete episode of an order.
+
+    Raises:
+        RouteError: It cannot be built.
+        MapError: It cannot be built.
+        ConfigError: It cannot be built.
+    """
+    from ssad.scenarios.dynamic import build_episode, scenario_from
+    from ssad.simulators.highway_env import highway_episode
+
+    scenario = scenario_from(order.spec["scenario"])
+    if in_highway(order):
+        seed = order.seed if order.spec["repetition"] else scenario.seed
+        return replace(highway_episode(scenario, seed), key=order.key)
+    return replace(
+        build_episode(scenario, town(scenario.town), seed=order.seed, spread=order.spec["spread"]), key=order.key
+    )
+
+
+def drive(
+    orders: Sequence[Order],
+    *,
+    device: str,
+    driver: Driver | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    perturbation: Mapping[str, Perturbation] | None = None,
+    key: Callable[[Order], str] = attrgetter("key"),
+) -> tuple[list[Episode], list[EpisodeTrace], Mapping[str, Any]]:
+    """Episodes and traces of orders that share a system and a simulator, run as one batch.
+
+    The third is what a simulator counts by sensors of its own (`ssad.simulators.carla.events`), which drives one order
+    at a time; else it is empty.
+
+    Args:
+        orders: What is to be driven.
+        device: Where the world computes.
+        driver: Who drives; None: the system that the orders name.
+        sensors: What drivers may ask for; None: `onboard_sensors`.
+        perturbation: What changes the pictures that drivers get; see `ssad.world.rollout.rollout`.
+        key: Of the episodes, on which the noise of sensors depends; traces have those of their orders.
+    """
+    from ssad.drivers import make_system
+    from ssad.simulators.highway_env import HighwayEnv
+    from ssad.world.rollout import rollout
+    from ssad.world.world import World
+
+    episodes = [replace(episode_of(order), key=key(order)) for order in orders]
+    graphs = {episode.town: town(episode.town) for episode in episodes}
+    system = driver or system_of(orders[0].system)
+    policies = {name: make_system(name) for episode in episodes for name in policies_of(episode.scenario)}
+    for one in (system, *policies.values()):
+        if callable(getattr(one, "to", None)):
+            one.to(device)  # type: ignore[attr-defined]
+    away = orders[0].spec.get("simulator")
+    simulator: Simulator
+    if away:
+        from ssad.simulators.carla.sensors import Own, eyes_of
+        from ssad.simulators.carla.server import Server
+        from ssad.simulators.carla.simulator import Carla
+
+        server = Server.of(away)
+        eyes = eyes_of(asked_sensors([system]), STEP) if server.sensors == "carla" and sensors is None else {}
+        simulator = Carla(episodes, graphs, server=server, eyes=eyes)
+        if eyes:
+            sensors = onboard_sensors(list(policies.values()), device) | {name: Own(name) for name in eyes}
+    else:
+        simulator = HighwayEnv(episodes, graphs) if in_highway(orders[0]) else World(episodes, graphs, device=device)
+    if sensors is None:
+        sensors = onboard_sensors([system, *policies.values()], device)
+    try:
+        traces = rollout(simulator, system, sensors=sensors, perturbation=perturbation, policies=policies.__getitem__)
+        measured = dict(getattr(simulator, "measured", {}))
+    finally:
+        getattr(simulator, "close", lambda: None)()
+    return episodes, [replace(trace, key=order.key) for trace, order in zip(traces, orders, strict=True)], measured
+
+
+def asked_sensors(drivers: Sequence[Driver]) -> dict[str, Camera | tuple[str, Lidar]]:
+    """The cameras that drivers ask for, and the LiDARs and radars beside a word that says which, by name."""
+    from ssad.rendering.camera.rig import rig_camera
+    from ssad.rendering.lidar import HDL32E
+
+    found: dict[str, Camera | tuple[str, Lidar]] = {}
+    for driver in drivers:
+        own: dict[str, Camera | tuple[str, Lidar]] = dict(getattr(driver, "cameras", {}))
+        own |= {name: ("lidar", one) for name, one in getattr(driver, "lidars", {}).items()}
+        own |= {name: ("radar", one) for name, one in getattr(driver, "radars", {}).items()}
+        for name in getattr(driver, "sensors", ()):
+            if name in own:
+                found[name] = own[name]
+            elif name in CAMERAS:
+                found[name] = rig_camera(name, WIDTH)
+            elif name == LIDAR:
+                found[name] = "lidar", HDL32E
+    return found
+
+
+def onboard_sensors(drivers: Sequence[Driver], device: str) -> dict[str, Sensor]:
+    """The cameras and the LiDAR of nuScenes, by channel, where a driver asks for one, and the drivers' own sensors."""
+    asked = asked_sensors(drivers)
+    if not asked:
+        return {}
+    from ssad.rendering.onboard import Onboard
+    from ssad.rendering.radar import OnboardRadar
+
+    onboard = Onboard(device=device)
+    found: dict[str, Sensor] = {**onboard.rig(), LIDAR: onboard.lidar()}
+    for name, one in asked.items():
+        if isinstance(one, tuple):
+            found[name] = onboard.lidar(one[1]) if one[0] == "lidar" else OnboardRadar(onboard, one[1])
+        else:
+            found[name] = onboard.camera(one)
+    return found
+
+
+def grade_of(episode: Episode, trace: EpisodeTrace, device: str) -> Grade:
+    """Who could have avoided the collision of a drive."""
+    return grades_of([(episode, trace)], device)[0]
+
+
+def grades_of(drives: Sequence[tuple[Episode, EpisodeTrace]], device: str) -> list[Grade]:
+    """Who could have avoided the collision of each drive; all are played side by side."""
+    from ssad.drivers import make_system
+    from ssad.drivers.careful.grade import grade_collisions
+
+    made = [
+        make_system(name) for name in dict.fromkeys(n for episode, _ in drives for n in policies_of(episode.scenario))
+    ]
+    sensors = onboard_sensors(made, device)
+    known = [(episode, town(episode.town), trace) for episode, trace in drives]
+    return grade_collisions(known, device=device, policies=make_system, sensors=sensors)

@@ -1,0 +1,38 @@
+"""How far points are from the edge of the road, on a raster around them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+from ssad.core.types import F64
+from ssad.world.roads.query import LaneQuery
+
+CELL = 0.5  # m
+MARGIN = 20.0  # m that a raster reaches beyond the points it is made for
+
+
+def edge_raster(query: LaneQuery, held: F64) -> tuple[F64, F64]:
+    """Signed distances from the edge of the road, more than 0 off it, at points `CELL` apart.
+
+    Args:
+        query: Lanes of the town.
+        held: Points [n, 2], m, that the raster holds with a margin of `MARGIN`.
+
+    Returns:
+        Distances [rows, columns], m: y and x grow with them; place of the first one [2], m.
+    """
+    origin: F64 = np.floor(held.min(0) - MARGIN)
+    shape = np.ceil((held.max(0) + MARGIN - origin) / CELL).astype(int) + 1
+    x, y = (origin[k] + CELL * np.arange(shape[k]) for k in (0, 1))
+    grid = np.stack(np.meshgrid(x, y, indexing="xy"), -1).reshape(-1, 2)
+    off = query.off_road(grid).reshape(shape[1], shape[0])
+    # the edge lies half-way between a cell on the road and one off it
+    outside, inside = (distance_transform_edt(mask) for mask in (off, ~off))
+    return CELL * np.where(off, outside - 0.5, 0.5 - inside), origin
+
+
+def edge_distances(query: LaneQuery, points: F64) -> F64:
+    """Signed distances from the edge of the road [n], m, more than 0 off it, of points [n, 2], m; linear in between."""
+    raster, origin = edge_raster(query, points)
+    return np.asarray(map_coordinates(raster, ((points - origin) / CELL).T[::-1], order=1), np.float64)

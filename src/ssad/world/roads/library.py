@@ -1,0 +1,98 @@
+"""Towns by name: those that ship, those the user has imported, or a file."""
+
+from __future__ import annotations
+
+import tempfile
+from functools import lru_cache
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from ssad.core.errors import MapError, unknown_name
+from ssad.core.lane_graph import LaneGraph, load_graph
+from ssad.core.safeio import home, read_text
+from ssad.world.roads.bake import bake
+from ssad.world.roads.random_towns import RANDOM, write_random_town
+from ssad.world.roads.signals import signal_names
+from ssad.world.roads.xodr import MAX_BYTES, read_network
+
+BUILT_IN = ("Twinford", "Crossgate", "ProvingGround", "Oldmarket", "Larkhill", "Ringmere", "Longreach")
+
+
+def town_names() -> dict[str, str]:
+    """Name -> "built-in", or the path of an imported town. A built-in name cannot be taken by an import."""
+    found = dict.fromkeys(BUILT_IN, "built-in")
+    for path in sorted((home() / "towns").glob("*.npz")):
+        found.setdefault(path.stem, str(path))
+    return found
+
+
+def is_town(name: str) -> bool:
+    """Whether this is the name of a town: one of `town_names`, or Random and a number (see `random_town`)."""
+    return name in town_names() or RANDOM.fullmatch(name) is not None
+
+
+def load_town(name: str) -> LaneGraph:
+    """The lane graph of a town: its name, or the path of a baked town (.npz) or OpenDRIVE map (.xodr).
+
+    UnknownNameError shows the closest names; MapError says what is wrong with a file. A graph is immutable and
+    kept, so that asking again is free.
+    """
+    if name in BUILT_IN:
+        return _built_in(name)
+    path = home() / "towns" / f"{name}.npz" if Path(name).name == name else Path(name)
+    if path.suffix == ".npz" and path.is_file():
+        return _stored(str(path), path.stat().st_mtime_ns)
+    if RANDOM.fullmatch(name):
+        return _random(name)
+    if Path(name).suffix == ".xodr":
+        return bake(Path(name))
+    if Path(name).suffix == ".npz" or "/" in name or "\\" in name:
+        raise MapError(f"{name}: no such file; give a town's name, a baked town (.npz) or a map (.xodr)")
+    raise unknown_name("town", name, town_names())
+
+
+def town_xodr(name: str) -> str:
+    """The OpenDRIVE text of a town, as `load_town` finds it.
+
+    Raises:
+        MapError: The town has none: its lanes were not made from OpenDRIVE.
+    """
+    from ssad.world.roads.designs import generate_town
+
+    if name in BUILT_IN:
+        return generate_town(name)
+    plain = Path(name).name == name and Path(name).suffix != ".xodr"
+    path = home() / "towns" / f"{name}.xodr" if plain else Path(name).with_suffix(".xodr")
+    if not path.is_file() and RANDOM.fullmatch(name):
+        return write_random_town(name)
+    if not path.is_file():
+        raise MapError(f"town '{name}' has no OpenDRIVE: there is no {path}; import its map: ssad import map FILE.xodr")
+    return read_text(path, limit=MAX_BYTES)
+
+
+@lru_cache(maxsize=8)
+def town_signals(name: str) -> dict[int, str]:
+    """The id that each signal of a town has in its OpenDRIVE; MapError as `town_xodr`."""
+    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
+        path = Path(folder) / "map.xodr"
+        path.write_text(town_xodr(name), encoding="utf-8")
+        return signal_names(load_town(name), read_network(path))
+
+
+@lru_cache(maxsize=8)
+def _built_in(name: str) -> LaneGraph:
+    with as_file(files("ssad.world.roads.towns") / f"{name}.npz") as path:
+        return load_graph(path)
+
+
+@lru_cache(maxsize=64)
+def _random(name: str) -> LaneGraph:
+    with tempfile.TemporaryDirectory(prefix="ssad-map-") as folder:
+        path = Path(folder) / f"{name}.xodr"
+        path.write_text(write_random_town(name), encoding="utf-8")
+        return bake(path, name)
+
+
+@lru_cache(maxsize=64)
+def _stored(path: str, changed: int) -> LaneGraph:
+    return load_graph(path)
