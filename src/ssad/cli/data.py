@@ -207,9 +207,9 @@ def record(
                 out,
                 pairs,
                 names(held_out),
-                clips,
+                clips,  # type: ignore[arg-type]
                 target=parse_target(target) if target else None,
-                seed=seed,  # type: ignore[arg-type]
+                seed=seed,
                 device=pick_device(device),
                 streets=streets,
             )

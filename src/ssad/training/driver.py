@@ -145,7 +145,7 @@ def run_driver_training(plan: DriverPlan, *, say: Say = print) -> Iterator[str]:
         episodes,
         graphs,
         learning.scenes,
-        observation=learning.observation,
+        observation=learning.observation,  # type: ignore[arg-type]
         action=learning.action,  # type: ignore[arg-type]
         reward=lambda state: learning.reward_scale * reward(state),
         policies=make_system,

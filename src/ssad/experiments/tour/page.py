@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ssad.core.errors import SSADError
+from ssad.experiments.runs import kind_of_run, write_report
 from ssad.report.default import result_table
 from ssad.report.load import Run, load_run
-from ssad.report.pages import kind_module, render, write_report
+from ssad.report.pages import render
 from ssad.report.tables import Table
-from ssad.report.verdict import verdict
+from ssad.report.verdict import complete_verdict
 
 TEMPLATE = Path(__file__).with_name("page.html")
 
@@ -32,12 +33,13 @@ def section(run: Run) -> tuple[str, Sequence[Table]]:
         found = _read(run.folder / name)
         if found is not None:
             write_report(found.folder)
-            table = replace(kind_module(found.kind).summary(found), name=name)
+            kind = kind_of_run(found)
+            table = replace(kind.summary(found), name=name)
             tables.append(table)
             part |= {
                 "title": str(found.suite.get("title") or name),
                 "table": table,
-                "verdict": verdict(found),
+                "verdict": complete_verdict(found, kind.verdict(found)),
                 "command": found.command,
             }
             part["cells"] = f"{len(found.lines)} of {found.planned} cells"

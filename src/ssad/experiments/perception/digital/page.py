@@ -337,7 +337,7 @@ def summary(found: Run) -> Table:
     return replace(main_table(run), note="\n".join(lines))
 
 
-def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
+def section(found: Run, sentences: Sequence[str] = ()) -> tuple[str, Sequence[Table]]:
     """The page of a digital run and its tables."""
     run = load_digital_run(found)
     verdict = audit(attempts_of(run))
@@ -349,7 +349,7 @@ def section(found: Run, verdict: Sequence[str] = ()) -> tuple[str, Sequence[Tabl
     page = render(
         TEMPLATE,
         found,
-        verdict=verdict,
+        verdict=sentences,
         others=others,
         distances=distances,
         main=main,

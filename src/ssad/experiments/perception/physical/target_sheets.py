@@ -8,7 +8,7 @@ from typing import Any
 from ssad.core import safeio
 from ssad.core.images import save_picture
 from ssad.experiments.perception.physical.target_attacks import TargetAttacks
-from ssad.experiments.perception.physical.target_sheet import LEAST
+from ssad.detectors.drawing import LEAST
 from ssad.experiments.perception.physical.target_table import CLEAN, GRID, Pair, TargetTable, options_title
 from ssad.experiments.perception.physical.target_views import TargetClips
 from ssad.scenarios.static.physical import TextureSpec
